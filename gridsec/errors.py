@@ -1,0 +1,65 @@
+"""The error tree. Offline code raises these; online code returns outcomes as values instead."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+
+class GridsecError(Exception):
+    """Base of every error that this project raises on purpose."""
+
+
+class FeederInvalid(GridsecError):
+    """A feeder's description is wrong; `problems` names everything that is wrong with it at once.
+
+    Parameters
+    ----------
+    problems
+        One sentence each, complete: where, what, and what would be right.
+    """
+
+    def __init__(self, problems: Iterable[str]) -> None:
+        self.problems: tuple[str, ...] = tuple(problems)
+        count = len(self.problems)
+        head = f"{count} problem{'s' if count != 1 else ''} with the feeder"
+        super().__init__("\n  - ".join([head + ":", *self.problems]))
+
+
+class NotObservable(GridsecError):
+    """A set of meters is too small for what was asked of it.
+
+    Parameters
+    ----------
+    subset
+        Indices of the meters in question.
+    rank
+        What they do determine: a rank, or the number of meters when counting is the obstacle.
+    why
+        The condition that fails, in words.
+    """
+
+    def __init__(self, subset: Iterable[int], rank: int, why: str) -> None:
+        self.subset: tuple[int, ...] = tuple(subset)
+        self.rank = rank
+        super().__init__(why)
+
+
+class DesignInfeasible(GridsecError):
+    """A design could not be found or did not survive its verification.
+
+    Parameters
+    ----------
+    what
+        The design that failed, with the condition it had to meet.
+    status
+        What the solver said, or which check failed. A solver's word is never proof by itself.
+    margin
+        The recomputed margin of the failed condition (negative: violated), if there is one.
+    """
+
+    def __init__(self, what: str, status: str, margin: float | None = None) -> None:
+        self.what = what
+        self.status = status
+        self.margin = margin
+        tail = "" if margin is None else f", margin {margin:.3g}"
+        super().__init__(f"{what}: {status}{tail}")

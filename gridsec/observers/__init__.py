@@ -1,0 +1,1 @@
+"""Observer families: one module is one family, with `design`, `init` and `step`."""

@@ -1,0 +1,127 @@
+"""The online vocabulary: what goes into and what comes out of every estimator's `step`.
+
+Every estimator family is three functions with these types at their borders::
+
+    design(...)                 -> Design                      offline; may raise a GridsecError
+    init(design, t)             -> State
+    step(design, state, frame)  -> (State, Estimate, Verdict)  online; never raises on data
+
+Outcomes are values. UNDECIDED is an answer of its own: no answer must never look like no attack.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+
+class Decision(StrEnum):
+    """The three answers."""
+
+    CLEAN = "clean"
+    ATTACKED = "attacked"
+    UNDECIDED = "undecided"
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """Everything that is known at one tick, in per unit. N customers, p meters.
+
+    Attributes
+    ----------
+    t
+        Unix time of the tick, s.
+    y : (p,)
+        Squared voltage that each meter reports, pu; NaN where `seen` is False.
+    seen : (p,)
+        Whether a usable reading of the meter belongs to this tick.
+    v0_squared
+        Squared busbar voltage as metered, pu; NaN if there is none.
+    p : (N,)
+        Net active injection of each customer (generation positive), pu; always finite.
+    p_error : (N,)
+        Half-width of the interval around `p` that holds the truth, pu.
+    q : (N,)
+        Reactive injection of each customer *without* its droop inverter, pu; always finite.
+    q_error : (N,)
+        Half-width for `q`, pu.
+    q_net : (N,)
+        Metered net reactive injection, inverter included, pu; NaN where not reported.
+    q_net_error : (N,)
+        Half-width for `q_net`, pu; ignored where `q_net` is NaN.
+    """
+
+    t: float
+    y: Floats
+    seen: Bools
+    v0_squared: float
+    p: Floats
+    p_error: Floats
+    q: Floats
+    q_error: Floats
+    q_net: Floats
+    q_net_error: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """The reconstructed state of the feeder. N customers, m inverters, b + 1 buses.
+
+    Attributes
+    ----------
+    t
+        Unix time, s.
+    v2 : (N,)
+        Reconstructed squared voltage of each customer, pu.
+    bound : (N,)
+        Half-width of the interval around `v2` that holds the truth while the design's assumptions
+        hold, pu.
+    v2_bus : (b + 1,)
+        Reconstructed squared voltage of every bus, the busbar first, pu.
+    trusted : (p,)
+        The meters that the estimate rests on.
+    x : (m,)
+        Estimated reactive injection of the droop inverters, pu.
+    """
+
+    t: float
+    v2: Floats
+    bound: Floats
+    v2_bus: Floats
+    trusted: Bools
+    x: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Who lies. p meters.
+
+    Attributes
+    ----------
+    decision
+        CLEAN, ATTACKED or UNDECIDED.
+    reason
+        Why, in one sentence, ready to be shown to an operator.
+    suspects : (p,)
+        The meters named as manipulated. May be non-empty with UNDECIDED, when more meters disagree
+        than the design can tell apart.
+    score : (p,)
+        Absolute output residual |y - y_hat|, squared pu; NaN for unseen meters.
+    threshold : (p,)
+        The largest score an honest meter can reach, squared pu: `score > threshold` is evidence.
+    attack : (p,)
+        Reconstructed additive attack on the squared voltage, pu; 0 for meters that are no suspects.
+    """
+
+    decision: Decision
+    reason: str
+    suspects: Bools
+    score: Floats
+    threshold: Floats
+    attack: Floats
