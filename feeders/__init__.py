@@ -1,0 +1,1 @@
+"""Real feeders: file format, converters, full AC power flow, recorded scenarios, studies."""

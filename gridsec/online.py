@@ -29,6 +29,20 @@ class Decision(StrEnum):
     UNDECIDED = "undecided"
 
 
+class Cause(StrEnum):
+    """Why a verdict is what it is, for programs; `Verdict.reason` says it for people."""
+
+    AGREEMENT = "agreement"
+    RESIDUALS = "residuals"
+    SETTLING = "settling"
+    SILENT_METERS = "silent-meters"
+    TOO_FEW_METERS = "too-few-meters"
+    NO_BUSBAR = "no-busbar"
+    TOO_MANY_SUSPECTS = "too-many-suspects"
+    AMBIGUOUS = "ambiguous"
+    DESIGN_INVALID = "design-invalid"
+
+
 @dataclass(frozen=True, slots=True)
 class Frame:
     """Everything that is known at one tick, in per unit. N customers, p meters.
@@ -106,6 +120,8 @@ class Verdict:
     ----------
     decision
         CLEAN, ATTACKED or UNDECIDED.
+    cause
+        AGREEMENT goes with CLEAN, RESIDUALS with ATTACKED, every other cause with UNDECIDED.
     reason
         Why, in one sentence, ready to be shown to an operator.
     suspects : (p,)
@@ -120,6 +136,7 @@ class Verdict:
     """
 
     decision: Decision
+    cause: Cause
     reason: str
     suspects: Bools
     score: Floats
