@@ -22,9 +22,7 @@ SYSTEM_PARTS = {"browser", "postgresql"}
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_runtest_makereport(
-    item: pytest.Item, call: pytest.CallInfo[None]
-) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
     """Where every system part has been installed, a test skipped for want of one has failed."""
     report = yield
     wanted = SYSTEM_PARTS & {mark.name for mark in item.iter_markers()}
