@@ -1,0 +1,610 @@
+"""From verdicts to alarms: delays, flapping, acknowledgement. Pure: time is an argument, state is a value.
+
+`conditions` says what is wrong at one tick, `advance` turns a stream of such ticks into transitions::
+
+    book = AlarmBook("village")
+    book, transitions = advance(book, AlarmRules(), conditions(report), report.t)
+
+A condition is present, absent, or unknown at a tick. Unknown *holds*: the clock of that condition stands
+still, nothing is raised and nothing is cleared, because no answer must never look like no attack. So an
+alarm is raised once its condition has been seen for `on_delay_s` without a tick in between that saw it
+absent, and cleared once it has been seen absent for `off_delay_s` without a tick that saw it present; time
+next to an unknown tick counts for neither. A restart is a hold, too: see `restore`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+
+from gridsec.errors import GridsecError
+from gridsec.online import Cause, Decision
+from service.report import BUSBAR, FeederReport, MeterReport, finite
+
+
+class AlarmKind(StrEnum):
+    """What can be wrong."""
+
+    METER_MANIPULATED = "meter-manipulated"
+    VOLTAGE_LIMIT = "voltage-limit"
+    DATA_LOSS = "data-loss"
+    UNDECIDED = "undecided"
+
+
+class AlarmState(StrEnum):
+    """Where an alarm stands. Clearing keeps who acknowledged it; rising again asks for a new answer."""
+
+    RAISED = "raised"
+    ACKNOWLEDGED = "acknowledged"
+    CLEARED = "cleared"
+
+
+class Severity(StrEnum):
+    """How much it matters."""
+
+    CRITICAL = "critical"
+    MAJOR = "major"
+    MINOR = "minor"
+
+
+class Change(StrEnum):
+    """What happened to an alarm."""
+
+    RAISED = "raised"
+    ACKNOWLEDGED = "acknowledged"
+    CLEARED = "cleared"
+
+
+class AlarmUnknown(GridsecError):
+    """No alarm has this id (any more)."""
+
+    def __init__(self, alarm_id: str) -> None:
+        self.alarm_id = alarm_id
+        super().__init__(f"no alarm has the id {alarm_id!r}")
+
+
+class AlreadyAcknowledged(GridsecError):
+    """Somebody was faster."""
+
+    def __init__(self, alarm: Alarm) -> None:
+        self.alarm = alarm
+        super().__init__(f"alarm {alarm.id} has already been acknowledged by {alarm.acknowledged_by}")
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """The numbers behind an alarm at the tick that raised it; None where there is none.
+
+    Attributes
+    ----------
+    score, threshold
+        Residual of the meter and the largest one that an honest meter can reach, squared pu.
+    v_volt_reported, v_volt_estimated, attack_volt_estimated
+        Reported and reconstructed voltage and their difference for suspects, V.
+    """
+
+    score: float | None = None
+    threshold: float | None = None
+    v_volt_reported: float | None = None
+    v_volt_estimated: float | None = None
+    attack_volt_estimated: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """One thing that is wrong at a tick or, with `known=False`, about which this tick says nothing.
+
+    Attributes
+    ----------
+    kind, feeder, meter
+        What and where; the meter is None if it is about the whole feeder.
+    severity, evidence, reason
+        How bad, the numbers, and a sentence for the operator.
+    known
+        False: nobody can tell at this tick; the alarm, if there is one, is held as it is.
+    """
+
+    kind: AlarmKind
+    feeder: str
+    meter: str | None
+    severity: Severity
+    evidence: Evidence = Evidence()
+    reason: str = ""
+    known: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Alarm:
+    """An alarm as operators see it. Times are Unix seconds.
+
+    Attributes
+    ----------
+    id
+        26 characters, the first ten of which sort by time; the same data gives the same id.
+    kind, feeder, meter, severity, reason, evidence
+        As in the condition that raised it.
+    state
+        Raised, acknowledged or cleared.
+    count
+        How often it has been raised: above 1 it flaps.
+    t_event
+        When the condition of the present (or last) occurrence was first seen.
+    t_raised
+        When that occurrence had lasted for the on-delay.
+    t_cleared
+        When it was cleared; None while it is active.
+    acknowledged_by, t_acknowledged, comment
+        The answer of an operator to the present (or last) occurrence.
+    """
+
+    id: str
+    kind: AlarmKind
+    feeder: str
+    meter: str | None
+    severity: Severity
+    state: AlarmState
+    count: int
+    t_event: float
+    t_raised: float
+    t_cleared: float | None
+    reason: str
+    evidence: Evidence
+    acknowledged_by: str | None = None
+    t_acknowledged: float | None = None
+    comment: str | None = None
+
+    @property
+    def active(self) -> bool:
+        """Whether the alarm still stands."""
+        return self.state is not AlarmState.CLEARED
+
+
+@dataclass(frozen=True, slots=True)
+class Transition:
+    """One change of one alarm: the alarm as it is afterwards, what happened, when, and by whom."""
+
+    alarm: Alarm
+    change: Change
+    t: float
+    who: str | None = None
+    comment: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class AlarmRules:
+    """How long a condition must last.
+
+    Attributes
+    ----------
+    on_delay_s, off_delay_s
+        How long a condition must be seen before its alarm is raised, and be gone before it is cleared, s.
+    on_delays_s, off_delays_s
+        Other delays for single kinds, s.
+    memory_s
+        A condition that returns within this time after it cleared raises the same alarm again, s.
+    """
+
+    on_delay_s: float = 2.0
+    off_delay_s: float = 5.0
+    on_delays_s: Mapping[AlarmKind, float] = field(default_factory=dict)
+    off_delays_s: Mapping[AlarmKind, float] = field(default_factory=dict)
+    memory_s: float = 600.0
+
+    def __post_init__(self) -> None:
+        times = (
+            self.on_delay_s,
+            self.off_delay_s,
+            self.memory_s,
+            *self.on_delays_s.values(),
+            *self.off_delays_s.values(),
+        )
+        if not all(math.isfinite(s) and s >= 0.0 for s in times):
+            raise ValueError(f"delays must be finite and not negative: {self}")
+
+    def on(self, kind: AlarmKind) -> float:
+        """Return the on-delay of a kind, s."""
+        return self.on_delays_s.get(kind, self.on_delay_s)
+
+    def off(self, kind: AlarmKind) -> float:
+        """Return the off-delay of a kind, s."""
+        return self.off_delays_s.get(kind, self.off_delay_s)
+
+
+Key = tuple[AlarmKind, str | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """What the book remembers about one condition.
+
+    Attributes
+    ----------
+    present
+        What the last tick that knew said.
+    onset
+        When the present run of equal answers began, s.
+    since
+        The same, moved forward by every hold, so that t - since is the time that counts, s.
+    t_known
+        The last tick that knew, s.
+    held
+        Whether there were ticks that did not know since then.
+    alarm
+        Its alarm: active, or cleared and remembered; None while the condition is only pending.
+    """
+
+    present: bool
+    onset: float
+    since: float
+    t_known: float
+    held: bool
+    alarm: Alarm | None
+
+
+@dataclass(frozen=True, slots=True)
+class AlarmBook:
+    """The alarm state of one feeder. A value: `advance` and `acknowledge` return a new one.
+
+    Attributes
+    ----------
+    feeder
+        Whose alarms these are.
+    t
+        Time of the last tick, s; None before the first one.
+    entries
+        By kind and meter.
+    """
+
+    feeder: str
+    t: float | None = None
+    entries: Mapping[Key, Entry] = field(default_factory=dict)
+
+    @property
+    def alarms(self) -> tuple[Alarm, ...]:
+        """Every alarm that is active, or cleared and still remembered; oldest first."""
+        found = (e.alarm for e in self.entries.values() if e.alarm is not None)
+        return tuple(sorted(found, key=lambda alarm: alarm.id))
+
+    @property
+    def active(self) -> tuple[Alarm, ...]:
+        """Every alarm that still stands; oldest first."""
+        return tuple(alarm for alarm in self.alarms if alarm.active)
+
+
+def conditions(report: FeederReport) -> list[Condition]:
+    """Say what is wrong with a feeder at one tick, and about what the tick says nothing.
+
+    - `meter-manipulated`: the verdict names the meter. Unknown while the verdict is UNDECIDED or the meter
+      is silent, whatever the list of suspects says.
+    - `voltage-limit`: the whole interval around the *reconstructed* voltage is outside the limits, so a
+      lying meter raises none. Unknown while the interval straddles a limit with its middle outside, or
+      while the reconstruction itself carries no guarantee.
+    - `data-loss`: a meter, or the busbar meter, is silent. Unknown while it is unseen but not for long.
+    - `undecided`: there is no verdict, for a cause of its own. Unknown while the monitor settles or a
+      silent meter is the cause: `data-loss` says that already.
+
+    Parameters
+    ----------
+    report
+        The feeder at this tick.
+
+    Returns
+    -------
+    list of Condition
+        What is not in it is known to be absent.
+    """
+    found = [*_manipulated(report), *_data_loss(report), *_undecided(report)]
+    for meter in report.meters:
+        found.extend(_voltage_limit(report, meter))
+    return found
+
+
+def _evidence(meter: MeterReport) -> Evidence:
+    values = (
+        meter.score,
+        meter.threshold,
+        meter.v_volt_reported,
+        meter.v_volt_estimated,
+        meter.attack_volt_estimated,
+    )
+    return Evidence(*(None if value is None else finite(value) for value in values))
+
+
+def _volt(value: float | None) -> str:
+    return "an unknown voltage" if value is None else f"{value:.1f} V"
+
+
+def _manipulated(report: FeederReport) -> Iterable[Condition]:
+    decided = report.verdict is not Decision.UNDECIDED
+    for meter in report.meters:
+        known = decided and meter.seen
+        if known and not meter.suspect:
+            continue
+        evidence = _evidence(meter)
+        reported, estimated = _volt(evidence.v_volt_reported), _volt(evidence.v_volt_estimated)
+        yield Condition(
+            AlarmKind.METER_MANIPULATED,
+            report.feeder,
+            meter.meter,
+            Severity.CRITICAL,
+            evidence,
+            f"reports {reported}, but the rest of the feeder says {estimated}",
+            known,
+        )
+
+
+# With these causes the reconstruction still is what the design promises: the readings that are there are
+# enough. With every other UNDECIDED its bound is not a bound.
+_SOUND = frozenset({Cause.AGREEMENT, Cause.RESIDUALS, Cause.SILENT_METERS})
+
+
+def _voltage_limit(report: FeederReport, meter: MeterReport) -> Iterable[Condition]:
+    evidence = _evidence(meter)
+    v = evidence.v_volt_estimated
+    half_width = None if meter.v_volt_std is None else finite(3.0 * meter.v_volt_std)
+    sound = report.cause in _SOUND and v is not None and half_width is not None
+    if v is None or half_width is None or not sound:
+        yield Condition(
+            AlarmKind.VOLTAGE_LIMIT, report.feeder, meter.meter, Severity.MAJOR, evidence, known=False
+        )
+        return
+    low, high = report.v_min_volt, report.v_max_volt
+    if low <= v <= high:
+        return
+    surely = v + half_width < low or v - half_width > high
+    side, limit = ("below", low) if v < low else ("above", high)
+    yield Condition(
+        AlarmKind.VOLTAGE_LIMIT,
+        report.feeder,
+        meter.meter,
+        Severity.MAJOR,
+        evidence,
+        f"{v:.1f} V ± {half_width:.1f} V at the connection point, {side} the limit of {limit:.1f} V",
+        surely,
+    )
+
+
+def _data_loss(report: FeederReport) -> Iterable[Condition]:
+    silent = dict(report.silent)
+    unsure = [meter.meter for meter in report.meters if not meter.seen and meter.meter not in silent]
+    if report.cause is Cause.NO_BUSBAR and BUSBAR not in silent:
+        unsure.append(BUSBAR)
+    for meter, seconds in silent.items():
+        # Without the busbar's voltage nothing on the feeder can be judged.
+        severity = Severity.MAJOR if meter == BUSBAR else Severity.MINOR
+        length = "yet" if not math.isfinite(seconds) else f"for {seconds:.0f} s"
+        yield Condition(
+            AlarmKind.DATA_LOSS, report.feeder, meter, severity, reason=f"no usable reading {length}"
+        )
+    for meter in unsure:
+        yield Condition(AlarmKind.DATA_LOSS, report.feeder, meter, Severity.MINOR, known=False)
+
+
+_COVERED = frozenset({Cause.SETTLING, Cause.SILENT_METERS, Cause.NO_BUSBAR})
+
+
+def _undecided(report: FeederReport) -> Iterable[Condition]:
+    if report.verdict is Decision.UNDECIDED:
+        yield Condition(
+            AlarmKind.UNDECIDED,
+            report.feeder,
+            None,
+            Severity.MAJOR,
+            reason=report.reason,
+            known=report.cause not in _COVERED,
+        )
+
+
+def advance(
+    book: AlarmBook, rules: AlarmRules, conditions: Iterable[Condition], t: float
+) -> tuple[AlarmBook, tuple[Transition, ...]]:
+    """Take one tick into the book.
+
+    Parameters
+    ----------
+    book
+        The feeder's alarms so far.
+    rules
+        Delays and memory.
+    conditions
+        What `conditions` says about this tick; what it does not mention is known to be absent.
+    t
+        Unix time of the tick, s. A tick that is older than the last one holds every clock.
+
+    Returns
+    -------
+    book, transitions
+        The new state, and what happened, in a repeatable order.
+
+    Raises
+    ------
+    ValueError
+        If a condition belongs to another feeder.
+    """
+    seen: dict[Key, Condition] = {}
+    for condition in conditions:
+        if condition.feeder != book.feeder:
+            raise ValueError(f"a condition of {condition.feeder!r} in the book of {book.feeder!r}")
+        seen[condition.kind, condition.meter] = condition
+    backwards = book.t is not None and t < book.t
+    entries: dict[Key, Entry] = {}
+    transitions: list[Transition] = []
+    for key in sorted({*book.entries, *seen}, key=_order):
+        old, condition_now = book.entries.get(key), seen.get(key)
+        if condition_now is not None and not condition_now.known:
+            entry = None if old is None else replace(old, held=True)
+        else:
+            entry, transition = _settle(
+                _timed(old, condition_now is not None, t, backwards), condition_now, rules, key, t
+            )
+            transitions.extend(transition)
+        if entry is not None:
+            entries[key] = entry
+    return AlarmBook(book.feeder, t, entries), tuple(transitions)
+
+
+def _order(key: Key) -> tuple[str, str]:
+    return key[0].value, key[1] or ""
+
+
+def _timed(old: Entry | None, present: bool, t: float, backwards: bool) -> Entry:
+    """Return the entry after a tick that knows, with its clock moved on."""
+    if old is None or old.present != present:
+        return Entry(present, t, t, t, held=False, alarm=None if old is None else old.alarm)
+    pause = t - old.t_known if old.held or backwards else 0.0
+    return replace(old, since=old.since + pause, t_known=t, held=False)
+
+
+def _settle(
+    entry: Entry, condition: Condition | None, rules: AlarmRules, key: Key, t: float
+) -> tuple[Entry | None, tuple[Transition, ...]]:
+    """Raise, clear or forget what is due."""
+    kind, alarm = key[0], entry.alarm
+    lasted = t - entry.since
+    if condition is not None:
+        if (alarm is None or not alarm.active) and lasted >= rules.on(kind):
+            alarm = _raise(alarm, condition, rules, entry.onset, t)
+            return replace(entry, alarm=alarm), (Transition(alarm, Change.RAISED, t),)
+        return entry, ()
+    if alarm is None:
+        return None, ()
+    if alarm.active:
+        if lasted < rules.off(kind):
+            return entry, ()
+        alarm = replace(alarm, state=AlarmState.CLEARED, t_cleared=t)
+        return replace(entry, alarm=alarm), (Transition(alarm, Change.CLEARED, t),)
+    return (entry if _remembered(alarm, rules, t) else None), ()
+
+
+def _remembered(alarm: Alarm, rules: AlarmRules, t: float) -> bool:
+    return alarm.t_cleared is not None and t - alarm.t_cleared <= rules.memory_s
+
+
+def _raise(old: Alarm | None, condition: Condition, rules: AlarmRules, onset: float, t: float) -> Alarm:
+    again = old is not None and _remembered(old, rules, onset)
+    return Alarm(
+        id=old.id if old is not None and again else alarm_id(condition, onset),
+        kind=condition.kind,
+        feeder=condition.feeder,
+        meter=condition.meter,
+        severity=condition.severity,
+        state=AlarmState.RAISED,
+        count=old.count + 1 if old is not None and again else 1,
+        t_event=onset,
+        t_raised=t,
+        t_cleared=None,
+        reason=condition.reason,
+        evidence=condition.evidence,
+    )
+
+
+_CROCKFORD = "0123456789ABCDEFGHJKMNPQRSTVWXYZ"
+
+
+def alarm_id(condition: Condition, onset: float) -> str:
+    """Return the id of the alarm of a condition that was first seen at `onset`.
+
+    In the form of a ULID: ten characters of Crockford's base 32 for the milliseconds, then sixteen; those
+    are a hash instead of random bits, so that a replay gives the same ids.
+
+    Parameters
+    ----------
+    condition
+        Kind, feeder and meter enter the hash.
+    onset
+        Unix time, s.
+    """
+    what = "\0".join((condition.kind, condition.feeder, condition.meter or "", repr(onset)))
+    tail = int.from_bytes(hashlib.sha256(what.encode()).digest()[:10], "big")
+    number = (max(0, int(onset * 1000.0)) % (1 << 48)) << 80 | tail
+    return "".join(_CROCKFORD[number >> shift & 31] for shift in range(125, -1, -5))
+
+
+def acknowledged(alarm: Alarm, who: str, comment: str, t: float) -> Transition:
+    """Return the transition by which an operator answers an alarm.
+
+    An alarm that has cleared unanswered can still be answered; it stays cleared.
+
+    Parameters
+    ----------
+    alarm
+        The alarm as it is.
+    who, comment
+        The operator, and what they say.
+    t
+        Unix time, s.
+
+    Raises
+    ------
+    AlreadyAcknowledged
+        If somebody did so before, for the same occurrence.
+    """
+    if alarm.acknowledged_by is not None:
+        raise AlreadyAcknowledged(alarm)
+    answered = replace(
+        alarm,
+        state=AlarmState.ACKNOWLEDGED if alarm.active else alarm.state,
+        acknowledged_by=who,
+        t_acknowledged=t,
+        comment=comment,
+    )
+    return Transition(answered, Change.ACKNOWLEDGED, t, who, comment)
+
+
+def acknowledge(
+    book: AlarmBook, alarm_id: str, who: str, comment: str, t: float
+) -> tuple[AlarmBook, tuple[Transition, ...]]:
+    """Answer an alarm of the book.
+
+    Parameters
+    ----------
+    book
+        The feeder's alarms.
+    alarm_id, who, comment, t
+        Which alarm, who answers it, with what words, and when (Unix s).
+
+    Returns
+    -------
+    book, transitions
+        As from `advance`.
+
+    Raises
+    ------
+    AlarmUnknown
+        If the book holds no such alarm: never raised, or cleared and forgotten (the store may know it).
+    AlreadyAcknowledged
+        If somebody was faster.
+    """
+    for key, entry in book.entries.items():
+        if entry.alarm is not None and entry.alarm.id == alarm_id:
+            transition = acknowledged(entry.alarm, who, comment, t)
+            entries = {**book.entries, key: replace(entry, alarm=transition.alarm)}
+            return replace(book, entries=entries), (transition,)
+    raise AlarmUnknown(alarm_id)
+
+
+def restore(feeder: str, alarms: Iterable[Alarm]) -> AlarmBook:
+    """Return the book of a feeder from its stored alarms, after a restart.
+
+    The restart is a hold: nobody looked. Alarms keep their id, count, state and acknowledgement; a clock
+    that was running (a condition pending, an alarm about to clear) starts again from zero, so a transition
+    may come later than without the restart, by less than its delay, and never earlier.
+
+    Parameters
+    ----------
+    feeder
+        Name.
+    alarms
+        Its active alarms and those that cleared within the memory of the rules, in any order. Of several
+        with the same kind and meter the latest counts.
+    """
+    entries: dict[Key, Entry] = {}
+    for alarm in sorted(alarms, key=lambda alarm: alarm.id):
+        if alarm.feeder != feeder:
+            raise ValueError(f"an alarm of {alarm.feeder!r} in the book of {feeder!r}")
+        t = alarm.t_raised if alarm.t_cleared is None else alarm.t_cleared
+        entries[alarm.kind, alarm.meter] = Entry(alarm.active, t, t, t, held=True, alarm=alarm)
+    return AlarmBook(feeder, None, entries)
