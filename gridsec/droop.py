@@ -1,0 +1,399 @@
+"""Droop inverters: the curves, their slope in the squared voltage, standard presets, capability limits.
+
+An inverter injects reactive power by a piecewise linear curve with four breakpoints and saturation at
+both ends. Inverters measure v, so their curve is linear in v between the breakpoints (`voltage_curve`).
+The model runs on `z = vbar^2 - v^2`, where the curve K of chong2020 (17) is linear between the *mapped*
+breakpoints (`Droop.__call__`). The two agree at the breakpoints; docs/theory-model.md bounds the rest.
+
+References
+----------
+.. [1] chong2020, equations (16) to (18). In (18) the slope restriction needs the larger of the two
+   slopes, not the smaller one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from math import log
+
+import numpy as np
+
+from gridsec.arrays import Floats, Ints, frozen, frozen_ints
+from gridsec.errors import FeederInvalid
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Droop:
+    """A fleet of m droop inverters, `tau_i dx_i/dt = -x_i + K_i(z_i)`.
+
+    K_i is piecewise linear and non-decreasing in z, constant outside the outer breakpoints, with slope
+    in `[0, slope_i]`. Calling the object evaluates K.
+
+    Attributes
+    ----------
+    customer : (m,)
+        Index of the customer each inverter belongs to.
+    v : (m, 4)
+        Breakpoints of the voltage, ascending, pu.
+    q : (m, 4)
+        Reactive injection at the breakpoints, non-increasing, pu of the feeder's base.
+    tau : (m,)
+        First-order time constant, s.
+    vbar
+        Reference voltage, pu; `z = vbar^2 - v^2`.
+    slope : (m,)
+        Derived. Largest slope of K, the d of chong2020 (18) as corrected.
+    limit : (m,)
+        Derived. Largest `|q|`, the saturation limit.
+
+    Raises
+    ------
+    FeederInvalid
+        With every problem found.
+    """
+
+    customer: Ints
+    v: Floats
+    q: Floats
+    tau: Floats
+    vbar: float = 1.0
+    slope: Floats = field(init=False, repr=False)
+    limit: Floats = field(init=False, repr=False)
+    # Ramp k of z is slope[k] * (clip(z, low[k], high[k]) - low_or_high[k]); see `_ramps`.
+    _ramps: tuple[_Ramp, ...] = field(init=False, repr=False)
+    _offset: Floats = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "customer", frozen_ints(self.customer))
+        for name in ("v", "q", "tau"):
+            object.__setattr__(self, name, frozen(getattr(self, name)))
+        problems = _problems(self)
+        if problems:
+            raise FeederInvalid(problems)
+        ramps, offset = _ramps(self.vbar**2 - self.v**2, self.q)
+        steepest = np.zeros(self.tau.shape)
+        for ramp in ramps:
+            np.maximum(steepest, ramp.slope, out=steepest)
+        object.__setattr__(self, "_ramps", tuple(ramp.compact() for ramp in ramps))
+        object.__setattr__(self, "_offset", _compact(offset))
+        object.__setattr__(self, "slope", frozen(steepest))
+        object.__setattr__(self, "limit", frozen(np.max(np.abs(self.q), axis=1, initial=0.0)))
+
+    def __call__(self, z: Floats, rows: Ints | None = None) -> Floats:
+        """K(z), chong2020 (17): reactive set-points of the inverters.
+
+        Parameters
+        ----------
+        z : (…, m), or the shape of `rows`
+            `vbar^2 - v^2` at each inverter, pu.
+        rows : (…)
+            Index of the inverter each entry of `z` belongs to; by default the last axis of `z` runs
+            over all inverters.
+
+        Returns
+        -------
+        Floats
+            Same shape as `z`, pu of the feeder's base.
+        """
+        total: Floats | None = None
+        for ramp in self._ramps:
+            part = np.maximum(z, _pick(ramp.low, rows))
+            np.minimum(part, _pick(ramp.high, rows), out=part)
+            part -= _pick(ramp.zero, rows)
+            part *= _pick(ramp.slope, rows)
+            total = part if total is None else np.add(total, part, out=total)
+        if total is None:
+            total = np.zeros(np.shape(z))
+        if self._offset.any():
+            total += _pick(self._offset, rows)
+        return total
+
+    def take(self, rows: Ints) -> Droop:
+        """The droop of the inverters `rows`, in that order and with repetitions.
+
+        Parameters
+        ----------
+        rows : (k,)
+            Indices of inverters.
+        """
+        return Droop(self.customer[rows], self.v[rows], self.q[rows], self.tau[rows], self.vbar)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Ramp:
+    """`slope (clip(z, low, high) - zero)`, one for each inverter; `zero` is `low` or `high`."""
+
+    low: Floats
+    high: Floats
+    zero: Floats
+    slope: Floats
+
+    def compact(self) -> _Ramp:
+        return _Ramp(_compact(self.low), _compact(self.high), _compact(self.zero), _compact(self.slope))
+
+
+def _compact(values: Floats) -> Floats:
+    """One entry instead of m equal ones, so that a gathered evaluation need not gather it."""
+    if values.size > 1 and np.all(values == values[0]):
+        return frozen(values[:1])
+    return frozen(values)
+
+
+def _pick(values: Floats, rows: Ints | None) -> Floats:
+    return values if rows is None or values.size == 1 else np.asarray(values[rows])
+
+
+def _ramps(z: Floats, q: Floats) -> tuple[list[_Ramp], Floats]:
+    """The ramps whose sum is K, and the value K has between its two middle breakpoints.
+
+    Parameters
+    ----------
+    z : (m, 4)
+        Breakpoints, descending (they are ascending in v).
+    q : (m, 4)
+        Values at the breakpoints, non-increasing.
+    """
+    # (upper breakpoint, lower breakpoint, where the ramp is zero): injecting, middle, absorbing.
+    ramps = []
+    for left, right, zero in ((0, 1, 1), (1, 2, 2), (2, 3, 2)):
+        rise = q[:, left] - q[:, right]
+        if not rise.any():
+            continue
+        width = z[:, left] - z[:, right]
+        slope = np.divide(rise, width, out=np.zeros_like(rise), where=rise > 0)
+        ramps.append(_Ramp(low=z[:, right], high=z[:, left], zero=z[:, zero], slope=slope))
+    return ramps, q[:, 2]
+
+
+def _problems(droop: Droop) -> list[str]:
+    """Every reason why the fields of `droop` do not describe a fleet."""
+    count = droop.customer.size
+    shapes = (
+        ("v", droop.v.shape, (count, 4)),
+        ("q", droop.q.shape, (count, 4)),
+        ("tau", droop.tau.shape, (count,)),
+    )
+    out = [f"droop: {what} has shape {has}; expected {wants}" for what, has, wants in shapes if has != wants]
+    if out:
+        return out
+    if not (np.isfinite(droop.vbar) and droop.vbar > 0):
+        out.append(f"droop: vbar is {droop.vbar}; it must be a positive number")
+    for i in range(count):
+        out.extend(f"inverter {i}: {text}" for text in _row_problems(droop.v[i], droop.q[i], droop.tau[i]))
+    if np.any(droop.customer < 0):
+        out.append("droop: a customer index is negative")
+    return out
+
+
+def _row_problems(v: Floats, q: Floats, tau: float) -> list[str]:
+    """What is wrong with one inverter's breakpoints or time constant."""
+    out = []
+    if not (np.all(np.isfinite(v)) and np.all(np.isfinite(q))):
+        out.append("breakpoints must be finite")
+    elif v[0] <= 0 or np.any(np.diff(v) < 0):
+        out.append(f"voltages {v.tolist()} must be positive and ascending")
+    elif np.any(np.diff(q) > 0):
+        out.append(f"reactive powers {q.tolist()} must not increase with the voltage")
+    elif np.any((np.diff(v) == 0) & (np.diff(q) < 0)):
+        out.append(f"voltages {v.tolist()}: the reactive power jumps where two of them are equal")
+    if not (np.isfinite(tau) and tau > 0):
+        out.append(f"time constant {tau} s must be positive")
+    return out
+
+
+@dataclass(frozen=True, slots=True)
+class DroopCurve:
+    """One preset, in the units of standards.
+
+    Attributes
+    ----------
+    name
+        Name of the preset.
+    v
+        Breakpoints of the voltage, pu of nominal.
+    q
+        Reactive injection, fraction of the rated apparent power.
+    tau
+        Time constant of the first-order response, s.
+    source
+        Where the numbers come from.
+    """
+
+    name: str
+    v: tuple[float, float, float, float]
+    q: tuple[float, float, float, float]
+    tau: float
+    source: str
+
+
+def _volts(*volts: float) -> tuple[float, float, float, float]:
+    """AS/NZS 4777.2 writes volts of a 230 V system."""
+    a, b, c, d = volts
+    return (a / 230.0, b / 230.0, c / 230.0, d / 230.0)
+
+
+# A first-order response reaches 90 % of its final value, the 'open loop response time' of IEEE 1547,
+# after tau ln 10.
+_NINETY_PERCENT = log(10.0)
+# VDE-AR-N 4105 asks for a PT1 with 3 tau = 10 s. AS/NZS 4777.2 wants the response complete within 10 s;
+# 'complete' is read as the same 95 %.
+_THREE_TAU = 3.0
+
+_1547 = "pyUL1741SB (IEEE 1547.1-2020, tables 25 to 27, characteristic 1) and CIMHub's OpenDSS models"
+_4777 = "DR_AS-NZS-Scripts of CSIRO and CanmetENERGY, written against the 2020 draft"
+_4105 = (
+    "Sungrow SH10T manual (first three voltages), pandapower and SIMONA test curves (fourth), SolaX manuals "
+    "(limits); time constant from memory"
+)
+
+_CURVES = (
+    DroopCurve(
+        "ieee1547-a", (0.90, 1.00, 1.00, 1.10), (0.25, 0.0, 0.0, -0.25), 10.0 / _NINETY_PERCENT, _1547
+    ),
+    DroopCurve("ieee1547-b", (0.92, 0.98, 1.02, 1.08), (0.44, 0.0, 0.0, -0.44), 5.0 / _NINETY_PERCENT, _1547),
+    DroopCurve("asnzs4777-a", _volts(207, 220, 240, 258), (0.44, 0.0, 0.0, -0.60), 10.0 / _THREE_TAU, _4777),
+    DroopCurve("asnzs4777-b", _volts(205, 220, 235, 255), (0.30, 0.0, 0.0, -0.40), 10.0 / _THREE_TAU, _4777),
+    DroopCurve("asnzs4777-c", _volts(215, 230, 240, 255), (0.44, 0.0, 0.0, -0.60), 10.0 / _THREE_TAU, _4777),
+    DroopCurve("vde4105", (0.93, 0.97, 1.03, 1.07), (0.436, 0.0, 0.0, -0.436), 10.0 / _THREE_TAU, _4105),
+    DroopCurve(
+        "vde4105-small", (0.93, 0.97, 1.03, 1.07), (0.312, 0.0, 0.0, -0.312), 10.0 / _THREE_TAU, _4105
+    ),
+)
+
+PRESETS: tuple[str, ...] = tuple(curve.name for curve in _CURVES)
+
+
+def preset(name: str) -> DroopCurve:
+    """A standard's default curve by name.
+
+    The numbers come from secondary sources, named in `DroopCurve.source`; nobody here has read the
+    standards themselves. `vde4105` is for inverters above 4.6 kVA, `vde4105-small` for the others.
+    Open-loop response times T (90 %) become `tau = T / ln 10`; a PT1 of 10 s in VDE-AR-N 4105 means
+    `3 tau = 10 s`; AS/NZS 4777.2 wants the response complete within 10 s, read here as 95 %, the
+    same `3 tau = 10 s`.
+
+    Parameters
+    ----------
+    name
+        One of `PRESETS`.
+
+    Raises
+    ------
+    FeederInvalid
+        If there is no such preset.
+    """
+    for curve in _CURVES:
+        if curve.name == name:
+            return curve
+    raise FeederInvalid([f"droop preset {name!r} does not exist; there are {', '.join(PRESETS)}"])
+
+
+def fleet(
+    customer: Ints,
+    names: str | Sequence[str],
+    rated_kva: Floats,
+    base_kva: float,
+    *,
+    tau: Floats | None = None,
+    capability: str = "fixed",
+    p_gen: Floats | None = None,
+    vbar: float = 1.0,
+) -> Droop:
+    """A fleet of inverters with standard curves.
+
+    Parameters
+    ----------
+    customer : (m,)
+        Index of the customer of each inverter.
+    names : (m,) or one
+        Preset of each inverter.
+    rated_kva : (m,)
+        Rated apparent power s, kVA.
+    base_kva
+        Three-phase base power of the feeder, kVA.
+    tau : (m,)
+        Time constants, s; NaN or no array at all: the preset's.
+    capability
+        `fixed`: the preset's limits always hold. `circular`: the output is capped at
+        `sqrt(s^2 - p_gen^2)`, chong2020 after (17); the slopes stay.
+    p_gen : (m,)
+        Active power that each inverter generates, pu of the feeder's base; required for `circular`.
+    vbar
+        Reference voltage, pu.
+
+    Raises
+    ------
+    FeederInvalid
+        If a preset does not exist, a rating is not positive, or an inverter generates above its rating.
+    """
+    index = frozen_ints(customer)
+    rated = np.asarray(rated_kva, dtype=np.float64)
+    each = [names] * index.size if isinstance(names, str) else list(names)
+    if len(each) != index.size or rated.shape != index.shape:
+        raise FeederInvalid(
+            [f"{index.size} inverters, {len(each)} presets, {rated.size} ratings: lengths differ"]
+        )
+    if not np.all(np.isfinite(rated) & (rated > 0)):
+        raise FeederInvalid(["rated apparent power of every inverter must be positive, in kVA"])
+    curves = [preset(name) for name in each]
+    v = np.array([curve.v for curve in curves], dtype=np.float64).reshape(index.size, 4)
+    q = np.array([curve.q for curve in curves], dtype=np.float64).reshape(index.size, 4)
+    own = np.array([curve.tau for curve in curves], dtype=np.float64)
+    if tau is not None:
+        given = np.asarray(tau, dtype=np.float64)
+        own = np.where(np.isnan(given), own, given)
+    droop = Droop(index, v, q * (rated / base_kva)[:, None], own, vbar)
+    if capability == "fixed":
+        return droop
+    if capability != "circular" or p_gen is None:
+        raise FeederInvalid([f"capability {capability!r} must be 'fixed', or 'circular' together with p_gen"])
+    headroom = (rated / base_kva) ** 2 - np.asarray(p_gen, dtype=np.float64) ** 2
+    if not np.all(headroom >= 0):
+        raise FeederInvalid(
+            [f"inverter {i} generates above its rating" for i in np.flatnonzero(~(headroom >= 0))]
+        )
+    return capped(droop, np.sqrt(headroom))
+
+
+def capped(droop: Droop, limit: Floats) -> Droop:
+    """The same fleet with `|q|` capped; the curve keeps its slopes in v and saturates earlier.
+
+    Parameters
+    ----------
+    droop
+        The fleet.
+    limit : (m,)
+        Largest `|q|` of each inverter, pu, not negative.
+    """
+    v, q = droop.v.copy(), np.clip(droop.q, -limit[:, None], limit[:, None])
+    # Breakpoints 0 and 3 move inwards to where the outer ramps meet the cap.
+    for outer, inner in ((0, 1), (3, 2)):
+        rise = droop.q[:, outer] - droop.q[:, inner]
+        kept = q[:, outer] - q[:, inner]
+        share = np.divide(kept, rise, out=np.ones_like(rise), where=rise != 0)
+        v[:, outer] = droop.v[:, inner] + share * (droop.v[:, outer] - droop.v[:, inner])
+    return Droop(droop.customer, v, q, droop.tau, droop.vbar)
+
+
+def voltage_curve(droop: Droop, v: Floats) -> Floats:
+    """The curves as inverters run them, piecewise linear in the voltage.
+
+    Parameters
+    ----------
+    droop
+        The fleet.
+    v : (…, m)
+        Voltage at each inverter, pu.
+
+    Returns
+    -------
+    (…, m)
+        Reactive set-points, pu of the feeder's base.
+    """
+    # The same ramps with -v in the place of z: descending breakpoints, non-decreasing curve.
+    ramps, offset = _ramps(-droop.v, droop.q)
+    total = np.zeros(np.shape(v)) + offset
+    for ramp in ramps:
+        total += ramp.slope * (np.clip(-v, ramp.low, ramp.high) - ramp.zero)
+    return total
