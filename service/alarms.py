@@ -17,21 +17,34 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
+from typing import Any
 
 from gridsec.errors import GridsecError
-from gridsec.online import Cause, Decision
-from service.report import BUSBAR, FeederReport, MeterReport, finite
+from service.conditions import AlarmKind, Condition, Evidence, Severity, conditions
 
-
-class AlarmKind(StrEnum):
-    """What can be wrong."""
-
-    METER_MANIPULATED = "meter-manipulated"
-    VOLTAGE_LIMIT = "voltage-limit"
-    DATA_LOSS = "data-loss"
-    UNDECIDED = "undecided"
+__all__ = [
+    "Alarm",
+    "AlarmBook",
+    "AlarmKind",
+    "AlarmRules",
+    "AlarmState",
+    "AlarmUnknown",
+    "AlreadyAcknowledged",
+    "Change",
+    "Condition",
+    "Evidence",
+    "Severity",
+    "Transition",
+    "acknowledge",
+    "acknowledged",
+    "advance",
+    "conditions",
+    "from_json",
+    "restore",
+    "to_json",
+]
 
 
 class AlarmState(StrEnum):
@@ -40,14 +53,6 @@ class AlarmState(StrEnum):
     RAISED = "raised"
     ACKNOWLEDGED = "acknowledged"
     CLEARED = "cleared"
-
-
-class Severity(StrEnum):
-    """How much it matters."""
-
-    CRITICAL = "critical"
-    MAJOR = "major"
-    MINOR = "minor"
 
 
 class Change(StrEnum):
@@ -72,48 +77,6 @@ class AlreadyAcknowledged(GridsecError):
     def __init__(self, alarm: Alarm) -> None:
         self.alarm = alarm
         super().__init__(f"alarm {alarm.id} has already been acknowledged by {alarm.acknowledged_by}")
-
-
-@dataclass(frozen=True, slots=True)
-class Evidence:
-    """The numbers behind an alarm at the tick that raised it; None where there is none.
-
-    Attributes
-    ----------
-    score, threshold
-        Residual of the meter and the largest one that an honest meter can reach, squared pu.
-    v_volt_reported, v_volt_estimated, attack_volt_estimated
-        Reported and reconstructed voltage and their difference for suspects, V.
-    """
-
-    score: float | None = None
-    threshold: float | None = None
-    v_volt_reported: float | None = None
-    v_volt_estimated: float | None = None
-    attack_volt_estimated: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Condition:
-    """One thing that is wrong at a tick or, with `known=False`, about which this tick says nothing.
-
-    Attributes
-    ----------
-    kind, feeder, meter
-        What and where; the meter is None if it is about the whole feeder.
-    severity, evidence, reason
-        How bad, the numbers, and a sentence for the operator.
-    known
-        False: nobody can tell at this tick; the alarm, if there is one, is held as it is.
-    """
-
-    kind: AlarmKind
-    feeder: str
-    meter: str | None
-    severity: Severity
-    evidence: Evidence = Evidence()
-    reason: str = ""
-    known: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -272,130 +235,6 @@ class AlarmBook:
     def active(self) -> tuple[Alarm, ...]:
         """Every alarm that still stands; oldest first."""
         return tuple(alarm for alarm in self.alarms if alarm.active)
-
-
-def conditions(report: FeederReport) -> list[Condition]:
-    """Say what is wrong with a feeder at one tick, and about what the tick says nothing.
-
-    - `meter-manipulated`: the verdict names the meter. Unknown while the verdict is UNDECIDED or the meter
-      is silent, whatever the list of suspects says.
-    - `voltage-limit`: the whole interval around the *reconstructed* voltage is outside the limits, so a
-      lying meter raises none. Unknown while the interval straddles a limit with its middle outside, or
-      while the reconstruction itself carries no guarantee.
-    - `data-loss`: a meter, or the busbar meter, is silent. Unknown while it is unseen but not for long.
-    - `undecided`: there is no verdict, for a cause of its own. Unknown while the monitor settles or a
-      silent meter is the cause: `data-loss` says that already.
-
-    Parameters
-    ----------
-    report
-        The feeder at this tick.
-
-    Returns
-    -------
-    list of Condition
-        What is not in it is known to be absent.
-    """
-    found = [*_manipulated(report), *_data_loss(report), *_undecided(report)]
-    for meter in report.meters:
-        found.extend(_voltage_limit(report, meter))
-    return found
-
-
-def _evidence(meter: MeterReport) -> Evidence:
-    values = (
-        meter.score,
-        meter.threshold,
-        meter.v_volt_reported,
-        meter.v_volt_estimated,
-        meter.attack_volt_estimated,
-    )
-    return Evidence(*(None if value is None else finite(value) for value in values))
-
-
-def _volt(value: float | None) -> str:
-    return "an unknown voltage" if value is None else f"{value:.1f} V"
-
-
-def _manipulated(report: FeederReport) -> Iterable[Condition]:
-    decided = report.verdict is not Decision.UNDECIDED
-    for meter in report.meters:
-        known = decided and meter.seen
-        if known and not meter.suspect:
-            continue
-        evidence = _evidence(meter)
-        reported, estimated = _volt(evidence.v_volt_reported), _volt(evidence.v_volt_estimated)
-        yield Condition(
-            AlarmKind.METER_MANIPULATED,
-            report.feeder,
-            meter.meter,
-            Severity.CRITICAL,
-            evidence,
-            f"reports {reported}, but the rest of the feeder says {estimated}",
-            known,
-        )
-
-
-# With these causes the reconstruction still is what the design promises: the readings that are there are
-# enough. With every other UNDECIDED its bound is not a bound.
-_SOUND = frozenset({Cause.AGREEMENT, Cause.RESIDUALS, Cause.SILENT_METERS})
-
-
-def _voltage_limit(report: FeederReport, meter: MeterReport) -> Iterable[Condition]:
-    evidence = _evidence(meter)
-    v = evidence.v_volt_estimated
-    half_width = None if meter.v_volt_std is None else finite(3.0 * meter.v_volt_std)
-    sound = report.cause in _SOUND and v is not None and half_width is not None
-    if v is None or half_width is None or not sound:
-        yield Condition(
-            AlarmKind.VOLTAGE_LIMIT, report.feeder, meter.meter, Severity.MAJOR, evidence, known=False
-        )
-        return
-    low, high = report.v_min_volt, report.v_max_volt
-    if low <= v <= high:
-        return
-    surely = v + half_width < low or v - half_width > high
-    side, limit = ("below", low) if v < low else ("above", high)
-    yield Condition(
-        AlarmKind.VOLTAGE_LIMIT,
-        report.feeder,
-        meter.meter,
-        Severity.MAJOR,
-        evidence,
-        f"{v:.1f} V ± {half_width:.1f} V at the connection point, {side} the limit of {limit:.1f} V",
-        surely,
-    )
-
-
-def _data_loss(report: FeederReport) -> Iterable[Condition]:
-    silent = dict(report.silent)
-    unsure = [meter.meter for meter in report.meters if not meter.seen and meter.meter not in silent]
-    if report.cause is Cause.NO_BUSBAR and BUSBAR not in silent:
-        unsure.append(BUSBAR)
-    for meter, seconds in silent.items():
-        # Without the busbar's voltage nothing on the feeder can be judged.
-        severity = Severity.MAJOR if meter == BUSBAR else Severity.MINOR
-        length = "yet" if not math.isfinite(seconds) else f"for {seconds:.0f} s"
-        yield Condition(
-            AlarmKind.DATA_LOSS, report.feeder, meter, severity, reason=f"no usable reading {length}"
-        )
-    for meter in unsure:
-        yield Condition(AlarmKind.DATA_LOSS, report.feeder, meter, Severity.MINOR, known=False)
-
-
-_COVERED = frozenset({Cause.SETTLING, Cause.SILENT_METERS, Cause.NO_BUSBAR})
-
-
-def _undecided(report: FeederReport) -> Iterable[Condition]:
-    if report.verdict is Decision.UNDECIDED:
-        yield Condition(
-            AlarmKind.UNDECIDED,
-            report.feeder,
-            None,
-            Severity.MAJOR,
-            reason=report.reason,
-            known=report.cause not in _COVERED,
-        )
 
 
 def advance(
@@ -608,3 +447,35 @@ def restore(feeder: str, alarms: Iterable[Alarm]) -> AlarmBook:
         t = alarm.t_raised if alarm.t_cleared is None else alarm.t_cleared
         entries[alarm.kind, alarm.meter] = Entry(alarm.active, t, t, t, held=True, alarm=alarm)
     return AlarmBook(feeder, None, entries)
+
+
+def to_json(alarm: Alarm) -> dict[str, Any]:
+    """Return the alarm as the JSON object that REST and zenoh show.
+
+    Parameters
+    ----------
+    alarm
+        The alarm.
+    """
+    return {
+        **asdict(alarm),
+        "kind": str(alarm.kind),
+        "severity": str(alarm.severity),
+        "state": str(alarm.state),
+    }
+
+
+def from_json(data: Mapping[str, Any]) -> Alarm:
+    """Return the alarm that `to_json` wrote.
+
+    Parameters
+    ----------
+    data
+        The object; it may carry more fields.
+    """
+    fields = {name: data[name] for name in Alarm.__dataclass_fields__}
+    fields["kind"] = AlarmKind(data["kind"])
+    fields["severity"] = Severity(data["severity"])
+    fields["state"] = AlarmState(data["state"])
+    fields["evidence"] = Evidence(**data["evidence"])
+    return Alarm(**fields)

@@ -1,0 +1,194 @@
+"""What is wrong with a feeder at one tick, and about what that tick says nothing. Pure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import StrEnum
+
+from gridsec.online import Cause, Decision
+from service.report import BUSBAR, FeederReport, MeterReport, finite
+
+
+class AlarmKind(StrEnum):
+    """What can be wrong."""
+
+    METER_MANIPULATED = "meter-manipulated"
+    VOLTAGE_LIMIT = "voltage-limit"
+    DATA_LOSS = "data-loss"
+    UNDECIDED = "undecided"
+
+
+class Severity(StrEnum):
+    """How much it matters."""
+
+    CRITICAL = "critical"
+    MAJOR = "major"
+    MINOR = "minor"
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """The numbers behind an alarm at the tick that raised it; None where there is none.
+
+    Attributes
+    ----------
+    score, threshold
+        Residual of the meter and the largest one that an honest meter can reach, squared pu.
+    v_volt_reported, v_volt_estimated, attack_volt_estimated
+        Reported and reconstructed voltage and their difference for suspects, V.
+    """
+
+    score: float | None = None
+    threshold: float | None = None
+    v_volt_reported: float | None = None
+    v_volt_estimated: float | None = None
+    attack_volt_estimated: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """One thing that is wrong at a tick or, with `known=False`, about which this tick says nothing.
+
+    Attributes
+    ----------
+    kind, feeder, meter
+        What and where; the meter is None if it is about the whole feeder.
+    severity, evidence, reason
+        How bad, the numbers, and a sentence for the operator.
+    known
+        False: nobody can tell at this tick; the alarm, if there is one, is held as it is.
+    """
+
+    kind: AlarmKind
+    feeder: str
+    meter: str | None
+    severity: Severity
+    evidence: Evidence = Evidence()
+    reason: str = ""
+    known: bool = True
+
+
+def conditions(report: FeederReport) -> list[Condition]:
+    """Say what is wrong with a feeder at one tick, and about what the tick says nothing.
+
+    - `meter-manipulated`: the verdict names the meter. Unknown while the verdict is UNDECIDED or the meter
+      is silent, whatever the list of suspects says.
+    - `voltage-limit`: the whole interval around the *reconstructed* voltage is outside the limits, so a
+      lying meter raises none. Unknown while the interval straddles a limit with its middle outside, or
+      while the reconstruction itself carries no guarantee.
+    - `data-loss`: a meter, or the busbar meter, is silent. Unknown while it is unseen but not for long.
+    - `undecided`: there is no verdict, for a cause of its own. Unknown while the monitor settles or a
+      silent meter is the cause: `data-loss` says that already.
+
+    Parameters
+    ----------
+    report
+        The feeder at this tick.
+
+    Returns
+    -------
+    list of Condition
+        What is not in it is known to be absent.
+    """
+    found = [*_manipulated(report), *_data_loss(report), *_undecided(report)]
+    for meter in report.meters:
+        found.extend(_voltage_limit(report, meter))
+    return found
+
+
+def _evidence(meter: MeterReport) -> Evidence:
+    values = (
+        meter.score,
+        meter.threshold,
+        meter.v_volt_reported,
+        meter.v_volt_estimated,
+        meter.attack_volt_estimated,
+    )
+    return Evidence(*(None if value is None else finite(value) for value in values))
+
+
+def _volt(value: float | None) -> str:
+    return "an unknown voltage" if value is None else f"{value:.1f} V"
+
+
+def _manipulated(report: FeederReport) -> Iterable[Condition]:
+    decided = report.verdict is not Decision.UNDECIDED
+    for meter in report.meters:
+        known = decided and meter.seen
+        if known and not meter.suspect:
+            continue
+        evidence = _evidence(meter)
+        reported, estimated = _volt(evidence.v_volt_reported), _volt(evidence.v_volt_estimated)
+        yield Condition(
+            AlarmKind.METER_MANIPULATED,
+            report.feeder,
+            meter.meter,
+            Severity.CRITICAL,
+            evidence,
+            f"reports {reported}, but the rest of the feeder says {estimated}",
+            known,
+        )
+
+
+# With these causes the reconstruction still is what the design promises: the readings that are there are
+# enough. With every other UNDECIDED its bound is not a bound.
+_SOUND = frozenset({Cause.AGREEMENT, Cause.RESIDUALS, Cause.SILENT_METERS})
+
+
+def _voltage_limit(report: FeederReport, meter: MeterReport) -> Iterable[Condition]:
+    evidence = _evidence(meter)
+    v = evidence.v_volt_estimated
+    half_width = None if meter.v_volt_std is None else finite(3.0 * meter.v_volt_std)
+    sound = report.cause in _SOUND and v is not None and half_width is not None
+    if v is None or half_width is None or not sound:
+        yield Condition(
+            AlarmKind.VOLTAGE_LIMIT, report.feeder, meter.meter, Severity.MAJOR, evidence, known=False
+        )
+        return
+    low, high = report.v_min_volt, report.v_max_volt
+    if low <= v <= high:
+        return
+    surely = v + half_width < low or v - half_width > high
+    side, limit = ("below", low) if v < low else ("above", high)
+    yield Condition(
+        AlarmKind.VOLTAGE_LIMIT,
+        report.feeder,
+        meter.meter,
+        Severity.MAJOR,
+        evidence,
+        f"{v:.1f} V ± {half_width:.1f} V at the connection point, {side} the limit of {limit:.1f} V",
+        surely,
+    )
+
+
+def _data_loss(report: FeederReport) -> Iterable[Condition]:
+    silent = dict(report.silent)
+    unsure = [meter.meter for meter in report.meters if not meter.seen and meter.meter not in silent]
+    if report.cause is Cause.NO_BUSBAR and BUSBAR not in silent:
+        unsure.append(BUSBAR)
+    for meter, seconds in silent.items():
+        # Without the busbar's voltage nothing on the feeder can be judged.
+        severity = Severity.MAJOR if meter == BUSBAR else Severity.MINOR
+        length = "yet" if not math.isfinite(seconds) else f"for {seconds:.0f} s"
+        yield Condition(
+            AlarmKind.DATA_LOSS, report.feeder, meter, severity, reason=f"no usable reading {length}"
+        )
+    for meter in unsure:
+        yield Condition(AlarmKind.DATA_LOSS, report.feeder, meter, Severity.MINOR, known=False)
+
+
+_COVERED = frozenset({Cause.SETTLING, Cause.SILENT_METERS, Cause.NO_BUSBAR})
+
+
+def _undecided(report: FeederReport) -> Iterable[Condition]:
+    if report.verdict is Decision.UNDECIDED:
+        yield Condition(
+            AlarmKind.UNDECIDED,
+            report.feeder,
+            None,
+            Severity.MAJOR,
+            reason=report.reason,
+            known=report.cause not in _COVERED,
+        )
