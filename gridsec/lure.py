@@ -17,10 +17,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import expm
 
-from gridsec.arrays import Floats, Ints, frozen
+from gridsec.arrays import Bools, Floats, Ints, exponential_integrals, frozen, perron_bound
 from gridsec.droop import Droop
-from gridsec.errors import FeederInvalid
+from gridsec.errors import DesignInfeasible, FeederInvalid
 from gridsec.feeder import Feeder, LinDistFlow, lindistflow
 
 Nonlinearity = Callable[[Floats], Floats]
@@ -154,3 +155,326 @@ def known_input(  # noqa: PLR0917  # every argument is a term of chong2020 (19),
     """
     base = vbar**2 - np.asarray(v0_squared, dtype=np.float64)[..., None]
     return np.asarray(base - 2.0 * (p @ model.R.T + q @ model.X.T) - correction)
+
+
+@dataclass(frozen=True, slots=True)
+class StepPolicy:
+    """How `advance` divides a step, and when it takes the equilibrium instead.
+
+    Attributes
+    ----------
+    substep
+        Longest substep times the fastest rate of the closed loop, dimensionless. The error of the
+        second-order scheme falls with its square.
+    settled
+        A step is long when every open-loop mode has decayed to this fraction; it then ends in the
+        equilibrium. 0: never.
+    tol
+        Residual of the equilibrium, in the unit of x.
+    max_iter
+        Newton steps allowed for the equilibrium.
+    """
+
+    substep: float
+    settled: float
+    tol: float
+    max_iter: int
+
+
+POLICY = StepPolicy(substep=0.1, settled=1e-6, tol=1e-10, max_iter=200)
+"""What `advance` does unless told otherwise; docs/theory-model.md says what accuracy it gives."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Transition:
+    """Everything about one step of length h that does not depend on x and u.
+
+    Attributes
+    ----------
+    h
+        Length of the step, s.
+    substeps
+        Into how many equal substeps it is divided; 0: the step is long and ends in the equilibrium.
+    decay, first, second : (n,) or (n, n)
+        `exp(A s)`, `s phi_1(A s)`, `s phi_2(A s)` for the substep s; diagonals where A is diagonal.
+    policy
+        The policy it was made by.
+    """
+
+    h: float
+    substeps: int
+    decay: Floats
+    first: Floats
+    second: Floats
+    policy: StepPolicy
+
+
+def transition(lure: Lure, h: float, policy: StepPolicy = POLICY) -> Transition:
+    """Prepare steps of a fixed length.
+
+    Parameters
+    ----------
+    lure
+        The system.
+    h
+        Length of the step, s, not negative.
+    policy
+        How to divide it.
+
+    References
+    ----------
+    M. Hochbruck, A. Ostermann, "Exponential integrators", Acta Numerica 19, 2010, sections 2.1, 2.3.
+    """
+    if not (np.isfinite(h) and h >= 0):
+        raise ValueError(f"a step of {h} s is no step; expected a number that is not negative")
+    own = np.diagonal(lure.A)
+    diagonal = np.count_nonzero(lure.A) == np.count_nonzero(own)
+    if diagonal:
+        slowest, fastest = (float(np.max(own, initial=-np.inf)), float(np.max(np.abs(own), initial=0.0)))
+    else:
+        slowest = float(np.max(np.linalg.eigvals(lure.A).real))
+        fastest = perron_bound(lure.A, _PERRON_ROUNDS)
+    if policy.settled > 0 and slowest * h <= np.log(policy.settled):
+        empty = np.zeros(0)
+        return Transition(h, 0, empty, empty, empty, policy)
+    fastest += perron_bound((np.abs(lure.G) * lure.slope) @ np.abs(lure.H), _PERRON_ROUNDS)
+    count = max(1, int(np.ceil(h * fastest / policy.substep)))
+    s = h / count
+    if diagonal:
+        decay, one, two = exponential_integrals(own * s)
+        return Transition(h, count, decay, s * one, s * two, policy)
+    n = own.size
+    # One exponential of a block matrix carries both integrals in its first row.
+    block = np.zeros((3 * n, 3 * n))
+    block[:n, :n] = s * lure.A
+    block[:n, n : 2 * n] = s * np.eye(n)
+    block[n : 2 * n, 2 * n :] = np.eye(n)
+    full = expm(block)
+    return Transition(h, count, full[:n, :n], full[:n, n : 2 * n], full[:n, 2 * n :], policy)
+
+
+_PERRON_ROUNDS = 8
+
+
+def step(prepared: Transition, lure: Lure, x: Floats, u: Floats) -> Floats:
+    """The state after one prepared step, with u held constant.
+
+    Parameters
+    ----------
+    prepared
+        From `transition`, for the same system.
+    lure
+        The system.
+    x : (…, n)
+        State at the beginning.
+    u : (…, l)
+        Input during the step.
+
+    Returns
+    -------
+    (…, n)
+        State at the end.
+    """
+    if prepared.substeps == 0:
+        return equilibrium(lure, u, x, tol=prepared.policy.tol, max_iter=prepared.policy.max_iter)
+    drive, push = u @ lure.F.T, u @ lure.B.T
+
+    def feedback(state: Floats) -> Floats:
+        return np.asarray(lure.phi(state @ lure.H.T + drive) @ lure.G.T + push)
+
+    for _ in range(prepared.substeps):
+        here = feedback(x)
+        ahead = _times(prepared.decay, x) + _times(prepared.first, here)
+        x = ahead + _times(prepared.second, feedback(ahead) - here)
+    return x
+
+
+def _times(matrix: Floats, x: Floats) -> Floats:
+    """`matrix @ x` along the last axis; a vector stands for a diagonal matrix."""
+    return np.asarray(x * matrix if matrix.ndim == 1 else x @ matrix.T)
+
+
+def advance(lure: Lure, x: Floats, u: Floats, h: float, policy: StepPolicy = POLICY) -> Floats:
+    """The state a time h later, with u held constant, for any h from milliseconds to hours.
+
+    Short steps: exponential Runge-Kutta of second order,
+
+        a  = exp(A s) x + s phi_1(A s) N(x),     N(x) = G phi(H x + F u) + B u
+        x+ = a + s phi_2(A s) (N(a) - N(x)),
+
+    in as many substeps s as the fastest closed-loop rate asks for, so that a loop gain above 1 is as
+    stable as any other. Steps after which every open-loop mode has decayed to `policy.settled` end in
+    the equilibrium, which presumes that it attracts (for droop inverters: proved in
+    docs/theory-model.md). Where many steps of one length follow, prepare them with `transition`.
+
+    Parameters
+    ----------
+    lure
+        The system.
+    x : (…, n)
+        State at the beginning.
+    u : (…, l)
+        Input during the step.
+    h
+        Length of the step, s.
+    policy
+        How to divide it.
+
+    Returns
+    -------
+    (…, n)
+        State at the end.
+
+    Raises
+    ------
+    DesignInfeasible
+        If a long step finds no equilibrium.
+    """
+    return step(transition(lure, h, policy), lure, x, u)
+
+
+def equilibrium(lure: Lure, u: Floats, x0: Floats | None = None, *, tol: float, max_iter: int) -> Floats:
+    """The state in which the system rests, `A x + G phi(H x + F u) + B u = 0`.
+
+    Parameters
+    ----------
+    lure
+        The system; A must be invertible.
+    u : (…, l)
+        Input.
+    x0 : (…, n)
+        Where to start; 0 by default.
+    tol
+        Largest entry of the residual `x + A^-1 (G phi + B u)`, in the unit of x.
+    max_iter
+        Newton steps allowed.
+
+    Returns
+    -------
+    (…, n)
+        The equilibrium.
+
+    Raises
+    ------
+    DesignInfeasible
+        If it is not found.
+    """
+    gain, bias = np.linalg.solve(-lure.A, lure.G), np.linalg.solve(-lure.A, lure.B)
+    offset = u @ bias.T
+    start = np.zeros(offset.shape) if x0 is None else np.broadcast_to(x0, offset.shape)
+    drive = u @ lure.F.T
+    return settle(lure.phi, gain, lure.H, drive=drive, bias=offset, x0=start, tol=tol, max_iter=max_iter)
+
+
+def settle(
+    phi: Nonlinearity,
+    gain: Floats,
+    H: Floats,
+    *,
+    drive: Floats,
+    bias: Floats,
+    x0: Floats,
+    tol: float,
+    max_iter: int,
+) -> Floats:
+    """Solve `x = gain phi(H x + drive) + bias` by a damped semismooth Newton method.
+
+    The Jacobian `I - gain Delta H` takes Delta, the slopes of phi, from difference quotients, which
+    are elements of the generalised Jacobian except within a hair of a kink. The step is halved until
+    the residual falls. Plain iteration would need a loop gain below 1; this does not.
+
+    Parameters
+    ----------
+    phi
+        Nonlinearity, entry by entry, non-decreasing.
+    gain : (n, m)
+        What phi feeds into.
+    H : (m, n) or (…, m, n)
+        Feedback, possibly another one for every leading index (one observer each).
+    drive : (…, m)
+    bias : (…, n)
+        Constant parts.
+    x0 : (…, n)
+        Where to start.
+    tol
+        Largest entry of the residual, in the unit of x.
+    max_iter
+        Newton steps allowed.
+
+    Returns
+    -------
+    (…, n)
+        The solution.
+
+    Raises
+    ------
+    DesignInfeasible
+        If the residual is still above `tol` after `max_iter` steps.
+    """
+    lead = np.broadcast_shapes(x0.shape[:-1], drive.shape[:-1], bias.shape[:-1], H.shape[:-2])
+    n, m = gain.shape
+    x = np.array(np.broadcast_to(x0, (*lead, n)), dtype=np.float64).reshape(-1, n)
+    c = np.broadcast_to(drive, (*lead, m)).reshape(-1, m)
+    e = np.broadcast_to(bias, (*lead, n)).reshape(-1, n)
+    every = np.broadcast_to(H, (*lead, m, n)).reshape(-1, m, n) if H.ndim > 2 else H[None]
+    open_rows = np.arange(x.shape[0])
+    for _ in range(max_iter):
+        loop = _Loop(
+            phi, gain, every if every.shape[0] == 1 else every[open_rows], c[open_rows], e[open_rows]
+        )
+        now = x[open_rows]
+        residual = loop.residual(now)
+        rough = np.max(np.abs(residual), axis=-1, initial=0.0) > tol
+        if not rough.any():
+            return x.reshape(*lead, n)
+        loop = loop.rows(rough)
+        open_rows, now, residual = open_rows[rough], now[rough], residual[rough]
+        x[open_rows] = loop.newton(now, residual)
+    raise DesignInfeasible(
+        "equilibrium of the droop loop", f"residual above {tol:g} after {max_iter} Newton steps", None
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Loop:
+    """The equation `x - gain phi(H x + drive) - bias = 0` for k rows at once."""
+
+    phi: Nonlinearity
+    gain: Floats
+    H: Floats  # (1 or k, m, n)
+    drive: Floats
+    bias: Floats
+
+    def rows(self, keep: Bools) -> _Loop:
+        H = self.H if self.H.shape[0] == 1 else self.H[keep]
+        return _Loop(self.phi, self.gain, H, self.drive[keep], self.bias[keep])
+
+    def outputs(self, x: Floats) -> Floats:
+        if self.H.shape[0] == 1:
+            return np.asarray(x @ self.H[0].T + self.drive)
+        return np.asarray(np.einsum("kmn,kn->km", self.H, x) + self.drive)
+
+    def residual(self, x: Floats) -> Floats:
+        return np.asarray(x - self.phi(self.outputs(x)) @ self.gain.T - self.bias)
+
+    def newton(self, x: Floats, residual: Floats) -> Floats:
+        """One damped Newton step from `x` (k, n), where the equation leaves `residual`."""
+        z = self.outputs(x)
+        width = _QUOTIENT * np.maximum(1.0, np.abs(z))
+        slopes = (self.phi(z + width) - self.phi(z - width)) / (2.0 * width)
+        jacobian = np.eye(x.shape[1]) - (self.gain * slopes[:, None, :]) @ self.H
+        direction = -np.linalg.solve(jacobian, residual[..., None])[..., 0]
+        size = np.linalg.norm(residual, axis=-1)
+        length = np.ones(x.shape[0])
+        for _ in range(_HALVINGS):
+            trial = x + length[:, None] * direction
+            worse = np.linalg.norm(self.residual(trial), axis=-1) > (1.0 - 1e-4 * length) * size
+            if not worse.any():
+                break
+            length = np.where(worse, 0.5 * length, length)
+        return np.asarray(x + length[:, None] * direction)
+
+
+# Half-width of the difference quotients, relative: far above rounding, far below any deadband.
+_QUOTIENT = 1e-7
+_HALVINGS = 30
