@@ -1,0 +1,108 @@
+"""A feeder's past, small enough to keep: which ticks are worth a row, and how a row is packed. Pure.
+
+A report of 146 meters is 30 kB of JSON and comes every second. Kept are the ticks on a coarser grid and
+every tick at which the verdict, its cause or its suspects change; of each the reported and the
+reconstructed voltage, score and threshold of every meter, as compressed single-precision columns (volts to
+2e-5), about 1 kB.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from service.report import FeederReport, MeterReport, finite
+
+_COLUMNS = ("v_volt_reported", "v_volt_estimated", "score", "threshold")
+_SEEN, _SUSPECT = 1, 2
+
+
+@dataclass(frozen=True, slots=True)
+class HistoryRules:
+    """How much of the past is kept.
+
+    Attributes
+    ----------
+    step_s
+        The grid of the kept ticks, s; 0 keeps all.
+    keep_s
+        How long they are kept, s.
+    """
+
+    step_s: float = 10.0
+    keep_s: float = 14 * 86400.0
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """What decides whether the next tick is kept: the last kept one."""
+
+    t: float
+    verdict: str
+    cause: str
+    suspects: tuple[str, ...]
+
+
+def mark(report: FeederReport) -> Mark:
+    """Return the mark of a report."""
+    suspects = tuple(meter.meter for meter in report.meters if meter.suspect)
+    return Mark(report.t, str(report.verdict), str(report.cause), suspects)
+
+
+def worth_keeping(last: Mark | None, now: Mark, rules: HistoryRules) -> bool:
+    """Say whether a tick gets a row.
+
+    Parameters
+    ----------
+    last
+        The last kept tick of the feeder, if any.
+    now
+        This tick.
+    rules
+        The grid.
+    """
+    if last is None or now.t < last.t:
+        return True
+    changed = (last.verdict, last.cause, last.suspects) != (now.verdict, now.cause, now.suspects)
+    step = rules.step_s
+    return changed or step <= 0.0 or math.floor(now.t / step) > math.floor(last.t / step)
+
+
+def pack(meters: Sequence[MeterReport]) -> bytes:
+    """Pack the meters of a report: four float32 columns (NaN for None), then one byte of flags each."""
+    none = math.nan
+    table = np.array(
+        [[none if (v := getattr(m, name)) is None else v for m in meters] for name in _COLUMNS], dtype="<f4"
+    )
+    flags = bytes(_SEEN * m.seen | _SUSPECT * m.suspect for m in meters)
+    return zlib.compress(table.tobytes() + flags, 6)
+
+
+def unpack(data: bytes, meters: Sequence[str]) -> list[dict[str, Any]]:
+    """Return what `pack` kept, one object per meter, with the field names of REST's `state`.
+
+    Parameters
+    ----------
+    data
+        The packed row.
+    meters
+        The ids of its meters, in order.
+    """
+    raw = zlib.decompress(data)
+    size = len(meters)
+    table = np.frombuffer(raw, dtype="<f4", count=4 * size).reshape(4, size)
+    flags = raw[16 * size :]
+    return [
+        {
+            "meter": meter,
+            "seen": bool(flags[i] & _SEEN),
+            "suspect": bool(flags[i] & _SUSPECT),
+            **{name: finite(float(table[k, i])) for k, name in enumerate(_COLUMNS)},
+        }
+        for i, meter in enumerate(meters)
+    ]
