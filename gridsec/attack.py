@@ -65,26 +65,223 @@ class _Attack:
     def __post_init__(self) -> None:
         _check_meters(self.meters, self.t_on, self.t_off)
 
-    def voltage(self, t: Floats, v: Floats, past: Past) -> Floats:
-        """What the k meters report while the attack is on.
 
-        Parameters
-        ----------
-        t : (T,)
-            Times inside [t_on, t_off), Unix s.
-        v : (T, k)
-            What they would report otherwise, pu.
-        past
-            The honest reports of all meters at earlier times, pu.
+@dataclass(frozen=True, slots=True, eq=False)
+class Bias(_Attack):
+    """A constant is added: v~ = v + size.
 
-        Returns
-        -------
-        (T, k)
-            Reported voltages, pu.
-        """
-        raise AssertionError(f"{type(self).__name__} has no signal")
+    Attributes
+    ----------
+    size : (k,)
+        Signed displacement, pu.
+    """
 
-    def load_pattern(R: Floats, X: Floats, target: int, ratio: float, v: Floats) -> Floats:
+    size: Floats
+
+    def __post_init__(self) -> None:
+        _check_meters(self.meters, self.t_on, self.t_off)
+        _check_per_meter(self.meters, size=self.size)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scaling(_Attack):
+    """The reading is stretched: v~ = (1 + factor) v.
+
+    Attributes
+    ----------
+    factor : (k,)
+        Signed relative change, 1.
+    """
+
+    factor: Floats
+
+    def __post_init__(self) -> None:
+        _check_meters(self.meters, self.t_on, self.t_off)
+        _check_per_meter(self.meters, factor=self.factor)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drift(_Attack):
+    """The reading creeps away: v~ = v + sign(rate) min(abs(rate) (t - t_on), limit).
+
+    Attributes
+    ----------
+    rate : (k,)
+        Signed speed, pu/s.
+    limit : (k,)
+        Largest displacement, pu, >= 0.
+    """
+
+    rate: Floats
+    limit: Floats
+
+    def __post_init__(self) -> None:
+        _check_meters(self.meters, self.t_on, self.t_off)
+        _check_per_meter(self.meters, rate=self.rate, limit=self.limit)
+        if np.any(self.limit < 0.0):
+            raise ValueError("limit of a drift is a magnitude and cannot be negative")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stuck(_Attack):
+    """The reading freezes at what the meter said when the attack began: v~(t) = v(t_on)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Replay(_Attack):
+    """An earlier stretch is played again: v~(t) = v(t - delay_s).
+
+    Attributes
+    ----------
+    delay_s
+        How far back the played stretch lies, s, > 0.
+    """
+
+    delay_s: float
+
+    def __post_init__(self) -> None:
+        _check_meters(self.meters, self.t_on, self.t_off)
+        if not self.delay_s > 0.0:
+            raise ValueError(f"a replay needs a positive delay, got {self.delay_s}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Random(_Attack):
+    """A random displacement, drawn anew every `hold_s`: v~ = v + s u with s = +-1 and low <= u <= high.
+
+    Attributes
+    ----------
+    low, high : (k,)
+        Smallest and largest magnitude of the displacement, pu.
+    hold_s
+        How long one draw stays, s, > 0.
+    seed
+        Chooses the draws.
+    """
+
+    low: Floats
+    high: Floats
+    hold_s: float
+    seed: int
+
+    def __post_init__(self) -> None:
+        _check_meters(self.meters, self.t_on, self.t_off)
+        _check_per_meter(self.meters, low=self.low, high=self.high)
+        if np.any(self.low < 0.0) or np.any(self.high < self.low):
+            raise ValueError("a random attack needs 0 <= low <= high for every meter")
+        if not self.hold_s > 0.0:
+            raise ValueError(f"a random attack needs a positive hold time, got {self.hold_s}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Coordinated(_Attack):
+    """Several meters tell one consistent story: the pattern that a load would leave which is not there.
+
+    ``v~ = v + shift``, ``p~ = p + p_shift``, ``q~ = q + q_shift``. `coordinate` sizes the pattern.
+
+    Attributes
+    ----------
+    shift : (k,)
+        Signed displacement of the voltage, pu; negative for a fake load.
+    p_shift, q_shift : (k,)
+        Displacement of the reported import, unit of the reports; zero when only voltages lie.
+    """
+
+    shift: Floats
+    p_shift: Floats
+    q_shift: Floats
+
+    def __post_init__(self) -> None:
+        _check_meters(self.meters, self.t_on, self.t_off)
+        _check_per_meter(self.meters, shift=self.shift, p_shift=self.p_shift, q_shift=self.q_shift)
+
+
+Attack: TypeAlias = Bias | Scaling | Drift | Stuck | Replay | Random | Coordinated
+
+
+def apply(attack: Attack, t: Floats, honest: Reports, past: Past) -> Reports:
+    """Reports under one attack.
+
+    Parameters
+    ----------
+    attack
+        The attack.
+    t : (T,)
+        Time of each report, Unix s.
+    honest
+        Reports without this attack; not modified.
+    past
+        The honest voltage reports at earlier times, pu. Called by `Stuck` and `Replay` only, never for a
+        time after the newest of `t`.
+
+    Returns
+    -------
+    Reports
+        The same reports with those of `attack.meters` inside [t_on, t_off) replaced.
+    """
+    rows = np.flatnonzero(active(attack, t))
+    if rows.size == 0:
+        return honest
+    cells = np.ix_(rows, attack.meters)
+    v = honest.v.copy()
+    v[cells] = _voltage(attack, t[rows], honest.v[cells], past)
+    if not isinstance(attack, Coordinated):
+        return replace(honest, v=v)
+    p, q = honest.p.copy(), honest.q.copy()
+    p[cells] += attack.p_shift
+    q[cells] += attack.q_shift  # NaN stays NaN: a meter that reports no q does not begin to
+    return Reports(v=v, p=p, q=q)
+
+
+def apply_all(attacks: Sequence[Attack], t: Floats, honest: Reports, past: Past) -> Reports:
+    """Reports under several attacks, applied in their order; see `apply`."""
+    reports = honest
+    for attack in attacks:
+        reports = apply(attack, t, reports, past)
+    return reports
+
+
+def active(attack: Attack, t: Floats) -> Bools:
+    """Whether the attack lies at each time: t_on <= t < t_off, (T,)."""
+    return (t >= attack.t_on) & (t < attack.t_off)
+
+
+def manipulated(attacks: Sequence[Attack], t: Floats, meters: int) -> Bools:
+    """Which of p meters are under some attack at each time.
+
+    Parameters
+    ----------
+    attacks
+        The attacks.
+    t : (T,)
+        Times, Unix s.
+    meters
+        Number of meters p.
+
+    Returns
+    -------
+    (T, p)
+        True where a meter is manipulated. A manipulated meter need not be displaced: one that is stuck at
+        the true voltage is manipulated all the same.
+    """
+    out = np.zeros((t.size, meters), dtype=np.bool_)
+    for attack in attacks:
+        out[np.ix_(active(attack, t), attack.meters)] = True
+    return out
+
+
+def reach(attack: Attack, t: float) -> float:
+    """How far into the past the attack looks at time t, s; 0 for attacks without memory."""
+    match attack:
+        case Stuck():
+            return max(t - attack.t_on, 0.0)
+        case Replay():
+            return attack.delay_s
+        case _:
+            return 0.0
+
+
+def load_pattern(R: Floats, X: Floats, target: int, ratio: float, v: Floats) -> Floats:
     """Voltage change at every customer per unit of extra load at one of them, to first order.
 
     From v^2 = v0^2 + 2 R p + 2 X q with a load P + j ratio P at customer k:
@@ -143,6 +340,28 @@ def coordinate(pattern: Floats, meters: Ints, size: float) -> float:
     if not weakest > 0.0:
         raise ValueError("a chosen meter does not feel the fake load at all")
     return size / weakest
+
+
+def _voltage(attack: Attack, t: Floats, v: Floats, past: Past) -> Floats:
+    """Reported voltage (T, k) of the attack's meters while it is on, from the honest one (T, k)."""
+    lie: Floats
+    match attack:
+        case Bias():
+            lie = v + attack.size
+        case Scaling():
+            lie = v * (1.0 + attack.factor)
+        case Drift():
+            grown = np.abs(attack.rate) * (t - attack.t_on)[:, None]
+            lie = v + np.sign(attack.rate) * np.minimum(grown, attack.limit)
+        case Stuck():
+            lie = np.broadcast_to(past(np.array([attack.t_on]))[:, attack.meters], v.shape)
+        case Replay():
+            lie = past(t - attack.delay_s)[:, attack.meters]
+        case Random():
+            lie = v + _random(attack, t)
+        case Coordinated():
+            lie = v + attack.shift
+    return lie
 
 
 def _random(attack: Random, t: Floats) -> Floats:
