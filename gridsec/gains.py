@@ -1,0 +1,407 @@
+"""Gains of circle-criterion observers: what they are and the inequality that they obey.
+
+Everything about a design that needs no solver: the corrected inequality (12) of chong2020 rebuilt
+as a plain matrix, its margin, the error bounds that follow from it, and how strongly the observer
+listens to its meters.
+
+References
+----------
+chong2020, section VI; the correction and all proofs are in docs/theory-observers.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats, Ints, frozen
+from gridsec.errors import DesignInfeasible
+from gridsec.lure import Lure
+
+# A meter that moves the observer by less than this part of what it could is not listened to.
+_BLIND = 1e-3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CircleOptions:
+    """What a design is asked for. n states, p meters, l inputs, r directions of uncertainty.
+
+    Attributes
+    ----------
+    rate
+        alpha, certified decay rate of the error, 1/s.
+    noise : (p,)
+        Scale of each meter's error n_j, squared pu. The attack enters where the noise does.
+    load : (l, r)
+        Shape of the error of the known input, u - u_hat = load @ delta with |delta_i| about 1.
+        Correlations between customers live here; a diagonal matrix has none.
+    weight : (n, n)
+        Q, what an error costs: e^T Q e.
+    floor
+        Smallest gain, 0 … 1, from a trusted meter to the curve of an inverter that it sits at.
+    """
+
+    rate: float
+    noise: Floats
+    load: Floats
+    weight: Floats
+    floor: float
+
+    def __post_init__(self) -> None:
+        """Freeze the arrays and refuse what cannot be meant."""
+        for name in ("noise", "load", "weight"):
+            object.__setattr__(self, name, frozen(getattr(self, name)))
+        problems = [
+            text
+            for bad, text in (
+                (not (np.isfinite(self.rate) and self.rate > 0.0), "the rate must be positive"),
+                (
+                    self.noise.ndim != 1 or not _within(self.noise),
+                    "noise must be finite, >= 0, of shape (p,)",
+                ),
+                (
+                    self.load.ndim != 2 or not np.isfinite(self.load).all(),
+                    "load must be finite, of shape (l, r)",
+                ),
+                (not _is_square(self.weight), "the weight must be a finite square matrix"),
+                (not 0.0 <= self.floor < 1.0, "the floor must lie in [0, 1)"),
+            )
+            if bad
+        ]
+        if problems:
+            raise ValueError("; ".join(problems))
+        if not np.any(self.noise > 0.0):
+            raise ValueError("at least one meter must have a noise scale above zero")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CircleGains:
+    """One designed observer with its proof. k trusted meters, n states, m nonlinearities.
+
+    Attributes
+    ----------
+    J : (k,)
+        The trusted meters.
+    L, K : (n, k), (m, k)
+        Injection into the state, and into the argument of the nonlinearities.
+    P : (n, n)
+        V = e^T P e is the certificate.
+    Lambda : (m,)
+        Diagonal multiplier of the slope restriction.
+    nu, mu, mu_delta : float
+        V' <= -2 alpha V - nu e^T Q e + mu |n / noise|^2 + mu_delta |delta|^2.
+    alpha
+        Certified decay rate, 1/s.
+    noise : (k,)
+        Scale of each trusted meter's error, squared pu.
+    load, weight : (l, r), (n, n)
+        As in `CircleOptions`.
+    margin
+        Of the rebuilt inequality, see `margin`; positive: it holds.
+    sensitivity : (k,)
+        How strongly each trusted meter moves the observer, see `sensitivity`.
+    backoff
+        By which part alpha, nu, mu and mu_delta were relaxed after the solver; 0 if not at all.
+    status
+        What the solver said. Not proof of anything.
+    """
+
+    J: Ints
+    L: Floats
+    K: Floats
+    P: Floats
+    Lambda: Floats
+    nu: float
+    mu: float
+    mu_delta: float
+    alpha: float
+    noise: Floats
+    load: Floats
+    weight: Floats
+    margin: float
+    sensitivity: Floats
+    backoff: float
+    status: str
+
+
+def options_for(
+    lure: Lure,
+    *,
+    rate: float,
+    noise: Floats | float,
+    load: Floats,
+    weight: Floats | None = None,
+    floor: float = 0.0,
+) -> CircleOptions:
+    """Options of a design, with short forms filled in for a plant.
+
+    Parameters
+    ----------
+    lure
+        Plant; p meters, l inputs, n states.
+    rate
+        alpha, 1/s.
+    noise : (p,) or scalar
+        Scale of the meters' errors, squared pu.
+    load : (l, r) or (l,)
+        Error of the known input; a vector means independent entries.
+    weight : (n, n)
+        Q; by default H^T H, the squared error of z at the inverters.
+    floor
+        Smallest gain from a trusted meter to the curve at the same place.
+    """
+    load = np.asarray(load, dtype=np.float64)
+    options = CircleOptions(
+        rate=float(rate),
+        noise=np.array(np.broadcast_to(np.asarray(noise, dtype=np.float64), (len(lure.C),))),
+        load=np.diag(load) if load.ndim == 1 else load,
+        weight=lure.H.T @ lure.H if weight is None else np.asarray(weight, dtype=np.float64),
+        floor=float(floor),
+    )
+    if len(options.load) != lure.F.shape[1] or len(options.weight) != len(lure.A):
+        raise ValueError(f"load {options.load.shape} or weight {options.weight.shape} do not fit the plant")
+    return options
+
+
+def circle_matrix(lure: Lure, J: Ints | Sequence[int], gains: CircleGains) -> Floats:
+    r"""Rebuild the corrected inequality (12): the matrix that must be negative semidefinite.
+
+    With `e = x - x_hat`, `psi` the difference of the nonlinearities and the columns in the order
+    (e, psi, n / noise, delta)::
+
+        [ E   P G + (H - K C_J)^T Lam   -P L N     P (B - L D_J) W    ]
+        [ *   -2 Lam d^-1               -Lam K N   Lam (F - K D_J) W  ]      N = diag(noise_J)
+        [ *   *                         -mu I      0                  ]      W = load
+        [ *   *                         *          -mu_delta I        ]
+
+        E = P (A - L C_J) + (A - L C_J)^T P + 2 alpha P + nu Q
+
+    Nonlinearities of slope bound 0 are constant and have no column.
+
+    Parameters
+    ----------
+    lure
+        Plant; n states, m nonlinearities, p meters, l inputs.
+    J : (k',)
+        Meters whose injection is counted, a subset of `gains.J`. Leaving some out gives the matrix
+        of the same observer while those meters are silent.
+    gains
+        The design.
+
+    Returns
+    -------
+    Floats
+        Symmetric, square.
+
+    Raises
+    ------
+    ValueError
+        If `J` is no subset of the design's meters.
+
+    References
+    ----------
+    chong2020 (12), corrected: docs/theory-observers.md, section 2.
+    """
+    keep = np.isin(gains.J, np.asarray(J, dtype=np.intp))
+    if np.count_nonzero(keep) != len(J):
+        raise ValueError(f"{list(J)} is no subset of the design's meters {gains.J.tolist()}")
+    rows, L, K, N = gains.J[keep], gains.L[:, keep], gains.K[:, keep], gains.noise[keep]
+    live = lure.slope > 0.0
+    G, H, F, K = lure.G[:, live], lure.H[live], lure.F[live], K[live]
+    P, Lam, W = gains.P, gains.Lambda[live], gains.load
+    C, D = lure.C[rows], lure.D[rows]
+    drift = P @ (lure.A - L @ C)
+    ee = drift + drift.T + 2.0 * gains.alpha * P + gains.nu * gains.weight
+    ep = P @ G + (H - K @ C).T * Lam
+    en, ed = -P @ L * N, P @ (lure.B - L @ D) @ W
+    pp = np.diag(-2.0 * Lam / lure.slope[live])
+    pn, pd = -(Lam[:, None] * K) * N, Lam[:, None] * ((F - K @ D) @ W)
+    nn, nd, dd = (
+        -gains.mu * np.eye(len(rows)),
+        np.zeros((len(rows), W.shape[1])),
+        -gains.mu_delta * np.eye(W.shape[1]),
+    )
+    return np.block([[ee, ep, en, ed], [ep.T, pp, pn, pd], [en.T, pn.T, nn, nd], [ed.T, pd.T, nd.T, dd]])
+
+
+def negativity(matrix: Floats) -> float:
+    """How clearly a symmetric matrix is negative definite: positive if it is, whatever its scaling.
+
+    Minus the largest eigenvalue of `S M S`, with the diagonal `S` that makes the diagonal of `M`
+    minus one, minus a bound on what rounding can have added. By Sylvester's law `S M S` has the
+    signs of `M`; its entries are of order one, so that the answer does not drown when the blocks
+    of `M` differ by many orders of magnitude. A diagonal entry that is not negative settles it.
+
+    Parameters
+    ----------
+    matrix : (s, s)
+        Symmetric.
+    """
+    if not np.isfinite(matrix).all():
+        return -np.inf
+    if matrix.size == 0:
+        return np.inf
+    diagonal = np.diagonal(matrix)
+    size = float(np.max(np.abs(matrix)))
+    if np.any(diagonal >= 0.0):
+        return -float(np.max(diagonal)) / size if size > 0.0 and np.max(diagonal) > 0.0 else -np.inf
+    scale = 1.0 / np.sqrt(-diagonal)
+    scaled = scale[:, None] * matrix * scale
+    eigenvalues = np.linalg.eigvalsh(0.5 * (scaled + scaled.T))
+    rounding = 4.0 * len(matrix) * np.finfo(np.float64).eps * float(np.max(np.abs(eigenvalues)))
+    return float(-eigenvalues[-1]) - rounding
+
+
+def margin(lure: Lure, J: Ints | Sequence[int], gains: CircleGains) -> float:
+    """Margin of everything that the proof needs; positive: the certificate holds.
+
+    The smallest of: the negativity of `circle_matrix`, the positivity of P, and the signs of
+    Lambda, mu, mu_delta, nu and alpha.
+
+    Parameters
+    ----------
+    lure, J, gains
+        As in `circle_matrix`.
+    """
+    live = lure.slope > 0.0
+    signs = np.array([*gains.Lambda[live], gains.mu, gains.mu_delta, gains.nu, gains.alpha])
+    if not np.all(signs > 0.0):
+        return -np.inf
+    return min(negativity(-gains.P), negativity(circle_matrix(lure, J, gains)))
+
+
+def sensitivity(lure: Lure, L: Floats, K: Floats) -> Floats:
+    """How strongly each meter moves an observer: 0 not at all, 1 as directly as possible.
+
+    `s_j = max(max_i |K_ij|, max_i |L_ij| / (|G| d)_i)`: the part of a meter's lie that reaches the
+    argument of some curve, or the push on some state relative to what the curves can push.
+
+    Parameters
+    ----------
+    lure
+        Plant.
+    L, K : (n, k), (m, k)
+        Gains.
+
+    Returns
+    -------
+    Floats
+        (k,), dimensionless.
+    """
+    drive = np.abs(lure.G) @ lure.slope
+    live = lure.slope > 0.0
+    through_K = np.max(np.abs(K[live]), axis=0, initial=0.0)
+    # A state that no curve drives is compared with its own decay over one unit of output.
+    reference = np.where(drive > 0.0, drive, np.abs(np.diagonal(lure.A)))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pushed = np.where(L == 0.0, 0.0, np.abs(L) / reference[:, None])
+    return np.asarray(np.maximum(through_K, np.max(pushed, axis=0, initial=0.0)), dtype=np.float64)
+
+
+def same_place(lure: Lure, J: Ints) -> Bools:
+    """Which nonlinearity's argument is exactly which meter's output.
+
+    Parameters
+    ----------
+    lure
+        Plant.
+    J : (k,)
+        Meters.
+
+    Returns
+    -------
+    Bools
+        (m, k): True where (H, F)_i and (C, D)_j are the same rows, the inverter and the meter of
+        one customer.
+    """
+    inverter = np.hstack([lure.H, lure.F])
+    meter = np.hstack([lure.C[J], lure.D[J]])
+    return np.asarray(np.all(inverter[:, None, :] == meter[None, :, :], axis=2))
+
+
+def refuse_blind(J: Ints, heard: Floats) -> None:
+    """Refuse a design that ignores every one of its meters.
+
+    Parameters
+    ----------
+    J : (k,)
+        The trusted meters.
+    heard : (k,)
+        Their `sensitivity`.
+
+    Raises
+    ------
+    DesignInfeasible
+        If no meter is heard, with the reason and the remedies.
+    """
+    if np.max(heard, initial=0.0) < _BLIND:
+        raise DesignInfeasible(
+            f"circle-criterion observer of the meters {J.tolist()}",
+            "degenerate: the best gains are L = K = 0, an observer that ignores its meters. The plant "
+            "converges by itself, so listening to a meter only costs when noise or attacks are large against "
+            "the load uncertainty. Every observer of such a bank gives the same estimate and no attack is "
+            "visible in it. State the uncertainty of the loads (`load`), or smaller meter noise, or demand a "
+            "smallest gain (`floor`)",
+            float(np.max(heard, initial=0.0)) - _BLIND,
+        )
+
+
+def state_bound(gains: CircleGains, rows: Floats, noise: float, delta: float) -> Floats:
+    r"""Ultimate bound on linear functions of the error.
+
+    `|c^T e| <= sqrt(c^T P^{-1} c) sqrt((mu s_n^2 + mu_delta s_d^2) / (2 alpha))`, after the initial
+    error has decayed with `exp(-alpha t)`.
+
+    Parameters
+    ----------
+    gains
+        A design whose margin is positive.
+    rows : (k, n)
+        The functions c^T of the error that are asked for, for example the rows of H.
+    noise
+        s_n, supremum over time of the Euclidean norm of (n + a)_J / noise.
+    delta
+        s_d, supremum over time of the Euclidean norm of delta.
+
+    Returns
+    -------
+    Floats
+        (k,), in the units of `rows @ e`.
+    """
+    level = (gains.mu * noise**2 + gains.mu_delta * delta**2) / (2.0 * gains.alpha)
+    spread = np.sum(rows * np.linalg.solve(gains.P, rows.T).T, axis=1)
+    return np.asarray(np.sqrt(spread * level), dtype=np.float64)
+
+
+def stacked(gains: Sequence[CircleGains], meters: int) -> tuple[Floats, Floats]:
+    """Gains of many observers on a leading axis, with zero columns for the meters each one ignores.
+
+    Parameters
+    ----------
+    gains
+        B designs of one plant.
+    meters
+        p, number of meters of the plant.
+
+    Returns
+    -------
+    L, K : (B, n, p), (B, m, p)
+        So that every observer of the bank injects `L @ r` and `K @ r` with one and the same r.
+    """
+    first = gains[0]
+    L = np.zeros((len(gains), len(first.L), meters))
+    K = np.zeros((len(gains), len(first.K), meters))
+    for index, one in enumerate(gains):
+        L[index][:, one.J] = one.L
+        K[index][:, one.J] = one.K
+    return L, K
+
+
+def _within(values: Floats) -> bool:
+    return bool(np.isfinite(values).all() and np.all(values >= 0.0))
+
+
+def _is_square(matrix: Floats) -> bool:
+    return matrix.ndim == 2 and matrix.shape[0] == matrix.shape[1] and bool(np.isfinite(matrix).all())

@@ -1,0 +1,475 @@
+"""Design of circle-criterion observers by linear matrix inequalities.
+
+The observer of the trusted meters J is
+
+    x_hat' = A x_hat + G phi(zeta) + B u + L r,   zeta = H x_hat + F u + K r,   r = (y - C x_hat - D u)_J
+
+and `circle` finds the L and K, with their proof, that keep the error small when the known input is
+off by `load @ delta` and the meters by `noise * n`. Solvers are believed nothing: the inequality is
+rebuilt from the gains in NumPy, in the plant's own units, before a design leaves this module.
+
+References
+----------
+chong2020 (11), (12), corrected; arcak2001. Proofs: docs/theory-observers.md.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from gridsec.arrays import Floats, Ints, frozen, frozen_ints
+from gridsec.designs import design_key, from_bytes, to_bytes
+from gridsec.errors import DesignInfeasible
+from gridsec.gains import (
+    CircleGains,
+    CircleOptions,
+    circle_matrix,
+    margin,
+    options_for,
+    refuse_blind,
+    same_place,
+    sensitivity,
+    stacked,
+    state_bound,
+)
+from gridsec.lure import Lure
+
+__all__ = [
+    "CircleGains",
+    "CircleOptions",
+    "cached",
+    "circle",
+    "circle_matrix",
+    "design_key",
+    "from_bytes",
+    "margin",
+    "options_for",
+    "sensitivity",
+    "solve_many",
+    "stacked",
+    "state_bound",
+    "to_bytes",
+]
+
+# Slack of the scaled inequality, whose entries are of order one: a hundred times the solver's
+# tolerance, so that its last digits cannot decide the sign of the margin.
+_SLACK = 1e-6
+# Relaxations tried, in order, when the rebuilt inequality is violated all the same.
+_BACKOFF = (0.0, 1e-4, 1e-3, 1e-2, 5e-2)
+# Subsets per task of `solve_many`: enough to share one canonicalisation, few enough for steady progress.
+_CHUNK = 5
+
+
+def circle(
+    lure: Lure,
+    J: Sequence[int] | Ints,
+    *,
+    rate: float,
+    noise: Floats | float,
+    load: Floats,
+    weight: Floats | None = None,
+    floor: float = 0.0,
+) -> CircleGains:
+    """Design the circle-criterion observer of one set of trusted meters.
+
+    Minimises `k mu + r mu_delta`, a bound on the mean of e^T Q e while every signal has its stated
+    size, over (P, P L, Lambda, Lambda K, mu, mu_delta) subject to the corrected (12) with nu = 1.
+
+    Parameters
+    ----------
+    lure
+        Plant.
+    J : (k,)
+        Trusted meters.
+    rate, noise, load, weight, floor
+        See `options_for`.
+
+    Returns
+    -------
+    CircleGains
+        With a positive margin.
+
+    Raises
+    ------
+    DesignInfeasible
+        If there is no such observer, if the inequality does not survive being rebuilt, or if the
+        optimum is the blind L = K = 0.
+
+    References
+    ----------
+    chong2020 (12), corrected: docs/theory-observers.md, section 2.
+    """
+    options = options_for(lure, rate=rate, noise=noise, load=load, weight=weight, floor=floor)
+    return _Template(lure, options, len(J)).solve(np.asarray(J, dtype=np.intp))
+
+
+def solve_many(
+    lure: Lure,
+    subsets: Sequence[Sequence[int]],
+    options: CircleOptions,
+    *,
+    workers: int,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[CircleGains, ...]:
+    """Design the observers of many trusted sets, in several processes.
+
+    Processes are spawned, so a script that calls this needs the `if __name__ == "__main__"` guard;
+    each runs its linear algebra on one thread. With one worker everything happens in this process.
+
+    Parameters
+    ----------
+    lure
+        Plant. Its matrices travel to the workers; its nonlinearity, which no inequality needs,
+        stays here.
+    subsets
+        Trusted sets, of any sizes, in any order.
+    options
+        From `options_for`.
+    workers
+        Number of processes.
+    progress
+        Called in this process with (done, total) whenever designs are finished.
+
+    Returns
+    -------
+    tuple of CircleGains
+        In the order of `subsets`.
+
+    Raises
+    ------
+    DesignInfeasible
+        For the first set whose design fails; work not begun is dropped.
+    """
+    chunks = _chunks(subsets)
+    results: dict[int, CircleGains] = {}
+
+    def collect(indices: Sequence[int], outcome: list[CircleGains] | _Failure) -> None:
+        if isinstance(outcome, _Failure):
+            raise DesignInfeasible(outcome.what, outcome.status, outcome.margin)
+        results.update(zip(indices, outcome, strict=True))
+        if progress is not None:
+            progress(len(results), len(subsets))
+
+    bare = replace(lure, phi=_no_curve)
+    if workers <= 1 or len(chunks) <= 1:
+        for indices, group in chunks:
+            collect(indices, _solve_chunk(bare, options, group))
+    else:
+        context = multiprocessing.get_context("spawn")
+        count = min(workers, len(chunks))
+        pool = ProcessPoolExecutor(count, mp_context=context, initializer=_one_thread)
+        try:
+            jobs: dict[Future[list[CircleGains] | _Failure], Sequence[int]] = {
+                pool.submit(_solve_chunk, bare, options, group): indices for indices, group in chunks
+            }
+            for job in as_completed(jobs):
+                collect(jobs[job], job.result())
+        finally:
+            pool.shutdown(cancel_futures=True)
+    return tuple(results[index] for index in range(len(subsets)))
+
+
+def cached(
+    lure: Lure,
+    subsets: Sequence[Sequence[int]],
+    options: CircleOptions,
+    *,
+    get: Callable[[str], bytes | None],
+    put: Callable[[str, bytes], None],
+    workers: int,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[tuple[CircleGains, ...], str]:
+    """Designs from a store if it has them and they still hold, new ones otherwise.
+
+    What the store returns is proven again: readable, the right sets, every margin recomputed and
+    positive, no blind design. Otherwise the bank is designed anew and put into the store.
+
+    Parameters
+    ----------
+    lure, subsets, options, workers, progress
+        As in `solve_many`.
+    get
+        Bytes stored under a key, or None.
+    put
+        Stores bytes under a key.
+
+    Returns
+    -------
+    designs, origin
+        `origin` says where they came from: "stored", "new", or "redesigned: " with what was wrong
+        with the stored ones.
+
+    Raises
+    ------
+    DesignInfeasible
+        As `solve_many`.
+    """
+    key = design_key(lure, subsets, options)
+    blob = get(key)
+    origin = "new"
+    if blob is not None:
+        try:
+            return _proven(lure, subsets, options, from_bytes(blob)), "stored"
+        except DesignInfeasible as damage:
+            origin = f"redesigned: {damage}"
+    designs = solve_many(lure, subsets, options, workers=workers, progress=progress)
+    put(key, to_bytes(designs, options))
+    return designs, origin
+
+
+def _proven(
+    lure: Lure, subsets: Sequence[Sequence[int]], options: CircleOptions, stored: tuple[CircleGains, ...]
+) -> tuple[CircleGains, ...]:
+    """The stored designs with margins recomputed, or DesignInfeasible."""
+    what = "stored design"
+    wanted = [tuple(int(j) for j in subset) for subset in subsets]
+    if [tuple(one.J.tolist()) for one in stored] != wanted:
+        raise DesignInfeasible(what, "made for other sets of meters")
+    out = []
+    for one in stored:
+        shapes = (one.L.shape, one.K.shape, one.P.shape, one.Lambda.shape, one.load.shape)
+        n, m, k = len(lure.A), len(lure.slope), len(one.J)
+        if shapes != ((n, k), (m, k), (n, n), (m,), options.load.shape):
+            raise DesignInfeasible(what, "made for a plant of another size")
+        # A relaxed rate is part of a design; anything beyond the stated back-off is damage.
+        honest = (1.0 - _BACKOFF[-1]) * options.rate <= one.alpha <= options.rate * (1.0 + 1e-12)
+        same = np.array_equal(one.noise, options.noise[one.J]) and np.array_equal(one.load, options.load)
+        if not (honest and same):
+            raise DesignInfeasible(what, f"{one.J.tolist()} was made for other options")
+        found = margin(lure, one.J, one)
+        if not found > 0.0:
+            raise DesignInfeasible(what, f"{one.J.tolist()} does not hold", found)
+        heard = sensitivity(lure, one.L, one.K)
+        refuse_blind(one.J, heard)
+        out.append(replace(one, margin=found, sensitivity=frozen(heard)))
+    return tuple(out)
+
+
+@dataclass(frozen=True, slots=True)
+class _Failure:
+    """A DesignInfeasible on its way between processes: exceptions with several arguments do not pickle."""
+
+    what: str
+    status: str
+    margin: float | None
+
+
+def _chunks(subsets: Sequence[Sequence[int]]) -> list[tuple[list[int], list[Ints]]]:
+    """Group the sets by size, because one canonicalised problem serves one size."""
+    sizes: dict[int, list[int]] = {}
+    for index, subset in enumerate(subsets):
+        sizes.setdefault(len(subset), []).append(index)
+    parts = [
+        indices[start : start + _CHUNK]
+        # The largest sets take longest: first, so that no worker is left with them at the end.
+        for _, indices in sorted(sizes.items(), reverse=True)
+        for start in range(0, len(indices), _CHUNK)
+    ]
+    return [(part, [np.asarray(subsets[index], dtype=np.intp) for index in part]) for part in parts]
+
+
+def _one_thread() -> None:
+    """Pin the linear algebra of a worker; several processes with several threads each only fight."""
+    import scipy.linalg  # noqa: F401  # loads the libraries that are to be limited
+    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]  # has no stubs
+
+    threadpool_limits(limits=1)
+
+
+def _no_curve(z: Floats) -> Floats:
+    """Stands in for the nonlinearity where only its slope bounds matter."""
+    raise AssertionError(f"a design evaluated the nonlinearity, shape {z.shape}")
+
+
+def _solve_chunk(lure: Lure, options: CircleOptions, group: Sequence[Ints]) -> list[CircleGains] | _Failure:
+    """Worker: designs for sets of one size."""
+    try:
+        template = _Template(lure, options, len(group[0]))
+        return [template.solve(J) for J in group]
+    except DesignInfeasible as failure:
+        return _Failure(failure.what, failure.status, failure.margin)
+
+
+@contextmanager
+def _solver_warnings_as_status() -> Iterator[None]:
+    """An inaccurate solution is judged by its margin, not by a warning that nobody reads."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Solution may be inaccurate", category=UserWarning)
+        yield
+
+
+def _cvxpy() -> Any:
+    """Import cvxpy late: it takes a second, and only a design needs it. Its annotations are incomplete."""
+    import cvxpy
+
+    return cvxpy
+
+
+class _Template:
+    """The scaled inequality for sets of one size, canonicalised once and solved for many sets.
+
+    Units: time in `1 / |A|`, z and y in `z_unit` (a typical load error), nonlinearity i in
+    `slope_i z_unit` (so that every slope bound becomes 1), states in what the nonlinearities can
+    push in one unit of time, noise in its root mean square. All entries are then of order one,
+    whatever the feeder's base power.
+    """
+
+    def __init__(self, lure: Lure, options: CircleOptions, size: int) -> None:
+        if size == 0:
+            raise DesignInfeasible("circle-criterion observer", "no trusted meter: nothing to design")
+        self.lure, self.options, self.size = lure, options, size
+        self.live = lure.slope > 0.0
+        self._set_units()
+        self._pose()
+
+    def _set_units(self) -> None:
+        lure, load = self.lure, self.options.load
+        spread = np.sqrt(np.sum((lure.F @ load) ** 2, axis=1))
+        noise = float(np.sqrt(np.mean(self.options.noise**2)))
+        self.z_unit = float(np.sqrt(np.mean(spread**2))) if np.any(spread > 0.0) else noise
+        self.noise_unit = noise
+        self.clock = float(np.linalg.norm(lure.A, 2))
+        push = (np.abs(lure.G) @ lure.slope) * self.z_unit / self.clock
+        self.x_unit = np.where(push > 0.0, push, np.max(push, initial=0.0) or self.z_unit)
+        scaled = self.x_unit[:, None] * self.options.weight * self.x_unit
+        self.q_unit = float(np.trace(scaled)) / len(scaled)
+        if not self.q_unit > 0.0:
+            raise DesignInfeasible("circle-criterion observer", "the weight Q is zero: nothing to keep small")
+
+    def _pose(self) -> None:
+        """State the problem in scaled coordinates, with the set of meters as a parameter."""
+        cp = _cvxpy()
+        lure, options, live, k = self.lure, self.options, self.live, self.size
+        x, z, clock = self.x_unit, self.z_unit, self.clock
+        n, m, r = len(lure.A), int(np.count_nonzero(live)), options.load.shape[1]
+        A = lure.A * x / x[:, None] / clock
+        G = lure.G[:, live] * (lure.slope[live] * z) / x[:, None] / clock
+        H, F = lure.H[live] * x / z, lure.F[live] @ options.load / z
+        B = lure.B @ options.load / x[:, None] / clock
+        Q = x[:, None] * options.weight * x / self.q_unit
+        self.C, self.D = cp.Parameter((k, n)), cp.Parameter((k, r))
+        self.N, self.at = cp.Parameter((1, k), nonneg=True), cp.Parameter((m, k), nonneg=True)
+        P, Y = cp.Variable((n, n), symmetric=True), cp.Variable((n, k))
+        lam, Gamma = cp.Variable(m), cp.Variable((m, k))
+        mu, mu_delta = cp.Variable(), cp.Variable()
+        Lam = cp.diag(lam)
+        half = P @ A - Y @ self.C
+        ee = half + half.T + (2.0 * options.rate / clock) * P + Q
+        ep = P @ G + (Lam @ H - Gamma @ self.C).T
+        en, pn = -cp.multiply(Y, np.ones((n, 1)) @ self.N), -cp.multiply(Gamma, np.ones((m, 1)) @ self.N)
+        ed, pd = P @ B - Y @ self.D, Lam @ F - Gamma @ self.D
+        nn, nd, dd = -mu * np.eye(k), np.zeros((k, r)), -mu_delta * np.eye(r)
+        whole = cp.bmat(
+            [[ee, ep, en, ed], [ep.T, -2.0 * Lam, pn, pd], [en.T, pn.T, nn, nd], [ed.T, pd.T, nd.T, dd]]
+        )
+        constraints = [whole << -_SLACK * np.eye(n + m + k + r), P >> _SLACK * np.eye(n)]
+        if options.floor > 0.0:
+            constraints.append(
+                cp.multiply(self.at, Gamma) >= options.floor * cp.multiply(self.at, Lam @ np.ones((m, k)))
+            )
+        # The noise column is written for unit noise and weighted here: its size changes the optimum,
+        # not the conditioning.
+        loud = (self.noise_unit / z) ** 2
+        self.problem = cp.Problem(cp.Minimize(k * loud * mu + r * mu_delta), constraints)
+        self.variables = (P, Y, lam, Gamma, mu, mu_delta)
+
+    def solve(self, J: Ints) -> CircleGains:
+        """Design for one set, verified.
+
+        Raises
+        ------
+        DesignInfeasible
+            As in `circle`.
+        """
+        cp = _cvxpy()
+        lure, options, live = self.lure, self.options, self.live
+        what = f"circle-criterion observer of the meters {J.tolist()} at rate {options.rate:g}/s"
+        self.C.value = lure.C[J] * self.x_unit / self.z_unit
+        self.D.value = lure.D[J] @ options.load / self.z_unit
+        self.N.value = (options.noise[J] / self.noise_unit)[None, :]
+        self.at.value = same_place(lure, J)[live].astype(np.float64)
+        try:
+            with _solver_warnings_as_status():
+                self.problem.solve(solver=cp.CLARABEL)
+        except cp.error.SolverError as failure:
+            raise DesignInfeasible(what, f"the solver failed: {failure}") from failure
+        if self.problem.status not in {cp.OPTIMAL, cp.OPTIMAL_INACCURATE}:
+            raise DesignInfeasible(what, f"the inequality has no solution ({self.problem.status})")
+        return settle(lure, self._in_plant_units(J), what)
+
+    def _in_plant_units(self, J: Ints) -> CircleGains:
+        """Undo the scaling; nu = 1 fixes the scale that an inequality leaves free."""
+        lure, options, live = self.lure, self.options, self.live
+        P, Y, lam, Gamma, mu, mu_delta = (np.asarray(v.value, dtype=np.float64) for v in self.variables)
+        x, z = self.x_unit, self.z_unit
+        L = np.linalg.solve(P, Y) * (x * self.clock / z)[:, None]
+        K = np.zeros((len(lure.slope), self.size))
+        K[live] = Gamma / lam[:, None]
+        Lambda = np.zeros(len(lure.slope))
+        Lambda[live] = self.q_unit * lam / (lure.slope[live] * z**2)
+        half = 0.5 * (P + P.T)
+        return CircleGains(
+            J=frozen_ints(J),
+            L=frozen(L),
+            K=frozen(K),
+            P=frozen(self.q_unit / self.clock * half / x[:, None] / x),
+            Lambda=frozen(Lambda),
+            nu=1.0,
+            mu=self.q_unit * float(mu) * (self.noise_unit / z) ** 2,
+            mu_delta=self.q_unit * float(mu_delta),
+            alpha=options.rate,
+            noise=frozen(options.noise[J]),
+            load=options.load,
+            weight=options.weight,
+            margin=np.nan,
+            sensitivity=frozen(sensitivity(lure, L, K)),
+            backoff=0.0,
+            status=str(self.problem.status),
+        )
+
+
+def settle(lure: Lure, found: CircleGains, what: str) -> CircleGains:
+    """Turn a solver's answer into a proven design, or refuse it.
+
+    The margin is recomputed in the plant's own units. If it is not positive, alpha, nu are shrunk
+    and mu, mu_delta grown together by the stated steps (at most 5 %), which makes every diagonal
+    block but that of psi more negative; the gains stay. The step used is kept in `backoff`.
+
+    Parameters
+    ----------
+    lure
+        Plant.
+    found
+        The solver's gains.
+    what
+        Names the design in errors.
+
+    Raises
+    ------
+    DesignInfeasible
+        If no step helps, or if the design listens to no meter.
+    """
+    best = -np.inf
+    for step in _BACKOFF:
+        tried = replace(
+            found,
+            alpha=found.alpha * (1.0 - step),
+            nu=found.nu * (1.0 - step),
+            mu=found.mu * (1.0 + step),
+            mu_delta=found.mu_delta * (1.0 + step),
+            backoff=step,
+        )
+        reached = margin(lure, found.J, tried)
+        if reached > 0.0:
+            refuse_blind(found.J, found.sensitivity)
+            return replace(tried, margin=reached)
+        best = max(best, reached)
+    raise DesignInfeasible(what, f"solver: {found.status}, but the rebuilt inequality is violated", best)
