@@ -1,0 +1,402 @@
+"""Readings in the order they arrive become ticks of a feeder: who said what at this moment.
+
+A tick is a multiple of the feeder's `tick_s`. A meter is seen at a tick if its latest reading at or before it
+is not older than `max_age_s`, so that a single lost reading does no harm. A tick is let go as soon as every
+source that is not silent has reported for it, and at the latest `grace_s` after it. What comes later is late:
+counted, and used for the next tick if it is still fresh. Silence does not stop the ticks.
+
+There is no clock in here. `now` is an argument (the wall clock), or is told by the readings themselves
+(`Clock.EVENTS`: the latest time that at least half of the sources have reached, so that a few wild clocks
+cannot move it; for replay and for time that runs faster). The same readings in the same order, with the same
+`now`, give the same ticks, whatever happens in between.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left, insort
+from collections import Counter, OrderedDict
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+from service.reading import Reading
+
+HELD_PER_SOURCE = 512
+"""A source that is more than this many readings ahead of the ticks is not listened to."""
+
+BACKLOG_TICKS = 3600
+"""After a longer gap (a suspended machine, a hole in a recording) the older ticks are skipped."""
+
+_ACTIVE_ROUNDS = 4
+
+
+class Clock(StrEnum):
+    """Who says what time it is."""
+
+    WALL = "wall"
+    EVENTS = "events"
+
+
+class Outcome(StrEnum):
+    """What became of a reading that is well-formed."""
+
+    ACCEPTED = "accepted"
+    OUT_OF_ORDER = "out-of-order"
+    LATE = "late"
+    DUPLICATE = "duplicate"
+    OVERFLOW = "overflow"
+    CLOCK_OFF = "clock-off"
+
+
+@dataclass(frozen=True, slots=True)
+class AlignRules:
+    """The times of one feeder, all in seconds.
+
+    Attributes
+    ----------
+    tick_s
+        Interval between ticks.
+    max_age_s
+        A reading older than this at a tick does not count as seen.
+    grace_s
+        How long after a tick to wait for those who have not reported.
+    lead_s
+        A reading up to this much after a tick still belongs to it: meters that mean to read at the tick
+        miss it by a little in both directions.
+    max_skew_s
+        A reading whose time is further than this from now is refused: that clock is off.
+    silence_s
+        A source whose last reading is older than this is silent.
+    clock
+        Who says what time it is.
+    """
+
+    tick_s: float
+    max_age_s: float
+    grace_s: float
+    lead_s: float
+    max_skew_s: float
+    silence_s: float
+    clock: Clock = Clock.WALL
+
+    def __post_init__(self) -> None:
+        times = (self.tick_s, self.max_age_s, self.max_skew_s, self.silence_s)
+        if not all(math.isfinite(s) and s > 0.0 for s in times):
+            raise ValueError(f"times must be finite and positive: {self}")
+        if not all(math.isfinite(s) and s >= 0.0 for s in (self.grace_s, self.lead_s)):
+            raise ValueError(f"times must be finite and not negative: {self}")
+
+
+def rules(
+    tick_s: float,
+    silence_s: float,
+    *,
+    clock: Clock = Clock.WALL,
+    max_skew_s: float | None = None,
+    grace_s: float | None = None,
+) -> AlignRules:
+    """Return the rules that follow from a feeder's tick.
+
+    Staleness beyond the regular interval is limited to 2 s: at 1 s ticks that bridges single losses, at
+    15 min a lost reading is a lost reading, because a voltage of a quarter of an hour ago says nothing.
+
+    Parameters
+    ----------
+    tick_s, silence_s
+        As in the feeder's file.
+    clock
+        Who says what time it is.
+    max_skew_s
+        None: a minute, or two ticks where they are longer.
+    grace_s
+        None: half a tick, at most a minute.
+    """
+    max_age_s = tick_s + min(1.5 * tick_s, 2.0)
+    return AlignRules(
+        tick_s=tick_s,
+        max_age_s=max_age_s,
+        grace_s=min(0.5 * tick_s, 60.0) if grace_s is None else grace_s,
+        lead_s=min(0.1 * tick_s, 1.0),
+        max_skew_s=max(60.0, 2.0 * tick_s) if max_skew_s is None else max_skew_s,
+        silence_s=max(silence_s, max_age_s),
+        clock=clock,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """What is known at one tick.
+
+    Attributes
+    ----------
+    t
+        Unix time, s.
+    readings
+        The usable reading of each meter, in the order of the feeder's meters; None where unseen.
+    busbar
+        The usable reading of the busbar meter, or None.
+    silent
+        (meter, seconds since its last reading) of those who are silent; None is the busbar meter, and
+        infinity says never.
+    """
+
+    t: float
+    readings: tuple[Reading | None, ...]
+    busbar: Reading | None
+    silent: tuple[tuple[str | None, float], ...]
+
+
+@dataclass(slots=True)
+class _Source:
+    held: list[Reading] = field(default_factory=list)
+    last_t: float = -math.inf
+    claim: float = -math.inf
+    heard: int = 0
+    seq: int | None = None
+
+
+def _time_of(reading: Reading) -> float:
+    return reading.t
+
+
+class Aligner:
+    """The alignment of one feeder. It belongs to one task.
+
+    Parameters
+    ----------
+    meters
+        Ids of the feeder's meters, in order. The busbar meter is added.
+    rules
+        The times.
+
+    Attributes
+    ----------
+    counts
+        Readings by outcome.
+    lost
+        Readings that never came, by the gaps in their running numbers.
+    skipped
+        Ticks that were skipped because the backlog was too long.
+    """
+
+    def __init__(self, meters: Iterable[str], rules: AlignRules) -> None:
+        self.meters = tuple(meters)
+        self.rules = rules
+        self.counts: Counter[Outcome] = Counter()
+        self.lost = 0
+        self.skipped = 0
+        self._sources: dict[str | None, _Source] = {meter: _Source() for meter in (*self.meters, None)}
+        self._waiting: set[str | None] = set()
+        self._next: int | None = None
+        self._first: int | None = None
+        self._refused: list[Reading] = []
+        self._now: float | None = None
+        self._arrivals = 0
+        self._active: OrderedDict[str | None, float] = OrderedDict()
+        self._claims: list[float] = []
+
+    # ---------------------------------------------------------------- in
+
+    def take(self, reading: Reading, now: float) -> tuple[Outcome, list[Tick]]:
+        """Take one reading in, and let go the ticks that are due.
+
+        Parameters
+        ----------
+        reading
+            A reading of this feeder.
+        now
+            Wall time of its arrival, Unix s; ignored when the readings tell the time.
+
+        Returns
+        -------
+        outcome, ticks
+            What became of the reading; the ticks, in order.
+        """
+        ticks = list(self.due(now))
+        source = self._sources[reading.meter]
+        if self.rules.clock is Clock.EVENTS:
+            self._hear(reading, source)
+            ticks.extend(self.due(now))
+        outcome = self._place(reading, source, self.now(now))
+        self.counts[outcome] += 1
+        ticks.extend(self.due(now))
+        return outcome, ticks
+
+    def refused(self) -> tuple[Reading, ...]:
+        """Return, once, the readings that were taken in but turned out to have a wrong clock."""
+        refused, self._refused = tuple(self._refused), []
+        return refused
+
+    def _place(self, reading: Reading, source: _Source, now: float | None) -> Outcome:
+        t = reading.t
+        if now is not None and abs(t - now) > self.rules.max_skew_s:
+            return Outcome.CLOCK_OFF
+        index = bisect_left(source.held, t, key=_time_of)
+        if index < len(source.held) and source.held[index].t == t:
+            return Outcome.DUPLICATE
+        self._count_gap(reading, source)
+        late = self._next is not None and t <= self._time(self._next - 1) + self.rules.lead_s
+        if late and t <= source.last_t:
+            return Outcome.LATE
+        if len(source.held) >= HELD_PER_SOURCE:
+            return Outcome.OVERFLOW
+        source.held.insert(index, reading)
+        in_order = t > source.last_t
+        source.last_t = max(source.last_t, t)
+        if self._next is not None and self._reported(source, self._next):
+            self._waiting.discard(reading.meter)
+        if late:
+            return Outcome.LATE
+        return Outcome.ACCEPTED if in_order else Outcome.OUT_OF_ORDER
+
+    def _count_gap(self, reading: Reading, source: _Source) -> None:
+        # Numbers that go back are a restart or another order, no loss; the ring of the subscription drops
+        # the oldest samples, which shows here and nowhere else.
+        if reading.seq is None:
+            return
+        if source.seq is not None and reading.seq > source.seq + 1:
+            self.lost += reading.seq - source.seq - 1
+        source.seq = reading.seq
+
+    # ---------------------------------------------------------------- time
+
+    def now(self, wall: float) -> float | None:
+        """Return the time that counts here, s; None while the readings have not told it yet.
+
+        Parameters
+        ----------
+        wall
+            Wall time, Unix s.
+        """
+        return wall if self.rules.clock is Clock.WALL else self._now
+
+    def wake(self) -> float | None:
+        """Return the wall time at which `due` has something at the latest, s; None if only readings can."""
+        if self.rules.clock is Clock.EVENTS or self._next is None:
+            return None
+        return self._time(self._next) + (self.rules.grace_s if self._waiting else 0.0)
+
+    def _hear(self, reading: Reading, source: _Source) -> None:
+        """Let a reading have its say about the time."""
+        self._arrivals += 1
+        meter = reading.meter
+        if meter in self._active:
+            self._claims.pop(bisect_left(self._claims, self._active.pop(meter)))
+        source.claim = max(source.claim, reading.t) if source.heard else reading.t
+        source.heard = self._arrivals
+        self._active[meter] = source.claim
+        insort(self._claims, source.claim)
+        window = max(_ACTIVE_ROUNDS * len(self._sources), 64)
+        while self._sources[next(iter(self._active))].heard <= self._arrivals - window:
+            _, claim = self._active.popitem(last=False)
+            self._claims.pop(bisect_left(self._claims, claim))
+        if self._now is None and 2 * len(self._active) < len(self._sources) and self._arrivals < window:
+            return
+        count = len(self._claims)
+        reached = self._claims[count - (count + 1) // 2]
+        if self._now is None:
+            self._now = reached
+            self._sweep(reached)
+        else:
+            self._now = max(self._now, reached)
+
+    def _sweep(self, now: float) -> None:
+        """Throw out what was taken in before the time was known and does not fit it."""
+        for source in self._sources.values():
+            wild = [r for r in source.held if abs(r.t - now) > self.rules.max_skew_s]
+            if wild:
+                self._refused.extend(wild)
+                self.counts[Outcome.ACCEPTED] -= len(wild)
+                self.counts[Outcome.CLOCK_OFF] += len(wild)
+                source.held = [r for r in source.held if abs(r.t - now) <= self.rules.max_skew_s]
+                source.last_t = source.held[-1].t if source.held else -math.inf
+
+    def _time(self, number: int) -> float:
+        return number * self.rules.tick_s
+
+    # ---------------------------------------------------------------- out
+
+    def due(self, wall: float) -> Iterator[Tick]:
+        """Let go the ticks that are due, in order.
+
+        Parameters
+        ----------
+        wall
+            Wall time, Unix s; ignored when the readings tell the time.
+        """
+        now = self.now(wall)
+        if now is None:
+            return
+        if self._next is None:
+            self._first = math.ceil(now / self.rules.tick_s)
+            self._turn_to(self._first)
+        behind = math.floor(now / self.rules.tick_s) - self._number()
+        if behind > BACKLOG_TICKS:
+            self.skipped += behind - BACKLOG_TICKS
+            self._turn_to(self._number() + behind - BACKLOG_TICKS)
+        while True:
+            t = self._time(self._number())
+            if now < t or (self._waiting and now < t + self.rules.grace_s):
+                return
+            tick = self._tick(t)
+            self._turn_to(self._number() + 1)
+            yield tick
+
+    def flush(self) -> Iterator[Tick]:
+        """Let go every tick that the readings have reached, without grace: nothing more will come."""
+        if self._now is None and self._claims:
+            self._now = self._claims[len(self._claims) // 2]
+            self._sweep(self._now)
+        if self._now is None:
+            return
+        yield from self.due(self._now)
+        while self._time(self._number()) <= self._now:
+            tick = self._tick(self._time(self._number()))
+            self._turn_to(self._number() + 1)
+            yield tick
+
+    def _number(self) -> int:
+        if self._next is None:
+            raise RuntimeError("no tick before the time is known")
+        return self._next
+
+    def _turn_to(self, number: int) -> None:
+        self._next = number
+        t = self._time(number)
+        before = self._time(number - 1) + self.rules.lead_s
+        self._waiting.clear()
+        for meter, source in self._sources.items():
+            # The newest reading at or before the last tick may serve the next one; older ones never will.
+            done = bisect_left(source.held, math.nextafter(before, math.inf), key=_time_of)
+            if done > 1:
+                del source.held[: done - 1]
+            if not self._reported(source, number) and not self._silent_for(source, t):
+                self._waiting.add(meter)
+
+    def _reported(self, source: _Source, number: int) -> bool:
+        return source.last_t > self._time(number - 1) + self.rules.lead_s
+
+    def _silent_for(self, source: _Source, t: float) -> float:
+        """Return for how long a source has been silent at t, s; 0 if it is not silent."""
+        since = source.last_t
+        if since == -math.inf and self._first is not None:
+            since = self._time(self._first)
+            return math.inf if t - since > self.rules.silence_s else 0.0
+        return t - since if t - since > self.rules.silence_s else 0.0
+
+    def _tick(self, t: float) -> Tick:
+        seen = {meter: self._usable(source, t) for meter, source in self._sources.items()}
+        silent = tuple(
+            (meter, seconds)
+            for meter, source in self._sources.items()
+            if (seconds := self._silent_for(source, t)) > 0.0
+        )
+        return Tick(t, tuple(seen[meter] for meter in self.meters), seen[None], silent)
+
+    def _usable(self, source: _Source, t: float) -> Reading | None:
+        index = bisect_left(source.held, math.nextafter(t + self.rules.lead_s, math.inf), key=_time_of)
+        if index == 0:
+            return None
+        reading = source.held[index - 1]
+        return reading if t - reading.t <= self.rules.max_age_s else None

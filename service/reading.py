@@ -1,0 +1,273 @@
+"""Readings: what a usable one is, and everything that can be wrong with one.
+
+A value is judged as a whole: a `BadReading` names every problem of the reading at once. The reason is one of
+a few words (a label for counters), the problems are sentences (for people).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any
+
+import msgspec
+
+T_MIN, T_MAX = 1e8, 1e10
+"""Unix seconds outside of 1973 to 2286 are milliseconds, counters or uptimes, but no seconds."""
+
+VOLT_FACTOR = 10.0
+"""A meter that reads more than this many times the nominal voltage is broken, not manipulated."""
+
+SEQ_MAX = 2**63 - 1
+HEAD_BYTES = 200
+NOT_REPORTED = math.nan
+
+
+class BadReason(StrEnum):
+    """Why a reading is not used: few enough for a label of a counter."""
+
+    KEY = "key"
+    UNKNOWN_FEEDER = "unknown-feeder"
+    UNKNOWN_METER = "unknown-meter"
+    OVERSIZE = "oversize"
+    ENCODING = "encoding"
+    EMPTY = "empty"
+    SYNTAX = "syntax"
+    TYPE = "type"
+    VALUE = "value"
+    CLOCK_OFF = "clock-off"
+
+
+class Reading(msgspec.Struct, frozen=True, gc=False):
+    """One usable reading.
+
+    Attributes
+    ----------
+    feeder
+        Name of the feeder.
+    meter
+        Id of the meter; None is the busbar meter of the substation.
+    t
+        Unix time of the measurement by the meter's clock, s.
+    v_volt
+        RMS phase-to-neutral voltage, V.
+    p_kw, q_kvar
+        Net import at the connection point, kW and kvar; NaN where not reported.
+    seq
+        Running number of the reading, or None.
+    """
+
+    feeder: str
+    meter: str | None
+    t: float
+    v_volt: float
+    p_kw: float = NOT_REPORTED
+    q_kvar: float = NOT_REPORTED
+    seq: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class BadReading:
+    """A payload, or an element of one, that was not used.
+
+    Attributes
+    ----------
+    reason
+        The kind of problem.
+    problems
+        Everything that is wrong, one sentence each.
+    key
+        The zenoh key it came on.
+    feeder, meter
+        Known ids only; None where the key names nothing that is known here.
+    head
+        The beginning of the payload or element, printable.
+    count
+        How many readings this stands for (more than one only for the tail of a bad batch).
+    """
+
+    reason: BadReason
+    problems: tuple[str, ...]
+    key: str
+    feeder: str | None = None
+    meter: str | None = None
+    head: str = ""
+    count: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """What has to be known of a feeder to judge its readings.
+
+    Attributes
+    ----------
+    meters
+        Ids of its meters.
+    nominal_volt
+        Nominal phase-to-neutral voltage, V.
+    power_max_kw
+        Largest believable magnitude of a customer's active or reactive power, kW or kvar.
+    """
+
+    meters: frozenset[str]
+    nominal_volt: float
+    power_max_kw: float
+
+
+class Raw(msgspec.Struct, gc=False):
+    """A reading as it is on the wire; `meter` is there in batches only."""
+
+    t: float
+    v_volt: float
+    p_kw: float | None = None
+    q_kvar: float | None = None
+    seq: int | None = None
+    meter: str | None = None
+
+
+def plausible(raw: Raw, known: Known) -> bool:
+    """Tell whether every number of a well-typed reading is believable."""
+    limit = known.power_max_kw
+    return (
+        0.0 < raw.v_volt <= VOLT_FACTOR * known.nominal_volt
+        and T_MIN <= raw.t <= T_MAX
+        and (raw.p_kw is None or -limit <= raw.p_kw <= limit)
+        and (raw.q_kvar is None or -limit <= raw.q_kvar <= limit)
+        and (raw.seq is None or 0 <= raw.seq <= SEQ_MAX)
+    )
+
+
+def to_reading(feeder: str, meter: str | None, raw: Raw) -> Reading:
+    """Return the reading of a meter (None: the busbar)."""
+    return Reading(
+        feeder,
+        meter,
+        raw.t,
+        raw.v_volt,
+        NOT_REPORTED if raw.p_kw is None else raw.p_kw,
+        NOT_REPORTED if raw.q_kvar is None else raw.q_kvar,
+        raw.seq,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Findings:
+    """What is wrong with one reading, by kind."""
+
+    of: dict[BadReason, list[str]] = field(default_factory=dict)
+
+    def add(self, reason: BadReason, problem: str) -> None:
+        """Note a problem."""
+        self.of.setdefault(reason, []).append(printable(problem))
+
+    @property
+    def reason(self) -> BadReason:
+        """The kind under which the reading is counted: a wrong type before a wrong value."""
+        return next(reason for reason in _GRAVITY if reason in self.of)
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """Every problem."""
+        return tuple(problem for reason in _GRAVITY for problem in self.of.get(reason, ()))
+
+
+_GRAVITY = (BadReason.TYPE, BadReason.VALUE, BadReason.UNKNOWN_METER)
+
+
+def judge(value: Any, known: Known, *, in_batch: bool) -> Raw | Findings:
+    """Return the reading in a parsed value, or everything that is wrong with it.
+
+    Parameters
+    ----------
+    value
+        Anything that JSON, CBOR or a row of columns can hold.
+    known
+        The feeder's limits.
+    in_batch
+        Whether the reading has to name its meter.
+    """
+    findings = Findings()
+    if not isinstance(value, dict):
+        findings.add(BadReason.TYPE, f"a reading is an object, not {name_of(value)}")
+        return findings
+    t = _number(value, "t", findings, required=True)
+    if t is not None and not T_MIN <= t <= T_MAX:
+        findings.add(BadReason.VALUE, f"t = {t:g} is no Unix time in seconds")
+    v_volt = _number(value, "v_volt", findings, required=True)
+    if v_volt is not None and not 0.0 < v_volt <= VOLT_FACTOR * known.nominal_volt:
+        problem = f"v_volt = {v_volt:g} V is absurd where {known.nominal_volt:g} V is nominal"
+        findings.add(BadReason.VALUE, problem)
+    p_kw = _power(value, "p_kw", known, findings)
+    q_kvar = _power(value, "q_kvar", known, findings)
+    seq = value.get("seq")
+    if seq is not None and (isinstance(seq, bool) or not isinstance(seq, int)):
+        findings.add(BadReason.TYPE, f"seq is {name_of(seq)}, not an integer")
+    elif seq is not None and not 0 <= seq <= SEQ_MAX:
+        findings.add(BadReason.VALUE, "seq is outside of 0 to 2^63 - 1")
+    meter = value.get("meter") if in_batch else None
+    if in_batch and not isinstance(meter, str):
+        problem = "meter is missing" if meter is None else f"meter is {name_of(meter)}, not a string"
+        findings.add(BadReason.TYPE, problem)
+    elif in_batch and meter not in known.meters:
+        findings.add(BadReason.UNKNOWN_METER, f"the feeder has no meter `{str(meter)[:64]}`")
+    if findings.of or t is None or v_volt is None:
+        return findings
+    return Raw(t, v_volt, p_kw, q_kvar, seq, meter)
+
+
+def _power(value: dict[Any, Any], name: str, known: Known, findings: Findings) -> float | None:
+    power = _number(value, name, findings, required=False)
+    limit = known.power_max_kw
+    if power is not None and abs(power) > limit:
+        findings.add(BadReason.VALUE, f"{name} = {power:g} is absurd for one customer (limit {limit:g})")
+    return power
+
+
+def _number(value: dict[Any, Any], name: str, findings: Findings, *, required: bool) -> float | None:
+    number = value.get(name)
+    if number is None:
+        if required:
+            findings.add(BadReason.TYPE, f"{name} is {'null' if name in value else 'missing'}")
+        return None
+    if isinstance(number, bool) or not isinstance(number, int | float):
+        findings.add(BadReason.TYPE, f"{name} is {name_of(number)}, not a number")
+        return None
+    try:
+        result = float(number)
+    except OverflowError:
+        result = math.inf
+    if not math.isfinite(result):
+        findings.add(BadReason.VALUE, f"{name} = {result} is no finite number")
+        return None
+    return result
+
+
+def name_of(value: object) -> str:
+    """Return what a value is, in the words of JSON."""
+    names: dict[type, str] = {
+        type(None): "null",
+        bool: "a truth value",
+        str: "a string",
+        int: "a number",
+        float: "a number",
+        list: "an array",
+        dict: "an object",
+        bytes: "bytes",
+    }
+    return names.get(type(value), type(value).__name__)
+
+
+def printable(text: str) -> str:
+    """Return text with control characters and broken Unicode escaped: fit for logs and databases."""
+    return text if text.isprintable() else repr(text)[1:-1]
+
+
+def head_of(value: object) -> str:
+    """Return the beginning of something as printable text."""
+    if isinstance(value, bytes):
+        return printable(value[:HEAD_BYTES].decode("utf-8", "backslashreplace"))
+    try:
+        return printable(repr(value)[:HEAD_BYTES])
+    except (ValueError, RecursionError):  # an integer of thousands of digits, a value inside itself
+        return name_of(value)
