@@ -1,6 +1,7 @@
-"""Designs as bytes: a key by content, and a round trip that is exact.
+"""Designs that are kept: a key by content, an exact round trip through bytes, proof before reuse.
 
-What a design cache is made of. Files are the caller's business; nothing here reads or writes one.
+What a design cache is made of: `cached` asks a store, proves again what it gets, and designs what is
+missing or damaged. Files are the store's business; nothing here reads or writes one.
 """
 
 from __future__ import annotations
@@ -8,8 +9,8 @@ from __future__ import annotations
 import hashlib
 import io
 import zipfile
-from collections.abc import Sequence
-from dataclasses import fields
+from collections.abc import Callable, Sequence
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,8 @@ from numpy.typing import NDArray
 
 from gridsec.arrays import frozen, frozen_ints
 from gridsec.errors import DesignInfeasible
-from gridsec.gains import CircleGains, CircleOptions
+from gridsec.gains import CircleGains, CircleOptions, margin, refuse_blind, sensitivity
+from gridsec.lmi import BACKOFF, solve_many
 from gridsec.lure import Lure
 
 _FORMAT = "gridsec circle gains 1"
@@ -141,4 +143,80 @@ def _unpack(arrays: _Arrays) -> tuple[CircleGains, ...]:
                 status=str(values["status"]),
             )
         )
+    return tuple(out)
+
+
+def cached(
+    lure: Lure,
+    subsets: Sequence[Sequence[int]],
+    options: CircleOptions,
+    *,
+    get: Callable[[str], bytes | None],
+    put: Callable[[str, bytes], None],
+    workers: int,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[tuple[CircleGains, ...], str]:
+    """Designs from a store if it has them and they still hold, new ones otherwise.
+
+    What the store returns is proven again: readable, the right sets, every margin recomputed and
+    positive, no blind design. Otherwise the bank is designed anew and put into the store.
+
+    Parameters
+    ----------
+    lure, subsets, options, workers, progress
+        As in `solve_many`.
+    get
+        Bytes stored under a key, or None.
+    put
+        Stores bytes under a key.
+
+    Returns
+    -------
+    designs, origin
+        `origin` says where they came from: "stored", "new", or "redesigned: " with what was wrong
+        with the stored ones.
+
+    Raises
+    ------
+    DesignInfeasible
+        As `solve_many`.
+    """
+    key = design_key(lure, subsets, options)
+    blob = get(key)
+    origin = "new"
+    if blob is not None:
+        try:
+            return _proven(lure, subsets, options, from_bytes(blob)), "stored"
+        except DesignInfeasible as damage:
+            origin = f"redesigned: {damage}"
+    designs = solve_many(lure, subsets, options, workers=workers, progress=progress)
+    put(key, to_bytes(designs, options))
+    return designs, origin
+
+
+def _proven(
+    lure: Lure, subsets: Sequence[Sequence[int]], options: CircleOptions, stored: tuple[CircleGains, ...]
+) -> tuple[CircleGains, ...]:
+    """The stored designs with margins recomputed, or DesignInfeasible."""
+    what = "stored design"
+    wanted = [tuple(int(j) for j in subset) for subset in subsets]
+    if [tuple(one.J.tolist()) for one in stored] != wanted:
+        raise DesignInfeasible(what, "made for other sets of meters")
+    out = []
+    for one in stored:
+        shapes = (one.L.shape, one.K.shape, one.P.shape, one.Lambda.shape, one.load.shape)
+        n, m, k = len(lure.A), len(lure.slope), len(one.J)
+        if shapes != ((n, k), (m, k), (n, n), (m,), options.load.shape):
+            raise DesignInfeasible(what, "made for a plant of another size")
+        # A relaxed rate is part of a design; anything beyond the stated back-off is damage.
+        honest = (1.0 - BACKOFF[-1]) * options.rate <= one.alpha <= options.rate * (1.0 + 1e-12)
+        same = np.array_equal(one.noise, options.noise[one.J]) and np.array_equal(one.load, options.load)
+        if not (honest and same):
+            raise DesignInfeasible(what, f"{one.J.tolist()} was made for other options")
+        found = margin(lure, one.J, one)
+        if not found > 0.0:
+            raise DesignInfeasible(what, f"{one.J.tolist()} does not hold", found)
+        heard = sensitivity(lure, one.L, one.K)
+        refuse_blind(one.J, heard)
+        out.append(replace(one, margin=found, sensitivity=frozen(heard)))
     return tuple(out)

@@ -26,7 +26,6 @@ from typing import Any
 import numpy as np
 
 from gridsec.arrays import Floats, Ints, frozen, frozen_ints
-from gridsec.designs import design_key, from_bytes, to_bytes
 from gridsec.errors import DesignInfeasible
 from gridsec.gains import (
     CircleGains,
@@ -45,25 +44,22 @@ from gridsec.lure import Lure
 __all__ = [
     "CircleGains",
     "CircleOptions",
-    "cached",
     "circle",
     "circle_matrix",
-    "design_key",
-    "from_bytes",
     "margin",
     "options_for",
+    "prove",
     "sensitivity",
     "solve_many",
     "stacked",
     "state_bound",
-    "to_bytes",
 ]
 
 # Slack of the scaled inequality, whose entries are of order one: a hundred times the solver's
 # tolerance, so that its last digits cannot decide the sign of the margin.
 _SLACK = 1e-6
 # Relaxations tried, in order, when the rebuilt inequality is violated all the same.
-_BACKOFF = (0.0, 1e-4, 1e-3, 1e-2, 5e-2)
+BACKOFF = (0.0, 1e-4, 1e-3, 1e-2, 5e-2)
 # Subsets per task of `solve_many`: enough to share one canonicalisation, few enough for steady progress.
 _CHUNK = 5
 
@@ -109,6 +105,35 @@ def circle(
     """
     options = options_for(lure, rate=rate, noise=noise, load=load, weight=weight, floor=floor)
     return _Template(lure, options, len(J)).solve(np.asarray(J, dtype=np.intp))
+
+
+def prove(lure: Lure, J: Sequence[int] | Ints, L: Floats, K: Floats, options: CircleOptions) -> CircleGains:
+    """Certificate for an observer whose gains are given: the corrected (12) in P and Lambda only.
+
+    Parameters
+    ----------
+    lure
+        Plant; n states, m nonlinearities.
+    J : (k,)
+        Trusted meters.
+    L, K : (n, k), (m, k)
+        Gains. For nonlinearities of slope bound 0 no gain matters.
+    options
+        From `options_for`. Its `floor` has no meaning here.
+
+    Returns
+    -------
+    CircleGains
+        With exactly these gains and a positive margin. Blind gains are accepted: they were asked for.
+
+    Raises
+    ------
+    DesignInfeasible
+        If the inequality has no solution, or does not survive being rebuilt.
+    """
+    given = (np.asarray(L, dtype=np.float64), np.asarray(K, dtype=np.float64))
+    template = _Template(lure, replace(options, floor=0.0), len(J), given=given)
+    return template.solve(np.asarray(J, dtype=np.intp))
 
 
 def solve_many(
@@ -175,82 +200,6 @@ def solve_many(
         finally:
             pool.shutdown(cancel_futures=True)
     return tuple(results[index] for index in range(len(subsets)))
-
-
-def cached(
-    lure: Lure,
-    subsets: Sequence[Sequence[int]],
-    options: CircleOptions,
-    *,
-    get: Callable[[str], bytes | None],
-    put: Callable[[str, bytes], None],
-    workers: int,
-    progress: Callable[[int, int], None] | None = None,
-) -> tuple[tuple[CircleGains, ...], str]:
-    """Designs from a store if it has them and they still hold, new ones otherwise.
-
-    What the store returns is proven again: readable, the right sets, every margin recomputed and
-    positive, no blind design. Otherwise the bank is designed anew and put into the store.
-
-    Parameters
-    ----------
-    lure, subsets, options, workers, progress
-        As in `solve_many`.
-    get
-        Bytes stored under a key, or None.
-    put
-        Stores bytes under a key.
-
-    Returns
-    -------
-    designs, origin
-        `origin` says where they came from: "stored", "new", or "redesigned: " with what was wrong
-        with the stored ones.
-
-    Raises
-    ------
-    DesignInfeasible
-        As `solve_many`.
-    """
-    key = design_key(lure, subsets, options)
-    blob = get(key)
-    origin = "new"
-    if blob is not None:
-        try:
-            return _proven(lure, subsets, options, from_bytes(blob)), "stored"
-        except DesignInfeasible as damage:
-            origin = f"redesigned: {damage}"
-    designs = solve_many(lure, subsets, options, workers=workers, progress=progress)
-    put(key, to_bytes(designs, options))
-    return designs, origin
-
-
-def _proven(
-    lure: Lure, subsets: Sequence[Sequence[int]], options: CircleOptions, stored: tuple[CircleGains, ...]
-) -> tuple[CircleGains, ...]:
-    """The stored designs with margins recomputed, or DesignInfeasible."""
-    what = "stored design"
-    wanted = [tuple(int(j) for j in subset) for subset in subsets]
-    if [tuple(one.J.tolist()) for one in stored] != wanted:
-        raise DesignInfeasible(what, "made for other sets of meters")
-    out = []
-    for one in stored:
-        shapes = (one.L.shape, one.K.shape, one.P.shape, one.Lambda.shape, one.load.shape)
-        n, m, k = len(lure.A), len(lure.slope), len(one.J)
-        if shapes != ((n, k), (m, k), (n, n), (m,), options.load.shape):
-            raise DesignInfeasible(what, "made for a plant of another size")
-        # A relaxed rate is part of a design; anything beyond the stated back-off is damage.
-        honest = (1.0 - _BACKOFF[-1]) * options.rate <= one.alpha <= options.rate * (1.0 + 1e-12)
-        same = np.array_equal(one.noise, options.noise[one.J]) and np.array_equal(one.load, options.load)
-        if not (honest and same):
-            raise DesignInfeasible(what, f"{one.J.tolist()} was made for other options")
-        found = margin(lure, one.J, one)
-        if not found > 0.0:
-            raise DesignInfeasible(what, f"{one.J.tolist()} does not hold", found)
-        heard = sensitivity(lure, one.L, one.K)
-        refuse_blind(one.J, heard)
-        out.append(replace(one, margin=found, sensitivity=frozen(heard)))
-    return tuple(out)
 
 
 @dataclass(frozen=True, slots=True)
@@ -322,10 +271,12 @@ class _Template:
     whatever the feeder's base power.
     """
 
-    def __init__(self, lure: Lure, options: CircleOptions, size: int) -> None:
+    def __init__(
+        self, lure: Lure, options: CircleOptions, size: int, given: tuple[Floats, Floats] | None = None
+    ) -> None:
         if size == 0:
             raise DesignInfeasible("circle-criterion observer", "no trusted meter: nothing to design")
-        self.lure, self.options, self.size = lure, options, size
+        self.lure, self.options, self.size, self.given = lure, options, size, given
         self.live = lure.slope > 0.0
         self._set_units()
         self._pose()
@@ -371,6 +322,9 @@ class _Template:
             [[ee, ep, en, ed], [ep.T, -2.0 * Lam, pn, pd], [en.T, pn.T, nn, nd], [ed.T, pd.T, nd.T, dd]]
         )
         constraints = [whole << -_SLACK * np.eye(n + m + k + r), P >> _SLACK * np.eye(n)]
+        if self.given is not None:
+            L, K = self.given
+            constraints += [P @ (L * z / x[:, None] / clock) == Y, Gamma == Lam @ K[live]]
         if options.floor > 0.0:
             constraints.append(
                 cp.multiply(self.at, Gamma) >= options.floor * cp.multiply(self.at, Lam @ np.ones((m, k)))
@@ -403,16 +357,19 @@ class _Template:
             raise DesignInfeasible(what, f"the solver failed: {failure}") from failure
         if self.problem.status not in {cp.OPTIMAL, cp.OPTIMAL_INACCURATE}:
             raise DesignInfeasible(what, f"the inequality has no solution ({self.problem.status})")
-        return settle(lure, self._in_plant_units(J), what)
+        return settle(lure, self._in_plant_units(J), what, blind=self.given is not None)
 
     def _in_plant_units(self, J: Ints) -> CircleGains:
         """Undo the scaling; nu = 1 fixes the scale that an inequality leaves free."""
         lure, options, live = self.lure, self.options, self.live
         P, Y, lam, Gamma, mu, mu_delta = (np.asarray(v.value, dtype=np.float64) for v in self.variables)
         x, z = self.x_unit, self.z_unit
-        L = np.linalg.solve(P, Y) * (x * self.clock / z)[:, None]
-        K = np.zeros((len(lure.slope), self.size))
-        K[live] = Gamma / lam[:, None]
+        if self.given is not None:
+            L, K = self.given
+        else:
+            L = np.linalg.solve(P, Y) * (x * self.clock / z)[:, None]
+            K = np.zeros((len(lure.slope), self.size))
+            K[live] = Gamma / lam[:, None]
         Lambda = np.zeros(len(lure.slope))
         Lambda[live] = self.q_unit * lam / (lure.slope[live] * z**2)
         half = 0.5 * (P + P.T)
@@ -436,7 +393,7 @@ class _Template:
         )
 
 
-def settle(lure: Lure, found: CircleGains, what: str) -> CircleGains:
+def settle(lure: Lure, found: CircleGains, what: str, *, blind: bool = False) -> CircleGains:
     """Turn a solver's answer into a proven design, or refuse it.
 
     The margin is recomputed in the plant's own units. If it is not positive, alpha, nu are shrunk
@@ -451,6 +408,8 @@ def settle(lure: Lure, found: CircleGains, what: str) -> CircleGains:
         The solver's gains.
     what
         Names the design in errors.
+    blind
+        Accept gains that listen to no meter.
 
     Raises
     ------
@@ -458,7 +417,7 @@ def settle(lure: Lure, found: CircleGains, what: str) -> CircleGains:
         If no step helps, or if the design listens to no meter.
     """
     best = -np.inf
-    for step in _BACKOFF:
+    for step in BACKOFF:
         tried = replace(
             found,
             alpha=found.alpha * (1.0 - step),
@@ -469,7 +428,8 @@ def settle(lure: Lure, found: CircleGains, what: str) -> CircleGains:
         )
         reached = margin(lure, found.J, tried)
         if reached > 0.0:
-            refuse_blind(found.J, found.sensitivity)
+            if not blind:
+                refuse_blind(found.J, found.sensitivity)
             return replace(tried, margin=reached)
         best = max(best, reached)
     raise DesignInfeasible(what, f"solver: {found.status}, but the rebuilt inequality is violated", best)
