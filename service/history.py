@@ -102,7 +102,12 @@ def unpack(data: bytes, meters: Sequence[str]) -> list[dict[str, Any]]:
             "meter": meter,
             "seen": bool(flags[i] & _SEEN),
             "suspect": bool(flags[i] & _SUSPECT),
-            **{name: finite(float(table[k, i])) for k, name in enumerate(_COLUMNS)},
+            **{name: _short(float(table[k, i])) for k, name in enumerate(_COLUMNS)},
         }
         for i, meter in enumerate(meters)
     ]
+
+
+def _short(value: float) -> float | None:
+    """Return a single-precision number without the digits that it never had."""
+    return finite(float(f"{value:.7g}"))

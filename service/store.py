@@ -170,7 +170,6 @@ class Store:
         self._lock = threading.RLock()
         self._lock_file: IO[bytes] | None = None
         self._marks: dict[str, Mark] = {}
-        self._layouts: dict[str, int] = {}
         self._since_prune: dict[str, int] = {}
         try:
             parsed = sa.make_url(url)
@@ -425,10 +424,8 @@ class Store:
             The id.
         """
         with self._read() as connection:
-            rows = connection.execute(
-                sa.select(_EVENT).where(_EVENT.c.alarm_id == alarm_id).order_by(_EVENT.c.seq)
-            )
-            return [_event(row) for row in rows]
+            query = sa.select(_EVENT).where(_EVENT.c.alarm_id == alarm_id).order_by(_EVENT.c.seq)
+            return [_event(row) for row in connection.execute(query).mappings()]
 
     def events_after(self, number: int, *, feeder: str | None = None, limit: int = 100) -> list[Event]:
         """Return the events after a number, oldest first.
@@ -446,7 +443,7 @@ class Store:
         if feeder is not None:
             query = query.where(_EVENT.c.feeder == feeder)
         with self._read() as connection:
-            return [_event(row) for row in connection.execute(query)]
+            return [_event(row) for row in connection.execute(query).mappings()]
 
     def outbox_pending(self, limit: int = 1000) -> list[Event]:
         """Return the events that have not been published yet, oldest first.
@@ -458,7 +455,7 @@ class Store:
         """
         query = sa.select(_EVENT).join(_OUTBOX, _OUTBOX.c.seq == _EVENT.c.seq).order_by(_EVENT.c.seq)
         with self._read() as connection:
-            return [_event(row) for row in connection.execute(query.limit(limit))]
+            return [_event(row) for row in connection.execute(query.limit(limit)).mappings()]
 
     def history(
         self,
@@ -502,11 +499,11 @@ class Store:
         with self._read() as connection:
             rows = connection.execute(query).all()
         points = []
-        for row in reversed(rows):
-            meters = unpack(row.data, json.loads(row.meters))
+        for t, verdict, cause, data, layout in reversed(rows):
+            meters = unpack(data, json.loads(layout))
             chosen = [item for item in meters if meter is None or item["meter"] == meter]
             if chosen or meter is None:
-                points.append({"t": row.t, "verdict": row.verdict, "cause": row.cause, "meters": chosen})
+                points.append({"t": t, "verdict": verdict, "cause": cause, "meters": chosen})
         return points
 
     def rejected(self, limit: int = 100) -> list[Rejected]:
@@ -613,8 +610,7 @@ class Store:
         if not url.database or url.database == ":memory:":
             raise StoreUnavailable(f"{self.name}: name a file; what is in memory does not survive")
         path = Path(url.database).absolute()
-        lock = path.with_name(path.name + ".lock").open("ab")
-        self._lock_file = lock
+        lock = self._lock_file = path.with_name(path.name + ".lock").open("ab")
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
@@ -702,5 +698,12 @@ def _put_rejected(connection: sa.Connection, rejected: Iterable[Rejected]) -> No
     connection.execute(_BAD.delete().where(_BAD.c.seq <= newest - BAD_READINGS_KEPT))
 
 
-def _event(row: Any) -> Event:
-    return Event(row.seq, row.t, Change(row.change), row.who, row.comment, from_json(json.loads(row.data)))
+def _event(row: sa.RowMapping) -> Event:
+    return Event(
+        row["seq"],
+        row["t"],
+        Change(row["change"]),
+        row["who"],
+        row["comment"],
+        from_json(json.loads(row["data"])),
+    )

@@ -1,0 +1,486 @@
+"""REST, server-sent events and the web page. The only module that imports FastAPI.
+
+Nothing here owns state: reads come from the store and from the backend's latest reports, writes go through
+the backend. Streams keep no queue per client: a wake-up from the backend lets each of them read on from the
+store (alarms, by event number) or take the latest report (states), so a slow client costs no memory and
+loses no alarm. Every error is `application/problem+json` (RFC 9457).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import json
+from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable
+from functools import partial
+from pathlib import Path as FilePath
+from typing import Annotated, Any, Protocol, cast
+
+from anyio import to_thread
+from fastapi import APIRouter, Depends, FastAPI, Header, HTTPException, Path, Query, Request, Response
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from fastapi.sse import EventSourceResponse, ServerSentEvent
+from fastapi.staticfiles import StaticFiles
+from starlette.exceptions import HTTPException as AnyHTTPException
+
+from gridsec.errors import DesignInfeasible, FeederInvalid, GridsecError, NotObservable
+from service import models
+from service.alarms import AlarmKind, AlarmState, AlarmUnknown, AlreadyAcknowledged, Severity
+from service.alarms import to_json as alarm_json
+from service.problem import Guard, problem
+from service.report import FeederReport
+from service.report import to_json as report_json
+from service.store import Event, Store, StoreUnavailable
+
+MAX_BODY = 4 << 20
+"""Longest request body that is read, bytes."""
+MAX_STREAMS = 100
+"""Event streams that may be open at once."""
+_WEB = FilePath(__file__).with_name("web")
+_NAME = r"^[A-Za-z0-9_-]{1,64}$"
+
+
+class Backend(Protocol):
+    """What the API needs from the running service."""
+
+    @property
+    def store(self) -> Store:
+        """The database, for reads."""
+
+    def feeders(self) -> list[dict[str, Any]]:
+        """Return the fields of `models.FeederSummary` for every feeder; verdict and time are added here."""
+
+    def feeder(self, name: str) -> dict[str, Any] | None:
+        """Return the fields of `models.FeederDetail`, or None if there is no such feeder."""
+
+    def report(self, name: str) -> FeederReport | None:
+        """Return the latest report of a feeder, or None before its first tick."""
+
+    def metrics(self) -> bytes:
+        """Return the metrics in Prometheus's text format."""
+
+    def ready(self) -> tuple[bool, list[str]]:
+        """Say whether everything works that is needed to watch, and what does not."""
+
+    def healthy(self) -> tuple[bool, list[str]]:
+        """Say whether the process should live on, and if not, why."""
+
+    async def put_feeder(self, name: str, tables: dict[str, Any]) -> None:
+        """Take over a feeder's tables; raises FeederInvalid, NotObservable or DesignInfeasible."""
+
+    async def acknowledge(self, alarm_id: str, who: str, comment: str) -> dict[str, Any]:
+        """Answer an alarm and return it; raises AlarmUnknown or AlreadyAcknowledged."""
+
+    def subscribe(self) -> AsyncGenerator[dict[str, Any], None]:
+        """Return an asynchronous generator of wake-ups; it ends when the service stops.
+
+        Each is `{"type": "alarm" | "state", "data": ...}`, sent after the alarm has been stored or the
+        report replaced. Only the type is read here, so the backend may drop wake-ups of a client that is
+        slow, as long as one is left. The first step into the generator subscribes, closing it ends that.
+        """
+
+
+def create_api(backend: Backend) -> FastAPI:
+    """Return the HTTP application.
+
+    Parameters
+    ----------
+    backend
+        The running service.
+    """
+    app = FastAPI(
+        title="gridsec",
+        description="Watches the voltages of distribution feeders and names the meters that lie.",
+        version="1",
+        docs_url=None,
+        redoc_url=None,
+        openapi_url="/api/v1/openapi.json",
+        responses={"default": {"model": models.Problem, "description": "Any error, as problem+json."}},
+    )
+    app.state.backend = backend
+    app.state.streams = 0
+    app.add_middleware(Guard, max_body=MAX_BODY)
+    for error, status in _STATUS.items():
+        app.add_exception_handler(error, _gridsec_handler(status))
+    app.add_exception_handler(AnyHTTPException, _http_handler)
+    app.add_exception_handler(RequestValidationError, _validation_handler)
+    app.add_exception_handler(Exception, _unexpected_handler)
+    app.include_router(_feeders)
+    app.include_router(_alarms)
+    app.include_router(_operations)
+    app.mount("/", StaticFiles(directory=_WEB, html=True), name="web")
+    return app
+
+
+def _backend(request: Request) -> Backend:
+    backend: Backend = request.app.state.backend
+    return backend
+
+
+BackendHere = Annotated[Backend, Depends(_backend)]
+FeederName = Annotated[str, Path(pattern=_NAME, description="Name of the feeder.")]
+AlarmId = Annotated[str, Path(pattern=r"^[0-9A-Z]{26}$", description="Id of the alarm.")]
+Since = Annotated[float | None, Query(allow_inf_nan=False, description="Not before this Unix time, s.")]
+Until = Annotated[float | None, Query(allow_inf_nan=False, description="Before this Unix time, s.")]
+
+
+def _known_feeder(backend: BackendHere, feeder: FeederName) -> str:
+    if backend.feeder(feeder) is None:
+        raise HTTPException(404, f"there is no feeder {feeder!r}")
+    return feeder
+
+
+def _latest(backend: BackendHere, feeder: Annotated[str, Depends(_known_feeder)]) -> FeederReport:
+    report = backend.report(feeder)
+    if report is None:
+        raise HTTPException(503, f"feeder {feeder!r} has had no tick yet", {"Retry-After": "1"})
+    return report
+
+
+async def _json_only(request: Request) -> None:
+    """Refuse bodies that do not say that they are JSON; this also keeps foreign web pages from posting."""
+    kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if kind != "application/json":
+        raise HTTPException(415, f"the body must be application/json, not {kind or 'of unknown type'}")
+
+
+async def _slot(request: Request) -> AsyncIterator[None]:
+    """Count an open stream for as long as it is open."""
+    state = request.app.state
+    if state.streams >= MAX_STREAMS:
+        raise HTTPException(503, f"{MAX_STREAMS} event streams are open already", {"Retry-After": "10"})
+    state.streams += 1
+    try:
+        yield
+    finally:
+        state.streams -= 1
+
+
+KnownFeeder = Annotated[str, Depends(_known_feeder)]
+Latest = Annotated[FeederReport, Depends(_latest)]
+IfNoneMatch = Annotated[str | None, Header(include_in_schema=False)]
+
+_NOT_MODIFIED: dict[int | str, dict[str, Any]] = {304: {"description": "As the client has it."}}
+
+
+def _unchanged(response: Response, tag: str, if_none_match: str | None) -> Response | None:
+    """Mark a response with its ETag; return the answer 304 if the client has it already."""
+    headers = {"ETag": tag, "Cache-Control": "no-cache"}
+    response.headers.update(headers)
+    known = {part.strip() for part in (if_none_match or "").split(",")}
+    return Response(status_code=304, headers=headers) if known & {tag, "*"} else None
+
+
+# -------------------------------------------------------------------- feeders
+
+_feeders = APIRouter(prefix="/api/v1/feeders", tags=["feeders"])
+
+
+def _summary(backend: Backend, fields: dict[str, Any]) -> models.FeederSummary:
+    report = backend.report(fields["name"])
+    now = {} if report is None else {"t": report.t, "verdict": report.verdict}
+    return models.FeederSummary.model_validate({**fields, **now})
+
+
+@_feeders.get("")
+def list_feeders(backend: BackendHere) -> models.Feeders:
+    """All feeders, with the latest verdict of each."""
+    return models.Feeders(feeders=[_summary(backend, fields) for fields in backend.feeders()])
+
+
+@_feeders.get("/{feeder}", response_model=models.FeederDetail, responses=_NOT_MODIFIED)
+def get_feeder(
+    backend: BackendHere, feeder: KnownFeeder, response: Response, if_none_match: IfNoneMatch = None
+) -> Any:
+    """A feeder: its tree, and the columns of its files."""
+    fields = backend.feeder(feeder)
+    text = json.dumps(fields, sort_keys=True, default=str)
+    tag = f'"{hashlib.sha256(text.encode()).hexdigest()[:32]}"'
+    return _unchanged(response, tag, if_none_match) or fields
+
+
+@_feeders.put("/{feeder}", response_model=models.FeederDetail, dependencies=[Depends(_json_only)])
+async def put_feeder(backend: BackendHere, feeder: FeederName, tables: dict[str, Any]) -> Any:
+    """Add a feeder or replace it, from JSON of the same columns as its files."""
+    try:
+        await to_thread.run_sync(lambda: json.dumps(tables, allow_nan=False))
+    except ValueError as error:
+        raise FeederInvalid(["the JSON contains NaN or an infinity; leave the field out instead"]) from error
+    await backend.put_feeder(feeder, tables)
+    return backend.feeder(feeder)
+
+
+@_feeders.get("/{feeder}/state")
+def get_state(report: Latest, response: Response) -> models.State:
+    """The latest tick: verdict, and every meter with what it says and what is true there."""
+    response.headers["Cache-Control"] = "no-store"
+    return models.State.model_validate(report_json(report))
+
+
+@_feeders.get("/{feeder}/meters/{meter}")
+def get_meter(report: Latest, meter: str, response: Response) -> models.MeterNow:
+    """One meter at the latest tick."""
+    response.headers["Cache-Control"] = "no-store"
+    for found in report_json(report)["meters"]:
+        if found["meter"] == meter:
+            whole = {"feeder": report.feeder, "t": report.t, "verdict": report.verdict}
+            return models.MeterNow.model_validate({**found, **whole})
+    raise HTTPException(404, f"feeder {report.feeder!r} has no meter {meter!r}")
+
+
+@_feeders.get("/{feeder}/history")
+def get_history(
+    backend: BackendHere,
+    feeder: KnownFeeder,
+    *,
+    since: Since = None,
+    until: Until = None,
+    meter: Annotated[str | None, Query(description="Also the numbers of this meter.")] = None,
+    limit: Annotated[int, Query(ge=1, le=5000)] = 500,
+) -> models.History:
+    """The newest kept ticks in [since, until), oldest first."""
+    rows = backend.store.history(feeder, since=since, until=until, limit=limit)
+    points = [_point(row, meter) for row in rows]
+    return models.History(feeder=feeder, points=points, more=len(rows) == limit)
+
+
+def _point(row: dict[str, Any], meter: str | None) -> models.HistoryPoint:
+    meters = row["meters"]
+    volts = [m["v_volt_estimated"] for m in meters if m["v_volt_estimated"] is not None]
+    return models.HistoryPoint(
+        t=row["t"],
+        verdict=row["verdict"],
+        cause=row["cause"],
+        seen=sum(m["seen"] for m in meters),
+        suspects=[m["meter"] for m in meters if m["suspect"]],
+        v_volt_lowest=min(volts, default=None),
+        v_volt_highest=max(volts, default=None),
+        meter=next((models.HistoryMeter(**m) for m in meters if m["meter"] == meter), None),
+    )
+
+
+@_feeders.get(
+    "/{feeder}/stream", response_class=EventSourceResponse, dependencies=[Depends(_slot)], tags=["streams"]
+)
+async def stream_states(backend: BackendHere, feeder: KnownFeeder) -> AsyncIterator[ServerSentEvent]:
+    """Server-sent events `state`: the latest tick and each that follows; a slow client skips some."""
+    yield ServerSentEvent(comment="connected", retry=2000)
+    last: FeederReport | None = None
+    async for _ in _wakes(backend):
+        report = backend.report(feeder)
+        if report is not None and report is not last:
+            last = report
+            yield ServerSentEvent(event="state", data=models.State.model_validate(report_json(report)))
+
+
+# --------------------------------------------------------------------- alarms
+
+_alarms = APIRouter(prefix="/api/v1/alarms", tags=["alarms"])
+
+
+@_alarms.get("", response_model=models.Alarms, responses=_NOT_MODIFIED)
+def list_alarms(
+    backend: BackendHere,
+    response: Response,
+    *,
+    state: Annotated[list[AlarmState] | None, Query(description="May be repeated.")] = None,
+    kind: Annotated[list[AlarmKind] | None, Query(description="May be repeated.")] = None,
+    severity: Annotated[list[Severity] | None, Query(description="May be repeated.")] = None,
+    feeder: Annotated[str | None, Query(pattern=_NAME)] = None,
+    meter: Annotated[str | None, Query(max_length=64)] = None,
+    since: Since = None,
+    until: Until = None,
+    cursor: Annotated[str | None, Query(pattern=r"^[0-9A-Z]{26}$")] = None,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+    if_none_match: IfNoneMatch = None,
+) -> Any:
+    """A page of alarms, those that began last first; `since` and `until` are about `t_raised`."""
+    last_event = backend.store.last_event
+    if known := _unchanged(response, f'W/"{last_event}"', if_none_match):
+        return known
+    page, following = backend.store.alarms(
+        state=state or (),
+        kind=kind or (),
+        severity=severity or (),
+        feeder=feeder,
+        meter=meter,
+        since=since,
+        until=until,
+        cursor=cursor,
+        limit=limit,
+    )
+    return {"alarms": [alarm_json(alarm) for alarm in page], "next": following, "last_event": last_event}
+
+
+@_alarms.get("/stream", response_class=EventSourceResponse, dependencies=[Depends(_slot)], tags=["streams"])
+async def stream_alarms(
+    backend: BackendHere,
+    feeder: Annotated[str | None, Query(pattern=_NAME, description="Only this one's.")] = None,
+    after: Annotated[int | None, Query(ge=0, description="Begin after this event number.")] = None,
+    last_event_id: Annotated[int | None, Header(ge=0, description="Goes before `after`.")] = None,
+) -> AsyncIterator[ServerSentEvent]:
+    """Server-sent events `alarm`, whose ids are event numbers: with `Last-Event-ID` none is ever missed.
+
+    Without it and without `after`, it begins with what happens next.
+    """
+    store = backend.store
+    start = last_event_id if last_event_id is not None else after
+    # A number from the future belongs to another database: begin now, or nothing would ever come.
+    seen = store.last_event if start is None else min(start, store.last_event)
+    yield ServerSentEvent(comment="connected", id=str(seen), retry=2000)
+    async for _ in _wakes(backend):
+        while seen < (newest := store.last_event):
+            try:
+                events = await to_thread.run_sync(partial(store.events_after, seen, feeder=feeder))
+            except StoreUnavailable:
+                return  # The client comes back with the number of the last event it got.
+            for event in events:
+                yield ServerSentEvent(event="alarm", id=str(event.seq), data=_event(event))
+                seen = event.seq
+            if not events:
+                seen = newest
+
+
+@_alarms.get("/{alarm_id}", response_model=models.AlarmModel)
+def get_alarm(backend: BackendHere, alarm_id: AlarmId) -> Any:
+    """One alarm."""
+    alarm = backend.store.alarm(alarm_id)
+    if alarm is None:
+        raise AlarmUnknown(alarm_id)
+    return alarm_json(alarm)
+
+
+@_alarms.get("/{alarm_id}/events")
+def get_events(backend: BackendHere, alarm_id: AlarmId) -> models.AlarmEvents:
+    """Everything that happened to an alarm, oldest first."""
+    events = backend.store.events(alarm_id)
+    if not events:
+        raise AlarmUnknown(alarm_id)
+    return models.AlarmEvents(events=[_event(event) for event in events])
+
+
+@_alarms.post("/{alarm_id}/ack", response_model=models.AlarmModel, dependencies=[Depends(_json_only)])
+async def acknowledge(backend: BackendHere, alarm_id: AlarmId, answer: models.Acknowledgement) -> Any:
+    """Answer an alarm: say who has seen it."""
+    return await backend.acknowledge(alarm_id, answer.who, answer.comment)
+
+
+def _event(event: Event) -> models.AlarmEvent:
+    return models.AlarmEvent(
+        seq=event.seq,
+        t=event.t,
+        change=event.change,
+        who=event.who,
+        comment=event.comment,
+        alarm=models.AlarmModel.model_validate(alarm_json(event.alarm)),
+    )
+
+
+async def _wakes(backend: Backend) -> AsyncIterator[None]:
+    """Yield once the subscription stands, and again after each wake-up, until the service stops."""
+    subscription = backend.subscribe()
+    waiting: asyncio.Future[dict[str, Any] | None] | None = None
+    try:
+        while True:
+            waiting = asyncio.ensure_future(anext(subscription, None))
+            await asyncio.sleep(0)  # The first step subscribes: nothing that happens from here on is missed.
+            yield
+            if await waiting is None:
+                return
+    finally:
+        if waiting is not None:
+            waiting.cancel()
+            await asyncio.gather(waiting, return_exceptions=True)
+        await subscription.aclose()
+
+
+# ----------------------------------------------------------------- operations
+
+_operations = APIRouter(tags=["operations"])
+
+
+@_operations.get("/api/v1/bad-readings")
+def list_rejected(
+    backend: BackendHere, limit: Annotated[int, Query(ge=1, le=1000)] = 100
+) -> models.RejectedReadings:
+    """The newest readings that could not be used, and why."""
+    return models.RejectedReadings(
+        readings=[
+            models.RejectedReading(
+                t=item.t, key=item.key, reason=item.reason, payload=item.payload.decode("utf-8", "replace")
+            )
+            for item in backend.store.rejected(limit)
+        ]
+    )
+
+
+@_operations.get("/healthz", response_model=models.Health)
+async def healthz(request: Request, backend: BackendHere) -> Any:
+    """Whether the process and its tasks are alive."""
+    return _probe(request, *backend.healthy(), "the service does not work and should be restarted")
+
+
+@_operations.get("/readyz", response_model=models.Health)
+def readyz(request: Request, backend: BackendHere) -> Any:
+    """Whether feeders are designed, the database can be written and zenoh is connected."""
+    ready, reasons = backend.ready()
+    try:
+        backend.store.check()
+    except StoreUnavailable as error:
+        ready, reasons = False, [*reasons, *([] if str(error) in reasons else [str(error)])]
+    return _probe(request, ready, reasons, "the service cannot watch at the moment")
+
+
+def _probe(request: Request, good: bool, reasons: list[str], what: str) -> Any:
+    if good:
+        return JSONResponse({"ok": True, "reasons": reasons}, headers={"Cache-Control": "no-store"})
+    return problem(request, 503, what, ok=False, reasons=reasons)
+
+
+@_operations.get("/metrics", response_class=Response)
+def metrics(backend: BackendHere) -> Response:
+    """Metrics in Prometheus's text format."""
+    return Response(backend.metrics(), media_type="text/plain; version=0.0.4; charset=utf-8")
+
+
+# --------------------------------------------------------------------- errors
+
+_STATUS: dict[type[GridsecError], int] = {
+    FeederInvalid: 422,
+    NotObservable: 422,
+    DesignInfeasible: 422,
+    AlarmUnknown: 404,
+    AlreadyAcknowledged: 409,
+    StoreUnavailable: 503,
+    GridsecError: 500,
+}
+
+Handler = Callable[[Request, Exception], Awaitable[Response]]
+
+
+def _gridsec_handler(status: int) -> Handler:
+    async def handler(request: Request, error: Exception) -> Response:
+        more = {"problems": list(error.problems)} if isinstance(error, FeederInvalid) else {}
+        headers = {"Retry-After": "5"} if status == 503 else None
+        return problem(request, status, str(error), headers=headers, **more)
+
+    return handler
+
+
+async def _http_handler(request: Request, error: Exception) -> Response:
+    error = cast(AnyHTTPException, error)
+    detail = "there is nothing here" if error.detail == "Not Found" else error.detail
+    return problem(request, error.status_code, detail, headers=dict(error.headers or {}))
+
+
+async def _validation_handler(request: Request, error: Exception) -> Response:
+    found = cast(RequestValidationError, error).errors()
+    errors = [{"where": ".".join(str(part) for part in item["loc"]), "what": item["msg"]} for item in found]
+    broken = any(item["type"] == "json_invalid" for item in found)
+    detail = "; ".join(f"{item['where']}: {item['what']}" for item in errors)
+    return problem(request, 400 if broken else 422, detail, errors=errors)
+
+
+async def _unexpected_handler(request: Request, _error: Exception) -> Response:
+    return problem(request, 500, "something went wrong here; the log of the service says what")

@@ -1,0 +1,256 @@
+"""What REST shows, as pydantic models: they write the OpenAPI description and keep NaN out of JSON."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StringConstraints
+
+from gridsec.online import Cause, Decision
+from service.alarms import AlarmKind, AlarmState, Change, Severity
+
+
+def _finite(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+Number = Annotated[float | None, BeforeValidator(_finite)]
+Line = Annotated[str, StringConstraints(strip_whitespace=True, min_length=1, max_length=64)]
+
+
+class Problem(BaseModel):
+    """An error, as RFC 9457 describes it (`application/problem+json`)."""
+
+    model_config = ConfigDict(extra="allow")
+
+    type: str = Field(description="Kind of problem; `about:blank` if the status says it all.")
+    title: str
+    status: int
+    detail: str
+    instance: str = Field(description="Path of the request.")
+
+
+class MeterState(BaseModel):
+    """One meter at the latest tick."""
+
+    meter: str
+    bus: str
+    seen: bool = Field(description="A usable reading belongs to this tick.")
+    suspect: bool = Field(description="The verdict names this meter as manipulated.")
+    score: Number = Field(description="Absolute residual of the squared voltage, squared pu.")
+    threshold: Number = Field(description="The largest score that an honest meter can reach, squared pu.")
+    v_volt_reported: Number = Field(description="Voltage the meter claims, phase to neutral, V.")
+    v_volt_estimated: Number = Field(description="Reconstructed voltage, V.")
+    v_volt_std: Number = Field(description="A third of the half-width of the hard interval around it, V.")
+    v2_pu_estimated: Number = Field(description="Reconstructed squared voltage, pu.")
+    attack_volt_estimated: Number = Field(description="Reported minus reconstructed, V; 0 if no suspect.")
+
+
+class BusState(BaseModel):
+    """One bus at the latest tick."""
+
+    bus: str
+    v_volt: Number = Field(description="Reconstructed voltage, phase to neutral, V.")
+
+
+class Silence(BaseModel):
+    """A meter without usable readings for longer than the feeder allows."""
+
+    meter: str
+    seconds: Number
+
+
+class State(BaseModel):
+    """A feeder at its latest tick."""
+
+    feeder: str
+    t: float = Field(description="Unix time of the tick, s.")
+    verdict: Decision
+    reason: str
+    cause: Cause
+    max_attacked: int
+    meters: list[MeterState]
+    buses: list[BusState]
+    silent: list[Silence]
+    v_min_volt: Number
+    v_max_volt: Number
+
+
+class MeterNow(MeterState):
+    """One meter at the latest tick, with what it belongs to."""
+
+    feeder: str
+    t: float
+    verdict: Decision
+
+
+class FeederSummary(BaseModel):
+    """A feeder in the list."""
+
+    model_config = ConfigDict(extra="allow")
+
+    name: str
+    title: str = ""
+    t: Number = Field(default=None, description="Latest tick; null before the first one.")
+    verdict: Decision | None = None
+
+
+class Feeders(BaseModel):
+    """All feeders."""
+
+    feeders: list[FeederSummary]
+
+
+class LayoutCustomer(BaseModel):
+    """Where a customer is connected."""
+
+    customer: str
+    bus: str = Field(description="Id of the bus in this layout (zero-impedance lines fuse buses).")
+    meter: str | None = Field(default=None, description="Its meter; null if it has none.")
+
+
+class Layout(BaseModel):
+    """The tree of the feeder, the busbar first."""
+
+    buses: list[str]
+    parent: list[int | None] = Field(description="Index of the bus that feeds each one; null for the busbar.")
+    xy: list[tuple[float, float] | None] | None = Field(default=None, description="Coordinates, if known.")
+    customers: list[LayoutCustomer]
+
+
+class FeederDetail(BaseModel):
+    """A feeder: its tree, and the columns of its files."""
+
+    model_config = ConfigDict(extra="allow")
+
+    name: str
+    title: str = ""
+    v_nominal_volt: float
+    v_min_volt: float
+    v_max_volt: float
+    tick_s: float = 1.0
+    layout: Layout
+    tables: dict[str, Any]
+
+
+class AlarmEvidence(BaseModel):
+    """The numbers behind an alarm when it was raised."""
+
+    score: Number
+    threshold: Number
+    v_volt_reported: Number
+    v_volt_estimated: Number
+    attack_volt_estimated: Number
+
+
+class AlarmModel(BaseModel):
+    """An alarm. Times are Unix seconds."""
+
+    id: str
+    kind: AlarmKind
+    feeder: str
+    meter: str | None = Field(description="Null if it is about the whole feeder; `substation` is the busbar.")
+    severity: Severity
+    state: AlarmState
+    count: int = Field(description="How often it has been raised; above 1 it flaps.")
+    t_event: float = Field(description="When the condition was first seen.")
+    t_raised: float = Field(description="When it had lasted for the on-delay.")
+    t_cleared: float | None
+    reason: str
+    evidence: AlarmEvidence
+    acknowledged_by: str | None
+    t_acknowledged: float | None
+    comment: str | None
+
+
+class Alarms(BaseModel):
+    """A page of alarms, those that began last first."""
+
+    alarms: list[AlarmModel]
+    next: str | None = Field(description="Cursor of the next page; null on the last one.")
+    last_event: int = Field(description="Newest event number: `after` of the stream that goes on from here.")
+
+
+class AlarmEvent(BaseModel):
+    """Something that happened to an alarm, and the alarm as it was afterwards."""
+
+    seq: int
+    t: float
+    change: Change
+    who: str | None
+    comment: str | None
+    alarm: AlarmModel
+
+
+class AlarmEvents(BaseModel):
+    """Everything that happened to an alarm, oldest first."""
+
+    events: list[AlarmEvent]
+
+
+class Acknowledgement(BaseModel):
+    """The answer of an operator."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    who: Line
+    comment: Annotated[str, StringConstraints(strip_whitespace=True, max_length=1000)] = ""
+
+
+class HistoryPoint(BaseModel):
+    """A kept tick of a feeder."""
+
+    t: float
+    verdict: Decision
+    cause: Cause
+    seen: int = Field(description="Number of meters with a usable reading.")
+    suspects: list[str]
+    v_volt_lowest: Number = Field(description="Lowest reconstructed voltage at a meter, V.")
+    v_volt_highest: Number = Field(description="Highest reconstructed voltage at a meter, V.")
+    meter: HistoryMeter | None = Field(default=None, description="If one was asked for.")
+
+
+class HistoryMeter(BaseModel):
+    """One meter at a kept tick."""
+
+    meter: str
+    seen: bool
+    suspect: bool
+    v_volt_reported: Number
+    v_volt_estimated: Number
+    score: Number
+    threshold: Number
+
+
+class History(BaseModel):
+    """The newest kept ticks of the time asked for, oldest first."""
+
+    feeder: str
+    points: list[HistoryPoint]
+    more: bool = Field(description="There may be older ones: ask again with `until` = `t` of the first.")
+
+
+class RejectedReading(BaseModel):
+    """A reading that could not be used."""
+
+    t: float
+    key: str
+    reason: str
+    payload: str = Field(description="The start of its bytes, as text where that is possible.")
+
+
+class RejectedReadings(BaseModel):
+    """The newest readings that could not be used, newest first."""
+
+    readings: list[RejectedReading]
+
+
+class Health(BaseModel):
+    """The answer to a probe."""
+
+    ok: Literal[True]
+    reasons: list[str]
+
+
+HistoryPoint.model_rebuild()
