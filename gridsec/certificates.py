@@ -1,30 +1,63 @@
-"""Closed-form proofs that the direct-injection observer forgets its errors, for all meter sets at once."""
+"""Closed-form proofs that the direct-injection observer forgets its errors, for all meter sets at once.
+
+The plant is `T x' = -x + K(z)`, `z = w - S x`, `S = -H`. The observer runs the same equations; the
+inverter of a trusted meter is driven by that meter's reading instead of the model. With Pi the
+projection on the inverters that are not, and Delta(t) the unknown slopes, `0 <= Delta_i <= d_i`,
+
+    T e' = -(I + Delta Pi S) e + Delta u,     u_i = load error of z_i, or minus noise and attack of meter i.
+
+Which meters are trusted may change at any moment; every statement here holds for all of it. Proofs:
+docs/theory-certificates.md.
+
+References
+----------
+.. [1] chong2020, Proposition 1 and equation (12), as corrected there.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
-from gridsec.arrays import Floats, frozen
+import numpy as np
+
+from gridsec.arrays import Bools, Floats, frozen
+from gridsec.droop import Droop
+from gridsec.errors import DesignInfeasible
+from gridsec.lure import Lure
+
+# Shares of 1 / slope on the diagonal of P that `reactance` tries, see Theorem 1.
+SHARES = (0.01, 0.03, 0.1, 0.3, 0.6, 1.0)
+# Part of the best rate that is given away, so that what is claimed has slack. The weights of the
+# small-gain norm need more of it: at the best rate itself, weakly coupled inverters have weight zero.
+BACKOFF = 0.01
+WEIGHT_BACKOFF = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Certificate:
-    """Why an observer's error decays, and how much disturbances can hold it up.
+    """Why the error of the direct-injection observer decays, and how much disturbances hold it up.
 
     Attributes
     ----------
     kind
-        `reactance`, `small-gain` or `lmi`.
+        `reactance` and `lmi`: the norm is `sqrt(e^T P e)`. `small-gain`: it is `max_i |e_i| / P_i`.
     P : (n, n) or (n,)
-        Matrix of the norm `sqrt(e^T P e)`, or weights of the norm `max |e_i| / P_i`.
+        Matrix or weights of the norm.
     rate
-        The error in that norm decays at least like `exp(-rate t)`, 1/s.
+        Without disturbances the error decays in that norm at least like `exp(-rate t)`, 1/s.
     noise, load, attack
-        Steady error in that norm for each pu of meter noise, load error, attack (largest entry).
+        Steady error in that norm for each pu in the largest entry of the meter noise, of the error of
+        the known input w, and of the attack.
     margin
-        Slack of the condition, recomputed in NumPy; positive: it holds.
+        Slack of the condition at the claimed rate, as recomputed by `verify`, relative to the rate of
+        the slowest inverter; positive: it holds.
     status
         One sentence about how the certificate came about.
+    saturation
+        Steady error in that norm whatever the attack, because droop curves saturate; infinite where
+        they do not.
+    multiplier : (m,) or (0,)
+        The multipliers Lambda of the quadratic kinds.
     """
 
     kind: str
@@ -35,6 +68,409 @@ class Certificate:
     attack: float
     margin: float
     status: str
+    saturation: float = np.inf
+    multiplier: Floats = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "P", frozen(self.P))
+        object.__setattr__(self, "multiplier", frozen(self.multiplier))
+
+
+def reactance(lure: Lure) -> Certificate:
+    """The certificate that rests on the reactance matrix being symmetric.
+
+    `V = e^T P e`, `P = (S + S^T) / 2 + kappa D^-1`, `Lambda = T^-1`. With
+    `b = P T^-1 - S^T Lambda`, V falls at the rate 2 alpha for every trusted set, every switching and
+    every slope if
+
+        P T^-1 + T^-1 P - b D Lambda^-1 b^T  >=  2 alpha P  >  0.
+
+    For symmetric S and one common tau this always holds, with `alpha = (1 - kappa / 2) / tau`; kappa
+    makes P positive definite where S is singular (customers on one bus or on the busbar). Other
+    systems are tried with the shares `SHARES`; what asymmetry there is costs margin.
+
+    Parameters
+    ----------
+    lure
+        The closed loop, from `close_loop`.
+
+    Raises
+    ------
+    DesignInfeasible
+        If the condition fails for every share, or the system is not of this form.
+    """
+    form = _droop_form(lure, "reactance certificate")
+    if form.tau.size == 0:
+        return _nothing("reactance")
+    S, slope, multiplier = form.S, form.slope, 1.0 / form.tau
+    # A larger bound on a slope is still a bound; it keeps D^-1 finite for inverters that do nothing.
+    top = float(np.max(slope, initial=0.0)) or 1.0
+    floor = np.maximum(slope, 1e-3 * top)
+    best, chosen = -np.inf, np.zeros_like(S)
+    for share in SHARES:
+        P = 0.5 * (S + S.T) + np.diag(share / floor)
+        rate = _quadratic_rate(P, multiplier, form)
+        if rate > best:
+            best, chosen = rate, P
+    if not best > 0:
+        raise DesignInfeasible(
+            "reactance certificate S T^-1 + T^-1 S > 0",
+            "the error can grow in this norm: time constants too far apart, or S too far from symmetric",
+            best * float(np.max(form.tau)),
+        )
+    status = "closed form; S + kappa / D with the best of the shares"
+    return quadratic(lure, chosen, multiplier, (1.0 - BACKOFF) * best, kind="reactance", status=status)
+
+
+def small_gain(lure: Lure) -> Certificate:
+    """The certificate that rests on the loop gain being below 1.
+
+    In the norm `max_i |e_i| / c_i` the error decays at the rate alpha for every trusted set, every
+    switching and every slope if, entry by entry,
+
+        T^-1 (I - D |S|) c  >=  alpha c,     c > 0.
+
+    Such c exists exactly if the spectral radius of `D |S|` is below 1; `max_i d_i sum_j |S_ij| < 1`
+    is the case `c = 1`. S need not be symmetric, nor the time constants equal.
+
+    Parameters
+    ----------
+    lure
+        The closed loop, from `close_loop`.
+
+    Raises
+    ------
+    DesignInfeasible
+        If the loop gain is 1 or more, or the system is not of this form.
+    """
+    form = _droop_form(lure, "small-gain certificate")
+    tau, slope = form.tau, form.slope
+    if tau.size == 0:
+        return _nothing("small-gain")
+    comparison = (np.eye(tau.size) - slope[:, None] * np.abs(form.S)) / tau[:, None]
+    best = float(np.min(np.linalg.eigvals(comparison).real))
+    if not best > 0:
+        worst = best * float(np.max(tau))
+        raise DesignInfeasible("small-gain certificate rho(D |S|) < 1", "the loop gain is too large", worst)
+    rate = (1.0 - WEIGHT_BACKOFF) * best
+    weights = np.asarray(np.linalg.solve(comparison - rate * np.eye(tau.size), 1.0 / tau), dtype=np.float64)
+    weights /= np.max(weights)
+    gain = float(np.max(slope / (tau * weights))) / rate
+    margin = _small_gain_margin(weights, rate, form)
+    saturation = float(np.max(_span(lure) / (tau * weights))) / rate
+    status = "closed form; weights from one linear solve"
+    return _checked(Certificate("small-gain", weights, rate, gain, gain, gain, margin, status, saturation))
+
+
+def quadratic(
+    lure: Lure, P: Floats, multiplier: Floats, rate: float, *, kind: str, status: str
+) -> Certificate:
+    """A certificate for a given norm matrix, multiplier and rate, verified and with its gains.
+
+    This is how a solution of the linear matrix inequality for *no* trusted meter becomes a
+    certificate for all sets at once (docs/theory-certificates.md, Theorem 1).
+
+    Parameters
+    ----------
+    lure
+        The closed loop, from `close_loop`.
+    P : (n, n)
+        Matrix of the norm, symmetric positive definite.
+    multiplier : (m,)
+        Lambda, positive.
+    rate
+        Claimed decay rate, 1/s.
+    kind, status
+        As in `Certificate`.
+
+    Raises
+    ------
+    DesignInfeasible
+        If it does not survive its verification.
+    """
+    form = _droop_form(lure, f"{kind} certificate")
+    none, one = np.zeros(form.tau.size), np.ones(form.tau.size)
+    made = Certificate(kind, P, rate, 0.0, 0.0, 0.0, _quadratic_margin(P, multiplier, rate, form), status)
+    made = _checked(replace(made, multiplier=multiplier))
+    noise = float(_level(made, form, form.slope / form.tau, none))
+    load = min(noise, float(_level(made, form, none, one)))
+    saturation = float(_level(made, form, _span(lure) / form.tau, none))
+    return replace(made, noise=noise, load=load, attack=noise, saturation=saturation)
+
+
+def certify(lure: Lure) -> Certificate:
+    """The closed-form certificate with the highest rate.
+
+    Parameters
+    ----------
+    lure
+        The closed loop, from `close_loop`.
+
+    Raises
+    ------
+    DesignInfeasible
+        If none holds; the reasons of all are in the message.
+    """
+    found: list[Certificate] = []
+    failed: list[DesignInfeasible] = []
+    for attempt in (reactance, small_gain):
+        try:
+            found.append(attempt(lure))
+        except DesignInfeasible as error:
+            failed.append(error)
+    if not found:
+        margins = [error.margin for error in failed if error.margin is not None]
+        raise DesignInfeasible(
+            "closed-form certificate", "; ".join(str(error) for error in failed), max(margins, default=None)
+        )
+    return max(found, key=lambda certificate: certificate.rate)
+
+
+def verify(certificate: Certificate, lure: Lure, trusted: Bools | None = None) -> float:
+    """Recompute the margin of a certificate from its numbers alone, in NumPy.
+
+    Parameters
+    ----------
+    certificate
+        Any kind.
+    lure
+        The closed loop it is claimed for.
+    trusted : (p,)
+        Verify for this set only; by default for all sets at once, which is the harder claim: trusting
+        a meter only takes terms out of the condition.
+
+    Returns
+    -------
+    float
+        Slack of the condition at the claimed rate, relative to the rate of the slowest inverter and
+        less the rounding error of the computation. Positive: the certificate holds.
+
+    Raises
+    ------
+    DesignInfeasible
+        If the kind is unknown, or the system is not of the form that the certificates are about.
+    """
+    form = _droop_form(lure, f"{certificate.kind} certificate")
+    if trusted is not None:
+        form = replace(form, slope=np.where(np.any(feeds(lure) & trusted, axis=1), 0.0, form.slope))
+    P, multiplier, count = certificate.P, certificate.multiplier, form.tau.size
+    if count == P.size == 0:
+        return 1.0
+    if certificate.kind == "small-gain" and P.shape == (count,):
+        return _small_gain_margin(P, certificate.rate, form)
+    if (
+        certificate.kind in {"reactance", "lmi"}
+        and P.shape == (count, count)
+        and multiplier.shape == (count,)
+    ):
+        return _quadratic_margin(P, multiplier, certificate.rate, form)
+    raise DesignInfeasible(f"{certificate.kind} certificate", "its numbers do not fit the system")
+
+
+def feeds(lure: Lure) -> Bools:
+    """Which meter can drive which inverter of the observer: those that see the same voltage.
+
+    Parameters
+    ----------
+    lure
+        The closed loop.
+
+    Returns
+    -------
+    (m, p)
+        True where the rows of `(H, F)` and `(C, D)` agree.
+    """
+    inverters, meters = np.hstack([lure.H, lure.F]), np.hstack([lure.C, lure.D])
+    same: Bools = np.all(inverters[:, None, :] == meters[None, :, :], axis=2)
+    return same
+
+
+def error_bound(
+    lure: Lure,
+    trusted: Bools,
+    y_error: Floats,
+    u_error: Floats,
+    *,
+    z: Floats | None = None,
+    certificate: Certificate | None = None,
+) -> Floats:
+    """How far the observer's state can be from the plant's, inverter by inverter.
+
+    Every entry of `e` is a first-order lag of what drives it, so that the monotone map
+
+        bound_i <- min(span_i, k_i(u_i + free_i sum_j |S_ij| bound_j)),     k_i(r) = d_i r
+
+    takes bounds to bounds; it starts from the saturation of the curves, at most `2 limit`, and every
+    iterate is valid. The bound holds for all times if it holds at the beginning, and after the
+    transient otherwise. Under attack, put the size of the attack into `y_error`, infinity included.
+
+    Parameters
+    ----------
+    lure
+        The closed loop, from `close_loop`.
+    trusted : (…, p)
+        The meters that drive their inverters.
+    y_error : (…, p)
+        Largest error of each reading (noise and attack), squared pu.
+    u_error : (…, l)
+        Largest error of each entry of the known input w, squared pu.
+    z : (…, m)
+        The observer's own outputs. If given, `k_i(r)` is what the curve itself does within r of
+        `z_i`, nothing inside the deadband. The bound then holds while z rests, or moves slowly
+        against the time constants.
+    certificate
+        A quadratic certificate of the system; its norm gives another start of the iteration.
+
+    Returns
+    -------
+    (…, n)
+        Bound of `|x - xhat|`, pu.
+    """
+    form = _droop_form(lure, "error bound")
+    driven = feeds(lure) & trusted[..., None, :]
+    free = ~np.any(driven, axis=-1)
+    metered = np.max(np.where(driven, y_error[..., None, :], 0.0), axis=-1, initial=0.0)
+    direct = np.where(free, u_error @ np.abs(lure.F).T, metered)
+    span = np.broadcast_to(_span(lure), direct.shape)
+    bound = span
+    if certificate is not None and certificate.kind != "small-gain":
+        kick = np.where(free, 0.0, _reach(lure, direct, None, span)) / form.tau
+        level = _level(certificate, form, kick, np.where(free, direct, 0.0))
+        spread = np.sqrt(np.diagonal(np.linalg.inv(certificate.P)))
+        bound = np.minimum(bound, level[..., None] * spread)
+    coupling = np.abs(form.S).T
+    for _ in range(_ROUNDS):
+        around = direct.copy()
+        # An unbounded span times a zero coupling is no coupling.
+        np.add(around, np.nan_to_num(bound @ coupling, nan=np.inf), out=around, where=free)
+        tighter = np.minimum(bound, _reach(lure, around, z, span))
+        settled = np.all(tighter >= (1.0 - _TIGHTENING) * bound)
+        bound = tighter
+        if settled:
+            break
+    return np.array(bound)
+
+
+# Rounds of the monotone iteration, and the relative gain below which another round is not worth it.
+# Both trade tightness for time only: every iterate is a bound.
+_ROUNDS = 200
+_TIGHTENING = 1e-4
+
+
+def _reach(lure: Lure, radius: Floats, z: Floats | None, span: Floats) -> Floats:
+    """How far the set-points can move when their arguments move by `radius` (around `z`, if given)."""
+    if z is None:
+        # A curve of slope zero does not move, not even for an unbounded attack.
+        return np.minimum(
+            span, np.multiply(lure.slope, radius, out=np.zeros_like(radius), where=lure.slope > 0)
+        )
+    here = lure.phi(z)
+    return np.minimum(span, np.maximum(lure.phi(z + radius) - here, here - lure.phi(z - radius)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Form:
+    """The numbers of `T x' = -x + phi(w - S x)`."""
+
+    tau: Floats
+    S: Floats
+    slope: Floats
+
+
+def _droop_form(lure: Lure, what: str) -> _Form:
+    """Time constants, S and slopes of a system `T x' = -x + phi(w - S x)`."""
+    own = np.diagonal(lure.A)
+    square = lure.A.shape == lure.G.shape
+    fits = (
+        square
+        and bool(np.all(own < 0))
+        and np.array_equal(lure.A, np.diag(own))
+        and np.array_equal(lure.G, -lure.A)
+    )
+    if not fits or np.any(lure.B):
+        raise DesignInfeasible(what, "the system is not T x' = -x + phi(H x + F u)")
+    return _Form(-1.0 / own, -lure.H, lure.slope)
+
+
+def _nothing(kind: str) -> Certificate:
+    """Without inverters there is no state, and no error of it."""
+    empty = np.zeros((0, 0) if kind == "reactance" else 0)
+    return Certificate(kind, empty, np.inf, 0.0, 0.0, 0.0, 1.0, "no droop inverter, nothing to estimate", 0.0)
+
+
+def _span(lure: Lure) -> Floats:
+    """Distance between the two saturated values of each curve (m,); infinite where unknown."""
+    if isinstance(lure.phi, Droop):
+        return np.asarray(lure.phi.q[:, 0] - lure.phi.q[:, 3])
+    return np.full(lure.slope.size, np.inf)
+
+
+def _quadratic_form(P: Floats, multiplier: Floats, form: _Form) -> Floats:
+    """`P T^-1 + T^-1 P - b D Lambda^-1 b^T` with `b = P T^-1 - S^T Lambda`.
+
+    Twice the term of the circle criterion, so that half of it is left for the load error.
+    """
+    scaled = P / form.tau
+    b = scaled - form.S.T * multiplier
+    return np.asarray(scaled + scaled.T - (b * (form.slope / multiplier)) @ b.T)
+
+
+def _quadratic_rate(P: Floats, multiplier: Floats, form: _Form) -> float:
+    """Largest alpha with `form >= 2 alpha P`, less rounding; minus infinity unless P > 0."""
+    try:
+        factor = np.linalg.cholesky(P)
+    except np.linalg.LinAlgError:
+        return -np.inf
+    half = np.linalg.solve(factor, _quadratic_form(P, multiplier, form))
+    whole = np.linalg.solve(factor, half.T)
+    eigenvalues = np.linalg.eigvalsh(0.5 * (whole + whole.T))
+    # First-order bound of the rounding in factor, solves and eigenvalues.
+    rounding = 10.0 * P.shape[0] * np.finfo(np.float64).eps * np.linalg.cond(factor) ** 2
+    return float(eigenvalues[0] - rounding * np.max(np.abs(eigenvalues))) / 2.0
+
+
+def _quadratic_margin(P: Floats, multiplier: Floats, rate: float, form: _Form) -> float:
+    """Slack of `_quadratic_rate` over the claimed rate, relative to the slowest inverter."""
+    sound = np.all(multiplier > 0) and np.array_equal(P, P.T)
+    best = _quadratic_rate(P, multiplier, form) if sound else -np.inf
+    return (best - rate) * float(np.max(form.tau))
+
+
+def _small_gain_margin(weights: Floats, rate: float, form: _Form) -> float:
+    """Slack of `T^-1 (I - D |S|) c >= rate c`, relative to the slowest inverter."""
+    if not np.all(weights > 0):
+        return -np.inf
+    loop = form.slope * (np.abs(form.S) @ weights) / weights
+    rounding = 2.0 * weights.size * np.finfo(np.float64).eps * (1.0 + loop)
+    return float(np.min((1.0 - loop - rounding) / form.tau) - rate) * float(np.max(form.tau))
+
+
+def _level(certificate: Certificate, form: _Form, kick: Floats, load: Floats) -> Floats:
+    """Steady level of `W = sqrt(e^T P e)` under disturbances.
+
+    From `(W^2)' <= -2 alpha W^2 + 2 N W + L^2`: `W <= (N + sqrt(N^2 + 2 alpha L^2)) / (2 alpha)`.
+
+    Parameters
+    ----------
+    certificate
+        A quadratic certificate: P, Lambda and alpha.
+    form
+        The system.
+    kick : (…, n)
+        Largest entries of what acts on `e'` directly, pu/s: `N^2 = kick^T |P| kick`.
+    load : (…, m)
+        Largest load errors at the inverters that run on the model: `L^2 = sum d_i lambda_i load_i^2`.
+    """
+    rate = certificate.rate
+    direct = np.sum((kick @ np.abs(certificate.P)) * kick, axis=-1)
+    through = np.sum(form.slope * certificate.multiplier * load**2, axis=-1)
+    return np.asarray((np.sqrt(direct) + np.sqrt(direct + 2.0 * rate * through)) / (2.0 * rate))
+
+
+def _checked(certificate: Certificate) -> Certificate:
+    """The certificate, if its margin is positive."""
+    if not certificate.margin > 0:
+        raise DesignInfeasible(
+            f"{certificate.kind} certificate", "it fails its verification", certificate.margin
+        )
+    return certificate

@@ -359,7 +359,8 @@ def equilibrium(lure: Lure, u: Floats, x0: Floats | None = None, *, tol: float, 
     DesignInfeasible
         If it is not found.
     """
-    gain, bias = np.linalg.solve(-lure.A, lure.G), np.linalg.solve(-lure.A, lure.B)
+    gain = np.asarray(np.linalg.solve(-lure.A, lure.G), dtype=np.float64)
+    bias = np.linalg.solve(-lure.A, lure.B)
     offset = u @ bias.T
     start = np.zeros(offset.shape) if x0 is None else np.broadcast_to(x0, offset.shape)
     drive = u @ lure.F.T
