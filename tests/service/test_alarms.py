@@ -1,0 +1,496 @@
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gridsec.online import Cause, Decision
+from service.alarms import (
+    Alarm,
+    AlarmBook,
+    AlarmKind,
+    AlarmRules,
+    AlarmState,
+    AlarmUnknown,
+    AlreadyAcknowledged,
+    Change,
+    Condition,
+    Evidence,
+    Severity,
+    Transition,
+    acknowledge,
+    acknowledged,
+    advance,
+    conditions,
+    from_json,
+    restore,
+    to_json,
+)
+from service.report import BUSBAR, FeederReport, MeterReport
+
+T0 = 1_795_212_000.0
+FEEDER = "village"
+UNDECIDED_CAUSES = [cause for cause in Cause if cause not in (Cause.AGREEMENT, Cause.RESIDUALS)]
+
+
+def meter(name: str = "m1", **changes: object) -> MeterReport:
+    made = MeterReport(name, "b1", True, False, 1e-4, 2e-3, 230.0, 230.0, 0.5, 1.0, 0.0)
+    return replace(made, **changes)  # type: ignore[arg-type]
+
+
+def report(
+    *meters: MeterReport,
+    cause: Cause = Cause.AGREEMENT,
+    silent: tuple[tuple[str, float], ...] = (),
+    t: float = T0,
+) -> FeederReport:
+    verdict = {Cause.AGREEMENT: Decision.CLEAN, Cause.RESIDUALS: Decision.ATTACKED}.get(
+        cause, Decision.UNDECIDED
+    )
+    return FeederReport(FEEDER, t, verdict, "the reason", cause, 2, meters, (), silent, 207.0, 253.0)
+
+
+def said(found: Iterable[Condition]) -> dict[tuple[str, str | None], bool]:
+    return {(str(c.kind), c.meter): c.known for c in found}
+
+
+# ------------------------------------------------------------------ conditions
+
+
+def test_a_clean_feeder_has_no_conditions() -> None:
+    assert conditions(report(meter("m1"), meter("m2"))) == []
+
+
+def test_a_suspect_is_a_condition_with_its_numbers() -> None:
+    liar = meter("m2", suspect=True, score=9e-3, v_volt_reported=240.0, attack_volt_estimated=10.0)
+    (found,) = conditions(report(meter("m1"), liar, cause=Cause.RESIDUALS))
+    assert (found.kind, found.meter, found.known) == (AlarmKind.METER_MANIPULATED, "m2", True)
+    assert found.severity is Severity.CRITICAL
+    assert found.evidence == Evidence(9e-3, 2e-3, 240.0, 230.0, 10.0)
+    assert "240.0 V" in found.reason
+    assert "230.0 V" in found.reason
+
+
+@pytest.mark.parametrize("cause", UNDECIDED_CAUSES)
+def test_undecided_says_nothing_about_any_meter(cause: Cause) -> None:
+    found = said(conditions(report(meter("m1", suspect=True), meter("m2"), cause=cause)))
+    assert found["meter-manipulated", "m1"] is False
+    assert found["meter-manipulated", "m2"] is False
+
+
+@pytest.mark.parametrize("cause", [Cause.AGREEMENT, Cause.RESIDUALS])
+def test_a_silent_meter_is_neither_manipulated_nor_honest(cause: Cause) -> None:
+    unseen = meter("m2", seen=False, score=None, v_volt_reported=None)
+    found = said(conditions(report(meter("m1"), unseen, cause=cause)))
+    assert found["meter-manipulated", "m2"] is False
+    assert ("meter-manipulated", "m1") not in found
+
+
+def test_a_lying_meter_raises_no_voltage_alarm() -> None:
+    liar = meter("m1", suspect=True, v_volt_reported=260.0, v_volt_estimated=231.0)
+    found = said(conditions(report(liar, cause=Cause.RESIDUALS)))
+    assert found == {("meter-manipulated", "m1"): True}
+
+
+@pytest.mark.parametrize(
+    ("volt", "third", "expected"),
+    [
+        (253.0, 0.5, None),  # on the limit is inside
+        (253.1, 0.5, False),  # outside, but the truth may be inside: hold
+        (254.6, 0.5, True),  # the whole interval is outside
+        (254.5, 0.5, False),  # the interval just touches the limit
+        (207.0, 0.5, None),
+        (206.9, 0.5, False),
+        (205.4, 0.5, True),
+        (math.nan, 0.5, False),
+        (None, 0.5, False),
+        (260.0, None, False),
+        (260.0, math.inf, False),
+    ],
+)
+def test_voltage_limit_needs_the_whole_interval(
+    volt: float | None, third: float | None, expected: bool | None
+) -> None:
+    found = said(conditions(report(meter(v_volt_estimated=volt, v_volt_std=third))))
+    assert found.get(("voltage-limit", "m1")) is expected
+
+
+@pytest.mark.parametrize("cause", list(Cause))
+def test_voltage_limit_only_where_the_reconstruction_is_sound(cause: Cause) -> None:
+    found = said(conditions(report(meter(v_volt_estimated=260.0), cause=cause)))
+    sound = cause in (Cause.AGREEMENT, Cause.RESIDUALS, Cause.SILENT_METERS)
+    assert found["voltage-limit", "m1"] is sound
+
+
+def test_voltage_limit_says_which_side() -> None:
+    high, low = conditions(report(meter("m1", v_volt_estimated=260.0), meter("m2", v_volt_estimated=190.0)))
+    assert "above the limit of 253.0 V" in high.reason
+    assert "below the limit of 207.0 V" in low.reason
+
+
+def test_silence_is_data_loss_and_not_undecided() -> None:
+    unseen = meter("m2", seen=False, score=None, v_volt_reported=None)
+    found = conditions(report(meter("m1"), unseen, cause=Cause.SILENT_METERS, silent=(("m2", 12.0),)))
+    loss = next(c for c in found if c.kind is AlarmKind.DATA_LOSS)
+    assert (loss.meter, loss.known, loss.severity) == ("m2", True, Severity.MINOR)
+    assert "12 s" in loss.reason
+    assert said(found)["undecided", None] is False
+
+
+def test_a_meter_that_was_never_heard_is_data_loss_with_words_for_it() -> None:
+    unseen = meter("m1", seen=False)
+    found = conditions(report(unseen, cause=Cause.SILENT_METERS, silent=(("m1", math.inf),)))
+    loss = next(c for c in found if c.kind is AlarmKind.DATA_LOSS)
+    assert loss.reason == "no usable reading yet"
+
+
+def test_unseen_but_not_for_long_is_unknown() -> None:
+    found = said(conditions(report(meter("m1", seen=False), cause=Cause.SILENT_METERS)))
+    assert found["data-loss", "m1"] is False
+
+
+def test_a_silent_busbar_is_worse() -> None:
+    found = conditions(report(meter("m1"), cause=Cause.NO_BUSBAR, silent=((BUSBAR, 30.0),)))
+    loss = next(c for c in found if c.kind is AlarmKind.DATA_LOSS)
+    assert (loss.meter, loss.known, loss.severity) == (BUSBAR, True, Severity.MAJOR)
+    young = said(conditions(report(meter("m1"), cause=Cause.NO_BUSBAR)))
+    assert young["data-loss", BUSBAR] is False
+
+
+@pytest.mark.parametrize("cause", UNDECIDED_CAUSES)
+def test_undecided_is_an_alarm_unless_something_else_says_it(cause: Cause) -> None:
+    found = conditions(report(meter("m1"), cause=cause))
+    (undecided,) = (c for c in found if c.kind is AlarmKind.UNDECIDED)
+    covered = cause in (Cause.SETTLING, Cause.SILENT_METERS, Cause.NO_BUSBAR)
+    assert undecided.known is not covered
+    assert undecided.reason == "the reason"
+    assert undecided.meter is None
+
+
+# ------------------------------------------------------------- one condition's life
+
+RULES = AlarmRules(on_delay_s=2.0, off_delay_s=5.0, memory_s=60.0)
+TRUTHS = "PAU"  # present, absent, unknown
+
+
+def tick(truth: str, name: str | None = "m1") -> list[Condition]:
+    if truth == "A":
+        return []
+    kind = AlarmKind.METER_MANIPULATED
+    return [Condition(kind, FEEDER, name, Severity.CRITICAL, Evidence(1.0), "why", known=truth == "P")]
+
+
+Tick = tuple[float, str]
+
+
+def run(
+    ticks: Sequence[Tick], rules: AlarmRules = RULES, book: AlarmBook | None = None
+) -> tuple[AlarmBook, list[Transition]]:
+    book = book or AlarmBook(FEEDER)
+    happened: list[Transition] = []
+    for t, truth in ticks:
+        book, new = advance(book, rules, tick(truth), t)
+        happened += new
+    return book, happened
+
+
+def times(happened: Iterable[Transition]) -> list[tuple[float, Change]]:
+    return [(item.t - T0, item.change) for item in happened]
+
+
+def at_1_hz(truths: str) -> list[Tick]:
+    return [(T0 + k, truth) for k, truth in enumerate(truths)]
+
+
+def test_raised_after_the_on_delay_and_cleared_after_the_off_delay() -> None:
+    book, happened = run(at_1_hz("AAPPPPPAAAAAAAA"))
+    assert times(happened) == [(4.0, Change.RAISED), (12.0, Change.CLEARED)]
+    (alarm,) = book.alarms
+    assert (alarm.t_event, alarm.t_raised, alarm.t_cleared) == (T0 + 2, T0 + 4, T0 + 12)
+    assert (alarm.state, alarm.count, book.active) == (AlarmState.CLEARED, 1, ())
+
+
+def test_a_flicker_shorter_than_the_delay_is_no_alarm() -> None:
+    book, happened = run(at_1_hz("PPAPPAPPA"))
+    assert happened == []
+    assert book.entries == {}
+
+
+def test_no_answer_holds_an_alarm() -> None:
+    book, happened = run(at_1_hz("PPP" + "U" * 1000))
+    assert times(happened) == [(2.0, Change.RAISED)]
+    assert len(book.active) == 1
+
+
+def test_no_answer_confirms_nothing_and_forgets_nothing() -> None:
+    _, happened = run(at_1_hz("PP" + "U" * 50 + "PP"))
+    # One second before the hold, and one after it.
+    assert times(happened) == [(53.0, Change.RAISED)]
+
+
+def test_no_answer_does_not_count_for_clearing() -> None:
+    _, happened = run(at_1_hz("PPP" + "AAA" + "U" * 50 + "AAAA"))
+    assert times(happened) == [(2.0, Change.RAISED), (59.0, Change.CLEARED)]
+
+
+def test_coming_back_soon_counts_up_coming_back_late_is_a_new_alarm() -> None:
+    soon = "PPP" + "A" * 6 + "PPP"
+    book, happened = run(at_1_hz(soon + "A" * 80 + "PPP"))
+    first, _, second, _, third = (item.alarm for item in happened)
+    assert first.id == second.id
+    assert (first.count, second.count, third.count) == (1, 2, 1)
+    assert third.id > first.id
+    assert book.alarms == (third,)
+
+
+def test_a_forgotten_alarm_leaves_the_book() -> None:
+    book, _ = run(at_1_hz("PPP" + "A" * 100))
+    assert book.entries == {}
+
+
+def test_single_readings_far_apart_need_a_second_one() -> None:
+    quarter_hours = [(T0 + 900.0 * k, truth) for k, truth in enumerate("APPAA")]
+    _, happened = run(quarter_hours)
+    assert times(happened) == [(1800.0, Change.RAISED), (3600.0, Change.CLEARED)]
+
+
+def test_zero_delays_act_at_once() -> None:
+    rules = AlarmRules(on_delay_s=0.0, off_delay_s=0.0)
+    _, happened = run(at_1_hz("APAP"), rules)
+    assert [item.change for item in happened] == [Change.RAISED, Change.CLEARED, Change.RAISED]
+
+
+def test_each_kind_may_have_delays_of_its_own() -> None:
+    rules = AlarmRules(
+        on_delays_s={AlarmKind.METER_MANIPULATED: 0.0}, off_delays_s={AlarmKind.METER_MANIPULATED: 1.0}
+    )
+    _, happened = run(at_1_hz("PAA"), rules)
+    assert times(happened) == [(0.0, Change.RAISED), (2.0, Change.CLEARED)]
+    assert rules.on(AlarmKind.DATA_LOSS) == 2.0
+    assert rules.off(AlarmKind.DATA_LOSS) == 5.0
+
+
+@pytest.mark.parametrize("bad", [-1.0, math.nan, math.inf])
+def test_rules_refuse_impossible_times(bad: float) -> None:
+    with pytest.raises(ValueError, match="finite"):
+        AlarmRules(on_delay_s=bad)
+    with pytest.raises(ValueError, match="finite"):
+        AlarmRules(off_delays_s={AlarmKind.UNDECIDED: bad})
+
+
+def test_a_clock_set_back_holds() -> None:
+    ticks = [(T0, "P"), (T0 + 1, "P"), (T0 - 3600, "P"), (T0 - 3599, "P")]
+    _, happened = run(ticks)
+    assert [item.t for item in happened] == [T0 - 3599]
+
+
+def test_conditions_of_another_feeder_are_refused() -> None:
+    with pytest.raises(ValueError, match="village"):
+        advance(AlarmBook("town"), RULES, tick("P"), T0)
+    _, happened = run(at_1_hz("PPP"))
+    with pytest.raises(ValueError, match="village"):
+        restore("town", [happened[0].alarm])
+
+
+def test_meters_do_not_disturb_each_other_and_the_order_is_repeatable() -> None:
+    book = AlarmBook(FEEDER)
+    happened: list[Transition] = []
+    for k in range(4):
+        names = ["m2", None, "m1"] if k else ["m1"]
+        book, new = advance(book, RULES, [c for name in names for c in tick("P", name)], T0 + k)
+        happened += new
+    assert [(item.t - T0, item.alarm.meter) for item in happened] == [(2.0, "m1"), (3.0, None), (3.0, "m2")]
+    assert len({item.alarm.id for item in happened}) == 3
+
+
+# ------------------------------------------------------------------ properties
+
+steps = st.lists(
+    st.tuples(st.sampled_from([0.25, 0.5, 1.0, 2.0, 3.0]), st.sampled_from("PPPAAAU")),
+    max_size=60,
+)
+delays = st.sampled_from([0.0, 0.25, 1.0, 2.0, 5.0])
+rules_of = st.builds(
+    AlarmRules, on_delay_s=delays, off_delay_s=delays, memory_s=st.sampled_from([0.0, 4.0, 600.0])
+)
+
+
+def clocked(moves: list[tuple[float, str]]) -> list[Tick]:
+    ticks, t = [], T0
+    for dt, truth in moves:
+        t += dt
+        ticks.append((t, truth))
+    return ticks
+
+
+def seen_for(ticks: Sequence[Tick], k: int, truth: str) -> float:
+    """Seconds between neighbouring ticks that both say `truth`, back to the last one that says otherwise."""
+    first = k
+    while first > 0 and ticks[first - 1][1] in (truth, "U"):
+        first -= 1
+    return sum(b[0] - a[0] for a, b in pairwise(ticks[first : k + 1]) if a[1] == b[1] == truth)
+
+
+def oracle(ticks: Sequence[Tick], rules: AlarmRules) -> list[tuple[float, Change]]:
+    active, happened = False, []
+    for k, (t, truth) in enumerate(ticks):
+        if not active and truth == "P" and seen_for(ticks, k, "P") >= rules.on_delay_s:
+            active = True
+            happened.append((t - T0, Change.RAISED))
+        elif active and truth == "A" and seen_for(ticks, k, "A") >= rules.off_delay_s:
+            active = False
+            happened.append((t - T0, Change.CLEARED))
+    return happened
+
+
+@given(steps, rules_of)
+def test_transitions_are_those_of_the_definition(moves: list[tuple[float, str]], rules: AlarmRules) -> None:
+    ticks = clocked(moves)
+    _, happened = run(ticks, rules)
+    assert times(happened) == oracle(ticks, rules)
+
+
+@given(steps, rules_of)
+def test_never_too_early(moves: list[tuple[float, str]], rules: AlarmRules) -> None:
+    ticks = clocked(moves)
+    _, happened = run(ticks, rules)
+    for item in happened:
+        against = "A" if item.change is Change.RAISED else "P"
+        delay = rules.on_delay_s if item.change is Change.RAISED else rules.off_delay_s
+        counter = [t for t, truth in ticks if truth == against and t <= item.t]
+        begun = min(t for t, truth in ticks if truth not in (against, "U") and t > max(counter, default=0.0))
+        assert item.t - begun >= delay
+    assert all(a.change != b.change for a, b in pairwise(happened))
+
+
+@given(steps, rules_of)
+def test_a_replay_gives_the_same(moves: list[tuple[float, str]], rules: AlarmRules) -> None:
+    ticks = clocked(moves)
+    assert run(ticks, rules) == run(ticks, rules)
+
+
+@given(steps, rules_of, st.integers(0, 60))
+def test_ticks_that_know_nothing_change_nothing(
+    moves: list[tuple[float, str]], rules: AlarmRules, extra: int
+) -> None:
+    book, _ = run(clocked(moves), rules)
+    t = book.t or T0
+    after, happened = run([(t + k, "U") for k in range(extra)], rules, book)
+    assert happened == []
+    assert after.alarms == book.alarms
+
+
+@given(steps, steps, rules_of, st.booleans())
+def test_a_restart_keeps_every_alarm_and_continues(
+    before: list[tuple[float, str]], after: list[tuple[float, str]], rules: AlarmRules, answer: bool
+) -> None:
+    ticks = clocked(before + after)
+    head, tail = ticks[: len(before)], ticks[len(before) :]
+    book, _ = run(head, rules)
+    if answer and book.active and book.active[0].state is AlarmState.RAISED:
+        book, _ = acknowledge(book, book.active[0].id, "Ada", "seen", T0)
+    again = restore(FEEDER, [from_json(to_json(alarm)) for alarm in book.alarms])
+    assert again.alarms == book.alarms
+    at_rest = all(e.present == (e.alarm is not None and e.alarm.active) for e in book.entries.values())
+    there, here = run(tail, rules, again), run(tail, rules, book)
+    if at_rest:
+        assert there[1] == here[1]
+        assert there[0].alarms == here[0].alarms
+    # With a clock running, the restart is one more tick that knows nothing: it starts that clock anew, so
+    # nothing comes earlier than without the restart.
+    elif there[1]:
+        assert here[1]
+        assert there[1][0].t >= here[1][0].t
+
+
+# -------------------------------------------------------------- acknowledgement
+
+
+def raised() -> tuple[AlarmBook, Alarm]:
+    book, happened = run(at_1_hz("PPP"))
+    return book, happened[0].alarm
+
+
+def test_acknowledging_keeps_the_alarm_and_says_who() -> None:
+    book, alarm = raised()
+    book, (item,) = acknowledge(book, alarm.id, "Ada", "on my way", T0 + 10)
+    assert item == Transition(book.active[0], Change.ACKNOWLEDGED, T0 + 10, "Ada", "on my way")
+    assert item.alarm == replace(
+        alarm,
+        state=AlarmState.ACKNOWLEDGED,
+        acknowledged_by="Ada",
+        t_acknowledged=T0 + 10,
+        comment="on my way",
+    )
+
+
+def test_the_second_operator_is_told_who_was_first() -> None:
+    book, alarm = raised()
+    book, _ = acknowledge(book, alarm.id, "Ada", "", T0 + 10)
+    with pytest.raises(AlreadyAcknowledged, match="Ada") as caught:
+        acknowledge(book, alarm.id, "Grace", "", T0 + 11)
+    assert caught.value.alarm.id == alarm.id
+
+
+def test_an_unknown_alarm_cannot_be_acknowledged() -> None:
+    book, alarm = raised()
+    with pytest.raises(AlarmUnknown, match="nothing") as caught:
+        acknowledge(book, "nothing", "Ada", "", T0)
+    assert caught.value.alarm_id == "nothing"
+    pending, _ = run(at_1_hz("P"))
+    with pytest.raises(AlarmUnknown):
+        acknowledge(pending, alarm.id, "Ada", "", T0)
+
+
+def test_an_acknowledged_alarm_clears_and_remembers_who() -> None:
+    book, alarm = raised()
+    book, _ = acknowledge(book, alarm.id, "Ada", "", T0 + 10)
+    book, (cleared,) = run([(T0 + 20 + k, "A") for k in range(6)], book=book)
+    assert (cleared.alarm.state, cleared.alarm.acknowledged_by) == (AlarmState.CLEARED, "Ada")
+    book, (again,) = run([(T0 + 30 + k, "P") for k in range(3)], book=book)
+    assert (again.alarm.id, again.alarm.count) == (alarm.id, 2)
+    assert (again.alarm.state, again.alarm.acknowledged_by) == (AlarmState.RAISED, None)
+
+
+def test_a_cleared_alarm_can_still_be_answered_and_stays_cleared() -> None:
+    book, alarm = raised()
+    book, _ = run([(T0 + 20 + k, "A") for k in range(6)], book=book)
+    book, (item,) = acknowledge(book, alarm.id, "Ada", "", T0 + 30)
+    assert (item.alarm.state, item.alarm.acknowledged_by) == (AlarmState.CLEARED, "Ada")
+    with pytest.raises(AlreadyAcknowledged):
+        acknowledged(book.alarms[0], "Grace", "", T0 + 31)
+
+
+def test_restore_takes_the_latest_of_a_kind() -> None:
+    _, first = raised()
+    later = replace(first, id="Z" * 26, count=7)
+    assert restore(FEEDER, [later, first]).alarms == (later,)
+
+
+# ------------------------------------------------------------------------- ids
+
+
+def test_ids_are_ulids_that_sort_by_time() -> None:
+    alphabet = set("0123456789ABCDEFGHJKMNPQRSTVWXYZ")
+    ids = [run([(t + k, "P") for k in range(3)])[1][0].alarm.id for t in (0.0, 1.0, T0, T0 + 0.001, 4e9)]
+    assert all(len(name) == 26 and set(name) <= alphabet for name in ids)
+    assert ids == sorted(ids)
+    # The first ten characters are the milliseconds in base 32, most significant first.
+    digits = "0123456789ABCDEFGHJKMNPQRSTVWXYZ"
+    value = 0
+    for character in ids[2][:10]:
+        value = value * 32 + digits.index(character)
+    assert value == T0 * 1000
+
+
+def test_json_and_back() -> None:
+    _, alarm = raised()
+    data = to_json(alarm)
+    assert data["kind"] == "meter-manipulated"
+    assert type(data["state"]) is str
+    assert from_json({**data, "unknown": 1}) == alarm
