@@ -151,7 +151,6 @@ class Tick:
 class _Source:
     held: list[Reading] = field(default_factory=list)
     last_t: float = -math.inf
-    claim: float = -math.inf
     heard: int = 0
     seq: int | None = None
 
@@ -283,10 +282,9 @@ class Aligner:
         meter = reading.meter
         if meter in self._active:
             self._claims.pop(bisect_left(self._claims, self._active.pop(meter)))
-        source.claim = max(source.claim, reading.t) if source.heard else reading.t
         source.heard = self._arrivals
-        self._active[meter] = source.claim
-        insort(self._claims, source.claim)
+        self._active[meter] = reading.t
+        insort(self._claims, reading.t)
         window = max(_ACTIVE_ROUNDS * len(self._sources), 64)
         while self._sources[next(iter(self._active))].heard <= self._arrivals - window:
             _, claim = self._active.popitem(last=False)

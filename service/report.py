@@ -11,7 +11,12 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from gridsec.online import Cause, Decision
+import numpy as np
+
+from feeders.load import Site, Snapshot, volts
+from gridsec.arrays import Floats
+from gridsec.online import Cause, Decision, Estimate, Verdict
+from service.align import Tick
 
 BUSBAR = "substation"
 """The name under which the busbar meter is reported among the silent ones (as in its zenoh key)."""
@@ -78,8 +83,9 @@ class FeederReport:
     bus_v_volt
         (bus id, reconstructed voltage in V or None) of every bus, the busbar first.
     silent
-        (meter id, seconds since its last usable reading) of the meters that have been silent for longer
-        than the feeder's `silence_s`; the busbar meter appears as `BUSBAR`.
+        (meter id, seconds since its last usable reading, infinity if there never was one) of the meters
+        that have been silent for longer than the feeder's `silence_s`; the busbar meter appears as
+        `BUSBAR`.
     v_min_volt, v_max_volt
         The feeder's voltage limits, V.
     """
@@ -100,6 +106,144 @@ class FeederReport:
 def finite(value: float) -> float | None:
     """Return a number that JSON can carry: None for NaN and infinities."""
     return float(value) if math.isfinite(value) else None
+
+
+def snapshot(tick: Tick) -> Snapshot:
+    """Return what a tick's readings say, as `feeders.load.to_frame` takes it.
+
+    Parameters
+    ----------
+    tick
+        The tick.
+    """
+    nan = math.nan
+    rows = [(nan, nan, nan) if r is None else (r.v_volt, r.p_kw, r.q_kvar) for r in tick.readings]
+    columns = np.array(rows, dtype=np.float64).reshape(-1, 3)
+    return Snapshot(
+        t=tick.t,
+        v_volt=columns[:, 0].copy(),
+        p_kw=columns[:, 1].copy(),
+        q_kvar=columns[:, 2].copy(),
+        v0_volt=nan if tick.busbar is None else tick.busbar.v_volt,
+    )
+
+
+def build(site: Site, tick: Tick, max_attacked: int, estimate: Estimate, verdict: Verdict) -> FeederReport:
+    """Put a tick, its estimate and its verdict into an operator's words.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    tick
+        What was known.
+    max_attacked
+        The number M that the monitor was designed for.
+    estimate, verdict
+        What the monitor made of it.
+    """
+    v2 = estimate.v2[site.meters]
+    bound = estimate.bound[site.meters]
+    half_width = 0.5 * (volts(site, v2 + bound) - volts(site, v2 - bound))
+    numbers = np.column_stack((verdict.score, verdict.threshold, volts(site, v2), half_width / 3.0, v2))
+    attack = _attack_volts(site, tick, verdict)
+    meters = []
+    for k, (meter, reading) in enumerate(zip(site.meter_ids, tick.readings, strict=True)):
+        score, threshold, v_volt, v_std, v2_pu = (finite(value) for value in numbers[k])
+        meters.append(
+            MeterReport(
+                meter=meter,
+                bus=site.tables.customers[int(site.meters[k])].bus,
+                seen=reading is not None,
+                suspect=bool(verdict.suspects[k]),
+                score=score,
+                threshold=threshold,
+                v_volt_reported=None if reading is None else reading.v_volt,
+                v_volt_estimated=v_volt,
+                v_volt_std=v_std,
+                v2_pu_estimated=v2_pu,
+                attack_volt_estimated=finite(attack[k]),
+            )
+        )
+    buses = zip(site.feeder.buses, volts(site, estimate.v2_bus), strict=True)
+    return _whole(
+        site,
+        tick,
+        max_attacked,
+        verdict=(verdict.decision, verdict.cause, verdict.reason),
+        meters=tuple(meters),
+        buses=tuple((bus, finite(v)) for bus, v in buses),
+    )
+
+
+def blind(site: Site, tick: Tick, max_attacked: int, cause: Cause, reason: str) -> FeederReport:
+    """Return the report of a tick at which no monitor runs: undecided, with what the meters say.
+
+    Parameters
+    ----------
+    site, tick, max_attacked
+        As in `build`.
+    cause, reason
+        Why there is no estimate.
+    """
+    meters = tuple(
+        MeterReport(
+            meter=meter,
+            bus=site.tables.customers[int(site.meters[k])].bus,
+            seen=reading is not None,
+            suspect=False,
+            score=None,
+            threshold=None,
+            v_volt_reported=None if reading is None else reading.v_volt,
+            v_volt_estimated=None,
+            v_volt_std=None,
+            v2_pu_estimated=None,
+            attack_volt_estimated=None,
+        )
+        for k, (meter, reading) in enumerate(zip(site.meter_ids, tick.readings, strict=True))
+    )
+    return _whole(
+        site,
+        tick,
+        max_attacked,
+        verdict=(Decision.UNDECIDED, cause, reason),
+        meters=meters,
+        buses=tuple((bus, None) for bus in site.feeder.buses),
+    )
+
+
+def _attack_volts(site: Site, tick: Tick, verdict: Verdict) -> Floats:
+    """Turn the reconstructed attack on the squared voltage into volts: ``sqrt(y) - sqrt(y - a)``."""
+    base = site.feeder.base_volt
+    reported = np.array([math.nan if r is None else r.v_volt for r in tick.readings], dtype=np.float64)
+    true = volts(site, (reported / base) ** 2 - verdict.attack)
+    return np.where(verdict.suspects, reported - true, 0.0)
+
+
+def _whole(
+    site: Site,
+    tick: Tick,
+    max_attacked: int,
+    *,
+    verdict: tuple[Decision, Cause, str],
+    meters: tuple[MeterReport, ...],
+    buses: tuple[tuple[str, float | None], ...],
+) -> FeederReport:
+    limits, nominal = site.tables.meta.limits, site.tables.meta.voltage_volt
+    decision, cause, reason = verdict
+    return FeederReport(
+        feeder=site.feeder.name,
+        t=tick.t,
+        verdict=decision,
+        reason=reason,
+        cause=cause,
+        max_attacked=max_attacked,
+        meters=meters,
+        bus_v_volt=buses,
+        silent=tuple((BUSBAR if meter is None else meter, seconds) for meter, seconds in tick.silent),
+        v_min_volt=limits.v_min_pu * nominal,
+        v_max_volt=limits.v_max_pu * nominal,
+    )
 
 
 def to_json(report: FeederReport) -> dict[str, Any]:
@@ -139,7 +283,7 @@ def to_json(report: FeederReport) -> dict[str, Any]:
             for m in report.meters
         ],
         "buses": [{"bus": bus, "v_volt": v} for bus, v in report.bus_v_volt],
-        "silent": [{"meter": meter, "seconds": seconds} for meter, seconds in report.silent],
+        "silent": [{"meter": meter, "seconds": finite(seconds)} for meter, seconds in report.silent],
         "v_min_volt": report.v_min_volt,
         "v_max_volt": report.v_max_volt,
     }

@@ -1,0 +1,488 @@
+"""zenoh, and nothing but zenoh: samples in, estimates and alarms out, queries answered.
+
+The rest of the service sees plain Python: `Sample`s in batches, and `Outbox.latest` / `Outbox.event` to
+publish. What the binding demands is kept in here: samples are drained by one blocking receive and then
+non-blocking ones, callbacks are not used at all (they collapse under a busy interpreter, and calling zenoh
+from one can deadlock), every session is closed explicitly (or the process hangs at exit).
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections import OrderedDict, deque
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from gridsec.errors import GridsecError
+
+RING = 8192
+"""Samples that zenoh keeps for us; when full, the oldest go, and the gap shows in their numbers."""
+
+BATCH = 1024
+QUERIES_WAITING = 256
+_ESTIMATES = 1024
+EVENTS_WAITING = 10_000
+_MAX_SESSIONS = 100_000
+_ACCEPT_PENDING = 1_000
+_OPEN_TIMEOUT_MS = 10_000
+JSON = "application/json"
+
+
+class BusUnavailable(GridsecError):
+    """zenoh cannot be used as configured; the message says which endpoint and why."""
+
+
+@dataclass(frozen=True, slots=True)
+class BusConfig:
+    """How to take part in zenoh.
+
+    Attributes
+    ----------
+    mode
+        `router` for the service (it routes between clients and needs no separate router process), `client`
+        for meters and tools, `peer` if an existing network asks for it. None: what the file says, or
+        `router` without a file.
+    listen, connect
+        Endpoints such as `tcp/127.0.0.1:7447`.
+    file
+        A user's own json5 configuration (TLS, users, access control, ...). What it says is kept; mode and
+        endpoints given here are put on top.
+    """
+
+    mode: str | None = None
+    listen: tuple[str, ...] = ()
+    connect: tuple[str, ...] = ()
+    file: Path | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One put, copied out of zenoh: key, bytes, encoding, wall time of its arrival (Unix s)."""
+
+    key: str
+    payload: bytes
+    encoding: str
+    arrival: float
+
+
+def _config(config: BusConfig) -> zenoh.Config:
+    try:
+        if config.file is None:
+            built = zenoh.Config()
+            settings: dict[str, Any] = {
+                "mode": "router",
+                "listen/endpoints": [],
+                "connect/endpoints": [],
+                "connect/timeout_ms": {"router": -1, "peer": -1, "client": _OPEN_TIMEOUT_MS},
+                "scouting/multicast/enabled": False,
+                "transport/shared_memory/enabled": False,
+                "transport/unicast/max_sessions": _MAX_SESSIONS,
+                "transport/unicast/accept_pending": _ACCEPT_PENDING,
+            }
+        else:
+            built = zenoh.Config.from_file(str(config.file))
+            settings = {}
+        if config.mode is not None:
+            settings["mode"] = config.mode
+        if config.listen:
+            settings["listen/endpoints"] = [_buffered(endpoint) for endpoint in config.listen]
+        if config.connect:
+            settings["connect/endpoints"] = list(config.connect)
+        for key, value in settings.items():
+            built.insert_json5(key, json.dumps(value))
+    except (zenoh.ZError, OSError, ValueError) as error:
+        raise BusUnavailable(f"zenoh configuration: {_first_line(error)}") from error
+    return built
+
+
+def _buffered(endpoint: str) -> str:
+    """Bound the age of data when we are slow: small socket buffers make the sender feel it at once."""
+    if "#" in endpoint or not endpoint.startswith("tcp/"):
+        return endpoint
+    return endpoint + "#so_rcvbuf=65536;so_sndbuf=65536"
+
+
+def _first_line(error: BaseException) -> str:
+    return str(error).partition("\n")[0].partition(" at /")[0].strip()
+
+
+@contextmanager
+def session(config: BusConfig) -> Iterator[zenoh.Session]:
+    """Open a zenoh session and close it in any case.
+
+    Parameters
+    ----------
+    config
+        How.
+
+    Raises
+    ------
+    BusUnavailable
+        If an endpoint cannot be listened on or connected to, or the configuration is wrong.
+    """
+    built = _config(config)
+    try:
+        opened = zenoh.open(built)
+    except zenoh.ZError as error:
+        ends = ", ".join((*config.listen, *config.connect)) or "no endpoint"
+        raise BusUnavailable(f"zenoh cannot be opened on {ends}: {_first_line(error)}") from error
+    with opened:
+        yield opened
+
+
+@dataclass(slots=True)
+class BusCounts:
+    """What went through and what did not."""
+
+    received: int = 0
+    queue_dropped: int = 0
+    deleted: int = 0
+    published: int = 0
+    publish_failed: int = 0
+    queries: int = 0
+
+
+@dataclass(slots=True)
+class _Outgoing:
+    """What is waiting to be published: the newest value of each telemetry key, every event in order."""
+
+    latest: OrderedDict[str, bytes] = field(default_factory=OrderedDict)
+    events: deque[tuple[str, bytes | None, Callable[[], None] | None]] = field(default_factory=deque)
+    closing: bool = False
+
+
+class Bus:
+    """The service's side of zenoh, as a context manager.
+
+    Parameters
+    ----------
+    config
+        How to take part.
+    prefix
+        First chunks of every key.
+    deliver
+        Called from the receiving thread with each batch; has to return at once, and says how many samples
+        it had no room for.
+    """
+
+    def __init__(self, config: BusConfig, prefix: str, deliver: Callable[[list[Sample]], int]) -> None:
+        self._config = config
+        self._prefix = prefix
+        self._deliver = deliver
+        self._stack = ExitStack()
+        self._threads: list[threading.Thread] = []
+        self._wakeup = threading.Condition()
+        self._outgoing = _Outgoing()
+        self._answers: dict[str, bytes] = {}
+        self._answers_lock = threading.Lock()
+        self.counts = BusCounts()
+        self.failure: str | None = None
+
+    def __enter__(self) -> Bus:
+        """Open the session, subscribe, answer queries."""
+        with ExitStack() as stack:
+            live = stack.enter_context(session(self._config))
+            readings = [
+                f"{self._prefix}/*/meter/*/reading",
+                f"{self._prefix}/*/substation/reading",
+                f"{self._prefix}/*/concentrator/*/readings",
+            ]
+            for key in readings:
+                subscriber = live.declare_subscriber(key, zenoh.handlers.RingChannel(RING))
+                stack.callback(subscriber.undeclare)
+                self._start(f"zenoh {key}", self._receive, subscriber.handler)
+            for key in (f"{self._prefix}/*/estimate", f"{self._prefix}/*/alarm/*"):
+                queryable = live.declare_queryable(key, zenoh.handlers.FifoChannel(QUERIES_WAITING))
+                stack.callback(queryable.undeclare)
+                self._start(f"zenoh query {key}", self._answer, queryable.handler)
+            token = live.liveliness().declare_token(f"{self._prefix}/service/{live.zid()}")
+            stack.callback(token.undeclare)
+            publishing = self._start("zenoh publish", self._publish, live)
+            stack.callback(self._stop_publishing, publishing)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Publish what is waiting, close the session, end the threads."""
+        self._stack.close()
+        for thread in self._threads:
+            thread.join(timeout=2.0)
+
+    def _start(self, name: str, run: Callable[[Any], None], argument: Any) -> threading.Thread:
+        thread = threading.Thread(target=run, args=(argument,), name=name, daemon=True)
+        thread.start()
+        self._threads.append(thread)
+        return thread
+
+    # ---------------------------------------------------------------- in
+
+    def _receive(self, handler: zenoh.handlers.Handler[zenoh.Sample]) -> None:
+        while True:
+            try:
+                raw: zenoh.Sample | None = handler.recv()
+            except zenoh.ZError:  # the subscription is closed and drained
+                return
+            batch: list[Sample] = []
+            while raw is not None:
+                if raw.kind == zenoh.SampleKind.DELETE:
+                    self.counts.deleted += 1
+                else:
+                    batch.append(
+                        Sample(str(raw.key_expr), raw.payload.to_bytes(), str(raw.encoding), time.time())
+                    )
+                if len(batch) >= BATCH:
+                    break
+                raw = _try_recv(handler)
+            self.counts.received += len(batch)
+            self.counts.queue_dropped += self._deliver(batch)
+
+    # ---------------------------------------------------------------- out
+
+    def latest(self, key: str, payload: bytes) -> None:
+        """Publish the newest value of a key; an older one that is still waiting is replaced.
+
+        Parameters
+        ----------
+        key
+            Key without the prefix.
+        payload
+            JSON.
+        """
+        with self._answers_lock:
+            self._answers[f"{self._prefix}/{key}"] = payload
+        with self._wakeup:
+            self._outgoing.latest[f"{self._prefix}/{key}"] = payload
+            self._wakeup.notify()
+
+    def event(self, key: str, payload: bytes, *, last: bool, done: Callable[[], None] | None = None) -> bool:
+        """Publish something that must not be lost; in order, with high priority.
+
+        Parameters
+        ----------
+        key
+            Key without the prefix.
+        payload
+            JSON.
+        last
+            The matter is closed: the key is deleted after the put, and queries find nothing any more.
+        done
+            Called from the publishing thread once it is out.
+
+        Returns
+        -------
+        bool
+            False if too many events are waiting; nothing was taken.
+        """
+        full = f"{self._prefix}/{key}"
+        with self._answers_lock:
+            if last:
+                self._answers.pop(full, None)
+            else:
+                self._answers[full] = payload
+        with self._wakeup:
+            if len(self._outgoing.events) >= EVENTS_WAITING:
+                return False
+            self._outgoing.events.append((full, payload, None if last else done))
+            if last:
+                self._outgoing.events.append((full, None, done))
+            self._wakeup.notify()
+        return True
+
+    def answer(self, key: str, payload: bytes) -> None:
+        """Let queries for a key find this, without publishing it.
+
+        Parameters
+        ----------
+        key
+            Key without the prefix.
+        payload
+            JSON.
+        """
+        with self._answers_lock:
+            self._answers[f"{self._prefix}/{key}"] = payload
+
+    def _publish(self, live: zenoh.Session) -> None:
+        publishers: dict[str, zenoh.Publisher] = {}
+        while True:
+            with self._wakeup:
+                out = self._outgoing
+                while not (out.latest or out.events or out.closing):
+                    self._wakeup.wait()
+                if not (out.latest or out.events):
+                    return
+                event = out.events.popleft() if out.events else None
+                value = None if event else out.latest.popitem(last=False)
+            try:
+                if event is not None:
+                    _put_event(live, event[0], event[1])
+                elif value is not None:
+                    if value[0] not in publishers:
+                        publishers[value[0]] = live.declare_publisher(
+                            value[0],
+                            encoding=JSON,
+                            congestion_control=zenoh.CongestionControl.DROP,
+                        )
+                    publishers[value[0]].put(value[1])
+            except zenoh.ZError as error:
+                self.counts.publish_failed += 1
+                self.failure = _first_line(error)
+                continue
+            self.counts.published += 1
+            if event is not None and event[2] is not None:
+                event[2]()
+
+    def _stop_publishing(self, thread: threading.Thread) -> None:
+        with self._wakeup:
+            self._outgoing.closing = True
+            self._wakeup.notify()
+        thread.join(timeout=2.0)
+
+    # ---------------------------------------------------------------- queries
+
+    def _answer(self, handler: zenoh.handlers.Handler[zenoh.Query]) -> None:
+        while True:
+            try:
+                query = handler.recv()
+            except zenoh.ZError:
+                return
+            self.counts.queries += 1
+            with self._answers_lock:
+                known = tuple(self._answers.items())
+            with query:
+                for key, payload in known:
+                    if query.key_expr.intersects(key) and not _reply(query, key, payload):
+                        break
+
+
+def _put_event(live: zenoh.Session, key: str, payload: bytes | None) -> None:
+    options: Mapping[str, Any] = {
+        "congestion_control": zenoh.CongestionControl.BLOCK,
+        "priority": zenoh.Priority.INTERACTIVE_HIGH,
+        "express": True,
+    }
+    if payload is None:
+        live.delete(key, **options)
+    else:
+        live.put(key, payload, encoding=JSON, **options)
+
+
+def _reply(query: zenoh.Query, key: str, payload: bytes) -> bool:
+    try:
+        query.reply(key, payload, encoding=JSON)
+    except zenoh.ZError:  # the asker is gone
+        return False
+    return True
+
+
+def _try_recv(handler: zenoh.handlers.Handler[zenoh.Sample]) -> zenoh.Sample | None:
+    try:
+        return handler.try_recv()
+    except zenoh.ZError:  # closed and drained; the next blocking receive ends the thread
+        return None
+
+
+class Meters:
+    """The virtual meters' side of zenoh: puts readings, and watches the estimates if asked to.
+
+    Parameters
+    ----------
+    config
+        How to take part; usually a client of the service.
+    prefix
+        First chunks of every key.
+    """
+
+    def __init__(self, config: BusConfig, prefix: str) -> None:
+        self._config = config
+        self._prefix = prefix
+        self._stack = ExitStack()
+        self._live: zenoh.Session | None = None
+        self._estimates: zenoh.handlers.Handler[zenoh.Sample] | None = None
+
+    def __enter__(self) -> Meters:
+        """Open the session."""
+        self._live = self._stack.enter_context(session(self._config))
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the session."""
+        self._live = None
+        self._stack.close()
+
+    def watch(self, feeder: str) -> None:
+        """Start to watch the estimates of a feeder.
+
+        Parameters
+        ----------
+        feeder
+            Name.
+        """
+        live = self._session()
+        subscriber = live.declare_subscriber(
+            f"{self._prefix}/{feeder}/estimate", zenoh.handlers.RingChannel(_ESTIMATES)
+        )
+        self._stack.callback(subscriber.undeclare)
+        self._estimates = subscriber.handler
+
+    def estimates(self) -> list[bytes]:
+        """Return the estimates that have come since the last call, oldest first."""
+        found: list[bytes] = []
+        while self._estimates is not None and (sample := _try_recv(self._estimates)) is not None:
+            found.append(sample.payload.to_bytes())
+        return found
+
+    def query(self, key: str, timeout_s: float) -> dict[str, bytes]:
+        """Ask for the values of a key.
+
+        Parameters
+        ----------
+        key
+            Key or pattern, without the prefix.
+        timeout_s
+            How long to wait, s.
+
+        Returns
+        -------
+        dict
+            Payload by full key.
+        """
+        replies = self._session().get(f"{self._prefix}/{key}", timeout=timeout_s)
+        samples = (reply.ok for reply in replies)
+        return {str(one.key_expr): one.payload.to_bytes() for one in samples if one is not None}
+
+    def _session(self) -> zenoh.Session:
+        if self._live is None:
+            raise BusUnavailable("the meters' zenoh session is not open")
+        return self._live
+
+    def put(self, key: str, payload: bytes, encoding: str = JSON) -> None:
+        """Put a payload on a key (without the prefix).
+
+        Parameters
+        ----------
+        key, payload, encoding
+            As in zenoh.
+
+        Raises
+        ------
+        BusUnavailable
+            If the session is closed.
+        """
+        try:
+            # The default (drop when the network is congested) would lose readings of a simulation that runs
+            # faster than real time; a meter with one reading a second never notices the difference.
+            self._session().put(
+                f"{self._prefix}/{key}",
+                payload,
+                encoding=encoding,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+            )
+        except zenoh.ZError as error:
+            raise BusUnavailable(f"zenoh put: {_first_line(error)}") from error

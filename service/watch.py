@@ -1,0 +1,211 @@
+"""One feeder being watched: readings in, reports and alarm transitions out.
+
+The live service, replay and tests all run this. It has no clock, no threads and no input or output; whoever
+owns a `Watch` calls it from one place at a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import StrEnum
+
+from feeders.load import Site, plant, to_frame
+from gridsec import monitor
+from gridsec.online import Cause
+from service.alarms import AlarmBook, AlarmRules, Transition, acknowledge, advance
+from service.align import Aligner, AlignRules, Clock, Outcome, Tick, rules
+from service.conditions import conditions
+from service.reading import Known, Reading
+from service.report import FeederReport, blind, build, snapshot
+
+POWER_MAX_FACTOR = 100.0
+"""Powers beyond this many times the feeder's base power are no readings."""
+
+
+class Phase(StrEnum):
+    """Whether a feeder has a monitor."""
+
+    DESIGNING = "designing"
+    WATCHING = "watching"
+    FAILED = "failed"
+
+
+@dataclass(frozen=True, slots=True)
+class TickResult:
+    """What one tick brought."""
+
+    report: FeederReport
+    transitions: tuple[Transition, ...]
+
+
+def known_of(site: Site) -> Known:
+    """Return what the wire has to know of a feeder.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    """
+    meta = site.tables.meta
+    return Known(frozenset(site.meter_ids), meta.voltage_volt, POWER_MAX_FACTOR * meta.base_kva)
+
+
+def align_rules(
+    site: Site, clock: Clock, *, max_skew_s: float | None = None, grace_s: float | None = None
+) -> AlignRules:
+    """Return the times by which a feeder's readings are aligned.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    clock, max_skew_s, grace_s
+        As in `align.rules`.
+    """
+    settings = site.tables.meta.monitor
+    return rules(settings.tick_s, settings.silence_s, clock=clock, max_skew_s=max_skew_s, grace_s=grace_s)
+
+
+def alarm_rules(site: Site) -> AlarmRules:
+    """Return the delays of a feeder's alarms.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    """
+    settings = site.tables.meta.monitor
+    return AlarmRules(settings.on_delay_s, settings.off_delay_s)
+
+
+def design(site: Site) -> monitor.MonitorDesign:
+    """Return the monitor's design for a feeder; takes its time on large ones.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+
+    Raises
+    ------
+    NotObservable, DesignInfeasible
+        If the feeder cannot be watched as its file asks for.
+    """
+    settings = site.tables.meta.monitor
+    return monitor.design(plant(site), max_attacked=settings.max_attacked, step_s=settings.tick_s)
+
+
+class Watch:
+    """One feeder being watched.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    rules
+        Its times.
+    book
+        Its alarms so far.
+
+    Attributes
+    ----------
+    phase, problem
+        Whether there is a monitor, and if it failed, why.
+    report
+        The latest report, or None before the first tick.
+    """
+
+    def __init__(self, site: Site, rules: AlignRules, book: AlarmBook) -> None:
+        self.site = site
+        self.name = site.feeder.name
+        self.max_attacked = site.tables.meta.monitor.max_attacked
+        self.aligner = Aligner(site.meter_ids, rules)
+        self.book = book
+        self.phase = Phase.DESIGNING
+        self.problem = ""
+        self.report: FeederReport | None = None
+        self._alarm_rules = alarm_rules(site)
+        self._design: monitor.MonitorDesign | None = None
+        self._state: monitor.MonitorState | None = None
+
+    def install(self, finished: monitor.MonitorDesign) -> None:
+        """Begin to watch with a finished design.
+
+        Parameters
+        ----------
+        finished
+            The design.
+        """
+        self._design, self._state = finished, None
+        self.phase, self.problem = Phase.WATCHING, ""
+
+    def fail(self, problem: str) -> None:
+        """Give up watching; ticks go on and are undecided.
+
+        Parameters
+        ----------
+        problem
+            Why, for the operator.
+        """
+        self._design = self._state = None
+        self.phase, self.problem = Phase.FAILED, problem
+
+    def take(self, reading: Reading, now: float) -> tuple[Outcome, list[TickResult]]:
+        """Take one reading in.
+
+        Parameters
+        ----------
+        reading, now
+            As in `Aligner.take`.
+        """
+        outcome, ticks = self.aligner.take(reading, now)
+        return outcome, self._run(ticks)
+
+    def due(self, now: float) -> list[TickResult]:
+        """Do what is due without a new reading.
+
+        Parameters
+        ----------
+        now
+            Wall time, Unix s.
+        """
+        return self._run(self.aligner.due(now))
+
+    def flush(self) -> list[TickResult]:
+        """Do what the readings so far allow: nothing more will come."""
+        return self._run(self.aligner.flush())
+
+    def acknowledge(self, alarm_id: str, who: str, comment: str, t: float) -> tuple[Transition, ...]:
+        """Answer an alarm of this feeder.
+
+        Parameters
+        ----------
+        alarm_id, who, comment, t
+            As in `alarms.acknowledge`.
+        """
+        self.book, transitions = acknowledge(self.book, alarm_id, who, comment, t)
+        return transitions
+
+    def _run(self, ticks: Iterable[Tick]) -> list[TickResult]:
+        results = []
+        for tick in ticks:
+            self.report = self._judge(tick)
+            self.book, transitions = advance(
+                self.book, self._alarm_rules, conditions(self.report), self.report.t
+            )
+            results.append(TickResult(self.report, transitions))
+        return results
+
+    def _judge(self, tick: Tick) -> FeederReport:
+        if self._design is None:
+            if self.phase is Phase.FAILED:
+                cause, reason = Cause.DESIGN_INVALID, f"nobody watches: {self.problem}"
+            else:
+                cause, reason = Cause.SETTLING, "the monitor is still being designed"
+            return blind(self.site, tick, self.max_attacked, cause, reason)
+        if self._state is None:
+            self._state = monitor.init(self._design, tick.t)
+        frame = to_frame(self.site, snapshot(tick))
+        self._state, estimate, verdict = monitor.step(self._design, self._state, frame)
+        return build(self.site, tick, self.max_attacked, estimate, verdict)
