@@ -254,28 +254,23 @@ def loss_correction(
     """
     if steps < 1:
         raise ValueError(f"steps is {steps}; it must be at least 1")
-    drawn_p, drawn_q = (-_at_buses(feeder, np.asarray(s, dtype=np.float64)) for s in (p, q))
-    base = np.asarray(v0_squared, dtype=np.float64)[..., None]
-    P, Q = _below(feeder, drawn_p), _below(feeder, drawn_q)
-    linear = base + _from_busbar(feeder, -2.0 * (feeder.r * P[..., 1:] + feeder.x * Q[..., 1:]))
-    half = _half_charging(feeder)
-    v2, P_now, Q_now = linear, P[..., 1:], Q[..., 1:] - _below(feeder, half * linear)[..., 1:]
+    flows = _linear_flows(feeder, p, q, v0_squared)
+    v2, P, Q = flows.v2, flows.P, flows.charged
     for _ in range(steps):
-        current = (P_now**2 + Q_now**2) / v2[..., 1:]
-        loss_p = _strictly_below(feeder, feeder.r * current)
-        loss_q = _strictly_below(feeder, feeder.x * current) - _below(feeder, half * v2)[..., 1:]
-        drop = -2.0 * (feeder.r * loss_p + feeder.x * loss_q) - (feeder.r**2 + feeder.x**2) * current
-        v2 = linear + _from_busbar(feeder, drop)
-        P_now, Q_now = P[..., 1:] + loss_p, Q[..., 1:] + loss_q
-    return v2 - linear
+        current = (P**2 + Q**2) / v2[..., 1:]
+        loss_p, loss_q, drop = _losses(feeder, current, flows.half * v2, sign=-1.0)
+        v2 = flows.v2 + _from_busbar(feeder, -drop)
+        P, Q = flows.P + loss_p, flows.Q + loss_q
+    return np.asarray(v2 - flows.v2)
 
 
 def model_error_bound(feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:
     """How far `v^2` after one loss correction can be from the AC power flow, for every customer.
 
-    Twice the difference of the second and the first fixed-point step: the steps shrink geometrically,
-    and twice the next step bounds the sum of all that follow while each is at most half its
-    predecessor (in practice a few hundredths).
+    Twice the size of the second fixed-point step, summed up without regard to signs: the steps shrink
+    geometrically, and twice the next one bounds the sum of all that follow while each is at most half
+    its predecessor (in practice a few hundredths). Where the second step is *not* below half of the
+    first, near voltage collapse, the bound is infinite.
 
     Parameters
     ----------
@@ -287,23 +282,62 @@ def model_error_bound(feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats |
     (…, N)
         Bound on the remaining error of `v^2`, pu.
     """
-    once = loss_correction(feeder, p, q, v0_squared, steps=1)
-    twice = loss_correction(feeder, p, q, v0_squared, steps=2)
-    return np.asarray(2.0 * np.abs(twice - once)[..., feeder.bus])
+    flows = _linear_flows(feeder, p, q, v0_squared)
+    with np.errstate(all="ignore"):
+        current = (flows.P**2 + flows.charged**2) / flows.v2[..., 1:]
+        charge = flows.half * flows.v2
+        loss_p, loss_q, drop = _losses(feeder, current, charge, sign=-1.0)
+        v2 = flows.v2 + _from_busbar(feeder, -drop)
+        later = ((flows.P + loss_p) ** 2 + (flows.Q + loss_q) ** 2) / v2[..., 1:]
+        first = _from_busbar(feeder, _losses(feeder, np.abs(current), np.abs(charge), sign=1.0)[2])
+        change = np.abs(flows.half * (v2 - flows.v2))
+        second = _from_busbar(feeder, _losses(feeder, np.abs(later - current), change, sign=1.0)[2])
+        shrinks = np.max(second, axis=-1, keepdims=True) <= 0.5 * np.max(first, axis=-1, keepdims=True)
+        shrinks &= np.all(v2 > 0, axis=-1, keepdims=True) & np.all(flows.v2 > 0, axis=-1, keepdims=True)
+        bound = np.where(shrinks, 2.0 * second, np.inf)
+    return np.asarray(bound[..., feeder.bus])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Flows:
+    """The linear power flow.
+
+    P, Q: flows at the end of the branches, (…, b). charged: Q less what the charging below supplies.
+    v2: squared voltages (…, b + 1). half: susceptance at the buses (b + 1,).
+    """
+
+    P: Floats
+    Q: Floats
+    charged: Floats
+    v2: Floats
+    half: Floats
+
+
+def _linear_flows(feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats | float) -> _Flows:
+    """The linear power flow, from the injections of the customers."""
+    P, Q = (
+        _below(feeder, -_at_buses(feeder, np.asarray(each, dtype=np.float64)))[..., 1:] for each in (p, q)
+    )
+    base = np.asarray(v0_squared, dtype=np.float64)[..., None]
+    v2 = base + _from_busbar(feeder, -2.0 * (feeder.r * P + feeder.x * Q))
+    half = np.zeros(len(feeder.buses))
+    half[1:] = 0.5 * feeder.charging
+    np.add.at(half, feeder.parent, 0.5 * feeder.charging)
+    return _Flows(P, Q, Q - _below(feeder, half * v2)[..., 1:], v2, half)
+
+
+def _losses(feeder: Feeder, current: Floats, charge: Floats, *, sign: float) -> tuple[Floats, Floats, Floats]:
+    """What squared currents (…, b) and charging powers (…, b + 1) add to P, Q and to the drop of v^2."""
+    loss_p = _strictly_below(feeder, feeder.r * current)
+    loss_q = _strictly_below(feeder, feeder.x * current) + sign * _below(feeder, charge)[..., 1:]
+    drop = 2.0 * (feeder.r * loss_p + feeder.x * loss_q) + (feeder.r**2 + feeder.x**2) * current
+    return loss_p, loss_q, drop
 
 
 def _at_buses(feeder: Feeder, values: Floats) -> Floats:
     """Sum of the customers' `values` (…, N) at every bus, (…, b + 1)."""
     out = np.zeros((*values.shape[:-1], len(feeder.buses)))
     np.add.at(np.moveaxis(out, -1, 0), feeder.bus, np.moveaxis(values, -1, 0))
-    return out
-
-
-def _half_charging(feeder: Feeder) -> Floats:
-    """Susceptance at every bus, (b + 1,): half of each adjacent branch's."""
-    out = np.zeros(len(feeder.buses))
-    out[1:] = 0.5 * feeder.charging
-    np.add.at(out, feeder.parent, 0.5 * feeder.charging)
     return out
 
 
