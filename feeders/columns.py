@@ -1,0 +1,332 @@
+"""What each key of feeder.toml and each column of lines.csv and customers.csv may hold.
+
+One table of columns serves the files, the JSON form of the REST interface, the reader, the writer
+and the documentation, so that they cannot disagree. A cell arrives as text (CSV) or as a JSON or
+TOML value; `parse` turns it into the column's type or into a sentence that says what is wrong.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any, Final
+
+NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+WORDS_NO_NUMBER = {"nan", "inf", "+inf", "-inf", "infinity", "-infinity", "null", "none", "na", "n/a", "-"}
+NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
+LONGEST_ID = 128
+SHOWN = 60
+
+
+class Kind(Enum):
+    """The type of a cell."""
+
+    TEXT = "text"
+    ID = "an id: printable text of at most 128 characters"
+    NAME = "a name of 1 to 64 of the characters A-Z a-z 0-9 _ -"
+    NUMBER = "a number"
+    WHOLE = "a whole number"
+    TRUTH = "true or false"
+    PAIR = "a pair of numbers"
+    NAMES = "a list of names"
+
+
+class _Missing(Enum):
+    REQUIRED = "required"
+    BAD = "bad"
+
+
+REQUIRED: Final = _Missing.REQUIRED
+BAD: Final = _Missing.BAD
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """One column, or one key of feeder.toml.
+
+    Attributes
+    ----------
+    name
+        As in the file's header; the unit is part of the name.
+    kind
+        Type of the cell.
+    meaning
+        What the cell says, with its unit; used in messages and in the documentation.
+    default
+        Value of an empty or absent cell; REQUIRED if there is none.
+    low, high
+        Inclusive limits of a number.
+    above
+        Exclusive lower limit of a number.
+    choices
+        The only values allowed, if not None.
+    """
+
+    name: str
+    kind: Kind
+    meaning: str
+    default: Any = REQUIRED
+    low: float | None = None
+    high: float | None = None
+    above: float | None = None
+    choices: tuple[str, ...] | None = None
+
+    @property
+    def right(self) -> str:
+        """What would be right, in words."""
+        if self.choices is not None:
+            return "one of " + ", ".join(self.choices)
+        limits = []
+        if self.above is not None:
+            limits.append(f"above {self.above:g}")
+        if self.low is not None:
+            limits.append(f"at least {self.low:g}")
+        if self.high is not None:
+            limits.append(f"at most {self.high:g}")
+        return " ".join([self.kind.value, " and ".join(limits)]).strip()
+
+    def complaint(self, what: str) -> str:
+        """Return a problem of this column's cell as a sentence, with what would be right."""
+        return f"{what}; expected {self.right} ({self.meaning})"
+
+
+PHASES = ("abc", "a", "b", "c")
+
+LINE_COLUMNS: tuple[Column, ...] = (
+    Column("line", Kind.ID, "id of the line or switch"),
+    Column("from_bus", Kind.ID, "bus at one end"),
+    Column("to_bus", Kind.ID, "bus at the other end"),
+    Column("phases", Kind.TEXT, "conductors", "abc", choices=PHASES),
+    Column("r_ohm", Kind.NUMBER, "series resistance of the whole line, per phase, ohm", low=0.0),
+    Column("x_ohm", Kind.NUMBER, "series reactance of the whole line, per phase, ohm", low=0.0),
+    Column("r0_ohm", Kind.NUMBER, "zero-sequence resistance, ohm", None, low=0.0),
+    Column("x0_ohm", Kind.NUMBER, "zero-sequence reactance, ohm", None, low=0.0),
+    Column("b_us", Kind.NUMBER, "total shunt susceptance, microsiemens per phase", 0.0, low=0.0),
+    Column("tap", Kind.NUMBER, "ratio of an ideal transformer at from_bus", 1.0, above=0.0),
+    Column("closed", Kind.TRUTH, "whether the line carries current", True),
+    Column("rating_a", Kind.NUMBER, "thermal limit, ampere", None, above=0.0),
+    Column("to_x", Kind.NUMBER, "horizontal position of to_bus, any unit", None),
+    Column("to_y", Kind.NUMBER, "vertical position of to_bus, any unit", None),
+)
+
+CUSTOMER_COLUMNS: tuple[Column, ...] = (
+    Column("customer", Kind.ID, "id of the customer"),
+    Column("bus", Kind.ID, "bus of the connection point"),
+    Column("phases", Kind.TEXT, "connected phases", "abc", choices=PHASES),
+    Column("meter", Kind.NAME, "id of the meter; empty: no meter", ""),
+    Column("class_percent", Kind.NUMBER, "accuracy class of the voltage register, %", None, above=0.0),
+    Column("resolution_volt", Kind.NUMBER, "resolution of the voltage register, V", None, low=0.0),
+    Column("jitter_percent", Kind.NUMBER, "1 sigma noise of the voltage, % of nominal", None, low=0.0),
+    Column("p_error_percent", Kind.NUMBER, "error of the active power, % of reading", None, low=0.0),
+    Column("q_error_percent", Kind.NUMBER, "error of the reactive power, % of range", None, low=0.0),
+    Column("load_kw", Kind.NUMBER, "expected peak of the load, kW", low=0.0),
+    Column("load_profile", Kind.TEXT, "load profile of the library", ""),
+    Column("power_factor", Kind.NUMBER, "expected power factor of the load", None, above=0.0, high=1.0),
+    Column("power_factor_min", Kind.NUMBER, "its smallest value", None, above=0.0, high=1.0),
+    Column("power_factor_max", Kind.NUMBER, "its largest value", None, above=0.0, high=1.0),
+    Column("q_floor_kvar", Kind.NUMBER, "load's reactive power that does not follow p, kvar", None, low=0.0),
+    Column("pv_kw", Kind.NUMBER, "peak of the generation, kW", 0.0, low=0.0),
+    Column("pv_profile", Kind.TEXT, "generation profile of the library", ""),
+    Column("inverter_kva", Kind.NUMBER, "rating of the droop inverter, kVA; 0: none", 0.0, low=0.0),
+    Column("droop", Kind.TEXT, "droop preset of the inverter", ""),
+    Column("tau_s", Kind.NUMBER, "time constant of the inverter, s; empty: the preset's", None, above=0.0),
+)
+
+ESTIMATORS = ("exact-bank",)
+SUSPICIONS = ("voltage", "impedance", "ratio", "rating", "load", "class")
+
+META_COLUMNS: dict[str, tuple[Column, ...]] = {
+    "": (
+        Column("format", Kind.WHOLE, "version of this format", low=1, high=1),
+        Column("name", Kind.NAME, "name of the feeder"),
+        Column("title", Kind.TEXT, "title for people", ""),
+        Column("voltage_volt", Kind.NUMBER, "nominal voltage, phase to neutral, V", above=0.0),
+        Column(
+            "base_kva", Kind.NUMBER, "three-phase base power of the per-unit system, kVA", 100.0, above=0.0
+        ),
+        Column("busbar", Kind.ID, "bus whose voltage the busbar meter reads; root of the feeder"),
+        Column("busbar_xy", Kind.PAIR, "position of the busbar", None),
+        Column("busbar_class_percent", Kind.NUMBER, "accuracy class of the busbar meter, %", 0.1, above=0.0),
+        Column("busbar_resolution_volt", Kind.NUMBER, "its resolution, V", 0.1, low=0.0),
+        Column("busbar_jitter_percent", Kind.NUMBER, "its 1 sigma noise, % of nominal", 0.02, low=0.0),
+        Column("accept", Kind.NAMES, "suspicions that were checked and are right", (), choices=SUSPICIONS),
+    ),
+    "limits": (
+        Column("v_min_pu", Kind.NUMBER, "lowest allowed voltage, pu", 0.9, above=0.0, high=2.0),
+        Column("v_max_pu", Kind.NUMBER, "highest allowed voltage, pu", 1.1, above=0.0, high=2.0),
+    ),
+    "meters": (
+        Column("class_percent", Kind.NUMBER, "accuracy class of the voltage registers, %", 0.5, above=0.0),
+        Column("resolution_volt", Kind.NUMBER, "resolution of the voltage registers, V", 0.1, low=0.0),
+        Column("jitter_percent", Kind.NUMBER, "1 sigma noise of the voltage, % of nominal", 0.05, low=0.0),
+        Column("p_error_percent", Kind.NUMBER, "error of the active power, % of reading", 1.0, low=0.0),
+        Column("q_error_percent", Kind.NUMBER, "error of the reactive power, % of range", 2.0, low=0.0),
+        Column("p_resolution_kw", Kind.NUMBER, "resolution of the active power, kW", 0.01, low=0.0),
+    ),
+    "load": (
+        Column("power_factor", Kind.NUMBER, "expected power factor, lagging", 0.95, above=0.0, high=1.0),
+        Column("power_factor_min", Kind.NUMBER, "its smallest value", 0.9, above=0.0, high=1.0),
+        Column("power_factor_max", Kind.NUMBER, "its largest value", 1.0, above=0.0, high=1.0),
+        Column(
+            "q_floor_percent",
+            Kind.NUMBER,
+            "reactive power that does not follow p, % of load_kw",
+            2.0,
+            low=0.0,
+        ),
+    ),
+    "monitor": (
+        Column("estimator", Kind.TEXT, "estimator family", "exact-bank", choices=ESTIMATORS),
+        Column("max_attacked", Kind.WHOLE, "manipulated meters to withstand", 1, low=0),
+        Column("tick_s", Kind.NUMBER, "period of the frames, s", 1.0, above=0.0),
+        Column(
+            "on_delay_s", Kind.NUMBER, "how long a condition must last to raise an alarm, s", 2.0, low=0.0
+        ),
+        Column("off_delay_s", Kind.NUMBER, "how long it must be gone to clear it, s", 5.0, low=0.0),
+        Column("silence_s", Kind.NUMBER, "silence after which a meter counts as lost, s", 10.0, above=0.0),
+    ),
+}
+
+
+def shown(cell: object) -> str:
+    """Return a cell's value for a message: quoted, and cut where it is long."""
+    try:
+        text = repr(cell)
+    except (ValueError, RecursionError):  # integers of thousands of digits, nested JSON
+        text = f"a {type(cell).__name__} that is too large to show"
+    return text if len(text) <= SHOWN else text[: SHOWN - 1] + "…"
+
+
+def parse(column: Column, cell: object) -> tuple[Any, str | None]:
+    """Turn one cell into the column's type.
+
+    Parameters
+    ----------
+    column
+        What the cell should be.
+    cell
+        Text of a CSV file, a TOML or JSON value, or None where there is nothing.
+
+    Returns
+    -------
+    value, problem
+        The value, or BAD together with a sentence that names the value and what would be right.
+    """
+    if isinstance(cell, str):
+        cell = cell.strip()
+    if cell is None or (isinstance(cell, str) and cell == ""):
+        if column.default is REQUIRED:
+            return BAD, column.complaint("is missing")
+        return column.default, None
+    value, what = _PARSERS[column.kind](cell)
+    if what is not None:
+        return BAD, column.complaint(what)
+    what = _outside(column, value)
+    return (BAD, column.complaint(what)) if what is not None else (value, None)
+
+
+def _outside(column: Column, value: Any) -> str | None:
+    """Return what is wrong with a value of the right type, None if nothing is."""
+    if column.choices is not None:
+        given: Iterable[Any] = value if isinstance(value, tuple) else (value,)
+        return next((f"{shown(item)} is not known" for item in given if item not in column.choices), None)
+    if not isinstance(value, (int, float)) or isinstance(value, bool):
+        return None
+    if column.above is not None and value <= column.above:
+        return f"{value:g} is {'negative' if value < 0 else 'too small'}"
+    if column.low is not None and value < column.low:
+        return f"{value:g} is {'negative' if value < 0 else 'too small'}"
+    if column.high is not None and value > column.high:
+        return f"{value:g} is too large"
+    return None
+
+
+def _text(cell: object) -> tuple[Any, str | None]:
+    if not isinstance(cell, str):
+        return BAD, f"{shown(cell)} is not text"
+    if not cell.isprintable():
+        return BAD, f"{shown(cell)} holds characters that cannot be printed"
+    return cell, None
+
+
+def _id(cell: object) -> tuple[Any, str | None]:
+    value, what = _text(cell)
+    if what is None and len(value) > LONGEST_ID:
+        return BAD, f"{shown(cell)} is longer than {LONGEST_ID} characters"
+    return value, what
+
+
+def _name(cell: object) -> tuple[Any, str | None]:
+    if not isinstance(cell, str) or NAME.fullmatch(cell) is None:
+        return BAD, f"{shown(cell)} is not a valid name"
+    return cell, None
+
+
+def _number(cell: object) -> tuple[Any, str | None]:
+    if isinstance(cell, bool):
+        return BAD, f"{shown(cell)} is not a number"
+    if isinstance(cell, (int, float)):
+        try:
+            value = float(cell)
+        except OverflowError:
+            return BAD, f"{shown(cell)} is too large for a number"
+    elif isinstance(cell, str):
+        if cell.lower() in WORDS_NO_NUMBER:
+            return BAD, f"{shown(cell)} is not a finite number (leave the cell empty if there is none)"
+        if NUMBER.fullmatch(cell) is None:
+            comma = NUMBER.fullmatch(cell.replace(",", ".")) is not None
+            return BAD, f"{shown(cell)} is not a number" + (" (decimal point, not comma)" if comma else "")
+        value = float(cell)
+    else:
+        return BAD, f"{shown(cell)} is not a number"
+    if not math.isfinite(value):
+        return BAD, f"{shown(cell)} is not a finite number"
+    return value, None
+
+
+def _whole(cell: object) -> tuple[Any, str | None]:
+    value, what = _number(cell)
+    if what is not None:
+        return value, what
+    if value != int(value):
+        return BAD, f"{shown(cell)} is not a whole number"
+    return int(value), None
+
+
+def _truth(cell: object) -> tuple[Any, str | None]:
+    if isinstance(cell, bool):
+        return cell, None
+    if isinstance(cell, str) and cell.lower() in ("true", "1"):
+        return True, None
+    if isinstance(cell, str) and cell.lower() in ("false", "0"):
+        return False, None
+    return BAD, f"{shown(cell)} is neither true nor false"
+
+
+def _pair(cell: object) -> tuple[Any, str | None]:
+    if not isinstance(cell, (list, tuple)) or len(cell) != 2:
+        return BAD, f"{shown(cell)} is not a pair"
+    parsed = [_number(item) for item in cell]
+    bad = next((what for _, what in parsed if what is not None), None)
+    return (BAD, bad) if bad is not None else (tuple(value for value, _ in parsed), None)
+
+
+def _names(cell: object) -> tuple[Any, str | None]:
+    if not isinstance(cell, (list, tuple)) or not all(isinstance(item, str) for item in cell):
+        return BAD, f"{shown(cell)} is not a list of names"
+    return tuple(cell), None
+
+
+_PARSERS: dict[Kind, Callable[[object], tuple[Any, str | None]]] = {
+    Kind.TEXT: _text,
+    Kind.ID: _id,
+    Kind.NAME: _name,
+    Kind.NUMBER: _number,
+    Kind.WHOLE: _whole,
+    Kind.TRUTH: _truth,
+    Kind.PAIR: _pair,
+    Kind.NAMES: _names,
+}

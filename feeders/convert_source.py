@@ -1,0 +1,143 @@
+"""SOURCE.md: where converted data came from, how to make it again, and the licences beside it."""
+
+from __future__ import annotations
+
+from importlib.metadata import PackageNotFoundError, version
+
+from feeders.schema import FeederTables
+
+ODBL = """\
+The database called SimBench is made available under the Open Database License,
+http://opendatacommons.org/licenses/odbl/1.0/. Any rights in individual contents of the database are
+licensed under the Database Contents License, http://opendatacommons.org/licenses/dbcl/1.0/.
+Copyright (c) 2019-2026 by University of Kassel, TU Dortmund, RWTH Aachen University and Fraunhofer
+Institute for Energy Economics and Energy System Technology (IEE) Kassel and individual contributors.
+
+{this} contains information from SimBench and is made available under the same Open Database License.
+Who publishes a changed version of it must do so under that license too."""
+
+PANDAPOWER = """\
+The network data come with pandapower, which is under the 3-clause BSD license:
+
+Copyright (c)
+    2016-2026 University of Kassel
+    2016-2026 Fraunhofer Institute for Energy Economics
+    2016-2026 Energy System Technology (IEE) Kassel
+    2016-2026 individual contributors (see AUTHORS file for details)
+    All rights reserved.
+
+Redistribution and use in source and binary forms, with or without modification, are permitted provided
+that the following conditions are met:
+
+1. Redistributions of source code must retain the above copyright notice, this list of conditions and the
+following disclaimer.
+
+2. Redistributions in binary form must reproduce the above copyright notice, this list of conditions and
+the following disclaimer in the documentation and/or other materials provided with the distribution.
+
+3. Neither the name of the copyright holder nor the names of its contributors may be used to endorse or
+promote products derived from this software without specific prior written permission.
+
+THIS SOFTWARE IS PROVIDED BY THE COPYRIGHT HOLDERS AND CONTRIBUTORS "AS IS" AND ANY EXPRESS OR IMPLIED
+WARRANTIES, INCLUDING, BUT NOT LIMITED TO, THE IMPLIED WARRANTIES OF MERCHANTABILITY AND FITNESS FOR A
+PARTICULAR PURPOSE ARE DISCLAIMED. IN NO EVENT SHALL THE COPYRIGHT HOLDER OR CONTRIBUTORS BE LIABLE FOR ANY
+DIRECT, INDIRECT, INCIDENTAL, SPECIAL, EXEMPLARY, OR CONSEQUENTIAL DAMAGES (INCLUDING, BUT NOT LIMITED TO,
+PROCUREMENT OF SUBSTITUTE GOODS OR SERVICES; LOSS OF USE, DATA, OR PROFITS; OR BUSINESS INTERRUPTION)
+HOWEVER CAUSED AND ON ANY THEORY OF LIABILITY, WHETHER IN CONTRACT, STRICT LIABILITY, OR TORT (INCLUDING
+NEGLIGENCE OR OTHERWISE) ARISING IN ANY WAY OUT OF THE USE OF THIS SOFTWARE, EVEN IF ADVISED OF THE
+POSSIBILITY OF SUCH DAMAGE."""
+
+OWN_FILE = "The licence of the converted file applies; this conversion adds no terms of its own."
+
+ASSUMED = """\
+Every customer has a meter. The transformer is upstream of the metered busbar and not part of the feeder.
+Where the source gives no load profile or no reactive power, the load follows a profile of the library
+(data/profiles), dealt out in the order of the loads: households H0, above 30 kW or at medium voltage trade
+G and agriculture L; its power factor at the peak is then 0.93, as everywhere in SimBench's low voltage.
+power_factor_min, power_factor_max and q_floor_kvar hold every point of the profile's history
+(data/profiles/envelopes.csv)."""
+
+
+def _wrapped(notes: tuple[str, ...]) -> str:
+    return "\n".join(f"- {note}" for note in notes) or "- nothing"
+
+
+def _version(package: str) -> str:
+    try:
+        return f"{package} {version(package)}"
+    except PackageNotFoundError:
+        return package
+
+
+def feeder_source(
+    tables: FeederTables, about: str, origin: str, package: str, command: str, notes: tuple[str, ...]
+) -> str:
+    """Return the SOURCE.md of a converted feeder.
+
+    Parameters
+    ----------
+    tables
+        The feeder.
+    about
+        One sentence on the network.
+    origin
+        What was converted, as `convert` takes it.
+    package
+        `pandapower`, `simbench`, or `file`.
+    command
+        Command line that makes the folder again.
+    notes
+        What was left out, added or changed.
+    """
+    made = _version("pandapower") if package == "file" else _version(package)
+    licence = {"simbench": ODBL.format(this="This folder"), "pandapower": PANDAPOWER, "file": OWN_FILE}[
+        package
+    ]
+    return f"""# {tables.meta.title}
+
+{about}
+
+- Source: `{origin}`, {made}
+- Made by: `{command}`
+- {len(tables.lines)} lines and switches, {len(tables.customers)} customers
+
+{ASSUMED}
+
+## Left out, added, changed
+
+{_wrapped(notes)}
+
+## Licence
+
+{licence}
+"""
+
+
+def profiles_source(first: str, days: int, loads: int, generators: int) -> str:
+    """Return the SOURCE.md of the profile library.
+
+    Parameters
+    ----------
+    first
+        Time of the first sample, in words.
+    days
+        Number of days.
+    loads, generators
+        Numbers of profiles.
+    """
+    return f"""# Load and generation profiles
+
+{days} days from {first}, one value every 15 minutes, of SimBench's low-voltage profiles: {loads} load profiles
+(`_p` active power as a fraction of the peak, `_q` reactive power as a fraction of the one at the peak) and
+{generators} generation profiles (fraction of the peak). `t_s` counts seconds from the first sample.
+
+`envelopes.csv` holds, for each load profile, the narrowest limits `q_low p - q_floor <= q <= q_high p + q_floor`
+that hold every point of SimBench's whole year.
+
+- Source: {_version("simbench")}
+- Made by: `gridsec convert profiles data/profiles`
+
+## Licence
+
+{ODBL.format(this="This folder")}
+"""

@@ -1,0 +1,158 @@
+"""The feeder as a graph: fused buses, the tree below the busbar, loops and islands.
+
+Works on ids alone, so that the checks and the loader see the same graph.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+LOOPS_SHOWN = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Edge:
+    """A closed line: its id, its two buses, and whether it has any impedance."""
+
+    line: str
+    from_bus: str
+    to_bus: str
+    zero: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Tree:
+    """What is connected to the busbar, in topological order.
+
+    Attributes
+    ----------
+    group
+        Fused bus index of every bus that can be reached; 0 is the busbar.
+    buses
+        One id per fused bus: the first of its members in the order of the input.
+    parent
+        Fused bus that feeds bus k + 1; always at most k.
+    branch
+        Index (into the edges given) of the line that feeds bus k + 1.
+    loops
+        Indices of the edges of each loop (at most LOOPS_SHOWN loops). A feeder must have none.
+    islands
+        Buses that cannot be reached, one tuple for each connected piece.
+    """
+
+    group: dict[str, int]
+    buses: tuple[str, ...]
+    parent: tuple[int, ...]
+    branch: tuple[int, ...]
+    loops: tuple[tuple[int, ...], ...]
+    islands: tuple[tuple[str, ...], ...]
+
+
+class _Sets:
+    """Disjoint sets of buses; the representative is the first member in the order of the input."""
+
+    def __init__(self, order: Iterable[str]) -> None:
+        self.rank = {bus: k for k, bus in enumerate(dict.fromkeys(order))}
+        self.above = {bus: bus for bus in self.rank}
+
+    def find(self, bus: str) -> str:
+        root = bus
+        while self.above[root] != root:
+            root = self.above[root]
+        while self.above[bus] != root:
+            self.above[bus], bus = root, self.above[bus]
+        return root
+
+    def join(self, one: str, other: str) -> bool:
+        """Unite the sets of two buses; return False if they were one already."""
+        a, b = self.find(one), self.find(other)
+        if a == b:
+            return False
+        first, second = (a, b) if self.rank[a] < self.rank[b] else (b, a)
+        self.above[second] = first
+        return True
+
+
+def tree(busbar: str, edges: Sequence[Edge], others: Iterable[str] = ()) -> Tree:
+    """Fuse the buses at both ends of zero-impedance lines and walk the rest from the busbar.
+
+    Parameters
+    ----------
+    busbar
+        Root of the tree.
+    edges
+        The closed lines.
+    others
+        Buses that must be reached too (ends of open lines).
+    """
+    order = [busbar, *(bus for edge in edges for bus in (edge.from_bus, edge.to_bus)), *others]
+    fused, connected = _Sets(order), _Sets(order)
+    for edge in edges:
+        if edge.zero:
+            fused.join(edge.from_bus, edge.to_bus)
+            connected.join(edge.from_bus, edge.to_bus)
+    neighbours: dict[str, list[tuple[int, str]]] = {bus: [] for bus in fused.rank}
+    closing = []
+    for k, edge in enumerate(edges):
+        if edge.zero:
+            continue
+        a, b = fused.find(edge.from_bus), fused.find(edge.to_bus)
+        if connected.join(a, b):
+            neighbours[a].append((k, b))
+            neighbours[b].append((k, a))
+        else:
+            closing.append(k)
+    index, parent, branch = _walk(fused.find(busbar), neighbours)
+    loops = tuple(_loop(k, edges[k], fused, neighbours) for k in closing[:LOOPS_SHOWN])
+    pieces: dict[str, list[str]] = {}
+    for bus in fused.rank:
+        if fused.find(bus) not in index:
+            pieces.setdefault(connected.find(bus), []).append(bus)
+    return Tree(
+        {bus: index[fused.find(bus)] for bus in fused.rank if fused.find(bus) in index},
+        tuple(index),
+        parent,
+        branch,
+        loops,
+        tuple(map(tuple, pieces.values())),
+    )
+
+
+def _walk(
+    root: str, neighbours: dict[str, list[tuple[int, str]]]
+) -> tuple[dict[str, int], tuple[int, ...], tuple[int, ...]]:
+    """Number the buses depth first, feeder by feeder, as an operator would read the diagram."""
+    index: dict[str, int] = {}
+    parent: list[int] = []
+    branch: list[int] = []
+    stack = [(root, -1, -1)]
+    while stack:
+        bus, above, line = stack.pop()
+        index[bus] = len(index)
+        if above >= 0:
+            parent.append(above)
+            branch.append(line)
+        stack.extend((b, index[bus], k) for k, b in reversed(neighbours[bus]) if b not in index)
+    return index, tuple(parent), tuple(branch)
+
+
+def _loop(
+    closing: int, edge: Edge, fused: _Sets, neighbours: dict[str, list[tuple[int, str]]]
+) -> tuple[int, ...]:
+    """Return the edges of the loop that one more edge closes: that edge and the path between its ends."""
+    start, goal = fused.find(edge.from_bus), fused.find(edge.to_bus)
+    came: dict[str, tuple[int, str] | None] = {start: None}
+    stack = [start]
+    while stack and goal not in came:
+        bus = stack.pop()
+        for k, other in neighbours[bus]:
+            if other not in came:
+                came[other] = (k, bus)
+                stack.append(other)
+    path = [closing]
+    step = came.get(goal)
+    while step is not None:
+        path.append(step[0])
+        step = came[step[1]]
+    return tuple(path)
