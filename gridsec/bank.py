@@ -1,0 +1,350 @@
+"""The exact observer bank of chong2020: one observer for every set of N - M and of N - 2M meters.
+
+If at most M of p > 2M meters lie, one large set S contains no liar, and every large set contains a
+small one without liars. The estimate of the S that agrees best with its small subsets is therefore
+close to the truth, whatever the liars say (Theorem 2). `step` moves all observers at once; there is no
+loop over observers.
+
+References
+----------
+chong2020, equations (5) to (8), Theorem 2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from gridsec import slots, stacked
+from gridsec.arrays import Bools, Floats, Ints
+from gridsec.errors import DesignInfeasible
+from gridsec.lure import Lure, StepPolicy
+from gridsec.slots import SlotState
+from gridsec.stacked import Gains, StackedState, direct_gains
+from gridsec.subsets import Subsets, subsets
+
+__all__ = [
+    "POLICY",
+    "Bank",
+    "BankState",
+    "Gains",
+    "consistency",
+    "design",
+    "direct_gains",
+    "estimate",
+    "init",
+    "select",
+    "spread",
+    "step",
+    "subsets",
+]
+
+BankState = SlotState | StackedState
+
+MOST_OBSERVERS = 200_000
+POLICY = StepPolicy(substep=1.0, settled=1e-6, tol=1e-10, max_iter=60)
+"""Time steps of the bank: coarser than the simulation's, see docs/theory-detection.md."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bank:
+    """Both banks of observers for one plant. p meters, M liars at most, o observers.
+
+    Attributes
+    ----------
+    lure
+        The plant.
+    sets
+        Sensor subsets and who is compared to whom.
+    masks : (o, p)
+        Meters that each observer listens to; the C(p, M) large sets first.
+    sizes : (o,)
+        Their numbers.
+    direct
+        Whether the gains are direct injection.
+    gains
+        Stacked gains; None for direct injection in its structured form.
+    layout, base
+        The structured form of direct injection; None otherwise.
+    policy
+        Accuracy of the time steps.
+    """
+
+    lure: Lure
+    sets: Subsets
+    masks: Bools
+    sizes: Ints
+    direct: bool
+    gains: Gains | None
+    layout: slots.Layout | None
+    base: slots.Plan | None
+    policy: StepPolicy
+
+
+def design(
+    lure: Lure,
+    max_attacked: int,
+    *,
+    gains: Literal["direct"] | Gains = "direct",
+    reactive: Floats | None = None,
+    policy: StepPolicy = POLICY,
+    most: int = MOST_OBSERVERS,
+) -> Bank:
+    """Build both banks.
+
+    Parameters
+    ----------
+    lure
+        The plant with p meters.
+    max_attacked
+        M, how many meters may lie at the same time.
+    gains
+        `direct`, or gains of all observers in the order of `subsets(p, M).masks()`.
+    reactive : (l, p), optional
+        What one pu of reactive injection at each meter's customer does to u; direct injection only.
+        Needed where net reactive power is metered at customers without an inverter.
+    policy
+        Accuracy of the time steps.
+    most
+        Largest number of observers that is acceptable.
+
+    Raises
+    ------
+    NotObservable
+        Unless p > 2M.
+    DesignInfeasible
+        If there would be too many observers, or if an observer listens to none of its meters: the
+        degenerate gains L = K = 0 satisfy every convergence condition here and detect nothing.
+
+    References
+    ----------
+    chong2020, Theorem 1 and equation (5).
+    """
+    p = lure.C.shape[0]
+    sets = subsets(p, max_attacked, most=most)
+    masks = sets.masks()
+    sizes = masks.sum(axis=1)
+    if isinstance(gains, str):
+        lay = slots.layout(lure, reactive)
+        base = slots.make_plan(lay, sets, np.ones(p, dtype=np.bool_))
+        return Bank(lure, sets, masks, sizes, True, None, lay, base, policy)
+    _check_gains(lure, masks, gains)
+    return Bank(lure, sets, masks, sizes, False, gains, None, None, policy)
+
+
+def _check_gains(lure: Lure, masks: Bools, gains: Gains) -> None:
+    """Refuse gains of the wrong shape, gains from meters outside the set, and gains that do nothing."""
+    o, p = masks.shape
+    n, m = lure.A.shape[0], lure.slope.size
+    if gains.L.shape != (o, n, p) or gains.K.shape != (o, m, p):
+        raise ValueError(
+            f"gains have shapes {gains.L.shape}, {gains.K.shape}; expected {(o, n, p)}, {(o, m, p)}"
+        )
+    if not (np.isfinite(gains.L).all() and np.isfinite(gains.K).all()):
+        raise ValueError("gains must be finite")
+    outside = ~masks[:, None, :]
+    if (gains.L * outside).any() or (gains.K * outside).any():
+        raise ValueError("an observer has gains from a meter outside its set")
+    deaf = ~(gains.L.any(axis=(1, 2)) | gains.K.any(axis=(1, 2)))
+    # A set whose meters sit at no inverter has nothing to inject into; its silence is no degeneracy.
+    reach = (direct_gains(lure, masks).K != 0).any(axis=(1, 2))
+    if (deaf & reach).any() and n:
+        raise DesignInfeasible(
+            "observer bank",
+            f"{np.count_nonzero(deaf & reach)} of {o} observers have L = K = 0: they converge because the "
+            "plant does, listen to no meter, agree with each other under any attack, and so detect nothing",
+        )
+
+
+def init(bank: Bank, y: Floats, u: Floats, seen: Bools, *, net: Floats | None = None) -> BankState:
+    """All observers at the equilibrium that the first readings suggest.
+
+    Parameters
+    ----------
+    bank
+        The design.
+    y : (p,)
+        Readings as `z = vbar^2 - v^2`, pu; anything where not seen.
+    u : (l,)
+        Known input w, pu.
+    seen : (p,)
+        Live meters.
+    net : (p,), optional
+        As in `step`.
+    """
+    if bank.gains is not None:
+        state = stacked.start(bank.lure, bank.gains, bank.policy)
+        return stacked.settle(bank.lure, bank.gains, state, y=y, u=u, seen=seen, policy=bank.policy)
+    lay, base = _structure(bank)
+    first = slots.follow(lay, bank.sets, slots.start(lay, bank.sets, base, bank.policy), seen, None)
+    return slots.settle(lay, first, slots.drive(lay, y, u, seen, net), bank.policy)
+
+
+def step(  # noqa: PLR0917  # design and state, then the four inputs that every observer's step has
+    bank: Bank,
+    state: BankState,
+    y: Floats,
+    u: Floats,
+    seen: Bools,
+    h: float,
+    *,
+    net: Floats | None = None,
+    adopt: Floats | None = None,
+) -> BankState:
+    """All observers a time h later, under inputs that are held.
+
+    Parameters
+    ----------
+    bank, state
+        Design and state.
+    y : (p,)
+        Readings as `z = vbar^2 - v^2`, pu; anything where not seen.
+    u : (l,)
+        Known input w, pu.
+    seen : (p,)
+        Live meters. A silent meter is trusted by nobody; the observers go on. With 2M or fewer live
+        meters the banks rest, and only an observer that trusts no meter goes on.
+    h
+        Length of the step, s, not negative.
+    net : (p,), optional
+        Metered net reactive injection of each meter's customer minus what u assumes for its load, pu;
+        NaN where not reported. An observer uses it exactly if it trusts the meter. Direct injection
+        only.
+    adopt : (n,), optional
+        Injections from which inverters start whose meter has just returned. Direct injection only.
+    """
+    # Equal steps that differ by rounding share their coefficients.
+    h = round(h, 6)
+    if isinstance(state, StackedState):
+        gains = _gains(bank)
+        return stacked.advance(bank.lure, gains, state, y=y, u=u, seen=seen, h=h, policy=bank.policy)
+    lay, _ = _structure(bank)
+    state = slots.follow(lay, bank.sets, state, seen, adopt)
+    live = seen if state.plan is not None else np.zeros_like(seen)
+    return slots.advance(lay, state, slots.drive(lay, y, u, live, net), h, bank.policy)
+
+
+def _structure(bank: Bank) -> tuple[slots.Layout, slots.Plan]:
+    if bank.layout is None or bank.base is None:
+        raise ValueError("this state belongs to a bank with direct injection")
+    return bank.layout, bank.base
+
+
+def _gains(bank: Bank) -> Gains:
+    if bank.gains is None:
+        raise ValueError("this state belongs to a bank with stacked gains")
+    return bank.gains
+
+
+def decided(bank: Bank, state: BankState) -> bool:
+    """Whether enough meters are alive for the bank's guarantee: more than 2M.
+
+    Parameters
+    ----------
+    bank, state
+        Design and state.
+    """
+    return int(np.count_nonzero(state.seen)) > 2 * bank.sets.max_attacked
+
+
+def consistency(bank: Bank, state: BankState) -> Floats:
+    """How much each large set disagrees with its small subsets.
+
+    `pi_S = max over P within S of max_i |x_S,i - x_P,i|`
+
+    Parameters
+    ----------
+    bank, state
+        Design and state.
+
+    Returns
+    -------
+    (C(p, M),)
+        pi, pu of reactive power. Empty while 2M or fewer meters are alive.
+
+    References
+    ----------
+    chong2020, equation (6).
+    """
+    if isinstance(state, SlotState):
+        return slots.consistency(_structure(bank)[0], bank.sets, state)
+    if not decided(bank, state):
+        return np.zeros(0)
+    sets = bank.sets
+    large, small = state.x[: sets.count_large], state.x[sets.count_large :]
+    gaps = np.stack([np.abs(small - large[parent]).max(axis=1, initial=0.0) for parent in sets.parent])
+    return np.asarray(gaps.ravel()[sets.pairs].max(axis=1))
+
+
+def select(
+    pi: Floats, *, allowed: Bools | None = None, penalty: Floats | None = None, tie: float = 0.0
+) -> int:
+    """The large set to believe: smallest pi, ties by smallest penalty, then by number.
+
+    Parameters
+    ----------
+    pi : (s,)
+        From `consistency`.
+    allowed : (s,), optional
+        Sets that may be chosen; all by default.
+    penalty : (s,), optional
+        What decides between equals. Inside deadbands all observers coincide and every pi is zero.
+    tie
+        Sets whose pi is at most the smallest one plus this are equals, pu.
+
+    Returns
+    -------
+    int
+        Number of the set, -1 if there is none to choose from.
+
+    References
+    ----------
+    chong2020, equation (7).
+    """
+    value = pi if allowed is None else np.where(allowed, pi, np.inf)
+    if not value.size or not np.isfinite(value).any():
+        return -1
+    best = int(np.argmin(value))
+    if penalty is None:
+        return best
+    equal = value <= value[best] + tie
+    return int(np.argmin(np.where(equal, penalty, np.inf)))
+
+
+def spread(bank: Bank, state: BankState, index: int) -> Floats:
+    """`max over P within S of |x_S,i - x_P,i|` for one large set S, inverter by inverter.
+
+    Parameters
+    ----------
+    bank, state
+        Design and state.
+    index
+        Number of S.
+
+    Returns
+    -------
+    (n,)
+        Deviations, pu; their maximum is `pi_S`.
+    """
+    if isinstance(state, SlotState):
+        return slots.spread(_structure(bank)[0], bank.sets, state, index)
+    members = bank.sets.count_large + bank.sets.pairs[index] % bank.sets.count_small
+    return np.asarray(np.abs(state.x[members] - state.x[index]).max(axis=0))
+
+
+def estimate(bank: Bank, state: BankState, index: int) -> Floats:
+    """Reactive injections (n,) that one observer believes in.
+
+    Parameters
+    ----------
+    bank, state
+        Design and state.
+    index
+        Number of the observer as in `Bank.masks`. -1: with direct injection, the observer that trusts
+        every live meter, and none while 2M or fewer are alive; with other gains, the median of all.
+    """
+    if isinstance(state, SlotState):
+        return slots.estimate(_structure(bank)[0], bank.sets, state, index)
+    return np.asarray(state.x[index] if index >= 0 else np.median(state.x, axis=0))

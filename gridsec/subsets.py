@@ -1,0 +1,134 @@
+"""Index arithmetic of the two banks: which meters each observer leaves out, and who is compared to whom.
+
+A set of meters is written by what it leaves *out*: chong2020's S leaves out M of p meters, P leaves out
+2M, and P lies within S exactly if S leaves out M of the 2M meters that P leaves out. That makes both the
+sets and all their comparisons plain tables, computed once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+from math import comb
+
+import numpy as np
+
+from gridsec.arrays import Bools, Ints
+from gridsec.errors import DesignInfeasible, NotObservable
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Subsets:
+    """The sensor subsets of chong2020's two banks. p meters, M attacked at most.
+
+    Attributes
+    ----------
+    meters
+        p.
+    max_attacked
+        M.
+    out_large : (C(p, M), M)
+        Meters that each large set S leaves out, ascending.
+    out_small : (C(p, 2M), 2M)
+        Meters that each small set P leaves out, ascending.
+    choices : (C(2M, M), M)
+        The ways to pick M of the 2M places of `out_small`.
+    parent : (C(2M, M), C(p, 2M))
+        `parent[c, P]`: the S that leaves out those of P's meters that choice c picks.
+    pairs : (C(p, M), C(p - M, M))
+        For each S, where its comparisons stand in an array of shape `parent.shape`, flattened.
+    """
+
+    meters: int
+    max_attacked: int
+    out_large: Ints
+    out_small: Ints
+    choices: Ints
+    parent: Ints
+    pairs: Ints
+
+    @property
+    def count_large(self) -> int:
+        """Number of large sets S."""
+        return int(self.out_large.shape[0])
+
+    @property
+    def count_small(self) -> int:
+        """Number of small sets P."""
+        return int(self.out_small.shape[0])
+
+    def masks(self) -> Bools:
+        """Membership (C(p, M) + C(p, 2M), p) of the meters, large sets first."""
+        rows = []
+        for out in (self.out_large, self.out_small):
+            mask = np.ones((out.shape[0], self.meters), dtype=np.bool_)
+            np.put_along_axis(mask, out, values=False, axis=1)
+            rows.append(mask)
+        return np.concatenate(rows)
+
+
+def subsets(meters: int, max_attacked: int, *, most: int) -> Subsets:
+    """The tables for p meters of which M may lie.
+
+    Parameters
+    ----------
+    meters
+        p, number of meters.
+    max_attacked
+        M, number of meters that may be manipulated at the same time.
+    most
+        Largest number of observers that is acceptable.
+
+    Raises
+    ------
+    NotObservable
+        Unless p > 2M.
+    DesignInfeasible
+        If the banks would hold more than `most` observers.
+
+    References
+    ----------
+    chong2020, Theorem 1 (ii), equations (5) and (6).
+    """
+    if max_attacked < 0:
+        raise ValueError(f"max_attacked is {max_attacked}; it cannot be negative")
+    if meters <= 2 * max_attacked:
+        raise NotObservable(
+            range(meters),
+            meters,
+            f"{meters} meters cannot be told apart when {max_attacked} of them may lie: "
+            f"more than {2 * max_attacked} meters are needed (chong2020, Theorem 1), because two groups of "
+            f"{max_attacked} liars could otherwise tell two different stories that are equally credible",
+        )
+    count = comb(meters, max_attacked) + comb(meters, 2 * max_attacked)
+    if count > most:
+        raise DesignInfeasible(
+            f"exact bank for {meters} meters of which {max_attacked} may lie",
+            f"it needs {count} observers, and at most {most} are allowed; allow fewer manipulated meters",
+        )
+    out_large = _combinations(meters, max_attacked)
+    out_small = _combinations(meters, 2 * max_attacked)
+    choices = _combinations(2 * max_attacked, max_attacked)
+    parent = np.stack([_rank(out_small[:, pick], meters) for pick in choices])
+    pairs = np.argsort(parent, axis=None, kind="stable").reshape(out_large.shape[0], -1)
+    return Subsets(meters, max_attacked, out_large, out_small, choices, parent, pairs)
+
+
+def _combinations(n: int, k: int) -> Ints:
+    """All k-element subsets of range(n), each ascending, in lexicographic order; (C(n, k), k)."""
+    flat = [i for chosen in combinations(range(n), k) for i in chosen]
+    return np.array(flat, dtype=np.intp).reshape(comb(n, k), k)
+
+
+def _rank(rows: Ints, n: int) -> Ints:
+    """Position of each ascending row among `_combinations(n, k)`; (r,).
+
+    `C(n, k) - 1 - sum_i C(n - 1 - row_i, k - i)`: after a row come those that exceed it in its first,
+    second, … differing place.
+    """
+    k = rows.shape[1]
+    after = np.zeros(rows.shape[0], dtype=np.intp)
+    for i in range(k):
+        table = np.array([comb(n - 1 - value, k - i) for value in range(n)], dtype=np.intp)
+        after += table[rows[:, i]]
+    return comb(n, k) - 1 - after
