@@ -21,6 +21,7 @@ from typing import Final
 import numpy as np
 
 from feeders.powerflow import PowerFlow
+from feeders.variation import Demand
 from gridsec.arrays import Floats
 from gridsec.droop import Droop
 from gridsec.errors import GridsecError
@@ -102,6 +103,7 @@ class ClosedLoop:
         self._base_kva = base_kva
         self._base_volt = base_volt
         self._customer = droop.customer
+        self._owner = np.eye(flow.grid.customer_bus.size)[droop.customer]
         # One ramp between each pair of neighbouring breakpoints, (m, 3).
         self._low, self._high = droop.v[:, :-1], droop.v[:, 1:]
         self._start = droop.q[:, 0]
@@ -110,21 +112,33 @@ class ClosedLoop:
         self._sensitivity: Floats | None = None
 
     def reactive(self, q_kvar: Floats, x: Floats) -> Floats:
-        """Net reactive import of each customer, kvar: the load's minus what its inverters inject."""
-        net = q_kvar.copy()
-        np.subtract.at(net, self._customer, x * self._base_kva)
-        return net
+        """Net reactive import (…, N), kvar: the loads' q (…, N) minus what inverters inject, x (…, m)."""
+        return q_kvar - self._base_kva * (x @ self._owner)
 
     def setpoint(self, v_volt: Floats) -> Floats:
-        """K(v) of every inverter, pu, from the customers' voltages, V."""
-        v = (v_volt[self._customer] / self._base_volt)[:, None]
-        climbed: Floats = ((np.clip(v, self._low, self._high) - self._low) * self._ramp).sum(axis=1)
+        """K(v) of every inverter (…, m), pu, from the customers' voltages (…, N), V."""
+        v = (v_volt[..., self._customer] / self._base_volt)[..., None]
+        climbed: Floats = ((np.clip(v, self._low, self._high) - self._low) * self._ramp).sum(axis=-1)
         return self._start + climbed
 
     def point(self, loads: Loads, x: Floats) -> Point:
         """The feeder with given injections x, pu, whatever the inverters would like."""
         v_volt, v_bus_volt = self.flow.solve(loads.p_kw, self.reactive(loads.q_kvar, x), loads.v0_volt)
         return Point(x, self.setpoint(v_volt), v_volt, v_bus_volt)
+
+    def held(self, demand: Demand, rows: slice, x: Floats) -> tuple[Floats, Floats, Floats]:
+        """The feeder at many instants at once with given injections x (T, m), pu.
+
+        Returns
+        -------
+        v_volt (T, N), v_bus_volt (T, b + 1)
+            Voltages, V.
+        setpoint (T, m)
+            K(v), pu.
+        """
+        q = self.reactive(demand.q_kvar[rows], x)
+        v_volt, v_bus_volt = self.flow.solve_batch(demand.p_kw[rows], q, demand.v0_volt[rows])
+        return v_volt, v_bus_volt, self.setpoint(v_volt)
 
     def equilibrium(self, loads: Loads, start: Floats | None = None) -> Point:
         """The point where every inverter injects what its curve asks for: x = K(v(x)).
@@ -153,11 +167,16 @@ class ClosedLoop:
         h
             Length of the step, s, > 0.
         """
-        decay = np.exp(-h / self.tau)
-        new = 1.0 + np.expm1(-h / self.tau) * self.tau / h
-        kept = decay * now.x + (1.0 - decay - new) * now.setpoint
+        decay, old, new = self.weights(h)
+        kept = decay * now.x + old * now.setpoint
         ahead = now.setpoint if before is None else 2.0 * now.setpoint - before.setpoint
         return self.settle(loads, kept, new, kept + new * ahead)
+
+    def weights(self, h: float) -> tuple[Floats, Floats, Floats]:
+        """Weights of x, K(v) and K(v+) in a step of h seconds; each (m,), together 1."""
+        decay = np.exp(-h / self.tau)
+        new = 1.0 + np.expm1(-h / self.tau) * self.tau / h
+        return decay, 1.0 - decay - new, new
 
     def settle(self, loads: Loads, kept: Floats, new: Floats, guess: Floats) -> Point:
         """Solve x = kept + new K(v(x)).
@@ -221,7 +240,7 @@ class ClosedLoop:
     def _measure(self, loads: Loads, here: Point) -> Floats:
         """dv/dx between all inverters by AC power flow, 1, (m, m)."""
         probes = here.x + PROBE_PU * np.eye(self.count)
-        q = np.array([self.reactive(loads.q_kvar, x) for x in probes])
+        q = self.reactive(loads.q_kvar, probes)
         p = np.broadcast_to(loads.p_kw, q.shape)
         v, _ = self.flow.solve_batch(p, q, np.full(self.count, loads.v0_volt))
         change = (v - here.v_volt)[:, self._customer]

@@ -1,0 +1,361 @@
+"""Scenarios: a real feeder, its loads, inverters, meters and attackers, played tick by tick.
+
+The truth is full AC power flow with the droop inverters in closed loop (`feeders.inverters`); what comes out
+are readings as a service would receive them, beside the truth that they should have told. The same scenario
+gives the same numbers every time; no clock is read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from heapq import heappop, heappush
+from itertools import count
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from feeders.load import Snapshot
+from feeders.meters import BUSBAR, Channel, Delivery, MeterErrors, Meters, Registers
+from feeders.truth import Block, net_reactive, truth
+from feeders.variation import Variation
+from gridsec.arrays import Bools, Floats, Ints
+from gridsec.attack import Attack, Reports, apply_all, manipulated, reach
+
+if TYPE_CHECKING:
+    from feeders.load import Site
+
+START: Final = 1_780_272_000.0
+"""Monday, 1 June 2026, 00:00 UTC."""
+
+NOON_S: Final = 43_200.0
+LONGEST_LOOK_BACK_S: Final = 7 * 86_400.0
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """What happens to a feeder.
+
+    Attributes
+    ----------
+    seed
+        Chooses everything random, >= 0.
+    start
+        Unix time of the first tick, s.
+    duration_s
+        Ticks are at start + k dt_s < start + duration_s; may be infinite.
+    dt_s
+        Interval between readings, s.
+    profile_s
+        Position within the fourteen days of the profiles at `start`, s; noon of the first Monday by default.
+    substep_s
+        Longest step of the integrator, s; None: half the smallest time constant of the inverters, or one
+        quasi-static step where a tick is more than ten of the largest.
+    variation, errors, channel
+        How loads and busbar vary, what errors meters have, what happens to readings on the way.
+    attacks
+        Who lies, when and how, applied in this order. Meters are indices into `Site.meters`.
+    """
+
+    seed: int = 0
+    start: float = START
+    duration_s: float = 600.0
+    dt_s: float = 1.0
+    profile_s: float = NOON_S
+    substep_s: float | None = None
+    variation: Variation = field(default_factory=Variation)
+    errors: MeterErrors = field(default_factory=MeterErrors)
+    channel: Channel = field(default_factory=Channel)
+    attacks: tuple[Attack, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.seed < 0:
+            raise ValueError(f"seed must not be negative, got {self.seed}")
+        if not (np.isfinite(self.start) and self.start >= 0.0):
+            raise ValueError(f"start must be a Unix time, got {self.start}")
+        if not self.duration_s > 0.0:
+            raise ValueError(f"duration_s must be positive, got {self.duration_s}")
+        if not 0.0 < self.dt_s < np.inf:
+            raise ValueError(f"dt_s must be positive and finite, got {self.dt_s}")
+        if self.substep_s is not None and not self.substep_s > 0.0:
+            raise ValueError(f"substep_s must be positive, got {self.substep_s}")
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """One reading on its way to a service; net import positive.
+
+    Attributes
+    ----------
+    meter
+        Id of the meter; BUSBAR (the empty string) for the busbar's.
+    t
+        Time by the meter's clock, Unix s.
+    seq
+        Number of the reading; rises by one with every tick, also while nothing arrives.
+    arrival
+        When the reading arrives, Unix s.
+    v_volt
+        Voltage, phase to neutral, V.
+    p_kw, q_kvar
+        Net import, kW and kvar; None where not reported.
+    """
+
+    meter: str
+    t: float
+    seq: int
+    arrival: float
+    v_volt: float
+    p_kw: float | None
+    q_kvar: float | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sample:
+    """One tick: the truth, and what is reported of it. N customers, m inverters, p meters, b + 1 buses.
+
+    Attributes
+    ----------
+    t
+        Unix time, s.
+    seq
+        Number of the tick, from 0.
+    meter_ids : (p,)
+        Ids of the meters.
+    v_volt : (N,)
+        True voltage at each customer, V.
+    v_bus_volt : (b + 1,)
+        True voltage of each bus, the busbar first, V.
+    x_kvar : (m,)
+        True reactive injection of each inverter, kvar.
+    p_kw, q_kvar : (N,)
+        True net import of each customer, inverter included, kW and kvar.
+    manipulated : (p,)
+        Which meters are under attack.
+    shift_volt : (p,)
+        Reported minus honest reading, V; 0 for honest meters.
+    reported
+        What the meters report, manipulations included, as one row: whether or not it arrives.
+    delivery
+        When it arrives, as one row.
+    """
+
+    t: float
+    seq: int
+    meter_ids: tuple[str, ...]
+    v_volt: Floats
+    v_bus_volt: Floats
+    x_kvar: Floats
+    p_kw: Floats
+    q_kvar: Floats
+    manipulated: Bools
+    shift_volt: Floats
+    reported: Registers
+    delivery: Delivery
+
+    @property
+    def readings(self) -> list[Reading]:
+        """The readings of this tick that arrive, duplicates included, in the order of their arrival."""
+        out = [
+            self._reading(j, meter, float(arrival))
+            for j, meter in enumerate((*self.meter_ids, BUSBAR))
+            for arrival in (self.delivery.arrival[0, j], self.delivery.copy[0, j])
+            if np.isfinite(arrival)
+        ]
+        return sorted(out, key=lambda reading: reading.arrival)
+
+    def _reading(self, j: int, meter: str, arrival: float) -> Reading:
+        stamp, registers = float(self.delivery.stamp[0, j]), self.reported
+        if meter == BUSBAR:
+            return Reading(meter, stamp, self.seq, arrival, float(registers.v0_volt[0]), None, None)
+        q = float(registers.q_kvar[0, j])
+        return Reading(
+            meter,
+            stamp,
+            self.seq,
+            arrival,
+            float(registers.v_volt[0, j]),
+            float(registers.p_kw[0, j]),
+            None if np.isnan(q) else q,
+        )
+
+
+def simulate(site: Site, scenario: Scenario) -> Iterator[Sample]:
+    """Play a scenario.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    scenario
+        What happens to it.
+
+    Yields
+    ------
+    Sample
+        One per tick, in the order of time.
+
+    Raises
+    ------
+    PowerFlowDiverged
+        When the loads are beyond what the feeder can carry.
+    NoEquilibrium
+        When inverters and feeder find no common answer.
+    ValueError
+        When an attack or a silence names a meter that the feeder does not have, or looks too far back.
+    """
+    _check(site, scenario)
+    meters = Meters(site, scenario.errors, scenario.channel, scenario.seed)
+    nominal = site.tables.meta.voltage_volt
+    past = _Past(site.meters.size, scenario)
+    if past.first < 0:
+        for block in truth(site, scenario, past.first, 0):
+            past.add(block.ticks, _honest(site, meters, block).v_volt / nominal)
+    for block in truth(site, scenario, 0, _tick_count(scenario)):
+        honest = _honest(site, meters, block)
+        past.add(block.ticks, honest.v_volt / nominal)
+        lies = manipulated(scenario.attacks, block.t, site.meters.size)
+        reported = _attacked(site, scenario, block.t, honest, past=past, lies=lies)
+        delivery = meters.deliver(block.ticks, block.t)
+        yield from _samples(site, block, honest, reported, delivery=delivery, lies=lies)
+
+
+def _samples(
+    site: Site, block: Block, honest: Registers, reported: Registers, *, delivery: Delivery, lies: Bools
+) -> Iterator[Sample]:
+    """Take a block apart, tick by tick."""
+    shift = reported.v_volt - honest.v_volt
+    q_net = net_reactive(site, block)
+    x_kvar = block.x * site.feeder.base_kva
+    for k in range(block.t.size):
+        row = slice(k, k + 1)
+        yield Sample(
+            t=float(block.t[k]),
+            seq=int(block.ticks[k]),
+            meter_ids=site.meter_ids,
+            v_volt=block.v_volt[k],
+            v_bus_volt=block.v_bus_volt[k],
+            x_kvar=x_kvar[k],
+            p_kw=block.demand.p_kw[k],
+            q_kvar=q_net[k],
+            manipulated=lies[k],
+            shift_volt=shift[k],
+            reported=Registers(
+                reported.v_volt[row], reported.p_kw[row], reported.q_kvar[row], reported.v0_volt[row]
+            ),
+            delivery=Delivery(delivery.stamp[row], delivery.arrival[row], delivery.copy[row]),
+        )
+
+
+def snapshots(samples: Iterable[Sample]) -> Iterator[Snapshot]:
+    """Turn samples into what `feeders.load.to_frame` takes: one row of readings per tick.
+
+    Lost readings and silences are missing; delay and clock errors play no part.
+    """
+    for sample in samples:
+        there = np.isfinite(sample.delivery.arrival[0])
+        meters, registers = there[:-1], sample.reported
+        yield Snapshot(
+            t=sample.t,
+            v_volt=np.where(meters, registers.v_volt[0], np.nan),
+            p_kw=np.where(meters, registers.p_kw[0], np.nan),
+            q_kvar=np.where(meters, registers.q_kvar[0], np.nan),
+            v0_volt=float(registers.v0_volt[0]) if there[-1] else np.nan,
+        )
+
+
+def by_arrival(samples: Iterable[Sample]) -> Iterator[Reading]:
+    """Readings of many ticks in the order of their arrival; equal ones in the order of time and meters."""
+    waiting: list[tuple[float, int, Reading]] = []
+    number = count()
+    for sample in samples:
+        # Nothing of this tick or a later one arrives before its own time.
+        while waiting and waiting[0][0] < sample.t:
+            yield heappop(waiting)[2]
+        for reading in sample.readings:
+            heappush(waiting, (reading.arrival, next(number), reading))
+    while waiting:
+        yield heappop(waiting)[2]
+
+
+class _Past:
+    """The honest voltage reports that attacks may still want to see, pu, in blocks of consecutive ticks.
+
+    Attributes
+    ----------
+    first
+        The first tick that any attack will ask for; 0 or negative. Ticks before 0 have to be played before
+        the scenario begins.
+    """
+
+    def __init__(self, meters: int, scenario: Scenario) -> None:
+        self._meters = meters
+        self._scenario = scenario
+        self._blocks: dict[int, Floats] = {}
+        self._attacks = [attack for attack in scenario.attacks if reach(attack, attack.t_off) > 0.0]
+        self.first = min(self._oldest(scenario.start), 0)
+
+    def add(self, ticks: Ints, honest: Floats) -> None:
+        """Keep the reports (T, p) of some ticks and forget those that nobody can ask for any more."""
+        if not self._attacks:
+            return
+        self._blocks[int(ticks[0])] = honest
+        oldest = self._oldest(self._scenario.start + float(ticks[0]) * self._scenario.dt_s)
+        for start in [start for start, v in self._blocks.items() if start + len(v) <= oldest]:
+            del self._blocks[start]
+
+    def __call__(self, t: Floats) -> Floats:
+        """The reports at the ticks at or just before times t (T,): (T, p)."""
+        wanted = np.array([self._tick(float(when)) for when in t], dtype=np.intp)
+        out = np.full((t.size, self._meters), np.nan)
+        for start, v in self._blocks.items():
+            rows = (wanted >= start) & (wanted < start + len(v))
+            out[rows] = v[wanted[rows] - start]
+        return out
+
+    def _oldest(self, now: float) -> int:
+        """The oldest tick that can still be asked for from time `now` on."""
+        looks = []
+        for attack in self._attacks:
+            if attack.t_off > now:
+                then = max(now, attack.t_on)
+                looks.append(self._tick(then - reach(attack, then)))
+        return min(looks, default=self._tick(now))
+
+    def _tick(self, t: float) -> int:
+        # Half a microsecond of slack: t - delay is rarely a representable multiple of dt.
+        return int(np.floor((t - self._scenario.start + 5e-7) / self._scenario.dt_s))
+
+
+def _tick_count(scenario: Scenario) -> float:
+    return float(np.ceil(scenario.duration_s / scenario.dt_s - 1e-9))
+
+
+def _honest(site: Site, meters: Meters, block: Block) -> Registers:
+    return meters.read(
+        block.ticks, block.v_volt, block.demand.p_kw, net_reactive(site, block), block.demand.v0_volt
+    )
+
+
+def _attacked(
+    site: Site, scenario: Scenario, t: Floats, honest: Registers, *, past: _Past, lies: Bools
+) -> Registers:
+    """What is reported; honest meters keep their registers to the last bit."""
+    if not lies.any():
+        return honest
+    nominal = site.tables.meta.voltage_volt
+    before = Reports(honest.v_volt / nominal, honest.p_kw, honest.q_kvar)
+    after = apply_all(scenario.attacks, t, before, past)
+    v = np.where(lies, after.v * nominal, honest.v_volt)
+    return Registers(v, after.p, after.q, honest.v0_volt)
+
+
+def _check(site: Site, scenario: Scenario) -> None:
+    for attack in scenario.attacks:
+        if attack.meters.max() >= site.meters.size:
+            raise ValueError(
+                f"an attack names meter {attack.meters.max()}, but {site.feeder.name} has {site.meters.size}"
+            )
+        then = max(attack.t_on, scenario.start)
+        if attack.t_off > then and reach(attack, then) > LONGEST_LOOK_BACK_S:
+            raise ValueError(f"an attack looks back {reach(attack, then):.0f} s, further than can be played")
