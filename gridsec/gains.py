@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, Ints, frozen
+from gridsec.arrays import Floats, Ints, frozen
 from gridsec.errors import DesignInfeasible
 from gridsec.lure import Lure
 
@@ -298,27 +298,6 @@ def sensitivity(lure: Lure, L: Floats, K: Floats) -> Floats:
     with np.errstate(divide="ignore", invalid="ignore"):
         pushed = np.where(L == 0.0, 0.0, np.abs(L) / reference[:, None])
     return np.asarray(np.maximum(through_K, np.max(pushed, axis=0, initial=0.0)), dtype=np.float64)
-
-
-def same_place(lure: Lure, J: Ints) -> Bools:
-    """Which nonlinearity's argument is exactly which meter's output.
-
-    Parameters
-    ----------
-    lure
-        Plant.
-    J : (k,)
-        Meters.
-
-    Returns
-    -------
-    Bools
-        (m, k): True where (H, F)_i and (C, D)_j are the same rows, the inverter and the meter of
-        one customer.
-    """
-    inverter = np.hstack([lure.H, lure.F])
-    meter = np.hstack([lure.C[J], lure.D[J]])
-    return np.asarray(np.all(inverter[:, None, :] == meter[None, :, :], axis=2))
 
 
 def refuse_blind(J: Ints, heard: Floats) -> None:

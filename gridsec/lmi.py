@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from gridsec.arrays import Floats, Ints, frozen, frozen_ints
+from gridsec.certificates import Certificate, feeds, quadratic
 from gridsec.errors import DesignInfeasible
 from gridsec.gains import (
     CircleGains,
@@ -34,7 +35,6 @@ from gridsec.gains import (
     margin,
     options_for,
     refuse_blind,
-    same_place,
     sensitivity,
     stacked,
     state_bound,
@@ -46,6 +46,7 @@ __all__ = [
     "CircleOptions",
     "circle",
     "circle_matrix",
+    "contraction",
     "margin",
     "options_for",
     "prove",
@@ -134,6 +135,58 @@ def prove(lure: Lure, J: Sequence[int] | Ints, L: Floats, K: Floats, options: Ci
     given = (np.asarray(L, dtype=np.float64), np.asarray(K, dtype=np.float64))
     template = _Template(lure, replace(options, floor=0.0), len(J), given=given)
     return template.solve(np.asarray(J, dtype=np.intp))
+
+
+def contraction(lure: Lure, *, rate: float) -> Certificate:
+    """Certificate of direct injection for every trusted set at once, where no closed form applies.
+
+    Finds P > 0 and a diagonal Lambda > 0 with
+
+        [ P A + A^T P + 2 alpha P   P G + H^T Lambda ]
+        [ *                         -Lambda d^-1     ]  <=  0,
+
+    the corrected (12) for no trusted meter, with half of the multiplier's term kept back to pay for
+    errors of the load. Trusting meters only removes columns of H in it, and by
+    Theorem 1 of docs/theory-certificates.md this proves every set.
+
+    Parameters
+    ----------
+    lure
+        Closed loop of a feeder with droop, from `close_loop`.
+    rate
+        alpha, 1/s.
+
+    Raises
+    ------
+    DesignInfeasible
+        If there is no such P at this rate, or it does not survive its verification in NumPy.
+    """
+    cp = _cvxpy()
+    what = f"certificate of direct injection for all sets of meters at rate {rate:g}/s"
+    # Units as in _Template: every slope bound becomes 1. An inverter of slope bound 0 is given a
+    # small one, which is still a bound.
+    slope = np.maximum(lure.slope, 1e-3 * (float(np.max(lure.slope, initial=0.0)) or 1.0))
+    clock, n = float(np.linalg.norm(lure.A, 2)), len(lure.A)
+    A, G, H = lure.A * slope / slope[:, None] / clock, lure.G * slope / slope[:, None] / clock, lure.H * slope
+    P, lam = cp.Variable((n, n), symmetric=True), cp.Variable(n)
+    half, cross = P @ (A + rate / clock * np.eye(n)), P @ G + (cp.diag(lam) @ H).T
+    whole = cp.bmat([[half + half.T, cross], [cross.T, -cp.diag(lam)]])
+    # Homogeneous in (P, Lambda): the trace fixes the scale, and the slack is made as large as it gets.
+    slack = cp.Variable()
+    constraints = [whole << -slack * np.eye(2 * n), P >> slack * np.eye(n), cp.trace(P) == n]
+    problem = cp.Problem(cp.Maximize(slack), constraints)
+    try:
+        with _solver_warnings_as_status():
+            problem.solve(solver=cp.CLARABEL)
+    except cp.error.SolverError as failure:
+        raise DesignInfeasible(what, f"the solver failed: {failure}") from failure
+    if problem.status not in {cp.OPTIMAL, cp.OPTIMAL_INACCURATE} or not slack.value > 0.0:
+        raise DesignInfeasible(what, f"the inequality has no solution ({problem.status})", slack.value)
+    found = np.asarray(P.value, dtype=np.float64) / slope[:, None] / slope
+    # e^T P e in plant units; the multiplier follows from psi = slope * scaled psi and the clock.
+    Lambda = np.asarray(lam.value, dtype=np.float64) * clock / slope
+    status = f"corrected inequality (12) without meters, solver: {problem.status}"
+    return quadratic(lure, 0.5 * (found + found.T), Lambda, rate, kind="lmi", status=status)
 
 
 def solve_many(
@@ -349,7 +402,7 @@ class _Template:
         self.C.value = lure.C[J] * self.x_unit / self.z_unit
         self.D.value = lure.D[J] @ options.load / self.z_unit
         self.N.value = (options.noise[J] / self.noise_unit)[None, :]
-        self.at.value = same_place(lure, J)[live].astype(np.float64)
+        self.at.value = feeds(lure)[np.ix_(live, J)].astype(np.float64)
         try:
             with _solver_warnings_as_status():
                 self.problem.solve(solver=cp.CLARABEL)

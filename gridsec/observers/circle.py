@@ -21,10 +21,10 @@ from typing import Literal
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, frozen
-from gridsec.certificates import Certificate, certify
+from gridsec.certificates import Certificate, certify, error_bound, feeds
 from gridsec.errors import DesignInfeasible
-from gridsec.gains import CircleGains, CircleOptions, margin, same_place, sensitivity, state_bound
-from gridsec.lmi import circle
+from gridsec.gains import CircleGains, CircleOptions, margin, sensitivity, state_bound
+from gridsec.lmi import circle, contraction
 from gridsec.lure import POLICY, Lure, advance
 
 
@@ -40,22 +40,23 @@ class CircleDesign:
         J as a mask.
     L, K : (n, p), (m, p)
         Gains; the columns of meters outside J are zero.
-    certificate
-        Why its error decays.
+    rate
+        Certified decay rate of the error without disturbances, 1/s, in `error_norm`.
     sensitivity : (p,)
         How strongly each meter moves the estimate, see `gains.sensitivity`. A trusted meter without
         an inverter has 0 under direct injection: its lies show in its output residual only.
-    gains
-        The design by LMI with its multipliers; None for direct injection.
+    certificate
+        The proof: for direct injection a `Certificate` of all trusted sets at once, otherwise the
+        design by LMI itself.
     """
 
     lure: Lure
     trusted: Bools
     L: Floats
     K: Floats
-    certificate: Certificate
+    rate: float
     sensitivity: Floats
-    gains: CircleGains | None
+    certificate: Certificate | CircleGains
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,8 +78,8 @@ class CircleState:
 def direct_gain(lure: Lure, trusted: Bools) -> Floats:
     """K of direct injection: the inverter of a trusted meter is driven by that meter.
 
-    `K = E_J`: `K_ij = 1` where the argument of nonlinearity i is the output of the trusted meter j,
-    by the rows of the matrices; the first such meter where a customer has several. L is zero.
+    `K = E_J`: `K_ij = 1` where the argument of nonlinearity i is the output of the trusted meter j;
+    the first such meter where a customer has several. L is zero.
 
     Parameters
     ----------
@@ -92,11 +93,10 @@ def direct_gain(lure: Lure, trusted: Bools) -> Floats:
     Floats
         (m, p).
     """
-    meters = np.flatnonzero(trusted)
-    match = same_place(lure, meters)
-    K = np.zeros((len(lure.slope), len(trusted)))
+    match = feeds(lure) & trusted
+    K = np.zeros(match.shape)
     driven = np.flatnonzero(match.any(axis=1))
-    K[driven, meters[np.argmax(match[driven], axis=1)]] = 1.0
+    K[driven, np.argmax(match[driven], axis=1)] = 1.0
     return K
 
 
@@ -116,8 +116,8 @@ def design(
     trusted : (p,)
         J as a mask.
     gains
-        "direct": K = E_J, L = 0, proven in closed form for every J at once. "lmi": gains and proof
-        by `lmi.circle`. Or a design that was made before; it is verified again.
+        "direct": K = E_J, L = 0, proven for every J at once, in closed form or by `lmi.contraction`.
+        "lmi": gains and proof by `lmi.circle`. Or a design that was made before; it is verified again.
     options
         What an LMI design is asked for; required by "lmi".
 
@@ -132,7 +132,7 @@ def design(
     if trusted.shape != (len(lure.C),):
         raise ValueError(f"trusted has shape {trusted.shape}; the plant has {len(lure.C)} meters")
     if isinstance(gains, str) and gains == "direct":
-        return _direct(lure, trusted)
+        return _direct(lure, trusted, options)
     meters = np.flatnonzero(trusted)
     if isinstance(gains, CircleGains):
         made = gains
@@ -157,18 +157,35 @@ def design(
     return _from_gains(lure, trusted, made)
 
 
-def _direct(lure: Lure, trusted: Bools) -> CircleDesign:
+def _direct(lure: Lure, trusted: Bools, options: CircleOptions | None) -> CircleDesign:
     K = direct_gain(lure, trusted)
     L = np.zeros((len(lure.A), len(trusted)))
+    try:
+        proof = certify(lure)
+    except DesignInfeasible:
+        if not np.isfinite(rate := _fallback_rate(lure, options)):
+            raise
+        proof = contraction(lure, rate=rate)
     heard = sensitivity(lure, L, K)
-    return CircleDesign(lure, _mask(trusted), frozen(L), frozen(K), certify(lure), frozen(heard), None)
+    return CircleDesign(lure, _mask(trusted), frozen(L), frozen(K), proof.rate, frozen(heard), proof)
+
+
+def _fallback_rate(lure: Lure, options: CircleOptions | None) -> float:
+    """Rate to ask the solver for where no closed form applies; NaN where the plant is no droop loop."""
+    if lure.A.shape != lure.G.shape or not np.array_equal(lure.G, -lure.A):
+        return np.nan
+    return options.rate if options is not None else _MODEST * float(np.min(np.diagonal(lure.G)))
+
+
+# Part of the slowest inverter's rate that direct injection is proven for when a solver has to do it.
+_MODEST = 0.1
 
 
 def _from_gains(lure: Lure, trusted: Bools, made: CircleGains) -> CircleDesign:
     L, K = np.zeros((len(lure.A), len(trusted))), np.zeros((len(lure.slope), len(trusted)))
     L[:, made.J], K[:, made.J] = made.L, made.K
-    heard = sensitivity(lure, L, K)
-    return CircleDesign(lure, _mask(trusted), frozen(L), frozen(K), certificate_of(made), frozen(heard), made)
+    heard = frozen(sensitivity(lure, L, K))
+    return CircleDesign(lure, _mask(trusted), frozen(L), frozen(K), made.alpha, heard, made)
 
 
 def _mask(trusted: Bools) -> Bools:
@@ -177,43 +194,25 @@ def _mask(trusted: Bools) -> Bools:
     return out
 
 
-def certificate_of(gains: CircleGains) -> Certificate:
-    """The proof of an LMI design in the form that all proofs share.
-
-    From `V' <= -2 alpha V + mu |n / noise|^2 + mu_delta |delta|^2` the steady norm `sqrt(e^T P e)`
-    is at most `sqrt(mu sum_j noise_j^-2 / (2 alpha))` per unit of the largest meter error, and
-    `sqrt(mu_delta l / (2 alpha)) |load^-1|` per unit of the largest load error (infinite where
-    `load` leaves some direction out, because nothing was proven for that direction).
+def error_norm(design: CircleDesign, e: Floats) -> Floats:
+    """Norm in which the proof makes the error fall at least like `exp(-rate t)`.
 
     Parameters
     ----------
-    gains
-        A design whose margin is positive.
+    design
+        The observer.
+    e : (…, n)
+        Errors `x - x_hat`.
+
+    Returns
+    -------
+    Floats
+        (…): `sqrt(e^T P e)`, or `max |e_i| / P_i` for a small-gain certificate.
     """
-    with np.errstate(divide="ignore"):
-        meter = float(np.sqrt(gains.mu * np.sum(gains.noise**-2.0) / (2.0 * gains.alpha)))
-    reach = np.sqrt(gains.mu_delta * len(gains.load) / (2.0 * gains.alpha))
-    return Certificate(
-        kind="lmi",
-        P=gains.P,
-        rate=gains.alpha,
-        noise=meter,
-        load=float(reach) * _stretch(gains.load),
-        attack=meter,
-        margin=gains.margin,
-        status=f"corrected inequality (12) rebuilt and verified for the meters {gains.J.tolist()}",
-    )
-
-
-def _stretch(load: Floats) -> float:
-    """Largest |delta| for one unit of |load @ delta| over the directions of the plant's input."""
-    if len(load) == 0:
-        return 0.0
-    smallest = np.linalg.svd(load, compute_uv=False)
-    complete = (
-        load.shape[1] >= len(load) and smallest[-1] > len(load) * np.finfo(np.float64).eps * smallest[0]
-    )
-    return float(1.0 / smallest[-1]) if complete else np.inf
+    P = design.certificate.P
+    if P.ndim == 1:
+        return np.asarray(np.max(np.abs(e) / P, axis=-1, initial=0.0))
+    return np.asarray(np.sqrt(np.einsum("...i,ij,...j->...", e, P, e)))
 
 
 def init(design: CircleDesign, t: float, x: Floats | None = None) -> CircleState:
@@ -341,20 +340,22 @@ def margin_without(design: CircleDesign, silent: Ints) -> float:
     silent : (s,)
         Meters without readings.
     """
-    if design.gains is None:
-        return design.certificate.margin
-    return margin(design.lure, np.setdiff1d(design.gains.J, silent), design.gains)
+    proof = design.certificate
+    if isinstance(proof, CircleGains):
+        return margin(design.lure, np.setdiff1d(proof.J, silent), proof)
+    return proof.margin
 
 
 def residual_bound(design: CircleDesign, y_error: Floats, u_error: Floats) -> Floats:
     """How far an honest meter can be from the settled observer's `outputs`.
 
-    `|y - y_hat| <= |C e| + |D (u - u_hat)| + |n|`, with the ultimate bound on C e from the proof.
+    `|y - y_hat| <= |C e| + |D| |u - u_hat| + |n|`, with the ultimate bound on C e from the proof:
+    the ellipsoid of the LMI, or the componentwise bounds of direct injection.
 
     Parameters
     ----------
     design
-        The observer, by LMI.
+        The observer.
     y_error : (p,)
         Largest error of each meter, squared pu.
     u_error : (l,)
@@ -363,17 +364,32 @@ def residual_bound(design: CircleDesign, y_error: Floats, u_error: Floats) -> Fl
     Returns
     -------
     Floats
-        (p,).
+        (p,); infinite where the design says nothing about such errors.
     """
-    lure, gains = design.lure, design.gains
-    if gains is None:
-        raise ValueError("direct injection has componentwise bounds: gridsec.certificates.error_bound")
-    with np.errstate(divide="ignore", invalid="ignore"):
-        noise = np.where(y_error[gains.J] == 0.0, 0.0, y_error[gains.J] / gains.noise)
-    # |delta| over the box |u_i| <= u_error_i: no more than the sum over its edges.
+    lure, proof = design.lure, design.certificate
+    rest = np.abs(lure.D) @ u_error + y_error
+    if isinstance(proof, CircleGains):
+        return np.asarray(state_bound(proof, lure.C, *_sizes(proof, y_error, u_error)) + rest)
+    bound = error_bound(lure, design.trusted, y_error, u_error, certificate=proof)
+    return np.asarray(np.abs(lure.C) @ bound + rest)
+
+
+def _sizes(gains: CircleGains, y_error: Floats, u_error: Floats) -> tuple[float, float]:
+    """Largest norms of (n + a)_J / noise and of delta, for errors within a box."""
+    own = y_error[gains.J]
+    quiet = gains.noise == 0.0
+    if np.any(own[quiet] > 0.0):
+        return np.inf, np.inf
+    noise = float(np.linalg.norm(own[~quiet] / gains.noise[~quiet]))
+    # |delta| over the box |u_i| <= u_error_i is at most the sum over its edges, provided that
+    # `load` reaches every direction of the box.
     inverse = np.linalg.pinv(gains.load)
-    delta = float(np.sum(np.linalg.norm(inverse, axis=0) * u_error))
-    if not np.isfinite(_stretch(gains.load)) and np.any(u_error > 0.0):
-        delta = np.inf
-    error = state_bound(gains, lure.C, float(np.linalg.norm(noise)), delta)
-    return np.asarray(error + np.abs(lure.D) @ u_error + y_error)
+    box = np.diag(u_error)
+    missed = np.max(np.abs(gains.load @ (inverse @ box) - box), initial=0.0)
+    if missed > _REACH * np.max(u_error, initial=0.0):
+        return noise, np.inf
+    return noise, float(np.sum(np.linalg.norm(inverse, axis=0) * u_error))
+
+
+# Relative part of a load error that `load` may leave out by rounding.
+_REACH = 1e-9
