@@ -319,7 +319,8 @@ def error_bound(
         `z_i`, nothing inside the deadband. The bound then holds while z rests, or moves slowly
         against the time constants.
     certificate
-        A quadratic certificate of the system; its norm gives another start of the iteration.
+        A certificate of the system. If it is a quadratic one with its multiplier, its norm gives a
+        start of the iteration that may be tighter than saturation; others are not used.
 
     Returns
     -------
@@ -333,16 +334,18 @@ def error_bound(
     direct = np.where(free, u_error @ np.abs(lure.F).T, metered)
     span = np.broadcast_to(_span(lure), direct.shape)
     bound = span
-    if certificate is not None and certificate.kind != "small-gain":
+    if certificate is not None and certificate.multiplier.size:
         kick = np.where(free, 0.0, _reach(lure, direct, None, span)) / form.tau
         level = _level(certificate, form, kick, np.where(free, direct, 0.0))
         spread = np.sqrt(np.diagonal(np.linalg.inv(certificate.P)))
         bound = np.minimum(bound, level[..., None] * spread)
     coupling = np.abs(form.S).T
     for _ in range(_ROUNDS):
-        around = direct.copy()
-        # An unbounded span times a zero coupling is no coupling.
-        np.add(around, np.nan_to_num(bound @ coupling, nan=np.inf), out=around, where=free)
+        known = np.isfinite(bound)
+        through = np.where(known, bound, 0.0) @ coupling
+        # Unbounded entries only matter where they couple: infinity times zero is no coupling.
+        through[~known @ (coupling > 0)] = np.inf
+        around = np.where(free, direct + through, direct)
         tighter = np.minimum(bound, _reach(lure, around, z, span))
         settled = np.all(tighter >= (1.0 - _TIGHTENING) * bound)
         bound = tighter

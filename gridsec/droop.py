@@ -397,3 +397,25 @@ def voltage_curve(droop: Droop, v: Floats) -> Floats:
     for ramp in ramps:
         total += ramp.slope * (np.clip(-v, ramp.low, ramp.high) - ramp.zero)
     return total
+
+
+def curve_gap(droop: Droop) -> Floats:
+    """How far K(z) and `voltage_curve` can be apart, for every inverter.
+
+    Between breakpoints `v_a < v_b` with values `q_a >= q_b`, both interpolate linearly, one in `v^2` and
+    one in v; they differ by `(q_a - q_b) t (1 - t) (v_b - v_a) / (v_b + v_a)` with t the fraction of the
+    way in v, hence by at most a quarter of the factor of `t (1 - t)`.
+
+    Parameters
+    ----------
+    droop
+        The fleet.
+
+    Returns
+    -------
+    (m,)
+        Bound of `|K(vbar^2 - v^2) - voltage_curve(v)|` over all v, pu of the feeder's base.
+    """
+    v, q = droop.v, droop.q
+    widths = (v[:, 1:] - v[:, :-1]) / (v[:, 1:] + v[:, :-1])
+    return np.asarray(np.max((q[:, :-1] - q[:, 1:]) * widths / 4.0, axis=1, initial=0.0))
