@@ -266,22 +266,17 @@ def _name(cell: object) -> tuple[Any, str | None]:
 
 
 def _number(cell: object) -> tuple[Any, str | None]:
-    if isinstance(cell, bool):
+    if isinstance(cell, bool) or not isinstance(cell, (int, float, str)):
         return BAD, f"{shown(cell)} is not a number"
-    if isinstance(cell, (int, float)):
-        try:
-            value = float(cell)
-        except OverflowError:
-            return BAD, f"{shown(cell)} is too large for a number"
-    elif isinstance(cell, str):
-        if cell.lower() in WORDS_NO_NUMBER:
-            return BAD, f"{shown(cell)} is not a finite number (leave the cell empty if there is none)"
-        if NUMBER.fullmatch(cell) is None:
-            comma = NUMBER.fullmatch(cell.replace(",", ".")) is not None
-            return BAD, f"{shown(cell)} is not a number" + (" (decimal point, not comma)" if comma else "")
+    if isinstance(cell, str) and cell.lower() in WORDS_NO_NUMBER:
+        return BAD, f"{shown(cell)} is not a finite number (leave the cell empty if there is none)"
+    if isinstance(cell, str) and NUMBER.fullmatch(cell) is None:
+        comma = NUMBER.fullmatch(cell.replace(",", ".")) is not None
+        return BAD, f"{shown(cell)} is not a number" + (" (decimal point, not comma)" if comma else "")
+    try:
         value = float(cell)
-    else:
-        return BAD, f"{shown(cell)} is not a number"
+    except OverflowError:
+        return BAD, f"{shown(cell)} is too large for a number"
     if not math.isfinite(value):
         return BAD, f"{shown(cell)} is not a finite number"
     return value, None

@@ -15,12 +15,13 @@ from typing import Any
 
 from feeders import convert_simbench
 from feeders.convert_pandapower import Fleet, from_pandapower
-from feeders.profiles import ENVELOPES, FILE
 from feeders.convert_source import feeder_source, profiles_source
+from feeders.profiles import ENVELOPES, FILE
 from feeders.schema import validate, write
 from gridsec.errors import FeederInvalid, GridsecError
 
 PROFILES = "profiles"
+KERBER = "(G. Kerber, dissertation, TU Munich 2011)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,29 +40,28 @@ RECIPES: dict[str, Recipe] = {
     "kerber-landnetz": Recipe(
         "pandapower:create_kerber_landnetz_freileitung_1",
         "Kerber rural network, overhead line 1",
-        "A German rural low-voltage feeder, overhead lines, 13 customers (G. Kerber, dissertation, TU Munich 2011).",
-        fleet=Fleet(2, 5.0),
+        f"A German rural low-voltage feeder, overhead lines, 13 customers {KERBER}.",
+        fleet=Fleet(2, 10.0),
         max_attacked=2,
     ),
     "kerber-dorfnetz": Recipe(
         "pandapower:create_kerber_dorfnetz",
         "Kerber village network",
-        "A German village low-voltage grid, cables, 57 customers (G. Kerber, dissertation, TU Munich 2011).",
-        fleet=Fleet(2, 5.0),
+        f"A German village low-voltage grid, cables, 57 customers {KERBER}.",
+        fleet=Fleet(2, 10.0),
     ),
     "kerber-vorstadtnetz": Recipe(
         "pandapower:create_kerber_vorstadtnetz_kabel_1",
         "Kerber suburban network, cable 1",
-        "A German suburban low-voltage grid, cables, 146 customers (G. Kerber, dissertation, TU Munich 2011).",
-        fleet=Fleet(2, 5.0),
+        f"A German suburban low-voltage grid, cables, 146 customers {KERBER}.",
+        fleet=Fleet(2, 10.0),
     ),
     "cigre-lv": Recipe(
         "pandapower:create_cigre_network_lv",
         "CIGRE low-voltage benchmark, residential feeder",
-        "The residential feeder of the European low-voltage benchmark (CIGRE Task Force C6.04.02, TB 575, 2014).",
+        "The residential feeder of the European low-voltage benchmark (CIGRE Task Force C6.04.02, 2014).",
         root="Bus R1",
-        fleet=Fleet(2, 10.0),
-        max_attacked=1,
+        fleet=Fleet(1, 0.0),
     ),
     "case33bw": Recipe(
         "pandapower:case33bw",
@@ -152,7 +152,7 @@ def convert(
         ["gridsec convert", source, f"data/feeders/{chosen}" if recipe else str(out), *options]
     )
     about = recipe.about if recipe else "A converted network."
-    text = feeder_source(tables, about, origin, package, command, notes)
+    text = feeder_source(tables, about=about, origin=origin, package=package, command=command, notes=notes)
     (folder / "SOURCE.md").write_text(text, encoding="utf-8", newline="\n")
     return notes
 

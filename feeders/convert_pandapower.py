@@ -21,7 +21,8 @@ CARRIED = {"bus", "line", "load", "sgen", "switch"}
 SURROUNDINGS = {"trafo", "trafo3w", "ext_grid"}  # upstream of the busbar
 UNLIMITED_KA = 1000.0
 HOUSEHOLDS = ("H0-A", "H0-B", "H0-C", "H0-G", "H0-L")
-TRADE = ("G1-A", "G1-B", "G2-A", "G3-A", "G4-A", "G5-A", "G6-A", "L1-A", "L2-A")
+# Trade and agriculture whose reactive power follows the active power closely, as that of large loads does.
+TRADE = ("G1-A", "G2-A", "G6-A", "L1-A", "L2-A")
 HOUSEHOLD_KW = 30.0
 USUAL_POWER_FACTOR = 0.93
 SMALL_KVA = 4.6
@@ -114,7 +115,8 @@ def from_pandapower(
 
 def _root(net: Any, wanted: str | None) -> int:
     if wanted is not None:
-        hits = [int(i) for i in net.bus.index if str(net.bus.at[i, "name"]) == wanted or str(i) == wanted]
+        named = [int(i) for i in net.bus.index if str(net.bus.at[i, "name"]) == wanted]
+        hits = named or [int(i) for i in net.bus.index if str(i) == wanted]
         if len(hits) != 1:
             raise GridsecError(f"{len(hits)} buses are called {wanted!r}; give the index of one")
         return hits[0]
@@ -128,11 +130,18 @@ def _root(net: Any, wanted: str | None) -> int:
     return sides[0]
 
 
-def _ids(table: Any, noun: str) -> dict[int, str]:
-    """Return an id per row: the source's name where it is there and unique, otherwise with its index."""
+def _ids(table: Any, noun: str, taken: Iterable[str] = ()) -> dict[int, str]:
+    """Return an id per row: the source's name where there is a unique one, otherwise with its index."""
     given = {int(i): _clean(table.at[i, "name"]) for i in table.index}
-    count = Counter(given.values())
-    return {i: name if name and count[name] == 1 else f"{name or noun}-{i}" for i, name in given.items()}
+    count = Counter([*given.values(), *taken])
+    ids: dict[int, str] = {}
+    for i, name in given.items():
+        own = name if name and count[name] == 1 else f"{name or noun}-{i}"
+        while own != name and count[own]:
+            own += "'"
+        ids[i] = own
+        count[own] += own != name
+    return ids
 
 
 def _clean(name: object) -> str:
@@ -165,9 +174,9 @@ def _lines(source: _Source) -> list[LineRow]:
         a, b = by_name[row.from_bus], by_name[row.to_bus]
         if a in level and b in level:
             turned = level[b] < level[a]
-            row = replace(row, from_bus=row.to_bus, to_bus=row.from_bus) if turned else row
-            place = _place(source.net, by_name[row.to_bus])
-            kept.append(replace(row, to_x=place[0], to_y=place[1]) if place else row)
+            place = _place(source.net, a if turned else b)
+            away = replace(row, from_bus=row.to_bus, to_bus=row.from_bus) if turned else row
+            kept.append(replace(away, to_x=place[0], to_y=place[1]) if place else away)
         elif a in level or b in level:
             source.notes.append(f"left out: {row.line}, open towards a part that the busbar does not feed")
     outside = len(source.net.bus) - len(level)
@@ -187,6 +196,7 @@ def _line_rows(source: _Source) -> Iterable[LineRow]:
         for e, et, c in zip(switches.element, switches.et, switches.closed, strict=True)
         if et == "l" and not c
     }
+    dead = {int(bus) for bus in net.bus.index[~net.bus.in_service.astype(bool)]}
     omega = 2.0 * math.pi * float(net.f_hz)
     if len(net.line) and (net.line.g_us_per_km > 0).any():
         source.notes.append("left out: shunt conductance of lines")
@@ -203,7 +213,9 @@ def _line_rows(source: _Source) -> Iterable[LineRow]:
             r0_ohm=_zero_sequence(row, "r0_ohm_per_km", length / parallel),
             x0_ohm=_zero_sequence(row, "x0_ohm_per_km", length / parallel),
             b_us=_round(omega * float(row.c_nf_per_km) * length * parallel * 1e-3),
-            closed=bool(row.in_service) and i not in opened,
+            closed=bool(row.in_service)
+            and i not in opened
+            and not dead & {int(row.from_bus), int(row.to_bus)},
             rating_a=_round(limit * 1000.0) if 0.0 < limit < UNLIMITED_KA else None,
         )
 
@@ -215,15 +227,14 @@ def _zero_sequence(row: Any, column: str, factor: float) -> float | None:
 
 def _switch_rows(source: _Source) -> Iterable[LineRow]:
     net = source.net
-    names = _ids(net.switch, "switch")
-    taken = set(_ids(net.line, "line").values())
+    names = _ids(net.switch, "switch", _ids(net.line, "line").values())
     for i in map(int, net.switch.index):
         row = net.switch.loc[i]
         if row.et != "b":
             continue
         ohm = float(row.z_ohm) if "z_ohm" in row and row.z_ohm > 0 else 0.0
         yield LineRow(
-            line=names[i] if names[i] not in taken else f"{names[i]}-{i}",
+            line=names[i],
             from_bus=source.names[int(row.bus)],
             to_bus=source.names[int(row.element)],
             r_ohm=_round(ohm),
@@ -309,7 +320,7 @@ def _generators(
 ) -> None:
     """Give each static generator to the first customer of its bus, or make it a customer of its own."""
     net = source.net
-    names = _ids(net.sgen, "generator")
+    names = _ids(net.sgen, "generator", _ids(net.load, "load").values())
     inside = set(source.order)
     for i in map(int, net.sgen.index):
         generator = net.sgen.loc[i]
@@ -319,18 +330,16 @@ def _generators(
         kw = _round(float(generator.p_mw) * float(generator.scaling) * float(generator.in_service) * 1000.0)
         kva = float(generator.sn_mva) * 1000.0
         kva = _round(kva) if math.isfinite(kva) and kva > 0 else kw
-        taken = {row.customer for row in rows}
         if not at_bus[bus]:
-            own = names[i] if names[i] not in taken else f"{names[i]}-{i}"
             at_bus[bus].append(len(rows))
-            rows.append(CustomerRow(customer=own, bus=bus, load_kw=0.0))
+            rows.append(CustomerRow(customer=names[i], bus=bus, load_kw=0.0))
             source.notes.append(
                 f"changed: {names[i]} has no load at its bus and became a customer of its own"
             )
         k = at_bus[bus][0]
         if float(generator.q_mvar) != 0.0:
             source.notes.append(f"left out: fixed reactive power of {names[i]}; its droop curve decides")
-        profile = generator["profile"] if "profile" in generator else None
+        profile = generator.get("profile")
         rows[k] = replace(
             rows[k],
             pv_kw=_round(rows[k].pv_kw + kw),
@@ -384,6 +393,15 @@ def _leftovers(source: _Source) -> None:
         )
         if here:
             source.notes.append(f"left out: {here} row(s) of the table {table}")
-    lower = [int(i) for i in net.trafo.index if int(net.trafo.at[i, "hv_bus"]) in inside and i is not None]
+    lower = sum(int(bus) in inside for bus in net.trafo.hv_bus) + sum(
+        int(bus) in inside for bus in net.trafo3w.hv_bus
+    )
     if lower:
-        source.notes.append(f"left out: {len(lower)} transformer(s) that the feeder's buses supply")
+        source.notes.append(
+            f"left out: {lower} transformer(s) that the feeder's buses supply, with all behind them"
+        )
+    second = sum(int(bus) in inside and int(bus) != source.root for bus in net.ext_grid.bus)
+    if second:
+        source.notes.append(
+            f"left out: {second} more infeed(s) of an external grid; the feeder has one busbar"
+        )

@@ -70,7 +70,7 @@ def _version(package: str) -> str:
 
 
 def feeder_source(
-    tables: FeederTables, about: str, origin: str, package: str, command: str, notes: tuple[str, ...]
+    tables: FeederTables, *, about: str, origin: str, package: str, command: str, notes: tuple[str, ...]
 ) -> str:
     """Return the SOURCE.md of a converted feeder.
 
@@ -127,12 +127,13 @@ def profiles_source(first: str, days: int, loads: int, generators: int) -> str:
     """
     return f"""# Load and generation profiles
 
-{days} days from {first}, one value every 15 minutes, of SimBench's low-voltage profiles: {loads} load profiles
-(`_p` active power as a fraction of the peak, `_q` reactive power as a fraction of the one at the peak) and
-{generators} generation profiles (fraction of the peak). `t_s` counts seconds from the first sample.
+{days} days from {first}, one value every 15 minutes, of SimBench's low-voltage profiles:
+{loads} load profiles (`_p` active power as a fraction of the peak, `_q` reactive power as a fraction of the
+one at the peak) and {generators} generation profiles (fraction of the rating). `t_s` counts seconds from the
+first sample.
 
-`envelopes.csv` holds, for each load profile, the narrowest limits `q_low p - q_floor <= q <= q_high p + q_floor`
-that hold every point of SimBench's whole year.
+`envelopes.csv` holds, for each load profile, the narrowest limits
+`q_low p - q_floor <= q <= q_high p + q_floor` that hold every point of SimBench's whole year.
 
 - Source: {_version("simbench")}
 - Made by: `gridsec convert profiles data/profiles`

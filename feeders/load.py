@@ -16,7 +16,7 @@ from types import MappingProxyType
 import numpy as np
 
 from feeders.profiles import data_root
-from feeders.schema import CustomerRow, FeederTables, LineRow, read, to_json
+from feeders.schema import CustomerRow, FeederTables, LineRow, read, to_json, validate
 from feeders.topology import Edge, Tree, tree
 from gridsec.arrays import Floats, Ints, frozen, frozen_ints
 from gridsec.detect import MeterAccuracy
@@ -176,12 +176,15 @@ def from_tables(tables: FeederTables) -> Site:
     FeederInvalid
         If the tables are not valid, or need what the balanced model cannot do yet.
     """
-    problems = _unsupported(tables)
+    problems = validate(tables) or _unsupported(tables)
     if problems:
         raise FeederInvalid(problems)
     meta = tables.meta
     closed = [line for line in tables.lines if line.closed]
-    found = _grow(tables, closed)
+    found = tree(
+        meta.busbar,
+        [Edge(row.line, row.from_bus, row.to_bus, row.r_ohm == row.x_ohm == 0.0) for row in closed],
+    )
     feeder = _feeder(tables, closed, found)
     metered = [k for k, row in enumerate(tables.customers) if row.meter]
     inverters = [k for k, row in enumerate(tables.customers) if row.inverter_kva > 0]
@@ -288,49 +291,29 @@ def to_frame(site: Site, snapshot: Snapshot) -> Frame:
 # --- building -----------------------------------------------------------------------------------
 
 
-def _unsupported(tables: FeederTables) -> list[str]:
+def _unsupported(tables: FeederTables) -> tuple[str, ...]:
     """What the format can say and the balanced single-phase equivalent cannot do yet."""
     problems = []
-    for line in tables.lines:
-        if line.phases != "abc" and line.closed:
+    closed = [line for line in tables.lines if line.closed]
+    for line in closed:
+        where = f"lines, line {line.line!r}"
+        if line.phases != "abc":
             problems.append(
-                f"lines, line {line.line!r}: phases {line.phases!r}: the model is balanced and takes only 'abc' yet"
+                f"{where}: phases {line.phases!r}: the model is balanced yet and takes only 'abc'"
             )
-        if line.tap != 1.0 and line.closed:
+        if line.tap != 1.0:
             problems.append(
-                f"lines, line {line.line!r}: tap {line.tap:g}: the model takes no transformers in mid-feeder yet; "
-                "expected 1"
+                f"{where}: tap {line.tap:g}: the model takes no transformer in mid-feeder yet, only 1"
             )
     problems.extend(
-        f"customers, customer {row.customer!r}: phases {row.phases!r}: the model is balanced and takes only 'abc' yet"
+        f"customers, customer {row.customer!r}: phases {row.phases!r}: the model is balanced yet "
+        "and takes only 'abc'"
         for row in tables.customers
         if row.phases != "abc"
     )
-    return problems
-
-
-def _grow(tables: FeederTables, closed: list[LineRow]) -> Tree:
-    """Fuse and order the buses; tables made in memory are checked here as files are when read."""
-    others = [bus for line in tables.lines for bus in (line.from_bus, line.to_bus)]
-    edges = [Edge(line.line, line.from_bus, line.to_bus, line.r_ohm == line.x_ohm == 0.0) for line in closed]
-    found = tree(tables.meta.busbar, edges, others)
-    problems = []
-    if found.loops:
-        problems += [f"lines {', '.join(edges[k].line for k in loop)} form a loop" for loop in found.loops]
-    if found.islands:
-        problems += [f"buses {', '.join(island)} are not connected to the busbar" for island in found.islands]
-    problems += [
-        f"customer {row.customer!r}: bus {row.bus!r} is not known"
-        for row in tables.customers
-        if row.bus not in found.group and not any(row.bus in island for island in found.islands)
-    ]
-    if not problems and not found.parent:
-        problems.append(
-            "lines: every closed line has zero impedance; there is nothing to watch below the busbar"
-        )
-    if problems:
-        raise FeederInvalid(problems)
-    return found
+    if all(line.r_ohm == line.x_ohm == 0.0 for line in closed):
+        problems.append("lines: no closed line has an impedance; there is nothing to watch below the busbar")
+    return tuple(problems)
 
 
 def _feeder(tables: FeederTables, closed: list[LineRow], found: Tree) -> Feeder:

@@ -10,18 +10,16 @@ from __future__ import annotations
 import csv
 import io
 import json
-import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from feeders import check
+from feeders import check, raw
 from feeders.columns import CUSTOMER_COLUMNS, LINE_COLUMNS, META_COLUMNS, REQUIRED, Column, parse, shown
+from feeders.raw import CUSTOMERS_FILE, LINES_FILE, META_FILE, Rows
+from feeders.records import Parsed, Record
 from gridsec.errors import FeederInvalid
-
-META_FILE, LINES_FILE, CUSTOMERS_FILE = "feeder.toml", "lines.csv", "customers.csv"
-MAX_BYTES = 64 * 1024 * 1024
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,10 +173,10 @@ def validate(source: FeederTables | Path | str | Mapping[str, Any]) -> tuple[str
 def examine(source: FeederTables | Path | str | Mapping[str, Any]) -> Examination:
     """Read and check a feeder; never raises on its content."""
     if isinstance(source, FeederTables):
-        return _examine(_raw_json(to_json(source)))
+        return _examine(raw.from_object(to_json(source)))
     if isinstance(source, (Path, str)):
-        return _examine(_raw_folder(Path(source)))
-    return _examine(_raw_json(source))
+        return _examine(raw.from_folder(Path(source)))
+    return _examine(raw.from_object(source))
 
 
 def read(path: Path | str) -> FeederTables:
@@ -200,7 +198,7 @@ def from_json(obj: object) -> FeederTables:
     FeederInvalid
         With every problem of the tables, also if `obj` is no feeder at all.
     """
-    return _tables(_examine(_raw_json(obj)))
+    return _tables(_examine(raw.from_object(obj)))
 
 
 def to_json(tables: FeederTables) -> dict[str, Any]:
@@ -239,161 +237,16 @@ def _ordered(row: dict[str, Any], columns: tuple[Column, ...]) -> dict[str, Any]
     return {column.name: row[column.name] for column in columns}
 
 
-# --- raw input: cells as they were given, with the place of each row ------------------------------
-
-
-@dataclass(slots=True)
-class _Raw:
-    """Cells before parsing; tables that could not be had at all are None."""
-
-    meta_name: str
-    meta: Mapping[str, Any] | None
-    lines_name: str
-    lines: list[tuple[int, Mapping[str, Any]]] | None
-    customers_name: str
-    customers: list[tuple[int, Mapping[str, Any]]] | None
-    problems: list[str]
-
-
-def _raw_folder(folder: Path) -> _Raw:
-    raw = _Raw(META_FILE, None, LINES_FILE, None, CUSTOMERS_FILE, None, [])
-    if not folder.is_dir():
-        what = "is a file, not a folder" if folder.exists() else "does not exist"
-        raw.problems.append(
-            f"{folder} {what}; expected a folder with {META_FILE}, {LINES_FILE}, {CUSTOMERS_FILE}"
-        )
-        return raw
-    text = _file_text(folder / META_FILE, raw.problems)
-    if text is not None:
-        try:
-            raw.meta = tomllib.loads(text)
-        except (tomllib.TOMLDecodeError, RecursionError) as error:
-            raw.problems.append(f"{META_FILE}: no valid TOML: {error}")
-    text = _file_text(folder / LINES_FILE, raw.problems)
-    if text is not None:
-        raw.lines = _csv_rows(LINES_FILE, text, raw.problems)
-    text = _file_text(folder / CUSTOMERS_FILE, raw.problems)
-    if text is not None:
-        raw.customers = _csv_rows(CUSTOMERS_FILE, text, raw.problems)
-    return raw
-
-
-def _file_text(path: Path, problems: list[str]) -> str | None:
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            problems.append(f"{path.name}: larger than {MAX_BYTES // 1024**2} MiB; is it the right file?")
-            return None
-        data = path.read_bytes()
-    except FileNotFoundError:
-        problems.append(f"{path.name}: the file is missing in {path.parent}")
-        return None
-    except OSError as error:
-        problems.append(f"{path.name}: cannot be read: {error.strerror}")
-        return None
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        row = data[: error.start].count(b"\n") + 1
-        problems.append(
-            f"{path.name}, row {row}: byte 0x{data[error.start]:02x} is not UTF-8; save it as UTF-8"
-        )
-        return None
-    if not text.strip():
-        problems.append(f"{path.name}: the file is empty")
-        return None
-    return text
-
-
-def _csv_rows(name: str, text: str, problems: list[str]) -> list[tuple[int, Mapping[str, Any]]] | None:
-    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
-    rows: list[tuple[int, Mapping[str, Any]]] = []
-    try:
-        header = [cell.strip() for cell in next(reader)]
-        twice = sorted({cell for cell in header if header.count(cell) > 1})
-        if twice:
-            problems.append(f"{name}, row 1: column {', '.join(map(shown, twice))} is there more than once")
-            return None
-        if len(header) == 1 and (";" in header[0] or "\t" in header[0]):
-            problems.append(
-                f"{name}, row 1: one single column {shown(header[0])}; separate columns by commas"
-            )
-            return None
-        for cells in reader:
-            if not any(cell.strip() for cell in cells):
-                continue
-            if len(cells) != len(header):
-                problems.append(
-                    f"{name}, row {reader.line_num}: {len(cells)} cells under {len(header)} columns"
-                )
-                continue
-            rows.append((reader.line_num, dict(zip(header, cells, strict=True))))
-    except csv.Error as error:
-        problems.append(f"{name}, row {reader.line_num}: no valid CSV: {error}")
-        return None
-    if not rows:
-        problems.append(f"{name}: there is no row below the header")
-        return None
-    return rows
-
-
-def _raw_json(obj: object) -> _Raw:
-    raw = _Raw("feeder", None, "lines", None, "customers", None, [])
-    if not isinstance(obj, Mapping):
-        raw.problems.append(f"{shown(obj)} is no feeder; expected an object with feeder, lines and customers")
-        return raw
-    raw.problems.extend(
-        f"{name}: is missing; expected feeder, lines and customers"
-        for name in ("feeder", "lines", "customers")
-        if obj.get(name) is None
-    )
-    meta = obj.get("feeder")
-    if isinstance(meta, Mapping):
-        raw.meta = meta
-    elif meta is not None:
-        raw.problems.append(f"feeder: {shown(meta)} is no object")
-    raw.lines = _json_rows("lines", obj.get("lines"), raw.problems)
-    raw.customers = _json_rows("customers", obj.get("customers"), raw.problems)
-    return raw
-
-
-def _json_rows(name: str, table: object, problems: list[str]) -> list[tuple[int, Mapping[str, Any]]] | None:
-    if table is None:
-        return None
-    if isinstance(table, Mapping):
-        if not all(isinstance(cells, (list, tuple)) for cells in table.values()):
-            problems.append(f"{name}: expected a list of rows, or an object whose columns are lists")
-            return None
-        lengths = {column: len(cells) for column, cells in table.items()}
-        if len(set(lengths.values())) > 1:
-            problems.append(f"{name}: columns of different length: {shown(lengths)}")
-            return None
-        count = next(iter(lengths.values()), 0)
-        table = [{column: cells[k] for column, cells in table.items()} for k in range(count)]
-    if not isinstance(table, (list, tuple)):
-        problems.append(f"{name}: {shown(table)} is no table; expected a list of rows")
-        return None
-    if not table:
-        problems.append(f"{name}: there is no row")
-        return None
-    rows: list[tuple[int, Mapping[str, Any]]] = []
-    for number, row in enumerate(table, start=1):
-        if isinstance(row, Mapping):
-            rows.append((number, row))
-        else:
-            problems.append(f"{name}, row {number}: {shown(row)} is no object")
-    return rows
-
-
 # --- from cells to typed rows -------------------------------------------------------------------
 
 
-def _examine(raw: _Raw) -> Examination:
-    problems = raw.problems
+def _examine(given: raw.Raw) -> Examination:
+    problems = given.problems
     notes: list[str] = []
-    meta = _parse_meta(raw, problems, notes)
-    lines = _parse_table(raw.lines_name, LINE_COLUMNS, raw.lines, problems, notes)
-    customers = _parse_table(raw.customers_name, CUSTOMER_COLUMNS, raw.customers, problems, notes)
-    more, remarks = check.feeder(check.Parsed(raw.meta_name, meta, lines, customers))
+    meta = _parse_meta(given, problems, notes)
+    lines = _parse_table(given.lines_name, LINE_COLUMNS, given.lines, problems, notes)
+    customers = _parse_table(given.customers_name, CUSTOMER_COLUMNS, given.customers, problems, notes)
+    more, remarks = check.feeder(Parsed(given.meta_name, meta, lines, customers))
     problems.extend(more)
     notes.extend(remarks)
     if problems or meta is None or lines is None or customers is None:
@@ -412,33 +265,33 @@ def _examine(raw: _Raw) -> Examination:
     return Examination(tables, (), tuple(notes))
 
 
-def _parse_meta(raw: _Raw, problems: list[str], notes: list[str]) -> dict[str, dict[str, Any]] | None:
-    if raw.meta is None:
+def _parse_meta(given: raw.Raw, problems: list[str], notes: list[str]) -> dict[str, dict[str, Any]] | None:
+    if given.meta is None:
         return None
     parsed: dict[str, dict[str, Any]] = {}
-    unknown = [key for key in raw.meta if key not in {c.name for c in META_COLUMNS[""]} | set(META_COLUMNS)]
+    unknown = [key for key in given.meta if key not in {c.name for c in META_COLUMNS[""]} | set(META_COLUMNS)]
     for section, columns in META_COLUMNS.items():
-        cells: object = raw.meta if section == "" else raw.meta.get(section, {})
+        cells: object = given.meta if section == "" else given.meta.get(section, {})
         if not isinstance(cells, Mapping):
-            problems.append(f"{raw.meta_name}, [{section}]: {shown(cells)} is no table of keys")
+            problems.append(f"{given.meta_name}, [{section}]: {shown(cells)} is no table of keys")
             cells = {}
         if section:
             unknown.extend(f"{section}.{key}" for key in cells if key not in {c.name for c in columns})
         parsed[section] = _parse_cells(
-            f"{raw.meta_name}, [{section}]" if section else raw.meta_name, "key", columns, cells, problems
+            f"{given.meta_name}, [{section}]" if section else given.meta_name, "key", columns, cells, problems
         )
     if unknown:
-        notes.append(f"{raw.meta_name}: ignored unknown {_listed('key', unknown)}")
+        notes.append(f"{given.meta_name}: ignored unknown {_listed('key', unknown)}")
     return parsed
 
 
 def _parse_table(
     name: str,
     columns: tuple[Column, ...],
-    rows: list[tuple[int, Mapping[str, Any]]] | None,
+    rows: Rows | None,
     problems: list[str],
     notes: list[str],
-) -> list[check.Record] | None:
+) -> list[Record] | None:
     if rows is None:
         return None
     known = {column.name for column in columns}
@@ -456,7 +309,7 @@ def _parse_table(
         key = row.get(columns[0].name)
         label = f" ({key.strip()})" if isinstance(key, str) and key.strip() and len(key) <= 128 else ""
         where = f"{name}, row {number}{label}"
-        records.append(check.Record(where, _parse_cells(where, "column", wanted, row, problems)))
+        records.append(Record(where, _parse_cells(where, "column", wanted, row, problems)))
     return records
 
 

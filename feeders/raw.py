@@ -1,0 +1,163 @@
+"""A feeder's input before its cells are parsed: from a folder, or from decoded JSON."""
+
+from __future__ import annotations
+
+import csv
+import io
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from feeders.columns import shown
+
+META_FILE, LINES_FILE, CUSTOMERS_FILE = "feeder.toml", "lines.csv", "customers.csv"
+MAX_BYTES = 64 * 1024 * 1024
+
+# Rows with their numbers as a person counts them.
+Rows = list[tuple[int, Mapping[str, Any]]]
+
+
+@dataclass(slots=True)
+class Raw:
+    """Cells before parsing; tables that could not be had at all are None."""
+
+    meta_name: str
+    meta: Mapping[str, Any] | None
+    lines_name: str
+    lines: Rows | None
+    customers_name: str
+    customers: Rows | None
+    problems: list[str]
+
+
+def from_folder(folder: Path) -> Raw:
+    """Read the files of a feeder; what cannot be read is a problem, never an exception."""
+    raw = Raw(META_FILE, None, LINES_FILE, None, CUSTOMERS_FILE, None, [])
+    if not folder.is_dir():
+        what = "is a file, not a folder" if folder.exists() else "does not exist"
+        raw.problems.append(
+            f"{folder} {what}; expected a folder with {META_FILE}, {LINES_FILE}, {CUSTOMERS_FILE}"
+        )
+        return raw
+    text = _file_text(folder / META_FILE, raw.problems)
+    if text is not None:
+        try:
+            raw.meta = tomllib.loads(text)
+        except (tomllib.TOMLDecodeError, RecursionError) as error:
+            raw.problems.append(f"{META_FILE}: no valid TOML: {error}")
+    text = _file_text(folder / LINES_FILE, raw.problems)
+    if text is not None:
+        raw.lines = _csv_rows(LINES_FILE, text, raw.problems)
+    text = _file_text(folder / CUSTOMERS_FILE, raw.problems)
+    if text is not None:
+        raw.customers = _csv_rows(CUSTOMERS_FILE, text, raw.problems)
+    return raw
+
+
+def _file_text(path: Path, problems: list[str]) -> str | None:
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            problems.append(f"{path.name}: larger than {MAX_BYTES // 1024**2} MiB; is it the right file?")
+            return None
+        data = path.read_bytes()
+    except FileNotFoundError:
+        problems.append(f"{path.name}: the file is missing in {path.parent}")
+        return None
+    except OSError as error:
+        problems.append(f"{path.name}: cannot be read: {error.strerror}")
+        return None
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        row = data[: error.start].count(b"\n") + 1
+        problems.append(
+            f"{path.name}, row {row}: byte 0x{data[error.start]:02x} is not UTF-8; save it as UTF-8"
+        )
+        return None
+    if not text.strip():
+        problems.append(f"{path.name}: the file is empty")
+        return None
+    return text
+
+
+def _csv_rows(name: str, text: str, problems: list[str]) -> Rows | None:
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+    rows: Rows = []
+    try:
+        header = [cell.strip() for cell in next(reader)]
+        twice = sorted({cell for cell in header if header.count(cell) > 1})
+        if twice:
+            problems.append(f"{name}, row 1: column {', '.join(map(shown, twice))} is there more than once")
+            return None
+        if len(header) == 1 and (";" in header[0] or "\t" in header[0]):
+            problems.append(
+                f"{name}, row 1: one single column {shown(header[0])}; separate columns by commas"
+            )
+            return None
+        for cells in reader:
+            if not any(cell.strip() for cell in cells):
+                continue
+            if len(cells) != len(header):
+                problems.append(
+                    f"{name}, row {reader.line_num}: {len(cells)} cells under {len(header)} columns"
+                )
+                continue
+            rows.append((reader.line_num, dict(zip(header, cells, strict=True))))
+    except csv.Error as error:
+        problems.append(f"{name}, row {reader.line_num}: no valid CSV: {error}")
+        return None
+    if not rows:
+        problems.append(f"{name}: there is no row below the header")
+        return None
+    return rows
+
+
+def from_object(obj: object) -> Raw:
+    """Take the JSON form apart, already decoded; a table is a list of rows or an object of columns."""
+    raw = Raw("feeder", None, "lines", None, "customers", None, [])
+    if not isinstance(obj, Mapping):
+        raw.problems.append(f"{shown(obj)} is no feeder; expected an object with feeder, lines and customers")
+        return raw
+    raw.problems.extend(
+        f"{name}: is missing; expected feeder, lines and customers"
+        for name in ("feeder", "lines", "customers")
+        if obj.get(name) is None
+    )
+    meta = obj.get("feeder")
+    if isinstance(meta, Mapping):
+        raw.meta = meta
+    elif meta is not None:
+        raw.problems.append(f"feeder: {shown(meta)} is no object")
+    raw.lines = _json_rows("lines", obj.get("lines"), raw.problems)
+    raw.customers = _json_rows("customers", obj.get("customers"), raw.problems)
+    return raw
+
+
+def _json_rows(name: str, table: object, problems: list[str]) -> Rows | None:
+    if table is None:
+        return None
+    if isinstance(table, Mapping):
+        if not all(isinstance(cells, (list, tuple)) for cells in table.values()):
+            problems.append(f"{name}: expected a list of rows, or an object whose columns are lists")
+            return None
+        lengths = {column: len(cells) for column, cells in table.items()}
+        if len(set(lengths.values())) > 1:
+            problems.append(f"{name}: columns of different length: {shown(lengths)}")
+            return None
+        count = next(iter(lengths.values()), 0)
+        table = [{column: cells[k] for column, cells in table.items()} for k in range(count)]
+    if not isinstance(table, (list, tuple)):
+        problems.append(f"{name}: {shown(table)} is no table; expected a list of rows")
+        return None
+    if not table:
+        problems.append(f"{name}: there is no row")
+        return None
+    rows: Rows = []
+    for number, row in enumerate(table, start=1):
+        if isinstance(row, Mapping):
+            rows.append((number, row))
+        else:
+            problems.append(f"{name}, row {number}: {shown(row)} is no object")
+    return rows
