@@ -1,0 +1,266 @@
+"""A small service around the real alarms, store and HTTP application, for tests of what stands on top."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import threading
+import time
+from collections.abc import AsyncGenerator, Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import uvicorn
+
+from gridsec.errors import FeederInvalid
+from gridsec.online import Cause, Decision
+from service.alarms import AlarmBook, AlarmRules, AlarmUnknown, acknowledge, advance, conditions, to_json
+from service.api import create_api
+from service.report import FeederReport, MeterReport
+from service.store import Store
+
+T0 = 1_795_212_000.0
+NOMINAL = 230.94
+
+
+class Village:
+    """A feeder of a given number of customers: lines of ten from the busbar, each house on a drop."""
+
+    def __init__(self, name: str = "village", customers: int = 13, prefix: str = "H") -> None:
+        self.name = name
+        self.buses, self.parent = ["busbar"], [None]
+        self.customers: list[dict[str, Any]] = []
+        for k in range(customers):
+            pole = len(self.buses)
+            self.buses += [f"pole-{k}", f"drop-{k}"]
+            self.parent += [0 if k % 10 == 0 else pole - 2, pole]
+            self.customers.append({"customer": f"{prefix}{k}", "bus": f"drop-{k}", "meter": f"{prefix}{k}"})
+        self.meters = [c["meter"] for c in self.customers]
+
+    def detail(self) -> dict[str, Any]:
+        return {
+            "name": self.name,
+            "title": f"{self.name.capitalize()}, {len(self.customers)} customers",
+            "v_nominal_volt": NOMINAL,
+            "v_min_volt": 0.9 * NOMINAL,
+            "v_max_volt": 1.1 * NOMINAL,
+            "tick_s": 1.0,
+            "layout": {"buses": self.buses, "parent": self.parent, "xy": None, "customers": self.customers},
+            "tables": {"meta": {"name": self.name}, "lines": [], "customers": []},
+        }
+
+    def report(
+        self,
+        t: float,
+        *,
+        lies: dict[str, float] | None = None,
+        silent: tuple[str, ...] = (),
+        cause: Cause | None = None,
+        volts: dict[str, float] | None = None,
+        sag: float = 0.6,
+    ) -> FeederReport:
+        """Return a tick: voltages sag along the lines; `lies` are added to what meters report."""
+        lies, volts = lies or {}, volts or {}
+        cause = cause or (Cause.RESIDUALS if lies else Cause.SILENT_METERS if silent else Cause.AGREEMENT)
+        true = [NOMINAL]
+        for k, parent in enumerate(self.parent[1:], start=1):
+            assert parent is not None
+            true.append(true[parent] - sag * (0.3 if k % 2 == 0 else 1.0) + 0.2 * math.sin(t / 7 + k))
+        at = dict(zip(self.buses, true, strict=True))
+        meters = []
+        for c in self.customers:
+            name = c["meter"]
+            v = volts.get(name, at[c["bus"]])
+            lie = lies.get(name, 0.0)
+            seen = name not in silent
+            score = abs(2 * v * lie + lie * lie) / NOMINAL**2 + 1e-4
+            meters.append(
+                MeterReport(
+                    meter=name,
+                    bus=c["bus"],
+                    seen=seen,
+                    suspect=bool(lie),
+                    score=score if seen else None,
+                    threshold=1.2e-2,
+                    v_volt_reported=v + lie if seen else None,
+                    v_volt_estimated=v,
+                    v_volt_std=0.15,
+                    v2_pu_estimated=(v / NOMINAL) ** 2,
+                    attack_volt_estimated=lie,
+                )
+            )
+        decision = {Cause.AGREEMENT: Decision.CLEAN, Cause.RESIDUALS: Decision.ATTACKED}
+        verdict = decision.get(cause, Decision.UNDECIDED)
+        reason = {
+            Decision.CLEAN: "All meters agree with the feeder.",
+            Decision.ATTACKED: f"{len(lies)} of {len(meters)} meters contradict the rest of the feeder.",
+            Decision.UNDECIDED: f"No verdict: {cause.value.replace('-', ' ')}.",
+        }[verdict]
+        return FeederReport(
+            feeder=self.name,
+            t=t,
+            verdict=verdict,
+            reason=reason,
+            cause=cause,
+            max_attacked=2,
+            meters=tuple(meters),
+            bus_v_volt=tuple(at.items()),
+            silent=tuple((name, 12.0) for name in silent),
+            v_min_volt=0.9 * NOMINAL,
+            v_max_volt=1.1 * NOMINAL,
+        )
+
+
+class SmallService:
+    """A backend of the HTTP application: real alarms, real store, reports from the test."""
+
+    def __init__(self, url: str, *villages: Village) -> None:
+        self.store = Store(url)
+        self.villages = {village.name: village for village in villages}
+        self.reports: dict[str, FeederReport] = {}
+        self.rules = AlarmRules()
+        self.books = {name: AlarmBook(name) for name in self.villages}
+        self.is_ready: tuple[bool, list[str]] = (True, [])
+        self.is_healthy: tuple[bool, list[str]] = (True, [])
+        self.loop: asyncio.AbstractEventLoop | None = None
+        self.queues: set[asyncio.Queue[dict[str, Any] | None]] = set()
+        self.lock = threading.Lock()
+
+    def tick(self, report: FeederReport) -> None:
+        with self.lock:
+            book, transitions = advance(self.books[report.feeder], self.rules, conditions(report), report.t)
+            self.store.commit(transitions, reports=[report])
+            self.books[report.feeder], self.reports[report.feeder] = book, report
+        self.wake({"type": "state", "data": report})
+        for transition in transitions:
+            self.wake({"type": "alarm", "data": to_json(transition.alarm)})
+
+    def wake(self, event: dict[str, Any] | None) -> None:
+        def put() -> None:
+            for queue in self.queues:
+                if queue.full() and event is not None:
+                    queue.get_nowait()
+                queue.put_nowait(event)
+
+        if self.loop is not None:
+            self.loop.call_soon_threadsafe(put)
+
+    def feeders(self) -> list[dict[str, Any]]:
+        return [{"name": v.name, "title": v.detail()["title"]} for v in self.villages.values()]
+
+    def feeder(self, name: str) -> dict[str, Any] | None:
+        return self.villages[name].detail() if name in self.villages else None
+
+    def report(self, name: str) -> FeederReport | None:
+        return self.reports.get(name)
+
+    def metrics(self) -> bytes:
+        return b"# HELP gridsec_up Whether it runs.\n# TYPE gridsec_up gauge\ngridsec_up 1.0\n"
+
+    def ready(self) -> tuple[bool, list[str]]:
+        return self.is_ready
+
+    def healthy(self) -> tuple[bool, list[str]]:
+        return self.is_healthy
+
+    async def put_feeder(self, name: str, tables: dict[str, Any]) -> None:
+        if "customers" not in tables:
+            raise FeederInvalid(["customers.csv: missing", "lines.csv: missing"])
+        self.villages[name] = Village(name, int(tables["customers"]))
+        self.books[name] = AlarmBook(name)
+
+    async def acknowledge(self, alarm_id: str, who: str, comment: str) -> dict[str, Any]:
+        for name, book in self.books.items():
+            if any(alarm.id == alarm_id for alarm in book.alarms):
+                t = self.reports[name].t
+                self.books[name], transitions = acknowledge(book, alarm_id, who, comment, t)
+                await asyncio.to_thread(self.store.commit, transitions)
+                self.wake({"type": "alarm", "data": to_json(transitions[0].alarm)})
+                return to_json(transitions[0].alarm)
+        raise AlarmUnknown(alarm_id)
+
+    async def subscribe(self) -> AsyncGenerator[dict[str, Any], None]:
+        queue: asyncio.Queue[dict[str, Any] | None] = asyncio.Queue(8)
+        self.queues.add(queue)
+        try:
+            while (event := await queue.get()) is not None:
+                yield event
+        finally:
+            self.queues.discard(queue)
+
+    def close(self) -> None:
+        self.store.close()
+
+
+class Server:
+    """The HTTP application of a SmallService on a free port of this machine, in a thread."""
+
+    def __init__(self, service: SmallService) -> None:
+        self.service = service
+        config = uvicorn.Config(
+            create_api(service),
+            host="127.0.0.1",
+            port=0,
+            log_level="critical",
+            timeout_graceful_shutdown=1,
+            lifespan="off",
+        )
+        self.uvicorn = uvicorn.Server(config)
+        self.thread = threading.Thread(target=self._run, daemon=True)
+        self.thread.start()
+        deadline = time.monotonic() + 20
+        while not self.uvicorn.started:
+            assert self.thread.is_alive()
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        self.port: int = self.uvicorn.servers[0].sockets[0].getsockname()[1]
+        self.url = f"http://127.0.0.1:{self.port}"
+
+    def _run(self) -> None:
+        async def serve() -> None:
+            self.service.loop = asyncio.get_running_loop()
+            await self.uvicorn.serve()
+
+        asyncio.run(serve())
+
+    def stop(self) -> None:
+        self.service.wake(None)
+        self.uvicorn.should_exit = True
+        self.thread.join(timeout=20)
+        assert not self.thread.is_alive()
+        self.service.loop = None
+
+
+@pytest.fixture
+def village() -> type[Village]:
+    return Village
+
+
+@pytest.fixture
+def small_service(tmp_path: Path) -> Iterator[Callable[..., SmallService]]:
+    """Make services; each is closed at the end."""
+    made: list[SmallService] = []
+
+    def make(*villages: Village) -> SmallService:
+        made.append(SmallService(f"sqlite:///{tmp_path}/service-{len(made)}.db", *villages))
+        return made[-1]
+
+    yield make
+    for service in made:
+        service.close()
+
+
+@pytest.fixture
+def serve() -> Iterator[Callable[[SmallService], Server]]:
+    """Serve services over HTTP; each server is stopped at the end."""
+    made: list[Server] = []
+
+    def make(service: SmallService) -> Server:
+        made.append(Server(service))
+        return made[-1]
+
+    yield make
+    for server in made:
+        if server.thread.is_alive():
+            server.stop()
