@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from feeders.campaign import random_attacks
 from feeders.load import Snapshot
 from feeders.meters import BUSBAR, Channel, Delivery, MeterErrors, Meters, Registers
 from feeders.truth import Block, net_reactive, truth
@@ -24,6 +25,18 @@ from gridsec.attack import Attack, Reports, apply_all, manipulated, reach
 
 if TYPE_CHECKING:
     from feeders.load import Site
+
+__all__ = [
+    "NOON_S",
+    "START",
+    "Reading",
+    "Sample",
+    "Scenario",
+    "by_arrival",
+    "random_attacks",
+    "simulate",
+    "snapshots",
+]
 
 START: Final = 1_780_272_000.0
 """Monday, 1 June 2026, 00:00 UTC."""
@@ -92,7 +105,8 @@ class Reading:
     t
         Time by the meter's clock, Unix s.
     seq
-        Number of the reading; rises by one with every tick, also while nothing arrives.
+        Number of the reading; rises by one with every tick, also while nothing arrives. None in foreign
+        recordings without numbers.
     arrival
         When the reading arrives, Unix s.
     v_volt
@@ -103,7 +117,7 @@ class Reading:
 
     meter: str
     t: float
-    seq: int
+    seq: int | None
     arrival: float
     v_volt: float
     p_kw: float | None

@@ -24,19 +24,19 @@ def tables() -> FeederTables:
     )
 
     def customer(
-        name: str, bus: str, load: float, pv: float = 0.0, kva: float = 0.0, droop: str = ""
+        name: str, bus: str, load: float, pv: float = 0.0, *, kva: float = 0.0, droop: str = ""
     ) -> CustomerRow:
         return CustomerRow(name, bus, load, meter=f"m-{name}", pv_kw=pv, inverter_kva=kva, droop=droop)
 
     customers = (
         customer("c1", "n1", 8.0),
-        customer("c2", "n2", 12.0, 15.0, 18.0, "ieee1547-b"),
-        customer("c3", "n3", 9.0, 10.0, 12.0, "vde4105"),
+        customer("c2", "n2", 12.0, 15.0, kva=18.0, droop="ieee1547-b"),
+        customer("c3", "n3", 9.0, 10.0, kva=12.0, droop="vde4105"),
         customer("c4", "n3", 6.0),
-        customer("c5", "n5", 10.0, 20.0, 22.0, "asnzs4777-a"),
+        customer("c5", "n5", 10.0, 20.0, kva=22.0, droop="asnzs4777-a"),
         replace(customer("c6", "n6", 7.0), meter=""),
         customer("c7", "bb", 20.0),
-        customer("c8", "n6", 11.0, 25.0, 30.0, "ieee1547-b"),
+        customer("c8", "n6", 11.0, 25.0, kva=30.0, droop="ieee1547-b"),
     )
     return FeederTables(meta, lines, customers)
 

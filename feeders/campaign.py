@@ -1,0 +1,301 @@
+"""Attack campaigns on a given feeder: random ones for tests and studies, and consistent ones.
+
+Everything here knows the feeder and no estimator. The coordinated attack asks the same AC power flow that the
+truth comes from what an extra load would look like, droop inverters included: the strongest lie that leaves
+the shape of a real event.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from feeders.inverters import ClosedLoop, Loads
+from feeders.powerflow import PowerFlow, PowerFlowDiverged
+from feeders.variation import Customers, Stream, generator
+from gridsec.arrays import Floats, Ints
+from gridsec.attack import (
+    Attack,
+    Bias,
+    Coordinated,
+    Drift,
+    Random,
+    Replay,
+    Scaling,
+    Stuck,
+    coordinate,
+    load_pattern,
+    most_affected,
+)
+from gridsec.errors import GridsecError
+from gridsec.feeder import lindistflow
+
+if TYPE_CHECKING:
+    from feeders.load import Site
+    from feeders.scenario import Scenario
+
+LARGEST: Final = 1.5
+"""Random displacements lie between `size` and this times `size`."""
+
+LARGEST_SHIFT_PU: Final = 0.2
+"""A fake load that drops any voltage by more than this would be absurd at first sight."""
+
+TYPICAL_LOAD: Final = 0.3
+"""Share of `load_kw` that customers draw where no scenario says more."""
+
+SIZING_TOLERANCE: Final = 1e-4
+SIZING_ROUNDS: Final = 30
+
+
+class Kind(StrEnum):
+    """Kinds of attack that `random_attacks` makes."""
+
+    BIAS = "bias"
+    SCALING = "scaling"
+    DRIFT = "drift"
+    STUCK = "stuck"
+    REPLAY = "replay"
+    RANDOM = "random"
+    COORDINATED = "coordinated"
+    COORDINATED_POWER = "coordinated-power"
+
+
+class NoSuchAttack(GridsecError):
+    """An attack of the size asked for cannot be made on this feeder."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FakeLoad:
+    """A load that does not exist, and the trace that it would leave. p meters.
+
+    Attributes
+    ----------
+    customer
+        Index of the customer who would draw it.
+    p_kw, q_kvar
+        The load.
+    shift : (p,)
+        Change of the voltage at each meter, pu.
+    """
+
+    customer: int
+    p_kw: float
+    q_kvar: float
+    shift: Floats
+
+
+def random_attacks(
+    site: Site,
+    seed: int,
+    kind: Kind | str,
+    count: int,
+    size: float,
+    *,
+    t_on: float,
+    t_off: float,
+    scenario: Scenario | None = None,
+) -> tuple[Attack, ...]:
+    """Attack random meters of a feeder.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    seed
+        Chooses the meters, their displacements and the place of a fake load.
+    kind
+        What the attack does. Bias, scaling and random displacements have random signs and sizes between
+        `size` and 1.5 `size`; a drift arrives at such a size after a third of the attack; a replay plays
+        the hour before; a fake load moves the least affected of its meters by just `size`. Scaling moves
+        a meter by at least `size` while its voltage is within the feeder's limits. Stuck and replayed
+        meters are displaced by what has changed since, whatever `size` says.
+    count
+        How many meters lie.
+    size
+        Smallest displacement of a manipulated meter, pu of nominal, > 0.
+    t_on, t_off
+        When they lie, Unix s.
+    scenario
+        Where the loads beneath a fake load are taken from, at `t_on`; typical ones by default.
+
+    Raises
+    ------
+    NoSuchAttack
+        When there are fewer meters than `count`, or no place for a fake load of this size.
+    """
+    kind = Kind(kind)
+    if not 0 < count <= site.meters.size:
+        raise NoSuchAttack(f"{site.feeder.name} has {site.meters.size} meters; cannot attack {count}")
+    random = generator(seed, Stream.ATTACK)
+    if kind in (Kind.COORDINATED, Kind.COORDINATED_POWER):
+        loads = _typical(site) if scenario is None else _present(site, scenario, t_on)
+        meters, fake = _somewhere(site, random, count, size, loads)
+        power = kind is Kind.COORDINATED_POWER
+        return (coordinated(site, meters, fake, t_on=t_on, t_off=t_off, power=power),)
+    meters = np.sort(random.choice(site.meters.size, count, replace=False)).astype(np.intp)
+    amount = size * random.uniform(1.0, LARGEST, count)
+    signed = amount * random.choice([-1.0, 1.0], count)
+    return (_plain(kind, meters, signed, site, t_on=t_on, t_off=t_off, seed=seed),)
+
+
+def fake_load(
+    site: Site, customer: int, meters: Ints | int, size: float, *, loads: Loads | None = None
+) -> tuple[Ints, FakeLoad]:
+    """Size a load at one customer whose trace moves every lying meter by at least `size`.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    customer
+        Index of the customer.
+    meters : (k,) or k
+        The meters that will lie, or how many: then those that the load affects most, the customer's own
+        among them if it has one.
+    size
+        Smallest displacement, pu, > 0.
+    loads
+        What customers draw at the time; typical loads by default.
+
+    Returns
+    -------
+    meters : (k,)
+        Those that lie.
+    fake
+        The load, and its trace at all meters: the difference of two AC power flows in equilibrium with the
+        droop inverters, scaled at the very end (by less than SIZING_TOLERANCE) to `size`.
+
+    Raises
+    ------
+    NoSuchAttack
+        When no load moves the meters that far, or only one that is absurd at first sight.
+    """
+    loads = _typical(site) if loads is None else loads
+    loop = ClosedLoop(PowerFlow(site), site.droop, site.feeder.base_kva, site.feeder.base_volt)
+    without = loop.equilibrium(loads)
+    ratio = 0.5 * float(site.loads.tan_min[customer] + site.loads.tan_max[customer])
+    model = lindistflow(site.feeder)
+    v = without.v_volt / site.feeder.base_volt
+    pattern = load_pattern(model.R, model.X, customer, ratio, v)[site.meters]
+    chosen = _affected(site, customer, pattern, meters) if isinstance(meters, int) else meters
+    try:
+        power = coordinate(pattern, chosen, size)  # pu, to first order; AC has the last word below
+    except ValueError as error:
+        raise NoSuchAttack(
+            f"{site.feeder.name}, load at {site.feeder.customers[customer]}: {error}"
+        ) from error
+    for _ in range(SIZING_ROUNDS):
+        p_kw, q_kvar = loads.p_kw.copy(), loads.q_kvar.copy()
+        p_kw[customer] += power * site.feeder.base_kva
+        q_kvar[customer] += ratio * power * site.feeder.base_kva
+        try:
+            with_it = loop.equilibrium(Loads(p_kw, q_kvar, loads.v0_volt), without.x)
+        except PowerFlowDiverged as error:
+            raise NoSuchAttack(
+                f"{site.feeder.name} cannot carry a load of {power * site.feeder.base_kva:.0f} kW at "
+                f"{site.feeder.customers[customer]}, not even a fake one"
+            ) from error
+        shift = ((with_it.v_volt - without.v_volt) / site.feeder.base_volt)[site.meters]
+        missing = coordinate(shift, chosen, size)
+        if abs(missing - 1.0) < SIZING_TOLERANCE:
+            shift = shift * missing
+            if np.max(np.abs(shift)) > LARGEST_SHIFT_PU:
+                break
+            kw = power * site.feeder.base_kva
+            return chosen, FakeLoad(customer, kw, ratio * kw, shift)
+        power *= missing
+    raise NoSuchAttack(
+        f"{site.feeder.name}: no plausible load at {site.feeder.customers[customer]} moves {chosen.size} "
+        f"meters by {size:g} pu"
+    )
+
+
+def coordinated(
+    site: Site, meters: Ints, fake: FakeLoad, *, t_on: float, t_off: float, power: bool
+) -> Coordinated:
+    """Let meters tell the story of a fake load.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    meters : (k,)
+        Those that lie.
+    fake
+        The story; see `fake_load`.
+    t_on, t_off
+        When they lie, Unix s.
+    power
+        Whether the customer's own meter, if it is among them, also reports the load's p and q.
+    """
+    own = (site.meters[meters] == fake.customer) & power
+    return Coordinated(
+        meters=meters,
+        t_on=t_on,
+        t_off=t_off,
+        shift=fake.shift[meters],
+        p_shift=np.where(own, fake.p_kw, 0.0),
+        q_shift=np.where(own, fake.q_kvar, 0.0),
+    )
+
+
+def _somewhere(
+    site: Site,
+    random: np.random.Generator,
+    count: int,
+    size: float,
+    loads: Loads,
+) -> tuple[Ints, FakeLoad]:
+    """A fake load at the first customer, in random order, at whom it can be made."""
+    why: NoSuchAttack | None = None
+    for customer in random.permutation(site.meters):
+        try:
+            return fake_load(site, int(customer), count, size, loads=loads)
+        except NoSuchAttack as error:
+            why = error
+    raise NoSuchAttack(f"{site.feeder.name} has no place for a fake load of this size; the last try: {why}")
+
+
+def _affected(site: Site, customer: int, pattern: Floats, count: int) -> Ints:
+    """The customer's own meter, and those that feel its load most: all lines to it are theirs too."""
+    return most_affected(np.where(site.meters == customer, np.inf, pattern), count)
+
+
+def _plain(
+    kind: Kind, meters: Ints, signed: Floats, site: Site, *, t_on: float, t_off: float, seed: int
+) -> Attack:
+    """One attack in which every meter lies for itself."""
+    attack: Attack
+    match kind:
+        case Kind.BIAS:
+            attack = Bias(meters, t_on, t_off, size=signed)
+        case Kind.SCALING:
+            attack = Scaling(meters, t_on, t_off, factor=signed / site.tables.meta.limits.v_min_pu)
+        case Kind.DRIFT:
+            rate = 3.0 * signed / (t_off - t_on)
+            attack = Drift(meters, t_on, t_off, rate=rate, limit=np.abs(signed))
+        case Kind.STUCK:
+            attack = Stuck(meters, t_on, t_off)
+        case Kind.REPLAY:
+            attack = Replay(meters, t_on, t_off, delay_s=3600.0)
+        case Kind.RANDOM:
+            low = np.abs(signed)
+            attack = Random(meters, t_on, t_off, low=low, high=LARGEST * low, hold_s=1.0, seed=seed)
+        case _:
+            raise NoSuchAttack(f"{kind} is not an attack of single meters")
+    return attack
+
+
+def _typical(site: Site) -> Loads:
+    p_kw = TYPICAL_LOAD * np.array([row.load_kw for row in site.tables.customers])
+    q_kvar = 0.5 * (site.loads.tan_min + site.loads.tan_max) * p_kw
+    return Loads(p_kw, q_kvar, site.tables.meta.voltage_volt)
+
+
+def _present(site: Site, scenario: Scenario, t: float) -> Loads:
+    customers = Customers(site, scenario.variation, scenario.seed, scenario.start, scenario.profile_s)
+    demand = customers.at(np.array([t]))
+    return Loads(demand.p_kw[0], demand.q_kvar[0], float(demand.v0_volt[0]))
