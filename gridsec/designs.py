@@ -23,6 +23,7 @@ from gridsec.lmi import BACKOFF, solve_many
 from gridsec.lure import Lure
 
 _FORMAT = "gridsec circle gains 1"
+_DIGEST = 32
 _SHARED = ("load", "weight")
 _STORED = tuple(f.name for f in fields(CircleGains) if f.name not in _SHARED)
 
@@ -54,7 +55,7 @@ def design_key(lure: Lure, subsets: Sequence[Sequence[int]], options: CircleOpti
 
 
 def to_bytes(gains: Sequence[CircleGains], options: CircleOptions) -> bytes:
-    """Write designs of one plant, all with the same options, into the bytes of an NPZ archive.
+    """Write designs of one plant, all with the same options, into bytes: a digest and an NPZ archive.
 
     Parameters
     ----------
@@ -81,7 +82,8 @@ def to_bytes(gains: Sequence[CircleGains], options: CircleOptions) -> bytes:
             arrays[f"{size}/{name}"] = np.array([getattr(one, name) for one in group])
     out = io.BytesIO()
     np.savez(out, allow_pickle=False, **arrays)
-    return out.getvalue()
+    content = out.getvalue()
+    return hashlib.sha256(content).digest() + content
 
 
 def from_bytes(blob: bytes) -> tuple[CircleGains, ...]:
@@ -97,19 +99,14 @@ def from_bytes(blob: bytes) -> tuple[CircleGains, ...]:
     DesignInfeasible
         If the bytes are no such archive, or damaged.
     """
+    digest, content = blob[:_DIGEST], blob[_DIGEST:]
+    if hashlib.sha256(content).digest() != digest:
+        raise DesignInfeasible("stored design", "cannot be read: damaged, the digest does not fit")
     try:
-        with np.load(io.BytesIO(blob), allow_pickle=False) as archive:
+        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
         return _unpack(arrays)
-    except (
-        ValueError,
-        KeyError,
-        OSError,
-        EOFError,
-        IndexError,
-        NotImplementedError,
-        zipfile.BadZipFile,
-    ) as damage:
+    except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as damage:
         raise DesignInfeasible("stored design", f"cannot be read: {damage}") from damage
 
 

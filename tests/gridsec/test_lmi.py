@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from gridsec.arrays import Floats
-from gridsec.certificates import feeds
+from gridsec.certificates import feeds, verify
 from gridsec.errors import DesignInfeasible
 from gridsec.gains import CircleGains, CircleOptions, circle_matrix, margin, options_for
-from gridsec.lmi import circle, prove, settle, solve_many
+from gridsec.lmi import circle, contraction, prove, settle, solve_many
 from gridsec.lure import Lure
 from tests.gridsec.plants import Street, line, shared, street, tree
 
@@ -342,6 +342,32 @@ def test_given_gains_are_proven_as_they_are_or_not_at_all() -> None:
     # Positive feedback of the reading into the state: no certificate can exist.
     with pytest.raises(DesignInfeasible, match="no solution"):
         prove(of.lure, J, -1e3 * of.lure.C[J].T, K, options)
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=15)
+def test_the_contraction_certificate_holds_for_every_set_and_every_slope(seed: int) -> None:
+    """Oracle: the Lyapunov inequality of the linear error system, for drawn sets and slopes."""
+    rng = np.random.default_rng(seed)
+    of = line(4, tau=(0.5, 3.0), seed=seed % 50, kva=300.0)
+    taps = np.exp(rng.normal(0.0, 0.6, 4))
+    lure = replace(of.lure, H=of.lure.H * taps, C=of.lure.C * taps)
+    rate = 0.1 * float(np.min(np.diagonal(lure.G)))
+    proof = contraction(lure, rate=rate)
+    assert proof.kind == "lmi"
+    assert verify(proof, lure) == pytest.approx(proof.margin)
+    assert proof.margin > 0.0
+    for _ in range(40):
+        slopes = lure.slope * rng.choice([0.0, 1.0, rng.random()], 4)
+        free = rng.random(4) < 0.7
+        drift = lure.A + lure.G @ (np.diag(slopes * free) @ lure.H)
+        decay = proof.P @ drift + drift.T @ proof.P + 2.0 * rate * proof.P
+        assert np.linalg.eigvalsh(decay)[-1] <= 1e-12 * np.abs(decay).max()
+
+
+def test_a_contraction_rate_that_no_inverter_has_is_refused() -> None:
+    with pytest.raises(DesignInfeasible, match=r"0.6/s.*no solution"):
+        contraction(line(4).lure, rate=0.6)
 
 
 def test_a_rate_that_no_inverter_has_is_refused() -> None:
