@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import prod
 
 import numpy as np
 from scipy.linalg import expm
@@ -413,12 +414,12 @@ def settle(
         If the residual is still above `tol` after `max_iter` steps.
     """
     lead = np.broadcast_shapes(x0.shape[:-1], drive.shape[:-1], bias.shape[:-1], H.shape[:-2])
-    n, m = gain.shape
-    x = np.array(np.broadcast_to(x0, (*lead, n)), dtype=np.float64).reshape(-1, n)
-    c = np.broadcast_to(drive, (*lead, m)).reshape(-1, m)
-    e = np.broadcast_to(bias, (*lead, n)).reshape(-1, n)
-    every = np.broadcast_to(H, (*lead, m, n)).reshape(-1, m, n) if H.ndim > 2 else H[None]
-    open_rows = np.arange(x.shape[0])
+    (n, m), count = gain.shape, prod(lead)
+    x = np.array(np.broadcast_to(x0, (*lead, n)), dtype=np.float64).reshape(count, n)
+    c = np.broadcast_to(drive, (*lead, m)).reshape(count, m)
+    e = np.broadcast_to(bias, (*lead, n)).reshape(count, n)
+    every = np.broadcast_to(H, (*lead, m, n)).reshape(count, m, n) if H.ndim > 2 else H[None]
+    open_rows = np.arange(count)
     for _ in range(max_iter):
         loop = _Loop(
             phi, gain, every if every.shape[0] == 1 else every[open_rows], c[open_rows], e[open_rows]
