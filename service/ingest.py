@@ -23,9 +23,10 @@ import zenoh
 from gridsec.errors import GridsecError
 
 RING = 8192
-"""Samples that zenoh keeps for us; when full, the oldest go, and the gap shows in their numbers."""
+"""Samples that zenoh keeps for us, for each of the three kinds of keys."""
 
 BATCH = 1024
+_HEAD = 1024
 QUERIES_WAITING = 256
 _ESTIMATES = 1024
 EVENTS_WAITING = 10_000
@@ -64,12 +65,16 @@ class BusConfig:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One put, copied out of zenoh: key, bytes, encoding, wall time of its arrival (Unix s)."""
+    """One put, copied out of zenoh: key, bytes, encoding, wall time of its arrival (Unix s).
+
+    Of a payload above the limit only the beginning is kept; `size` is its whole length.
+    """
 
     key: str
     payload: bytes
     encoding: str
     arrival: float
+    size: int
 
 
 def _config(config: BusConfig) -> zenoh.Config:
@@ -139,10 +144,8 @@ def session(config: BusConfig) -> Iterator[zenoh.Session]:
 
 @dataclass(slots=True)
 class BusCounts:
-    """What went through and what did not."""
+    """What went through and what did not: deletions on reading keys, puts and deletes of ours, queries."""
 
-    received: int = 0
-    queue_dropped: int = 0
     deleted: int = 0
     published: int = 0
     publish_failed: int = 0
@@ -168,14 +171,28 @@ class Bus:
     prefix
         First chunks of every key.
     deliver
-        Called from the receiving thread with each batch; has to return at once, and says how many samples
-        it had no room for.
+        Called from the receiving threads with each batch. It may wait for room only if `lossless`.
+    max_payload
+        Of longer payloads only the beginning is kept.
+    lossless
+        When we are slow, let the senders wait instead of dropping the oldest samples: right where time is
+        told by the readings, wrong in real time, where old data are worth nothing.
     """
 
-    def __init__(self, config: BusConfig, prefix: str, deliver: Callable[[list[Sample]], int]) -> None:
+    def __init__(
+        self,
+        config: BusConfig,
+        prefix: str,
+        deliver: Callable[[list[Sample]], object],
+        *,
+        max_payload: int,
+        lossless: bool,
+    ) -> None:
         self._config = config
         self._prefix = prefix
         self._deliver = deliver
+        self._max_payload = max_payload
+        self._lossless = lossless
         self._stack = ExitStack()
         self._threads: list[threading.Thread] = []
         self._wakeup = threading.Condition()
@@ -195,7 +212,11 @@ class Bus:
                 f"{self._prefix}/*/concentrator/*/readings",
             ]
             for key in readings:
-                subscriber = live.declare_subscriber(key, zenoh.handlers.RingChannel(RING))
+                # A ring that is full drops the oldest samples; the gap shows in their numbers.
+                channel = (
+                    zenoh.handlers.FifoChannel(RING) if self._lossless else zenoh.handlers.RingChannel(RING)
+                )
+                subscriber = live.declare_subscriber(key, channel)
                 stack.callback(subscriber.undeclare)
                 self._start(f"zenoh {key}", self._receive, subscriber.handler)
             for key in (f"{self._prefix}/*/estimate", f"{self._prefix}/*/alarm/*"):
@@ -234,14 +255,15 @@ class Bus:
                 if raw.kind == zenoh.SampleKind.DELETE:
                     self.counts.deleted += 1
                 else:
-                    batch.append(
-                        Sample(str(raw.key_expr), raw.payload.to_bytes(), str(raw.encoding), time.time())
-                    )
-                if len(batch) >= BATCH:
-                    break
-                raw = _try_recv(handler)
-            self.counts.received += len(batch)
-            self.counts.queue_dropped += self._deliver(batch)
+                    batch.append(self._copy(raw))
+                raw = _try_recv(handler) if len(batch) < BATCH else None
+            self._deliver(batch)
+
+    def _copy(self, raw: zenoh.Sample) -> Sample:
+        payload = raw.payload.to_bytes()
+        size = len(payload)
+        kept = payload if size <= self._max_payload else payload[:_HEAD]
+        return Sample(str(raw.key_expr), kept, str(raw.encoding), time.time(), size)
 
     # ---------------------------------------------------------------- out
 

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
+
+from service.ingest import BusCounts
 
 _STEP_BUCKETS = (0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 _DELAY_BUCKETS = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0, 60.0, 300.0)
@@ -82,11 +86,21 @@ class Metrics:
             ["what"],
             registry=registry,
         )
-        self.published = Counter("gridsec_published", "Puts and deletes on zenoh.", registry=registry)
-        self.publish_failed = Counter(
-            "gridsec_publish_failed", "Puts and deletes that zenoh refused.", registry=registry
-        )
-        self.queries = Counter("gridsec_queries", "zenoh queries answered.", registry=registry)
+        self.bus = Counter("gridsec_zenoh", "What went through zenoh.", ["what"], registry=registry)
+        self._bus_before = asdict(BusCounts())
+
+    def count_bus(self, counts: BusCounts) -> None:
+        """Take over the counts of the zenoh bus.
+
+        Parameters
+        ----------
+        counts
+            Its running totals.
+        """
+        now = asdict(counts)
+        for what, total in now.items():
+            self.bus.labels(what.replace("_", "-")).inc(total - self._bus_before[what])
+        self._bus_before = now
 
     def exposition(self) -> bytes:
         """Return everything in Prometheus's text format."""

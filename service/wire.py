@@ -75,7 +75,7 @@ class Wire:
     prefix: str = "gridsec"
     max_bytes: int = 256 * 1024
 
-    def decode(self, key: str, payload: bytes, encoding: str = "") -> Decoded:
+    def decode(self, key: str, payload: bytes, encoding: str = "", *, size: int | None = None) -> Decoded:
         """Return the readings and the bad readings in one payload.
 
         Parameters
@@ -86,6 +86,8 @@ class Wire:
             The bytes.
         encoding
             The zenoh encoding; a schema after `;` is ignored.
+        size
+            Length of the payload where only its beginning was kept.
 
         Returns
         -------
@@ -97,8 +99,9 @@ class Wire:
         if isinstance(source, BadReading):
             return Decoded(bad=(replace(source, head=head),))
         base = BadReading(BadReason.SYNTAX, (), key, source.feeder, source.meter, head)
-        if len(payload) > self.max_bytes:
-            problem = f"payload of {len(payload)} bytes; at most {self.max_bytes} are read"
+        length = len(payload) if size is None else size
+        if length > self.max_bytes:
+            problem = f"payload of {length} bytes; at most {self.max_bytes} are read"
             return _refuse(base, BadReason.OVERSIZE, problem)
         if not payload:
             return _refuse(base, BadReason.EMPTY, "the payload is empty")

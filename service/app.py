@@ -1,0 +1,224 @@
+"""The service put together: settings, database, feeders, runtime, zenoh, HTTP. Straight-line wiring."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import signal
+import socket
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+
+import structlog
+import uvicorn
+
+from feeders.load import Site, from_tables, load
+from feeders.schema import from_json
+from gridsec.errors import FeederInvalid, GridsecError
+from service.align import Clock
+from service.api import create_api
+from service.ingest import Bus, BusConfig
+from service.rounds import RuntimeConfig
+from service.runtime import Runtime
+from service.settings import Settings, split_address
+from service.store import Store
+
+_GRACE_S = 1
+_log = structlog.get_logger("gridsec.app")
+
+
+class AddressUnavailable(GridsecError):
+    """The HTTP address cannot be listened on; the message says which and why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Running:
+    """What a starter wants to know once the service is up."""
+
+    url: str
+    feeders: tuple[str, ...]
+    stop: Callable[[], None]
+
+
+async def serve(
+    settings: Settings,
+    *,
+    announce: Callable[[Running], None] = lambda _: None,
+    signals: bool = True,
+) -> None:
+    """Run the service until SIGINT, SIGTERM or `Running.stop`.
+
+    Parameters
+    ----------
+    settings
+        All of them.
+    announce
+        Called once HTTP answers.
+    signals
+        Whether to listen to signals; not possible outside of the main thread.
+
+    Raises
+    ------
+    FeederInvalid, StoreUnavailable, BusUnavailable, AddressUnavailable
+        If it cannot start.
+    """
+    sites = load_sites(settings.feeders)
+    with ExitStack() as stack:
+        store = stack.enter_context(Store(settings.database))
+        sites = _with_stored(sites, store)
+        config = RuntimeConfig(
+            prefix=settings.prefix,
+            clock=settings.clock,
+            max_skew_s=settings.max_skew_s,
+            grace_s=settings.grace_s,
+            max_payload=settings.max_payload,
+            max_samples=settings.queue,
+        )
+        runtime = Runtime(config, store, sites.values())
+        listener = stack.enter_context(_listen(settings.http))
+        bus = stack.enter_context(
+            Bus(
+                BusConfig(
+                    settings.zenoh_mode, settings.zenoh_listen, settings.zenoh_connect, settings.zenoh_config
+                ),
+                settings.prefix,
+                runtime.deliver,
+                max_payload=settings.max_payload,
+                lossless=settings.clock is Clock.EVENTS,
+            )
+        )
+        runtime.attach(bus)
+        await _run(runtime, listener, tuple(sites), announce=announce, signals=signals)
+
+
+async def _run(
+    runtime: Runtime,
+    listener: socket.socket,
+    feeders: tuple[str, ...],
+    *,
+    announce: Callable[[Running], None],
+    signals: bool,
+) -> None:
+    server = _Server(
+        uvicorn.Config(
+            create_api(runtime),
+            lifespan="off",
+            log_config=None,
+            access_log=False,
+            timeout_graceful_shutdown=_GRACE_S,
+            server_header=False,
+        )
+    )
+    stop = asyncio.Event()
+    with _signals(stop) if signals else contextlib.nullcontext():
+        watching = asyncio.create_task(runtime.run(), name="runtime")
+        serving = asyncio.create_task(server.serve(sockets=[listener]), name="http")
+        stopping = asyncio.create_task(stop.wait(), name="stop")
+        started = asyncio.create_task(server.up.wait(), name="started")
+        await asyncio.wait({started, serving, stopping}, return_when=asyncio.FIRST_COMPLETED)
+        started.cancel()
+        host, port = listener.getsockname()[:2]
+        url = f"http://{f'[{host}]' if ':' in host else host}:{port}"
+        _log.info("serving", url=url, feeders=list(feeders))
+        announce(Running(url, feeders, stop.set))
+        await asyncio.wait({watching, serving, stopping}, return_when=asyncio.FIRST_COMPLETED)
+        stopping.cancel()
+        runtime.stop()
+        server.should_exit = True
+        results = await asyncio.gather(watching, serving, return_exceptions=True)
+    for result in results:
+        if isinstance(result, BaseException):
+            raise result
+
+
+class _Server(uvicorn.Server):
+    """uvicorn that says when it is up, and leaves signals to `serve`.
+
+    Its own handling would end the process before zenoh and the database are closed.
+    """
+
+    def __init__(self, config: uvicorn.Config) -> None:
+        super().__init__(config)
+        self.up = asyncio.Event()
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Start, and say so."""
+        await super().startup(sockets=sockets)
+        self.up.set()
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Change nothing."""
+        yield
+
+
+@contextlib.contextmanager
+def _signals(stop: asyncio.Event) -> Iterator[None]:
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, stop.set)
+    try:
+        yield
+    finally:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.remove_signal_handler(number)
+
+
+@contextlib.contextmanager
+def _listen(address: str) -> Iterator[socket.socket]:
+    host, port = split_address(address)
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family, socket.SOCK_STREAM) as listener:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            listener.bind((host, port))
+            listener.listen(socket.SOMAXCONN)
+        except OSError as error:
+            raise AddressUnavailable(f"HTTP cannot listen on {address}: {error.strerror or error}") from error
+        listener.setblocking(False)
+        yield listener
+
+
+def load_sites(names: Iterable[str]) -> dict[str, Site]:
+    """Load feeders, and name the problems of all of them at once.
+
+    Parameters
+    ----------
+    names
+        Folders, or names of feeders that come with the project.
+
+    Raises
+    ------
+    FeederInvalid
+        If any cannot be loaded, or two have the same name.
+    """
+    sites: dict[str, Site] = {}
+    problems: list[str] = []
+    for name in names:
+        try:
+            site = load(name)
+        except FeederInvalid as error:
+            problems.extend(f"{name}: {problem}" for problem in error.problems)
+            continue
+        if site.feeder.name in sites:
+            problems.append(f"{name}: a feeder named {site.feeder.name} has been given already")
+        sites[site.feeder.name] = site
+    if problems:
+        raise FeederInvalid(problems)
+    return sites
+
+
+def _with_stored(sites: dict[str, Site], store: Store) -> dict[str, Site]:
+    """Add the feeders that were put over REST; those given on the command line go before."""
+    together = dict(sites)
+    for name, tables in store.feeders().items():
+        if name in sites:
+            _log.warning("the feeder's files go before what was put over REST", feeder=name)
+            continue
+        try:
+            together[name] = from_tables(from_json(tables))
+        except FeederInvalid as error:
+            # It was valid when it was put; an update of the program must not keep the others from starting.
+            _log.error("a stored feeder is not watched", feeder=name, problems=list(error.problems))
+    return together

@@ -1,0 +1,57 @@
+"""Feeders as JSON: their summary in the list, and their detail with tree and tables."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from feeders.load import Site
+from feeders.schema import to_json
+
+
+def summary(site: Site) -> dict[str, Any]:
+    """Return a feeder's entry in the list of feeders.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    """
+    settings = site.tables.meta.monitor
+    return {
+        "name": site.feeder.name,
+        "title": site.tables.meta.title,
+        "customers": len(site.feeder.customers),
+        "meters": len(site.meter_ids),
+        "inverters": int(site.droop.customer.size),
+        "estimator": settings.estimator,
+        "max_attacked": settings.max_attacked,
+        "tick_s": settings.tick_s,
+    }
+
+
+def detail(site: Site) -> dict[str, Any]:
+    """Return everything about a feeder: limits, tree with positions, tables.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    """
+    meta, feeder = site.tables.meta, site.feeder
+    xy = site.xy
+    return {
+        **summary(site),
+        "v_nominal_volt": meta.voltage_volt,
+        "v_min_volt": meta.limits.v_min_pu * meta.voltage_volt,
+        "v_max_volt": meta.limits.v_max_pu * meta.voltage_volt,
+        "layout": {
+            "buses": list(feeder.buses),
+            "parent": [None, *(int(bus) for bus in feeder.parent)],
+            "xy": None if xy is None else [[float(x), float(y)] for x, y in xy],
+            "customers": [
+                {"customer": row.customer, "bus": feeder.buses[int(bus)], "meter": row.meter or None}
+                for row, bus in zip(site.tables.customers, feeder.bus, strict=True)
+            ],
+        },
+        "tables": to_json(site.tables),
+    }

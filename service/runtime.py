@@ -1,0 +1,347 @@
+"""The running service: one task owns all state.
+
+Rounds run one after the other in one worker thread, so that the event loop stays free for HTTP;
+acknowledgements, new feeders and finished designs are executed between them. Nothing else touches the state.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import threading
+import time
+from collections import deque
+from collections.abc import AsyncGenerator, Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Any, TypeVar
+
+import structlog
+
+from feeders.load import Site, from_tables
+from feeders.schema import from_json
+from gridsec.errors import FeederInvalid, GridsecError
+from gridsec.monitor import MonitorDesign
+from service import describe
+from service.align import Clock
+from service.inbox import Inbox
+from service.ingest import Sample
+from service.report import FeederReport
+from service.rounds import Publisher, Rounds, RuntimeConfig
+from service.store import Store, StoreUnavailable
+from service.watch import Phase, Watch, design
+
+SAMPLES_PER_ROUND = 512
+IDLE_S = 1.0
+STUCK_S = 30.0
+
+T = TypeVar("T")
+_log = structlog.get_logger("gridsec.runtime")
+
+
+class Runtime:
+    """The running service. It is the backend of the API.
+
+    Parameters
+    ----------
+    config
+        How it works.
+    store
+        The database.
+    sites
+        The feeders to watch.
+    wall
+        The wall clock, Unix s.
+    """
+
+    def __init__(
+        self,
+        config: RuntimeConfig,
+        store: Store,
+        sites: Iterable[Site],
+        *,
+        wall: Callable[[], float] = time.time,
+    ) -> None:
+        self._wall = wall
+        self._rounds = Rounds(config, store, sites, wall=wall, stored=self._wake_streams)
+        self._inbox = Inbox(
+            self._wake_from_thread, max_samples=config.max_samples, lossless=config.clock is Clock.EVENTS
+        )
+        self._commands: deque[tuple[Callable[[], Any], asyncio.Future[Any]]] = deque()
+        self._subscribers: set[asyncio.Queue[str]] = set()
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="gridsec-round")
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._wake = asyncio.Event()
+        self._stopping = False
+        self._last_round: float | None = None
+        self._died: str | None = None
+
+    # ---------------------------------------------------------------- the task
+
+    def attach(self, publisher: Publisher) -> None:
+        """Say where estimates and alarms go, before `run`.
+
+        Parameters
+        ----------
+        publisher
+            Usually the zenoh bus.
+        """
+        self._rounds.publisher = publisher
+
+    def deliver(self, batch: list[Sample]) -> int:
+        """Take samples from a receiving thread; returns how many were dropped for them.
+
+        Parameters
+        ----------
+        batch
+            In the order of arrival.
+        """
+        dropped = self._inbox.put(batch)
+        self._rounds.metrics.samples.inc(len(batch))
+        self._rounds.metrics.dropped.inc(dropped)
+        return dropped
+
+    async def run(self) -> None:
+        """Watch until `stop`."""
+        self._loop = asyncio.get_running_loop()
+        try:
+            await self._in_worker(self._rounds.begin)
+            for watch in self._rounds.watches.values():
+                self._start_design(watch)
+            while not self._stopping:
+                await self._execute_commands()
+                samples = self._inbox.drain(SAMPLES_PER_ROUND)
+                news = await self._in_worker(self._rounds.round, samples)
+                self._last_round = time.monotonic()
+                self._rounds.metrics.queue.set(len(self._inbox))
+                if news:
+                    self._notify("state")
+                await self._pause()
+            await self._in_worker(partial(self._rounds.commit, at_once=True))
+        except BaseException as error:
+            self._died = f"{type(error).__name__}: {error}"
+            raise
+        finally:
+            self.stop()
+            for _, answer in self._commands:
+                answer.cancel()
+            self._worker.shutdown(wait=False)
+
+    def stop(self) -> None:
+        """End `run` and every subscription soon; called from the event loop."""
+        self._stopping = True
+        self._inbox.close()
+        self._wake.set()
+        self._notify("stop")
+
+    async def _pause(self) -> None:
+        """Wait for samples, commands or the next tick."""
+        if self._stopping or len(self._inbox) or self._commands:
+            await asyncio.sleep(0)
+            return
+        now = self._wall()
+        wakes = [t for watch in self._rounds.watches.values() if (t := watch.aligner.wake()) is not None]
+        timeout = min([IDLE_S, *(t - now for t in wakes)])
+        if timeout > 0.0:
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._wake.wait(), timeout)
+        self._wake.clear()
+
+    async def _in_worker(self, run: Callable[..., T], *arguments: Any) -> T:
+        return await asyncio.get_running_loop().run_in_executor(self._worker, run, *arguments)
+
+    async def _execute_commands(self) -> None:
+        while self._commands:
+            command, answer = self._commands.popleft()
+            try:
+                result = await self._in_worker(command)
+            except GridsecError as error:
+                if not answer.done():
+                    answer.set_exception(error)
+            else:
+                if not answer.done():
+                    answer.set_result(result)
+
+    async def _command(self, run: Callable[[], T]) -> T:
+        """Have something executed between two rounds."""
+        if self._stopping:
+            raise StoreUnavailable("the service is stopping")
+        answer: asyncio.Future[T] = asyncio.get_running_loop().create_future()
+        self._commands.append((run, answer))
+        self._wake.set()
+        return await answer
+
+    def _in_loop(self, run: Callable[[], object]) -> None:
+        """Call something in the event loop, from any thread; not at all once the loop has ended."""
+        if self._loop is not None:
+            with contextlib.suppress(RuntimeError):
+                self._loop.call_soon_threadsafe(run)
+
+    def _wake_from_thread(self) -> None:
+        self._in_loop(self._wake.set)
+
+    def _wake_streams(self) -> None:
+        self._in_loop(partial(self._notify, "alarm"))
+
+    # ---------------------------------------------------------------- designs
+
+    def _start_design(self, watch: Watch) -> None:
+        """Design in a thread of its own, which must not keep the process from ending."""
+
+        def run() -> None:
+            started = time.monotonic()
+            finished: MonitorDesign | None = None
+            problem = ""
+            try:
+                finished = design(watch.site)
+            except GridsecError as error:
+                problem = str(error)
+            except Exception as error:  # noqa: BLE001 - shown to the operator as the feeder's problem
+                _log.exception("design failed", feeder=watch.name)
+                problem = f"{type(error).__name__}: {error}"
+            seconds = round(time.monotonic() - started, 3)
+            _log.info("design finished", feeder=watch.name, seconds=seconds, problem=problem or None)
+            self._in_loop(partial(self._hand_over, partial(_install, watch, finished, problem)))
+
+        threading.Thread(target=run, name=f"gridsec-design-{watch.name}", daemon=True).start()
+
+    def _hand_over(self, command: Callable[[], None]) -> None:
+        self._commands.append((command, asyncio.get_running_loop().create_future()))
+        self._wake.set()
+
+    # ---------------------------------------------------------------- the backend of the API
+
+    @property
+    def store(self) -> Store:
+        """The database."""
+        return self._rounds.store
+
+    def feeders(self) -> list[dict[str, Any]]:
+        """Return the summary of every feeder, with the phase of its monitor."""
+        return [
+            {**describe.summary(watch.site), "phase": str(watch.phase), "problem": watch.problem or None}
+            for watch in self._rounds.watches.values()
+        ]
+
+    def feeder(self, name: str) -> dict[str, Any] | None:
+        """Return everything about a feeder, or None.
+
+        Parameters
+        ----------
+        name
+            Its name.
+        """
+        watch = self._rounds.watches.get(name)
+        return None if watch is None else describe.detail(watch.site)
+
+    def report(self, name: str) -> FeederReport | None:
+        """Return a feeder's latest report, or None.
+
+        Parameters
+        ----------
+        name
+            Its name.
+        """
+        watch = self._rounds.watches.get(name)
+        return None if watch is None else watch.report
+
+    def metrics(self) -> bytes:
+        """Return the metrics in Prometheus's text format."""
+        return self._rounds.metrics.exposition()
+
+    def healthy(self) -> tuple[bool, list[str]]:
+        """Say whether the process should live on, and if not, why."""
+        problems = []
+        if self._died is not None:
+            problems.append(f"the runtime has died: {self._died}")
+        elif self._last_round is not None and time.monotonic() - self._last_round > STUCK_S:
+            problems.append(f"the runtime has been stuck for {time.monotonic() - self._last_round:.0f} s")
+        return not problems, problems
+
+    def ready(self) -> tuple[bool, list[str]]:
+        """Say whether everything works that is needed to watch, and what does not."""
+        rounds = self._rounds
+        problems = self.healthy()[1]
+        if self._last_round is None:
+            problems.append("the runtime is starting")
+        if rounds.store_problem is not None:
+            problems.append(f"database: {rounds.store_problem}")
+        if rounds.publisher is not None and rounds.publisher.failure is not None:
+            problems.append(f"zenoh: {rounds.publisher.failure}")
+        for watch in rounds.watches.values():
+            if watch.phase is Phase.DESIGNING:
+                problems.append(f"feeder {watch.name}: the monitor is still being designed")
+            elif watch.phase is Phase.FAILED:
+                problems.append(f"feeder {watch.name}: {watch.problem}")
+        return not problems, problems
+
+    async def put_feeder(self, name: str, tables: dict[str, Any]) -> None:
+        """Take over a feeder's tables: check, design, store, watch; all or nothing.
+
+        Parameters
+        ----------
+        name, tables
+            Its name, and JSON of the columns of its files.
+
+        Raises
+        ------
+        FeederInvalid, NotObservable, DesignInfeasible, StoreUnavailable
+            If it cannot be taken over; the feeder stays as it was.
+        """
+
+        def prepare() -> tuple[Site, MonitorDesign]:
+            parsed = from_json(tables)
+            if parsed.meta.name != name:
+                raise FeederInvalid([f"feeder: name {parsed.meta.name!r} does not fit the address {name!r}"])
+            site = from_tables(parsed)
+            return site, design(site)
+
+        site, finished = await asyncio.to_thread(prepare)
+
+        def install() -> None:
+            self._rounds.store_all()
+            self._rounds.store.put_feeder(name, tables)
+            self._rounds.add(site).install(finished)
+
+        await self._command(install)
+
+    async def acknowledge(self, alarm_id: str, who: str, comment: str) -> dict[str, Any]:
+        """Answer an alarm; it is on the disk when this returns.
+
+        Parameters
+        ----------
+        alarm_id, who, comment
+            Which alarm, who answers it, and with what words.
+
+        Raises
+        ------
+        AlarmUnknown, AlreadyAcknowledged, StoreUnavailable
+            If it cannot be answered; nothing has changed then.
+        """
+        return await self._command(partial(self._rounds.acknowledge, alarm_id, who, comment))
+
+    async def subscribe(self) -> AsyncGenerator[dict[str, Any], None]:
+        """Yield a wake-up after each stored alarm and each new report, until the service stops."""
+        queue: asyncio.Queue[str] = asyncio.Queue(maxsize=4)
+        self._subscribers.add(queue)
+        try:
+            while not self._stopping:
+                kind = await queue.get()
+                if kind == "stop":
+                    return
+                yield {"type": kind, "data": None}
+        finally:
+            self._subscribers.discard(queue)
+
+    def _notify(self, kind: str) -> None:
+        for queue in self._subscribers:
+            if queue.full():
+                queue.get_nowait()
+            queue.put_nowait(kind)
+
+
+def _install(watch: Watch, finished: MonitorDesign | None, problem: str) -> None:
+    if finished is None:
+        watch.fail(problem)
+    else:
+        watch.install(finished)

@@ -1,0 +1,143 @@
+"""What an operator can set: by command line, by environment (`GRIDSEC_...`), or not at all.
+
+All problems are reported at once, in the operator's words.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, ValidationError, field_validator
+from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
+
+from gridsec.errors import GridsecError
+from service.align import Clock
+
+ENV_PREFIX = "GRIDSEC_"
+_ENDPOINT = re.compile(r"^(tcp|udp|tls|quic|ws|unixsock-stream|unixpipe|vsock|serial)/\S+$")
+_PREFIX = re.compile(r"^[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*$")
+
+
+class SettingsInvalid(GridsecError):
+    """The settings are wrong; `problems` names all of them.
+
+    Parameters
+    ----------
+    problems
+        One sentence each.
+    """
+
+    def __init__(self, problems: Iterable[str]) -> None:
+        self.problems = tuple(problems)
+        super().__init__("\n  - ".join(["the settings are wrong:", *self.problems]))
+
+
+Listed = Annotated[tuple[str, ...], NoDecode]
+
+
+class Settings(BaseSettings):
+    """Everything that can be set for `gridsec serve`. Lists in the environment are separated by commas."""
+
+    model_config = SettingsConfigDict(env_prefix=ENV_PREFIX, extra="forbid", frozen=True)
+
+    feeders: Listed = ()
+    zenoh_listen: Listed = ("tcp/127.0.0.1:7447",)
+    zenoh_connect: Listed = ()
+    zenoh_mode: Literal["router", "peer", "client"] | None = None
+    zenoh_config: Path | None = None
+    prefix: str = "gridsec"
+    http: str = "127.0.0.1:8000"
+    database: str = "sqlite:///gridsec.db"
+    clock: Clock = Clock.WALL
+    max_skew_s: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
+    grace_s: float | None = Field(default=None, ge=0.0, allow_inf_nan=False)
+    max_payload: int = Field(default=256 * 1024, ge=1024, le=16 << 20)
+    queue: int = Field(default=20_000, ge=100)
+    log_level: Literal["debug", "info", "warning", "error"] = "info"
+    log_format: Literal["console", "json"] = "console"
+
+    @field_validator("feeders", "zenoh_listen", "zenoh_connect", mode="before")
+    @classmethod
+    def _split(cls, value: object) -> object:
+        if isinstance(value, str):
+            return tuple(part.strip() for part in value.split(",") if part.strip())
+        return value
+
+    @field_validator("zenoh_listen", "zenoh_connect")
+    @classmethod
+    def _endpoints(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        wrong = [end for end in value if not _ENDPOINT.match(end)]
+        if wrong:
+            raise ValueError(f"{', '.join(wrong)}: an endpoint looks like tcp/127.0.0.1:7447")
+        return value
+
+    @field_validator("zenoh_config")
+    @classmethod
+    def _file(cls, value: Path | None) -> Path | None:
+        if value is not None and not value.is_file():
+            raise ValueError(f"{value} is no file")
+        return value
+
+    @field_validator("prefix")
+    @classmethod
+    def _chunks(cls, value: str) -> str:
+        if not _PREFIX.match(value):
+            raise ValueError(f"{value!r}: letters, digits and _ . - in chunks separated by slashes")
+        return value
+
+    @field_validator("http")
+    @classmethod
+    def _address(cls, value: str) -> str:
+        split_address(value)
+        return value
+
+
+def split_address(address: str) -> tuple[str, int]:
+    """Return host and port of `host:port` or `[v6]:port`.
+
+    Parameters
+    ----------
+    address
+        The text.
+
+    Raises
+    ------
+    ValueError
+        If it is none.
+    """
+    host, _, port = address.rpartition(":")
+    host = host.removeprefix("[").removesuffix("]")
+    if not host or not port.isascii() or not port.isdigit() or int(port) > 65535:
+        raise ValueError(f"{address!r}: an address looks like 127.0.0.1:8000, with a port up to 65535")
+    return host, int(port)
+
+
+def settings(given: Mapping[str, Any]) -> Settings:
+    """Return the settings: what is given, else the environment, else the defaults.
+
+    Parameters
+    ----------
+    given
+        Values from the command line by field name; None means not given.
+
+    Raises
+    ------
+    SettingsInvalid
+        With every problem.
+    """
+    try:
+        return Settings(**{name: value for name, value in given.items() if value is not None})
+    except ValidationError as error:
+        raise SettingsInvalid(_problem(one) for one in error.errors()) from error
+
+
+def _problem(error: Any) -> str:
+    name = str(error["loc"][0]) if error["loc"] else "settings"
+    option, variable = "--" + name.replace("_", "-").removesuffix("-s"), ENV_PREFIX + name.upper()
+    option = {"--feeders": "--feeder"}.get(option, option)
+    message = str(error["msg"]).removeprefix("Value error, ")
+    shown = "" if error["type"] == "value_error" else f" (is {error['input']!r})"
+    return f"{option} or {variable}: {message}{shown}"
