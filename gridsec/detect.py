@@ -1,8 +1,13 @@
 """Residual thresholds: how far an honest meter may be from the reconstructed voltage.
 
 A meter is named manipulated when its output residual leaves the largest value that honest meters,
-loads known within stated intervals, and the model's own error can produce together. No term is a
-matter of taste: each comes from a stated accuracy.
+loads known within stated intervals, the observers' own error and the model's can produce together. No
+term is a matter of taste: each comes from a stated accuracy, and the sum is a worst case, because the
+errors of loads and meters may be systematic. docs/theory-detection.md has the derivation and the proof.
+
+References
+----------
+chong2020, section V and Theorem 2 (the estimate's error), equation (19) (the reconstructed voltage).
 """
 
 from __future__ import annotations
@@ -11,7 +16,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gridsec.online import Floats
+from gridsec.arrays import Bools, Floats, Ints, frozen
+from gridsec.droop import Droop, voltage_curve
+from gridsec.feeder import LinDistFlow
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,3 +65,356 @@ class MeterAccuracy:
             number = float(getattr(self, name))
             if not (np.isfinite(number) and number >= 0):
                 raise ValueError(f"{name} must be finite and not negative, got {number}")
+
+
+def reading_error(accuracy: MeterAccuracy, v2: Floats, sigmas: float) -> Floats:
+    """Largest honest error of a squared reading, per meter.
+
+    `(v + e)^2 - v^2 = 2 v e + e^2` with `e = class v + resolution / 2 + sigmas jitter`.
+
+    Parameters
+    ----------
+    accuracy
+        The meters.
+    v2 : (p,)
+        The largest squared voltage that the meter may be at, pu.
+    sigmas
+        How many standard deviations of jitter an honest reading may be off.
+
+    Returns
+    -------
+    (p,)
+        Bounds, squared pu.
+    """
+    v = np.sqrt(np.maximum(v2, 0.0))
+    e = accuracy.class_fraction * v + 0.5 * accuracy.resolution + sigmas * accuracy.jitter
+    return np.asarray(e * (2.0 * v + e))
+
+
+def busbar_error(accuracy: MeterAccuracy, v0_squared: float, sigmas: float) -> float:
+    """Largest honest error of the squared busbar voltage.
+
+    Parameters
+    ----------
+    accuracy
+        The meters.
+    v0_squared
+        The squared reading, pu.
+    sigmas
+        As in `reading_error`.
+    """
+    v = float(np.sqrt(max(v0_squared, 0.0)))
+    e = accuracy.busbar_class * v + 0.5 * accuracy.busbar_resolution + sigmas * accuracy.busbar_jitter
+    return e * (2.0 * v + e)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ErrorModel:
+    """How errors travel through the feeder and the observers. N customers, m inverters, p meters.
+
+    Attributes
+    ----------
+    droop
+        The inverters.
+    quota
+        2M: how many meters an observer without liars may leave out.
+    R2, X2 : (N, N)
+        `2 |R|`, `2 |X|`.
+    meters : (p,)
+        Customer of each meter.
+    meter_of : (m,)
+        Meter that drives each inverter; -1 for none.
+    span : (m,)
+        Distance between the saturated values of each curve, pu.
+    mismatch : (m,)
+        How far the curve that a real inverter runs, linear in v, can be from K, linear in z, pu.
+    """
+
+    droop: Droop
+    quota: int
+    R2: Floats
+    X2: Floats
+    meters: Ints
+    meter_of: Ints
+    span: Floats
+    mismatch: Floats
+
+
+def error_model(droop: Droop, model: LinDistFlow, meters: Ints, max_attacked: int) -> ErrorModel:
+    """Collect what the bounds need.
+
+    Parameters
+    ----------
+    droop
+        The inverters.
+    model
+        Linear power flow of the feeder.
+    meters : (p,)
+        Customer of each meter.
+    max_attacked
+        M.
+    """
+    at = {int(c): j for j, c in reversed(list(enumerate(meters)))}
+    return ErrorModel(
+        droop=droop,
+        quota=2 * max_attacked,
+        R2=frozen(2.0 * np.abs(model.R)),
+        X2=frozen(2.0 * np.abs(model.X)),
+        meters=meters,
+        meter_of=np.array([at.get(int(c), -1) for c in droop.customer], dtype=np.intp),
+        span=frozen(droop.q[:, 0] - droop.q[:, 3]),
+        mismatch=curve_mismatch(droop),
+    )
+
+
+def curve_mismatch(droop: Droop) -> Floats:
+    """Largest distance between the curve in v and its model in z, per inverter; (m,).
+
+    Both agree at the breakpoints. Between two of them, v as a function of z is a parabola against its
+    chord: the distance is largest in the middle of the interval of v, `(dv)^2 / 4` in z, and what that
+    is in reactive power is computed there, not approximated.
+
+    Parameters
+    ----------
+    droop
+        The inverters.
+    """
+    worst = np.zeros(droop.tau.shape)
+    for left in range(3):
+        # The sagitta of v^2 over [a, b] is largest at the arithmetic mean.
+        middle = 0.5 * (droop.v[:, left] + droop.v[:, left + 1])
+        gap = np.abs(voltage_curve(droop, middle) - droop(droop.vbar**2 - middle**2))
+        np.maximum(worst, gap, out=worst)
+    return worst
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Uncertainty:
+    """What is not known at one tick.
+
+    Attributes
+    ----------
+    base : (N,)
+        Error of each customer's squared voltage if all injections of inverters were known: busbar,
+        loads, model; squared pu.
+    reading : (p,)
+        Honest error of each reading, squared pu.
+    live : (p,)
+        Meters with a usable reading.
+    told : (p,)
+        Live meters whose customer's net reactive power is metered and used.
+    extra : (p,)
+        By how much the assumed load of such a customer is less certain than the metered net, pu.
+    """
+
+    base: Floats
+    reading: Floats
+    live: Bools
+    told: Bools
+    extra: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ErrorBound:
+    """Bounds on the observers' error, inverter by inverter; honest at every time. m inverters.
+
+    Attributes
+    ----------
+    driven : (m,)
+        For inverters that their own honest meter drives, pu.
+    free : (m,)
+        For inverters that run on the model, in every observer that leaves out at most 2M meters and
+        trusts only honest ones, pu.
+    """
+
+    driven: Floats
+    free: Floats
+
+
+def widest(model: ErrorModel) -> ErrorBound:
+    """The bound when nothing is known: curve and estimate both lie between the saturated values.
+
+    Parameters
+    ----------
+    model
+        The plant.
+    """
+    return ErrorBound(model.span.copy(), model.span.copy())
+
+
+def gap(model: ErrorModel, now: Uncertainty, bound: ErrorBound, rows: Ints | None = None) -> Floats:
+    """Error of the squared voltages that any liar-free observer with at most 2M meters left out sees.
+
+    `base_i + sum over undriven inverters 2 X_ik free_k + sum over meters 2 X_ij driven_j
+    + the 2M largest of 2 X_ij (free_j - driven_j)`: whichever 2M meters are left out, these cost most.
+
+    Parameters
+    ----------
+    model, now, bound
+        Plant, what is not known, and the bound on the observers' error.
+    rows : (r,), optional
+        Customers; all by default.
+
+    Returns
+    -------
+    (r,) or (N,)
+        Bounds, squared pu.
+    """
+    every = slice(None) if rows is None else rows
+    X2, base = model.X2[every], now.base[every]
+    own = model.droop.customer
+    metered = (model.meter_of >= 0) & now.live[model.meter_of] if now.live.size else model.meter_of >= 0
+    out = base + X2[:, own[~metered]] @ bound.free[~metered]
+    driven, free = np.zeros((2, now.live.size))
+    np.add.at(driven, model.meter_of[metered], bound.driven[metered])
+    np.add.at(free, model.meter_of[metered], bound.free[metered])
+    # While the net is metered and trusted, the inverter's own state does not matter to the voltage.
+    driven = np.where(now.told, 0.0, driven)
+    swing = np.maximum(np.where(now.told, free + now.extra, free) - driven, 0.0)
+    column = X2[:, model.meters]
+    return np.asarray(out + column @ driven + largest(column * swing, model.quota))
+
+
+def largest(values: Floats, count: int) -> Floats:
+    """Sum of the `count` largest entries of each row; (r,).
+
+    Parameters
+    ----------
+    values : (r, p)
+        Entries, not negative.
+    count
+        How many.
+    """
+    p = values.shape[1]
+    if count >= p:
+        return np.asarray(values.sum(axis=1))
+    if count == 0:
+        return np.zeros(values.shape[0])
+    return np.asarray(np.partition(values, p - count, axis=1)[:, p - count :].sum(axis=1))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """Where the estimate was and is, over one step.
+
+    Attributes
+    ----------
+    before, after : (m,)
+        Estimated z at the inverters at the beginning and the end, pu.
+    offset : (m,)
+        How far the selected estimate's z may be from that of a liar-free observer, pu.
+    h
+        Length of the step, s.
+    """
+
+    before: Floats
+    after: Floats
+    offset: Floats
+    h: float
+
+
+def settled(model: ErrorModel, now: Uncertainty, motion: Motion, start: ErrorBound) -> ErrorBound:
+    """Level towards which the bounds go, given that they never exceed `start`.
+
+    Iterates the monotone map of `docs/theory-detection.md` downwards from `start`; every iterate is a
+    bound, so that the iteration may stop at any time.
+
+    Parameters
+    ----------
+    model, now, motion
+        Plant, what is not known, and where the estimate was.
+    start
+        An upper bound that the map does not exceed.
+    """
+    level = start
+    for _ in range(_ROUNDS):
+        image = _image(model, now, motion, level)
+        lower = ErrorBound(np.minimum(level.driven, image.driven), np.minimum(level.free, image.free))
+        done = np.all(lower.free >= (1.0 - _TIGHTENING) * level.free)
+        level = lower
+        if done:
+            break
+    return level
+
+
+def _image(model: ErrorModel, now: Uncertainty, motion: Motion, bound: ErrorBound) -> ErrorBound:
+    """What errors of the size `bound` drive the curves' values to differ by."""
+    droop = model.droop
+    # Readings and loads are held over the step; how far they moved in it is part of their error. In a
+    # step far above the time constant only the last time constant counts.
+    hold = np.abs(motion.after - motion.before) / np.maximum(1.0, motion.h / droop.tau)
+    through = gap(model, now, bound, droop.customer) + hold
+    own = (now.reading[model.meter_of] if now.reading.size else np.zeros(hold.shape)) + hold
+    low = np.minimum(motion.before, motion.after) - motion.offset - through
+    high = np.maximum(motion.before, motion.after) + motion.offset + through
+
+    def reach(radius: Floats) -> Floats:
+        steep = np.minimum(droop.slope * radius, droop(high + radius) - droop(low - radius))
+        return np.asarray(np.minimum(steep + model.mismatch, model.span))
+
+    return ErrorBound(reach(own), reach(through))
+
+
+# Rounds of the iteration and the relative gain below which another round is not worth it. Both trade
+# tightness for time only.
+_ROUNDS = 40
+_TIGHTENING = 1e-3
+# How far above the last bound the next one is looked for before starting again from saturation.
+_ROOM = 1.05
+
+
+def advance(
+    model: ErrorModel, now: Uncertainty, motion: Motion, bound: ErrorBound, last: ErrorBound
+) -> tuple[ErrorBound, ErrorBound]:
+    """The bounds at the end of a step.
+
+    Every error is a first-order lag of what drives it, `tau |e|' <= -|e| + reach(e)`, and reach is
+    monotone: with any G that is at least the present bound and at least its own image, the error stays
+    below G during the step, and `bound+ = exp(-h/tau) bound + (1 - exp(-h/tau)) reach(G)`.
+
+    Parameters
+    ----------
+    model, now, motion
+        Plant, what is not known, and the step.
+    bound
+        Bound at the beginning.
+    last
+        The G of the previous step: a good first guess.
+
+    Returns
+    -------
+    ErrorBound, ErrorBound
+        Bound at the end, and this step's G.
+    """
+    keep = np.exp(-motion.h / model.droop.tau)
+    guess = ErrorBound(
+        np.minimum(np.maximum(bound.driven, _ROOM * last.driven), model.span),
+        np.minimum(np.maximum(bound.free, _ROOM * last.free), model.span),
+    )
+    image = _image(model, now, motion, guess)
+    if not (np.all(image.free <= guess.free) and np.all(image.driven <= guess.driven)):
+        guess = widest(model)
+    top = _above(model, now, motion, guess, bound)
+    image = _image(model, now, motion, top)
+    after = ErrorBound(
+        keep * bound.driven + (1.0 - keep) * image.driven, keep * bound.free + (1.0 - keep) * image.free
+    )
+    return after, top
+
+
+def _above(
+    model: ErrorModel, now: Uncertainty, motion: Motion, start: ErrorBound, floor: ErrorBound
+) -> ErrorBound:
+    """Lower `start` while it stays above `floor` and above its image."""
+    level = start
+    for _ in range(_ROUNDS):
+        image = _image(model, now, motion, level)
+        lower = ErrorBound(
+            np.minimum(level.driven, np.maximum(image.driven, floor.driven)),
+            np.minimum(level.free, np.maximum(image.free, floor.free)),
+        )
+        done = np.all(lower.free >= (1.0 - _TIGHTENING) * level.free)
+        level = lower
+        if done:
+            break
+    return level

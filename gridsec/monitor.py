@@ -1,46 +1,377 @@
 """The whole online chain for one feeder: from a frame of readings to an estimate and a verdict.
 
-    design(plant, *, max_attacked, step_s, gains="direct") -> MonitorDesign     offline, may raise
-    init(design, t) -> MonitorState
-    step(design, state, frame) -> (MonitorState, Estimate, Verdict)             online, never raises on data
+Offline, `design` turns a plant into a bank of observers with a certificate; online, `init` and `step`
+run it. A step never raises on data: outcomes are values.
 
-`step_s` is the expected interval between frames, s; any other interval works too. `gains` is "direct"
-or stacked circle-criterion gains.
+1. The known input w comes from the busbar voltage, the loads, and the loss correction at the last
+   estimate; chong2020 (19).
+2. The bank takes one step; chong2020 (5). The set whose estimate agrees best with those of its subsets
+   is selected, (6) and (7), among the sets without a named meter.
+3. The residuals of *all* meters against the selected estimate are compared with the largest value an
+   honest meter can reach (`gridsec.detect`). Lies inside a droop curve's deadband do not move any
+   estimate, so that agreement alone would not find them.
+4. A meter that stays above its threshold for `confirm` frames is named, one that stays below it for
+   `release` frames is not any more, and the selection is repeated without the accused.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import Literal
 
-from gridsec.arrays import Ints
-from gridsec.detect import MeterAccuracy
-from gridsec.feeder import Feeder
+import numpy as np
 
-if TYPE_CHECKING:
-    from gridsec.droop import Droop
+from gridsec import bank as banks
+from gridsec import detect
+from gridsec.arrays import Bools, Floats, Ints
+from gridsec.certificates import Certificate, certify, verify
+from gridsec.detect import ErrorBound, Motion
+from gridsec.errors import DesignInfeasible
+from gridsec.feeder import LinDistFlow, lindistflow, loss_correction
+from gridsec.frames import NO_VOLTAGE, Inputs, clean, injections
+from gridsec.judge import Situation, Tally, count, decide, residual_excess
+from gridsec.lure import close_loop
+from gridsec.online import Cause, Decision, Estimate, Frame, Verdict
+from gridsec.plant import MonitorDesign, MonitorState, Options, Plant
+
+__all__ = ["MonitorDesign", "MonitorState", "Options", "Plant", "design", "init", "step"]
+
+
+def design(
+    plant: Plant,
+    *,
+    max_attacked: int,
+    step_s: float,
+    gains: Literal["direct"] | banks.Gains = "direct",
+    options: Options | None = None,
+    certificate: Certificate | None = None,
+) -> MonitorDesign:
+    """Prepare to watch a feeder.
+
+    Parameters
+    ----------
+    plant
+        What is watched.
+    max_attacked
+        M, how many meters may be manipulated at the same time.
+    step_s
+        Expected interval between frames, s. Other intervals work, too; above 30 s a meter is named
+        after one frame instead of two, unless `options` say otherwise.
+    gains
+        `direct`: the inverter of a trusted meter is driven by that meter's reading. Or stacked gains
+        of circle-criterion observers in the order of `bank.subsets(p, M).masks()`; the error bounds
+        are those of direct injection for gains between zero and it.
+    options
+        The numbers that decide.
+    certificate
+        A proof made elsewhere; by default the best closed form. It is verified here.
+
+    Raises
+    ------
+    NotObservable
+        Unless there are more than 2M meters.
+    DesignInfeasible
+        If no certificate holds, the bank would be too large, or the gains detect nothing.
+    ValueError
+        If two meters sit at one customer, or the accuracy is that of other meters.
+
+    References
+    ----------
+    chong2020, Corollary 1, for any radial feeder and with what its errata ask for.
+    """
+    meters = plant.meters
+    if np.unique(meters).size != meters.size:
+        raise ValueError("two meters at one customer; combine them before")
+    if plant.accuracy.class_fraction.shape != meters.shape:
+        raise ValueError(
+            f"accuracy is given for {plant.accuracy.class_fraction.size} meters of {meters.size}"
+        )
+    if not (np.isfinite(step_s) and step_s > 0):
+        raise ValueError(f"step_s is {step_s}; it must be a positive number of seconds")
+    if options is None:
+        options = Options() if step_s <= 30.0 else Options(confirm=1, release=1)
+    lure = close_loop(plant.feeder, plant.droop, meters)
+    model = lindistflow(plant.feeder)
+    bank = banks.design(lure, max_attacked, gains=gains, reactive=_reactive(model, meters, gains))
+    proof = certify(lure) if certificate is None else certificate
+    margin = verify(proof, lure)
+    if not margin > 0:
+        raise DesignInfeasible(f"{proof.kind} certificate", "it fails its verification", margin)
+    errors = detect.error_model(plant.droop, model, meters, max_attacked)
+    return MonitorDesign(plant, model, bank, errors, proof, step_s, options)
+
+
+def _reactive(model: LinDistFlow, meters: Ints, gains: object) -> Floats | None:
+    return -2.0 * model.X[:, meters] if isinstance(gains, str) else None
+
+
+def init(design: MonitorDesign, t: float) -> MonitorState:
+    """Begin to watch; the observers start with the first frame.
+
+    Parameters
+    ----------
+    design
+        From `design`. Its certificate is verified once more: a design that was stored, or put
+        together by hand, is not believed.
+    t
+        Unix time, s.
+    """
+    m, p = design.plant.droop.tau.size, design.plant.meters.size
+    try:
+        valid = verify(design.certificate, design.bank.lure) > 0
+    except DesignInfeasible:
+        valid = False
+    widest = detect.widest(design.errors)
+    return MonitorState(
+        t=t,
+        valid=valid,
+        bank=None,
+        x=np.zeros(m),
+        z=np.zeros(m),
+        spread=np.zeros(m),
+        bound=widest,
+        level=widest,
+        settled=False,
+        tally=Tally(np.zeros(p, dtype=np.intp), np.zeros(p, dtype=np.intp), np.zeros(p, dtype=np.bool_)),
+        v0_squared=design.plant.droop.vbar**2,
+        last=None,
+    )
+
+
+def step(design: MonitorDesign, state: MonitorState, frame: Frame) -> tuple[MonitorState, Estimate, Verdict]:
+    """Take one frame in.
+
+    Parameters
+    ----------
+    design, state
+        From `design`, and from `init` or the last step.
+    frame
+        Everything known at one tick. A frame that is not later than the last one changes nothing: it
+        gets the last estimate again, and UNDECIDED.
+
+    Returns
+    -------
+    MonitorState, Estimate, Verdict
+        As every estimator's step; see `gridsec.online`.
+    """
+    late = state.bank is not None and not frame.t > state.t
+    if late or not np.isfinite(frame.t):
+        return _unusable(design, state, frame)
+    inputs = clean(design, state, frame)
+    h = 0.0 if state.bank is None else frame.t - state.t
+    if state.bank is None:
+        bank = banks.init(design.bank, inputs.z, inputs.w, inputs.live, net=inputs.net)
+    else:
+        bank = banks.step(
+            design.bank, state.bank, inputs.z, inputs.w, inputs.live, h, net=inputs.net, adopt=state.x
+        )
+        if banks.decided(design.bank, bank) and not banks.decided(design.bank, state.bank):
+            # The observers start anew, from one that trusted nobody.
+            widest = detect.widest(design.errors)
+            state = replace(state, bound=widest, level=widest, settled=False)
+        else:
+            state = replace(state, bound=_handed_over(design, state, inputs.live))
+    return _conclude(design, state, frame, inputs, bank, h)
+
+
+def _handed_over(design: MonitorDesign, state: MonitorState, live: Bools) -> ErrorBound:
+    """The bounds when meters fall silent or return: each inverter takes over the other way's error."""
+    meter_of, bound = design.errors.meter_of, state.bound
+    if state.bank is None or not live.size:
+        return bound
+    was, now = state.bank.seen[meter_of], live[meter_of]
+    silenced, returned = (meter_of >= 0) & was & ~now, (meter_of >= 0) & ~was & now
+    free = np.where(silenced, np.maximum(bound.free, bound.driven), bound.free)
+    # A returning meter's inverter starts from the selected estimate.
+    return ErrorBound(np.where(returned, bound.free + state.spread, bound.driven), free)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Plant:
-    """The feeder as it stands in the street. N customers, m inverters, p meters.
+class _View:
+    """The feeder as one selected set of meters sees it."""
 
-    Attributes
-    ----------
-    feeder
-        Radial tree with its customers.
-    droop
-        The customers' inverters and their curves.
-    meters : (p,)
-        Index of the customer at which each voltage meter sits; at most one meter per customer.
-    accuracy
-        What the meters promise.
-    loss_correction
-        DistFlow fixed-point steps that correct LinDistFlow for branch losses; 0 leaves it linear.
-    """
+    index: int
+    x: Floats
+    z: Floats
+    spread: Floats
+    bound: ErrorBound
+    level: ErrorBound
+    settled: bool
+    v2: Floats
+    v2_bus: Floats
+    error: Floats  # (N,)
+    score: Floats  # (p,) NaN where not live
+    threshold: Floats  # (p,)
 
-    feeder: Feeder
-    droop: Droop
-    meters: Ints
-    accuracy: MeterAccuracy
-    loss_correction: int = 1
+
+def _conclude(  # noqa: PLR0917  # the chain's three values, then what this step added
+    design: MonitorDesign,
+    state: MonitorState,
+    frame: Frame,
+    inputs: Inputs,
+    bank: banks.BankState,
+    h: float,
+) -> tuple[MonitorState, Estimate, Verdict]:
+    plant, options, live = design.plant, design.options, inputs.live
+    view = _select(design, state, frame, inputs, bank, h)
+    over = live & (np.nan_to_num(view.score) > view.threshold)
+    enough = banks.decided(design.bank, bank)
+    tally = state.tally
+    if enough:
+        tally = count(tally, over, live, confirm=options.confirm, release=options.release)
+    decision, cause, reason = decide(
+        Situation(
+            names=tuple(plant.feeder.customers[c] for c in plant.meters),
+            max_attacked=design.bank.sets.max_attacked,
+            live=live,
+            over=over,
+            named=tally.named,
+            wide=live & (view.threshold > options.widest),
+            valid=state.valid,
+            settled=view.settled,
+            busbar=inputs.busbar,
+        )
+    )
+    trusted = np.zeros(live.size, dtype=np.bool_)
+    if view.index >= 0:
+        trusted = design.bank.masks[view.index] & live & ~tally.named
+    error = view.error
+    if np.count_nonzero(tally.named) > design.bank.sets.max_attacked:
+        # More liars than the bank can take: only saturation bounds what they did to the estimate.
+        error = inputs.now.base + design.errors.X2[:, plant.droop.customer] @ design.errors.span
+    estimate = Estimate(t=frame.t, v2=view.v2, bound=error, v2_bus=view.v2_bus, trusted=trusted, x=view.x)
+    accused = tally.named & live
+    attack = np.where(accused, inputs.y - view.v2[plant.meters], 0.0)
+    verdict = Verdict(decision, cause, reason, tally.named, view.score, view.threshold, attack)
+    after = MonitorState(
+        t=frame.t,
+        valid=state.valid,
+        bank=bank,
+        x=view.x,
+        z=view.z,
+        spread=view.spread,
+        bound=view.bound,
+        level=view.level,
+        settled=view.settled,
+        tally=tally,
+        v0_squared=inputs.v0_squared,
+        last=(estimate, verdict),
+    )
+    return after, estimate, verdict
+
+
+def _select(  # noqa: PLR0917  # as _conclude
+    design: MonitorDesign,
+    state: MonitorState,
+    frame: Frame,
+    inputs: Inputs,
+    bank: banks.BankState,
+    h: float,
+) -> _View:
+    """Select a set, look for meters above their thresholds, and select again without them."""
+    sets, live = design.bank.sets, inputs.live
+    pi = banks.consistency(design.bank, bank)
+    tie = design.options.tie * float(np.max(design.plant.droop.limit, initial=0.0))
+    masks = design.bank.masks[: sets.count_large]
+    named = state.tally.named
+    excluded = named if np.count_nonzero(named) <= sets.max_attacked else np.zeros_like(named)
+    penalty: Floats | None = None
+    while True:
+        index = -1
+        if pi.size:
+            allowed = np.asarray(~(masks & excluded).any(axis=1))
+            index = banks.select(pi, allowed=allowed, penalty=penalty, tie=tie)
+        view = _view(design, state, frame, inputs, bank, index, h)
+        over = live & (np.nan_to_num(view.score) > view.threshold)
+        if index < 0 or not over.any():
+            return view
+        wanted = excluded | over
+        if np.count_nonzero(wanted) <= sets.max_attacked:
+            if not (masks[index] & wanted).any():
+                return view
+            excluded = wanted
+        elif penalty is None:
+            penalty = masks @ residual_excess(np.nan_to_num(view.score), view.threshold, live)
+        else:
+            return view
+
+
+def _view(  # noqa: PLR0917  # as _conclude
+    design: MonitorDesign,
+    state: MonitorState,
+    frame: Frame,
+    inputs: Inputs,
+    bank: banks.BankState,
+    index: int,
+    h: float,
+) -> _View:
+    plant, model, errors = design.plant, design.model, design.errors
+    own, at = plant.droop.customer, plant.meters
+    x = banks.estimate(design.bank, bank, index)
+    spread = banks.spread(design.bank, bank, index) if index >= 0 else np.zeros(x.shape)
+    told = inputs.now.told & (design.bank.masks[index] if index >= 0 else False)
+    q = injections(plant, frame, x, told)
+    correction = inputs.correction
+    if plant.loss_correction:
+        with np.errstate(all="ignore"):
+            correction = loss_correction(
+                plant.feeder, frame.p, q, inputs.v0_squared, steps=plant.loss_correction
+            )
+        correction = np.where(np.isfinite(correction), correction, inputs.correction)
+    v2_bus = inputs.v0_squared + 2.0 * (model.R_bus @ frame.p + model.X_bus @ q) + correction
+    v2 = v2_bus[plant.feeder.bus]
+    z = plant.droop.vbar**2 - v2[own]
+    # What the selected set takes from its meters and a liar-free subset may not: the estimate differs by
+    # `spread`, and metered reactive power of at most M meters is replaced.
+    offset = errors.X2[:, own] @ spread
+    if told.any():
+        held = np.bincount(own, weights=x, minlength=v2.size)[at] + inputs.q[at]
+        doubt = np.where(told, np.abs(frame.q_net[at] - held), 0.0)
+        offset = offset + detect.largest(errors.X2[:, at] * np.nan_to_num(doubt), errors.quota // 2)
+    moved = np.abs(correction - inputs.correction)[plant.feeder.bus]
+    now = replace(inputs.now, base=inputs.now.base + moved)
+    before = z if state.bank is None else state.z
+    motion = Motion(before=before, after=z, offset=offset[own], h=h)
+    if index >= 0:
+        bound, level = detect.advance(errors, now, motion, state.bound, state.level)
+        error = detect.gap(errors, now, bound) + offset
+    else:
+        bound, level = state.bound, state.level
+        error = now.base + errors.X2[:, own] @ errors.span
+    threshold = detect.reading_error(plant.accuracy, v2[at] + error[at], design.options.sigmas) + error[at]
+    score = np.where(inputs.live, np.abs(inputs.y - v2[at]), np.nan)
+    settled = state.settled
+    if index >= 0 and not settled:
+        rest = detect.settled(errors, now, motion, detect.widest(errors))
+        transient = detect.gap(errors, now, bound)[at] - detect.gap(errors, now, rest)[at]
+        settled = bool(np.all(transient <= design.options.settled * threshold))
+    return _View(index, x, z, spread, bound, level, settled, v2, v2_bus, error, score, threshold)
+
+
+def _unusable(
+    design: MonitorDesign, state: MonitorState, frame: Frame
+) -> tuple[MonitorState, Estimate, Verdict]:
+    """The answer to a frame that is not later than the last one: nothing new, and certainly not CLEAN."""
+    plant = design.plant
+    p, b = plant.meters.size, len(plant.feeder.buses)
+    if state.last is None:
+        v2_bus = np.full(b, state.v0_squared)
+        estimate = Estimate(
+            t=state.t,
+            v2=v2_bus[plant.feeder.bus],
+            bound=np.full(plant.feeder.bus.size, NO_VOLTAGE),
+            v2_bus=v2_bus,
+            trusted=np.zeros(p, dtype=np.bool_),
+            x=state.x,
+        )
+        score, threshold = np.full(p, np.nan), np.full(p, NO_VOLTAGE)
+        named, attack = state.tally.named, np.zeros(p)
+    else:
+        estimate, verdict = state.last
+        score, threshold, named, attack = verdict.score, verdict.threshold, verdict.suspects, verdict.attack
+    reason = f"A frame of time {frame.t} is not later than the last one, {state.t}; it was not used."
+    return (
+        state,
+        estimate,
+        Verdict(Decision.UNDECIDED, Cause.SETTLING, reason, named, score, threshold, attack),
+    )

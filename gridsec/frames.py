@@ -1,0 +1,134 @@
+"""One frame made fit for the observers: no NaN gets past here, and every error has a size."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gridsec import detect
+from gridsec.arrays import Bools, Floats
+from gridsec.detect import Uncertainty
+from gridsec.feeder import loss_correction, model_error_bound
+from gridsec.lure import known_input
+from gridsec.online import Frame
+from gridsec.plant import MonitorDesign, MonitorState, Plant
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Inputs:
+    """One frame, cleaned. No NaN gets past here."""
+
+    live: Bools  # (p,)
+    y: Floats  # (p,) 0 where not live
+    z: Floats  # (p,)
+    w: Floats  # (N,)
+    net: Floats | None  # (p,) metered net reactive injection minus the assumed load's; NaN where unused
+    q: Floats  # (N,) without the inverters, whatever is metered
+    v0_squared: float
+    busbar: bool
+    correction: Floats  # (b + 1,) at the last estimate
+    now: Uncertainty
+
+
+def clean(design: MonitorDesign, state: MonitorState, frame: Frame) -> Inputs:
+    """Clean one frame, and say how uncertain what is left of it is.
+
+    Parameters
+    ----------
+    design, state
+        From `gridsec.monitor`.
+    frame
+        Everything known at one tick.
+    """
+    plant, model, options = design.plant, design.model, design.options
+    at = plant.meters
+    live = frame.seen & np.isfinite(frame.y)
+    y = np.where(live, frame.y, 0.0)
+    told = live & _credible(design, frame)
+    net = np.where(told, frame.q_net[at] - frame.q[at], np.nan) if told.any() else None
+    q_all = injections(plant, frame, state.x, told)
+    q_error = frame.q_error.copy()
+    q_error[at] = np.where(told, frame.q_net_error[at], q_error[at])
+    low, high = options.v2_limits
+    busbar = bool(np.isfinite(frame.v0_squared) and low <= frame.v0_squared <= high)
+    v0 = frame.v0_squared if busbar else state.v0_squared
+    correction, rest = _losses(plant, frame.p, q_all, v0, p_error=frame.p_error, q_error=q_error)
+    base = design.errors.R2 @ frame.p_error + design.errors.X2 @ q_error + rest
+    rise = 2.0 * (model.R @ frame.p + model.X @ q_all) + correction[plant.feeder.bus]
+    reading = detect.reading_error(plant.accuracy, v0 + rise[at] + _ROOM, options.sigmas)
+    extra = np.where(told, np.maximum(frame.q_error[at] - frame.q_net_error[at], 0.0), 0.0)
+    now = Uncertainty(np.minimum(base, NO_VOLTAGE), reading, live, told, extra)
+    if busbar:
+        error = detect.busbar_error(plant.accuracy, v0, options.sigmas)
+    else:
+        v0, error = _implied(design, state, now, y - rise[at], v0)
+    now = replace(now, base=np.minimum(now.base + error, NO_VOLTAGE))
+    w = known_input(model, plant.droop.vbar, frame.p, frame.q, v0, correction[plant.feeder.bus])
+    z = plant.droop.vbar**2 - y
+    return Inputs(live, y, z, w, net, frame.q, v0, busbar, correction, now)
+
+
+# Room for the squared voltage at a meter to be above its prediction, where only its accuracy depends on it.
+_ROOM = 0.05
+# Errors of squared voltages end here: no voltage is above 2 pu.
+NO_VOLTAGE = 4.0
+
+
+def _credible(design: MonitorDesign, frame: Frame) -> Bools:
+    """Whose net reactive power is what its load and its inverter can produce together; (p,)."""
+    plant = design.plant
+    if not design.bank.direct:
+        return np.zeros(plant.meters.size, dtype=np.bool_)
+    count_ = frame.q.size
+    most = np.bincount(plant.droop.customer, weights=plant.droop.q[:, 0], minlength=count_)
+    least = np.bincount(plant.droop.customer, weights=plant.droop.q[:, 3], minlength=count_)
+    room = frame.q_error + np.nan_to_num(frame.q_net_error)
+    rest = np.nan_to_num(frame.q_net) - frame.q
+    credible = np.isfinite(frame.q_net) & (least - room <= rest) & (rest <= most + room)
+    return np.asarray(credible[plant.meters])
+
+
+def injections(plant: Plant, frame: Frame, x: Floats, told: Bools) -> Floats:
+    """Net reactive injection of every customer: metered where told, otherwise load plus inverter; (N,)."""
+    q = frame.q + np.bincount(plant.droop.customer, weights=x, minlength=frame.q.size)
+    at = plant.meters[told]
+    q[at] = frame.q_net[at]
+    return np.asarray(q)
+
+
+def _losses(
+    plant: Plant, p: Floats, q: Floats, v0: float, *, p_error: Floats, q_error: Floats
+) -> tuple[Floats, Floats]:
+    """Loss correction (b + 1,), and how far it can be from the truth at each customer (N,)."""
+    feeder, steps = plant.feeder, plant.loss_correction
+    # The correction is nearly quadratic in the loads: its ends are where all of them err the same way.
+    ends = np.array([0.0, -1.0, 1.0])[:, None]
+    with np.errstate(all="ignore"):
+        three = loss_correction(feeder, p + ends * p_error, q + ends * q_error, v0, steps=max(steps, 1))
+        rest = model_error_bound(feeder, p, q, v0)
+    three = np.nan_to_num(three, nan=0.0, posinf=0.0, neginf=0.0)
+    moved = np.abs(three[1:] - three[0]).max(axis=0)[feeder.bus]
+    rest = np.nan_to_num(rest, nan=NO_VOLTAGE, posinf=NO_VOLTAGE)
+    if steps == 0:
+        rest = rest + np.abs(three[0][feeder.bus])
+        return np.zeros(three.shape[1]), np.minimum(rest + moved, NO_VOLTAGE)
+    return np.asarray(three[0]), np.minimum(rest + moved, NO_VOLTAGE)
+
+
+def _implied(
+    design: MonitorDesign, state: MonitorState, now: Uncertainty, implied: Floats, last: float
+) -> tuple[float, float]:
+    """Squared busbar voltage that the meters imply, and its error.
+
+    The median lies between honest values as long as liars are fewer than half, and then its error is
+    at most the largest honest one.
+    """
+    use = now.live & ~state.tally.named
+    if np.count_nonzero(use) <= design.errors.quota:
+        use = now.live
+    if np.count_nonzero(use) <= design.errors.quota:
+        return last, NO_VOLTAGE
+    # The estimate of the injections is that of the last frame; in between each may have moved by its span.
+    stale = detect.gap(design.errors, now, detect.widest(design.errors))[design.plant.meters]
+    return float(np.median(implied[use])), float(np.max((stale + now.reading)[use]))

@@ -1,0 +1,184 @@
+"""From residuals to a verdict: who is named, and what the answer is. Pure bookkeeping, no physics."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats, Ints
+from gridsec.online import Cause, Decision
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tally:
+    """How long each meter has been where it is. p meters.
+
+    Attributes
+    ----------
+    above, below : (p,)
+        Readings in a row above the threshold, and not above it.
+    named : (p,)
+        Meters named as manipulated.
+    """
+
+    above: Ints
+    below: Ints
+    named: Bools
+
+
+def count(tally: Tally, over: Bools, live: Bools, *, confirm: int, release: int) -> Tally:
+    """Take the residuals of one frame into account.
+
+    A silent meter stays what it was: who was named and then falls silent has not been cleared.
+
+    Parameters
+    ----------
+    tally
+        So far.
+    over : (p,)
+        Whose residual is above the threshold.
+    live : (p,)
+        Who has a residual at all.
+    confirm, release
+        Frames in a row after which a meter is named, and is not named any more.
+    """
+    above = np.where(live, np.where(over, tally.above + 1, 0), tally.above)
+    below = np.where(live, np.where(over, 0, tally.below + 1), tally.below)
+    named = (tally.named & (below < release)) | (above >= confirm)
+    return Tally(above, below, named)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Situation:
+    """What a verdict depends on. p meters.
+
+    Attributes
+    ----------
+    names : (p,)
+        How to call the meters in sentences.
+    max_attacked
+        M.
+    live, over, named : (p,)
+        Who reports, whose residual is above the threshold now, who is named.
+    wide : (p,)
+        Whose threshold is too wide for an answer.
+    valid, settled, busbar
+        Whether the design holds, the initial state is forgotten, and the busbar voltage is known.
+    """
+
+    names: tuple[str, ...]
+    max_attacked: int
+    live: Bools
+    over: Bools
+    named: Bools
+    wide: Bools
+    valid: bool
+    settled: bool
+    busbar: bool
+
+
+def decide(now: Situation) -> tuple[Decision, Cause, str]:
+    """The answer, its cause, and one sentence for an operator.
+
+    In this order: what makes every other answer worthless comes first, and CLEAN is what is left when
+    nothing speaks against it.
+
+    Parameters
+    ----------
+    now
+        The situation.
+    """
+    undecided = Decision.UNDECIDED
+    live, named = int(np.count_nonzero(now.live)), int(np.count_nonzero(now.named))
+    need = 2 * now.max_attacked + 1
+    silent = ~now.live
+    pending = now.over & now.live & ~now.named
+    suspects = _list(now, now.named)
+    answers = (
+        (
+            not now.valid,
+            undecided,
+            Cause.DESIGN_INVALID,
+            "The design's certificate does not hold for this feeder; nothing is guaranteed.",
+        ),
+        (
+            live < need,
+            undecided,
+            Cause.TOO_FEW_METERS,
+            f"{live} of {live + int(silent.sum())} meters report; at least {need} are needed to tell "
+            f"{_liars(now.max_attacked)}.",
+        ),
+        (
+            not now.busbar,
+            undecided,
+            Cause.NO_BUSBAR,
+            "The busbar voltage is missing; it is replaced by what most meters imply, which is less exact.",
+        ),
+        (
+            named > now.max_attacked,
+            undecided,
+            Cause.TOO_MANY_SUSPECTS,
+            f"{named} meters disagree with the feeder ({suspects}), and at most {now.max_attacked} can be "
+            "told apart. A wrong busbar reading, switch or line in the model looks the same.",
+        ),
+        (
+            named > 0,
+            Decision.ATTACKED,
+            Cause.RESIDUALS,
+            f"Manipulated: {suspects}; further off than meter accuracy and load uncertainty allow.",
+        ),
+        (bool(silent.any()), undecided, Cause.SILENT_METERS, f"No reading from {_list(now, silent)}."),
+        (
+            not now.settled,
+            undecided,
+            Cause.SETTLING,
+            "The observers have not forgotten their initial state yet.",
+        ),
+        (
+            bool(pending.any()),
+            undecided,
+            Cause.AMBIGUOUS,
+            f"{_list(now, pending)}: further off than allowed, but not for long enough to be named.",
+        ),
+        (
+            bool(now.wide.any()),
+            undecided,
+            Cause.AMBIGUOUS,
+            f"The loads are not known well enough to judge {_list(now, now.wide)}.",
+        ),
+    )
+    for holds, decision, cause, reason in answers:
+        if holds:
+            return decision, cause, reason
+    return Decision.CLEAN, Cause.AGREEMENT, "All meters agree with the feeder."
+
+
+def _liars(most: int) -> str:
+    return (
+        "one manipulated meter from the others" if most == 1 else f"{most} manipulated meters from the others"
+    )
+
+
+_SHOWN = 5
+
+
+def _list(now: Situation, which: Bools) -> str:
+    """The meters' names, the first few of many."""
+    names = [now.names[j] for j in np.flatnonzero(which).tolist()]
+    rest = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    return ", ".join(names[:_SHOWN]) + rest
+
+
+def residual_excess(score: Floats, threshold: Floats, live: Bools) -> Floats:
+    """How far residuals are above their thresholds, in thresholds; 0 where they are not.
+
+    Parameters
+    ----------
+    score, threshold : (p,)
+        Residuals and thresholds, squared pu.
+    live : (p,)
+        Who has a residual.
+    """
+    ratio = np.divide(score, threshold, out=np.zeros_like(threshold), where=live & (threshold > 0))
+    return np.asarray(np.maximum(ratio - 1.0, 0.0))
