@@ -82,6 +82,8 @@ class Column:
         limits = []
         if self.above is not None:
             limits.append(f"above {self.above:g}")
+        if self.low is not None and self.low == self.high:
+            return f"{self.low:g}"
         if self.low is not None:
             limits.append(f"at least {self.low:g}")
         if self.high is not None:
@@ -120,7 +122,7 @@ CUSTOMER_COLUMNS: tuple[Column, ...] = (
     Column("class_percent", Kind.NUMBER, "accuracy class of the voltage register, %", None, above=0.0),
     Column("resolution_volt", Kind.NUMBER, "resolution of the voltage register, V", None, low=0.0),
     Column("jitter_percent", Kind.NUMBER, "1 sigma noise of the voltage, % of nominal", None, low=0.0),
-    Column("p_error_percent", Kind.NUMBER, "error of the active power, % of reading", None, low=0.0),
+    Column("p_error_percent", Kind.NUMBER, "error of the active power, % of it", None, low=0.0, high=50.0),
     Column("q_error_percent", Kind.NUMBER, "error of the reactive power, % of range", None, low=0.0),
     Column("load_kw", Kind.NUMBER, "expected peak of the load, kW", low=0.0),
     Column("load_profile", Kind.TEXT, "load profile of the library", ""),
@@ -162,7 +164,7 @@ META_COLUMNS: dict[str, tuple[Column, ...]] = {
         Column("class_percent", Kind.NUMBER, "accuracy class of the voltage registers, %", 0.5, above=0.0),
         Column("resolution_volt", Kind.NUMBER, "resolution of the voltage registers, V", 0.1, low=0.0),
         Column("jitter_percent", Kind.NUMBER, "1 sigma noise of the voltage, % of nominal", 0.05, low=0.0),
-        Column("p_error_percent", Kind.NUMBER, "error of the active power, % of reading", 1.0, low=0.0),
+        Column("p_error_percent", Kind.NUMBER, "error of the active power, % of it", 1.0, low=0.0, high=50.0),
         Column("q_error_percent", Kind.NUMBER, "error of the reactive power, % of range", 2.0, low=0.0),
         Column("p_resolution_kw", Kind.NUMBER, "resolution of the active power, kW", 0.01, low=0.0),
     ),

@@ -45,10 +45,8 @@ class LoadModel:
         Limits of the load's q / p (lagging).
     q_floor : (N,)
         Reactive power of the load that does not follow p.
-    p_fraction : (N,)
-        Error of a metered p, fraction of the reading.
-    p_floor : (N,)
-        Half the resolution of a metered p.
+    p_fraction, p_floor : (N,)
+        A metered p is within ``p_fraction |reading| + p_floor`` of the truth.
     q_error : (N,)
         Half-width of a metered q: a fraction of the customer's range.
     q_fraction : (N,)
@@ -235,8 +233,8 @@ def to_frame(site: Site, snapshot: Snapshot) -> Frame:
 
     Voltages: ``y = v |v|`` in pu, so that a negative reading stays a bad one.
 
-    Active power: a metered p is known within a fraction of the reading and half a step of the
-    register. Where it is missing, not finite or beyond anything the customer could draw, all that is
+    Active power: a register of f = `p_error_percent` and steps of 2 h shows r; the truth is within
+    ``(f |r| + h) / (1 - f)`` of it. Where it is missing, not finite or beyond anything the customer could draw, all that is
     known is the interval from full generation without load to full load without generation.
 
     Reactive power of the load (the inverter's is the observer's business): with net import P, the load
@@ -370,6 +368,9 @@ def _load_model(tables: FeederTables) -> LoadModel:
     given = _either(rows, "q_floor_kvar", np.nan)
     floor = np.where(np.isnan(given), meta.load.q_floor_percent / 100.0 * load, given)
     q_fraction = _either(rows, "q_error_percent", meta.meters.q_error_percent) / 100.0
+    # A register within f |p| + h of the truth p shows r: |p| <= (|r| + h) / (1 - f), so the error is at
+    # most (f |r| + h) / (1 - f).
+    p_fraction = _either(rows, "p_error_percent", meta.meters.p_error_percent) / 100.0
     # The range of the reactive register: the largest apparent power at the connection point.
     span = np.maximum.reduce([load * np.hypot(1.0, tan["power_factor_min"]), pv, inverter])
     fields = {
@@ -378,8 +379,8 @@ def _load_model(tables: FeederTables) -> LoadModel:
         "tan_min": tan["power_factor_max"],
         "tan_max": tan["power_factor_min"],
         "q_floor": floor / base,
-        "p_fraction": _either(rows, "p_error_percent", meta.meters.p_error_percent) / 100.0,
-        "p_floor": np.full(load.size, 0.5 * meta.meters.p_resolution_kw / base),
+        "p_fraction": p_fraction / (1.0 - p_fraction),
+        "p_floor": 0.5 * meta.meters.p_resolution_kw / base / (1.0 - p_fraction),
         "q_error": q_fraction * span / base,
         "q_fraction": q_fraction,
         "credible": np.maximum(CREDIBLE_FACTOR * (load + pv + inverter), CREDIBLE_KW) / base,

@@ -63,7 +63,7 @@ def _file_text(path: Path, problems: list[str]) -> str | None:
             return None
         data = path.read_bytes()
     except FileNotFoundError:
-        problems.append(f"{path.name}: the file is missing in {path.parent}")
+        problems.append(f"{path.name}: the file is missing")
         return None
     except OSError as error:
         problems.append(f"{path.name}: cannot be read: {error.strerror}")

@@ -165,5 +165,5 @@ def _drop(parsed: Parsed, edges: Sequence[Edge], found: Tree) -> Doubts:
         yield (
             "impedance",
             f"with every load at load_kw the voltage at bus {found.buses[worst]!r} would fall by "
-            f"{100 * drop[worst]:.0f} %; expected far below 100 %; r_ohm in milliohm or per km, load_kw in W?",
+            f"{100 * drop[worst]:.0f} %; expected far below 100; r_ohm per km or in milliohm? load_kw in W?",
         )
