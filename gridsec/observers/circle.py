@@ -25,7 +25,7 @@ from gridsec.certificates import Certificate, certify, error_bound, feeds
 from gridsec.errors import DesignInfeasible
 from gridsec.gains import CircleGains, CircleOptions, margin, sensitivity, state_bound
 from gridsec.lmi import circle, contraction
-from gridsec.lure import POLICY, Lure, advance
+from gridsec.lure import POLICY, Lure, StepPolicy, advance
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -276,7 +276,13 @@ def between_readings(design: CircleDesign, y: Floats, u: Floats, seen: Bools) ->
 
 
 def step(  # noqa: PLR0917  # the border that all observer families share
-    design: CircleDesign, state: CircleState, y: Floats, u: Floats, seen: Bools, h: float
+    design: CircleDesign,
+    state: CircleState,
+    y: Floats,
+    u: Floats,
+    seen: Bools,
+    h: float,
+    policy: StepPolicy = POLICY,
 ) -> CircleState:
     """Advance an observer over one step of any length.
 
@@ -294,6 +300,8 @@ def step(  # noqa: PLR0917  # the border that all observer families share
         Which readings exist. The rest has exactly no influence: the observer runs on its model there.
     h
         Length of the step, s.
+    policy
+        How the integrator divides it.
 
     Returns
     -------
@@ -302,11 +310,11 @@ def step(  # noqa: PLR0917  # the border that all observer families share
     """
     system, held = between_readings(design, y, u, seen)
     try:
-        x = advance(system, state.x, held, h)
+        x = advance(system, state.x, held, h, policy)
     except DesignInfeasible:
         # No equilibrium found for a long step (possible only without a certificate for the meters
         # that are left): then walk through it.
-        x = advance(system, state.x, held, h, replace(POLICY, settled=0.0))
+        x = advance(system, state.x, held, h, replace(policy, settled=0.0))
     return CircleState(state.t + h, x)
 
 
