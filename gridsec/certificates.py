@@ -16,6 +16,7 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -316,8 +317,8 @@ def error_bound(
         Largest error of each entry of the known input w, squared pu.
     z : (…, m)
         The observer's own outputs. If given, `k_i(r)` is what the curve itself does within r of
-        `z_i`, nothing inside the deadband. The bound then holds while z rests, or moves slowly
-        against the time constants.
+        `z_i`, nothing inside the deadband, and the bound is for observer and plant at rest, or
+        moving slowly against the time constants. It presumes that some certificate holds.
     certificate
         A certificate of the system. If it is a quadratic one with its multiplier, its norm gives a
         start of the iteration that may be tighter than saturation; others are not used.
@@ -340,18 +341,40 @@ def error_bound(
         spread = np.sqrt(np.diagonal(np.linalg.inv(certificate.P)))
         bound = np.minimum(bound, level[..., None] * spread)
     coupling = np.abs(form.S).T
-    for _ in range(_ROUNDS):
+
+    def drive(bound: Floats) -> Floats:
         known = np.isfinite(bound)
         through = np.where(known, bound, 0.0) @ coupling
         # Unbounded entries only matter where they couple: infinity times zero is no coupling.
         through[~known @ (coupling > 0)] = np.inf
-        around = np.where(free, direct + through, direct)
-        tighter = np.minimum(bound, _reach(lure, around, z, span))
+        return _reach(lure, np.where(free, direct + through, direct), z, span)
+
+    for _ in range(_ROUNDS):
+        tighter = np.minimum(bound, drive(bound))
         settled = np.all(tighter >= (1.0 - _TIGHTENING) * bound)
         bound = tighter
         if settled:
             break
-    return np.array(bound)
+    return np.array(bound if z is None else np.minimum(bound, _from_below(drive, span)))
+
+
+def _from_below(drive: Callable[[Floats], Floats], span: Floats) -> Floats:
+    """The smallest bound that the monotone map cannot leave; infinite where none is found.
+
+    At rest, and with any certificate in force, the error depends continuously on the size of the
+    disturbances and starts from zero with them: it cannot pass a bound that the map takes below itself.
+    """
+    bound = np.zeros_like(span)
+    for _ in range(_ROUNDS):
+        larger = drive(bound)
+        settled = np.all(larger <= (1.0 + _TIGHTENING) * bound)
+        bound = larger
+        if settled:
+            break
+    # Room for the map to be strictly inside; what is claimed is checked, whatever the loop did.
+    bound = (1.0 + 10.0 * _TIGHTENING) * bound + np.finfo(np.float64).tiny
+    inside = np.all(drive(bound) < bound, axis=-1, keepdims=True)
+    return np.where(inside, bound, np.inf)
 
 
 # Rounds of the monotone iteration, and the relative gain below which another round is not worth it.
@@ -465,7 +488,10 @@ def _level(certificate: Certificate, form: _Form, kick: Floats, load: Floats) ->
         Largest load errors at the inverters that run on the model: `L^2 = sum d_i lambda_i load_i^2`.
     """
     rate = certificate.rate
-    direct = np.sum((kick @ np.abs(certificate.P)) * kick, axis=-1)
+    known = np.isfinite(kick)
+    finite = np.where(known, kick, 0.0)
+    direct = np.sum((finite @ np.abs(certificate.P)) * finite, axis=-1)
+    direct = np.where(np.all(known, axis=-1), direct, np.inf)
     through = np.sum(form.slope * certificate.multiplier * load**2, axis=-1)
     return np.asarray((np.sqrt(direct) + np.sqrt(direct + 2.0 * rate * through)) / (2.0 * rate))
 

@@ -1,0 +1,503 @@
+"""Certificates against matrix exponentials, solve_ivp, the corrected inequality (12), and forgeries."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+
+from gridsec.arrays import spectral_radius
+from gridsec.certificates import (
+    Certificate,
+    certify,
+    error_bound,
+    feeds,
+    quadratic,
+    reactance,
+    small_gain,
+    verify,
+)
+from gridsec.droop import Droop, fleet
+from gridsec.errors import DesignInfeasible
+from gridsec.feeder import Feeder, lindistflow
+from gridsec.lure import Lure, close_loop, settle
+from tests.gridsec.radial import random_feeder, random_loop
+
+seeds = st.integers(0, 100_000)
+
+
+def norm(certificate: Certificate, e: np.ndarray) -> np.ndarray:
+    """The certificate's norm of errors in the last axis."""
+    if certificate.kind == "small-gain":
+        return np.max(np.abs(e) / certificate.P, axis=-1)
+    return np.sqrt(np.einsum("...i,ij,...j->...", e, certificate.P, e))
+
+
+def asymmetric(lure: Lure, droop: Droop, seed: int, amount: float) -> Lure:
+    """The loop with a skew part added to S, as single-phase customers on a three-phase cable have."""
+    rng = np.random.default_rng([seed, 9])
+    skew = rng.normal(size=lure.H.shape)
+    return replace(lure, H=lure.H + amount * np.max(np.abs(lure.H)) * (skew - skew.T), phi=droop)
+
+
+def switched_decay(lure: Lure, certificate: Certificate, seed: int) -> None:
+    """Products of exponentials over random trusted sets and slopes shrink every error as certified."""
+    rng = np.random.default_rng([seed, 6])
+    n = lure.slope.size
+    tau, S = -1.0 / np.diag(lure.A), -lure.H
+    e = rng.normal(size=(5, n)) * 10.0 ** rng.uniform(-2, 2, (5, n))
+    for _ in range(12):
+        slopes = lure.slope * rng.choice([0.0, 1.0, 1.0, 0.3], n) * (rng.random(n) < 0.7)
+        h = 10.0 ** rng.uniform(-2, 1)
+        after = e @ expm(-h * (np.eye(n) + slopes[:, None] * S) / tau[:, None]).T
+        allowed = norm(certificate, e) * np.exp(-certificate.rate * h)
+        assert np.all(norm(certificate, after) <= allowed * (1 + 1e-9))
+        e = after
+
+
+@given(seed=seeds, gain=st.sampled_from([0.1, 0.9, 1.1, 5.0, 50.0]))
+def test_reactance_holds_for_every_tree_and_common_tau(seed: int, gain: float) -> None:
+    # Customers share buses and sit on the busbar in most of these feeders: X is singular.
+    _, droop, lure = random_loop(seed, gain=gain)
+    certificate = reactance(lure)
+    assert certificate.kind == "reactance"
+    # kappa = 0.01 costs half a percent, the back-off another one.
+    assert 0.995 * 0.99 * (1 - 1e-9) <= certificate.rate * droop.tau[0] < 1.0
+    assert certificate.margin > 0
+    assert verify(certificate, lure) == certificate.margin
+    switched_decay(lure, certificate, seed)
+
+
+@given(seed=seeds, gain=st.sampled_from([0.1, 0.9, 2.0, 10.0]), spread=st.sampled_from([2.0, 5.0, 20.0]))
+def test_reactance_with_different_time_constants_decays_where_it_holds(
+    seed: int, gain: float, spread: float
+) -> None:
+    _, droop, lure = random_loop(seed, gain=gain, spread=spread)
+    try:
+        certificate = reactance(lure)
+    except DesignInfeasible as error:
+        refused = error
+    else:
+        switched_decay(lure, certificate, seed)
+        return
+    assert refused.margin is not None
+    assert refused.margin <= 0
+    assert gain > 0.5
+    assert np.ptp(droop.tau) > 0
+
+
+@given(seed=seeds, gain=st.sampled_from([0.1, 0.5, 0.9]), amount=st.sampled_from([0.02, 0.3]))
+def test_asymmetry_is_charged_for(seed: int, gain: float, amount: float) -> None:
+    _, droop, lure = random_loop(seed, gain=gain)
+    skewed = asymmetric(lure, droop, seed, amount)
+    try:
+        certificate = reactance(skewed)
+    except DesignInfeasible:
+        return
+    assert certificate.rate <= reactance(lure).rate * (1 + 1e-9)
+    switched_decay(skewed, certificate, seed)
+
+
+def test_strong_asymmetry_at_high_gain_is_refused() -> None:
+    _, droop, lure = random_loop(8, gain=5.0)
+    with pytest.raises(DesignInfeasible, match="reactance certificate"):
+        reactance(asymmetric(lure, droop, 8, 3.0))
+
+
+@given(
+    seed=seeds,
+    gain=st.sampled_from([0.1, 0.5, 0.9, 0.99]),
+    spread=st.sampled_from([1.0, 20.0, 300.0]),
+    amount=st.sampled_from([0.0, 0.3]),
+)
+def test_small_gain_decays_whatever_the_time_constants(
+    seed: int, gain: float, spread: float, amount: float
+) -> None:
+    _, droop, lure = random_loop(seed, gain=gain, spread=spread)
+    lure = asymmetric(lure, droop, seed, amount)
+    if spectral_radius(lure.slope[:, None] * np.abs(lure.H)) >= 1:
+        with pytest.raises(DesignInfeasible, match="loop gain is too large"):
+            small_gain(lure)
+        return
+    certificate = small_gain(lure)
+    assert certificate.margin > 0
+    assert verify(certificate, lure) == certificate.margin
+    assert np.all(certificate.P > 0)
+    switched_decay(lure, certificate, seed)
+
+
+@given(seed=seeds, row=st.floats(0.05, 0.999))
+def test_row_sums_below_one_are_enough(seed: int, row: float) -> None:
+    _, _, lure = random_loop(seed, gain=1.0)
+    sums = lure.slope * np.sum(np.abs(lure.H), axis=1)
+    if sums.max() == 0:
+        return
+    certificate = small_gain(replace(lure, H=lure.H * row / sums.max()))
+    # With weights 1 the rate would be (1 - row) / tau; better weights only raise it, less the back-off.
+    assert certificate.rate * 2.0 >= 0.9 * (1.0 - row) * (1 - 1e-9)
+
+
+def observer_and_plant(
+    lure: Lure, driven: np.ndarray, size: tuple[float, float], seed: int, e0: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Errors (k, n) of the nonlinear observer at times (k,), with switching sets and disturbances."""
+    rng = np.random.default_rng([seed, 7])
+    n, m = lure.slope.size, lure.F.shape[1]
+    tau = -1.0 / np.diag(lure.A)
+    x = rng.uniform(-1, 1, n) * (lure.phi.limit if isinstance(lure.phi, Droop) else 1.0)
+    hat = x + e0 * rng.normal(size=n)
+    times, errors, now = [0.0], [x - hat], 0.0
+    for _ in range(8):
+        w = rng.uniform(-0.2, 0.2, m)
+        y_bad = size[0] * rng.choice([-1.0, 1.0], n)
+        w_bad = size[1] * rng.choice([-1.0, 1.0], m)
+        trusted = driven & (rng.random(n) < 0.5)
+        h = float(10.0 ** rng.uniform(-1, 1))
+
+        def slope(_: float, both: np.ndarray, w=w, y_bad=y_bad, w_bad=w_bad, trusted=trusted) -> np.ndarray:
+            x, hat = both[:n], both[n:]
+            z = lure.H @ x + lure.F @ w
+            zeta = np.where(trusted, z + y_bad, lure.H @ hat + lure.F @ (w + w_bad))
+            return np.concatenate([(lure.phi(z) - x) / tau, (lure.phi(zeta) - hat) / tau])
+
+        run = solve_ivp(slope, (0.0, h), np.concatenate([x, hat]), method="LSODA", rtol=1e-8, atol=1e-11)
+        assert run.success
+        errors.extend((run.y[:n] - run.y[n:]).T)
+        times.extend(now + run.t)
+        x, hat, now = run.y[:n, -1], run.y[n:, -1], now + h
+    return np.array(times), np.array(errors)
+
+
+@settings(max_examples=25)
+@given(seed=seeds, gain=st.sampled_from([0.3, 0.8, 3.0]), spread=st.sampled_from([1.0, 3.0]))
+def test_nonlinear_observer_decays_at_the_certified_rate(seed: int, gain: float, spread: float) -> None:
+    _, _, lure = random_loop(seed, gain=gain, spread=spread)
+    certificate = certify(lure)
+    t, e = observer_and_plant(lure, np.ones(lure.slope.size, bool), (0.0, 0.0), seed, e0=0.02)
+    size = norm(certificate, e)
+    assert np.all(size <= size[0] * np.exp(-certificate.rate * t) + 1e-7 * (1 + size[0]))
+
+
+@settings(max_examples=25)
+@given(
+    seed=seeds,
+    gain=st.sampled_from([0.3, 0.8, 3.0]),
+    kind=st.sampled_from(["reactance", "small-gain"]),
+    sizes=st.sampled_from([(0.004, 0.0), (0.0, 0.004), (100.0, 0.0)]),
+)
+def test_gains_bound_the_error(seed: int, gain: float, kind: str, sizes: tuple[float, float]) -> None:
+    if kind == "small-gain":
+        gain = min(gain, 0.8)
+    _, _, lure = random_loop(seed, gain=gain)
+    certificate = reactance(lure) if kind == "reactance" else small_gain(lure)
+    _, e = observer_and_plant(lure, np.ones(lure.slope.size, bool), sizes, seed, e0=0.0)
+    # From rest the level is never exceeded: W' <= -rate W + rate level.
+    if sizes[0] == 100.0:
+        allowed = certificate.saturation
+        assert allowed < certificate.attack * 100.0
+    else:
+        allowed = certificate.noise * sizes[0] + certificate.load * sizes[1]
+    assert np.all(norm(certificate, e) <= allowed * (1 + 1e-6) + 1e-9)
+
+
+@settings(max_examples=40)
+@given(
+    seed=seeds,
+    gain=st.sampled_from([0.3, 0.9, 3.0]),
+    sizes=st.sampled_from([(0.004, 0.0), (0.0, 0.004), (0.002, 0.003), (100.0, 0.002)]),
+    proof=st.booleans(),
+)
+def test_error_bound_is_never_exceeded(
+    seed: int, gain: float, sizes: tuple[float, float], proof: bool
+) -> None:
+    # The trusted set is fixed in each example (the bound is for one set); the meters outside it may say
+    # anything, the load error is at its bound everywhere.
+    _, droop, lure = random_loop(seed, gain=gain, spread=2.0)
+    n, m = lure.slope.size, lure.F.shape[1]
+    rng = np.random.default_rng([seed, 8])
+    trusted = rng.random(n) < 0.5
+    bound = error_bound(
+        lure,
+        trusted,
+        np.full(n, sizes[0]),
+        np.full(m, sizes[1]),
+        certificate=certify(lure) if proof else None,
+    )
+    assert np.all(bound <= 2.0 * droop.limit + 1e-15)
+    x = hat = np.zeros(n)
+    tau = droop.tau
+    for _ in range(400):
+        w = rng.uniform(-0.2, 0.2, m)
+        y_bad, w_bad = sizes[0] * rng.choice([-1.0, 1.0], n), sizes[1] * rng.choice([-1.0, 1.0], m)
+        h = float(rng.choice([0.02, 0.5, 5.0]))
+        for _ in range(1 if h < 0.1 else 20):
+            z = lure.H @ x + lure.F @ w
+            zeta = np.where(trusted, z + y_bad, lure.H @ hat + lure.F @ (w + w_bad))
+            # Any convex combination of the state and the curve is a step of the differential inclusion.
+            share = 1.0 - np.exp(-min(h, 0.1) / tau)
+            x, hat = x + share * (droop(z) - x), hat + share * (droop(zeta) - hat)
+            assert np.all(np.abs(x - hat) <= bound * (1 + 1e-9) + 1e-12)
+
+
+@settings(max_examples=60)
+@given(seed=seeds, gain=st.sampled_from([0.3, 0.9, 3.0]), size=st.sampled_from([0.002, 0.02, 10.0]))
+def test_local_error_bound_at_rest(seed: int, gain: float, size: float) -> None:
+    _, droop, lure = random_loop(seed, gain=gain)
+    n, m = lure.slope.size, lure.F.shape[1]
+    rng = np.random.default_rng([seed, 8])
+    trusted = rng.random(n) < 0.5
+    w = rng.uniform(-0.2, 0.2, m)
+    none = np.zeros(n)
+    rest = {"drive": lure.F @ w, "bias": none, "x0": none, "tol": 1e-10, "max_iter": 100}
+    x = settle(droop, np.eye(n), lure.H, **rest)
+    z = lure.H @ x + lure.F @ w
+    y_bad, w_bad = rng.uniform(-size, size, n), rng.uniform(-0.003, 0.003, m)
+    heard = np.where(trusted, z + y_bad, lure.F @ (w + w_bad))
+    hat = settle(droop, np.eye(n), np.where(trusted[:, None], 0.0, lure.H), **(rest | {"drive": heard}))
+    zeta = np.where(trusted, z + y_bad, lure.H @ hat + lure.F @ (w + w_bad))
+    everywhere = error_bound(lure, trusted, np.full(n, size), np.full(m, 0.003))
+    local = error_bound(lure, trusted, np.full(n, size), np.full(m, 0.003), z=zeta)
+    assert np.all(np.abs(x - hat) <= local * (1 + 1e-9) + 1e-9)
+    assert np.all(local <= everywhere * (1 + 1e-3) + 1e-12)
+
+
+def test_local_bound_is_zero_inside_the_deadband() -> None:
+    _, _, lure = random_loop(8, gain=3.0)
+    n = lure.slope.size
+    off = np.zeros(n, bool)
+    small = np.full(n, 0.003)
+    assert np.all(error_bound(lure, off, small, small, z=np.zeros(n)) < 1e-300)
+    assert np.all(error_bound(lure, off, small, small)[lure.slope > 0] > 1e-3)
+
+
+def test_error_bounds_in_batches() -> None:
+    _, _, lure = random_loop(8, gain=0.9)
+    n, m = lure.slope.size, lure.F.shape[1]
+    rng = np.random.default_rng(0)
+    trusted, y, u = (
+        rng.random((2, 3, n)) < 0.5,
+        rng.uniform(0, 0.01, (2, 3, n)),
+        rng.uniform(0, 0.01, (2, 3, m)),
+    )
+    proof = reactance(lure)
+    together = error_bound(lure, trusted, y, u, certificate=proof)
+    for i, j in np.ndindex(2, 3):
+        alone = error_bound(lure, trusted[i, j], y[i, j], u[i, j], certificate=proof)
+        assert np.allclose(together[i, j], alone, rtol=1e-3)
+
+
+def test_unbounded_attacks_are_capped_by_saturation() -> None:
+    _, droop, lure = random_loop(8, gain=0.9)
+    n = lure.slope.size
+    on = np.ones(n, bool)
+    bound = error_bound(lure, on, np.full(n, np.inf), np.zeros(n), certificate=reactance(lure))
+    assert np.all(bound <= 2.0 * droop.limit)
+    assert np.all(bound[droop.slope > 0] > 0)
+    # One meter attacked without bound, all trusted: the others stay exact.
+    only = np.where(np.arange(n) == 0, np.inf, 0.0)
+    assert not error_bound(lure, on, only, np.zeros(n))[1:].any()
+
+
+def test_unsaturated_curves_have_unbounded_attacks() -> None:
+    eye = np.eye(2)
+    lure = Lure(-eye, eye, np.diag([-0.5, 0.0]), eye, 0 * eye, np.diag([-0.5, 0.0]), eye, np.ones(2), np.tanh)
+    y = np.array([np.inf, 0.0])
+    bound = error_bound(lure, np.array([True, False]), y, np.zeros(2))
+    assert bound.tolist() == [np.inf, 0.0]
+    assert reactance(lure).saturation == small_gain(lure).saturation == np.inf
+
+
+@given(seed=seeds, gain=st.sampled_from([0.5, 5.0]))
+def test_feasible_point_of_the_corrected_inequality(seed: int, gain: float) -> None:
+    # chong2020 (12) as corrected, for direct injection K = E_J, L = 0, built block by block. Lambda is
+    # 1 / tau off J and large on J, mu large.
+    _, _, lure = random_loop(seed, gain=gain)
+    certificate = reactance(lure)
+    rng = np.random.default_rng([seed, 10])
+    n = lure.slope.size
+    J = np.flatnonzero(rng.random(n) < 0.5)
+    E = np.eye(n)[:, J]
+    H = lure.H - E @ lure.C[J]
+    P, alpha = certificate.P, certificate.rate
+    top = 1e3 * np.max(np.abs(P)) * np.max(lure.slope) / np.min(np.linalg.eigvalsh(P))
+    heavy = certificate.multiplier * np.where(np.isin(np.arange(n), J), max(1e3, top), 1.0)
+    Lambda, live = np.diag(heavy), lure.slope > 0
+    mu = 1e6 * max(1.0, float(np.max(heavy)) ** 2)
+    off = P @ lure.G + H.T @ Lambda
+    # Entries of psi with slope zero vanish: their rows and columns are left out instead of divided by 0.
+    blocks = [
+        [P @ lure.A + lure.A.T @ P + 2 * alpha * P, off[:, live], np.zeros((n, J.size))],
+        [off[:, live].T, -2 * np.diag(heavy[live] / lure.slope[live]), -(Lambda @ E)[live]],
+        [np.zeros((J.size, n)), -(Lambda @ E)[live].T, -mu * np.eye(J.size)],
+    ]
+    matrix = np.block(blocks)
+    scale = 1.0 / np.sqrt(np.maximum(np.abs(np.diag(matrix)), 1e-300))
+    assert np.max(np.linalg.eigvalsh(scale[:, None] * matrix * scale)) <= 1e-12
+
+
+def test_time_constants_too_far_apart() -> None:
+    # Two customers on one street, one inverter a hundred times as fast, loop gain 20.
+    feeder = Feeder(
+        name="street",
+        parent=np.array([0, 1]),
+        r=np.array([0.01, 0.01]),
+        x=np.array([0.02, 0.02]),
+        bus=np.array([1, 2]),
+        customers=("near", "far"),
+        buses=("0", "1", "2"),
+        base_volt=230.0,
+        base_kva=100.0,
+        charging=np.zeros(2),
+    )
+    own = np.array([0, 1])
+    droop = fleet(own, "ieee1547-b", np.full(2, 5000.0), 100.0, tau=np.array([0.2, 20.0]))
+    lure = close_loop(feeder, droop, own)
+    with pytest.raises(DesignInfeasible, match="reactance") as caught:
+        reactance(lure)
+    assert caught.value.margin is not None
+    assert caught.value.margin < 0
+    with pytest.raises(DesignInfeasible, match="small-gain") as caught:
+        certify(lure)
+    assert "reactance" in str(caught.value)
+    # The certificate of the same fleet with one common tau is a forgery here, and verify says so ...
+    honest = close_loop(feeder, fleet(own, "ieee1547-b", np.full(2, 5000.0), 100.0, tau=np.full(2, 2.0)), own)
+    certificate = reactance(honest)
+    assert verify(certificate, honest) > 0
+    assert verify(certificate, lure) < 0
+    # ... rightly: trusting nobody, some slopes make this norm grow.
+    tau, S = droop.tau, -lure.H
+    plain = S + np.diag(1e-9 / droop.slope)
+    growth = [
+        np.max(np.linalg.eigvals(-np.linalg.solve(plain, plain @ M + M.T @ plain)).real)
+        for M in [(np.eye(2) + np.diag(droop.slope * on) @ S) / tau[:, None] for on in np.ndindex(2, 2)]
+    ]
+    assert max(growth) > 0
+
+
+@given(seeds)
+def test_forgeries_are_caught(seed: int) -> None:
+    _, _, lure = random_loop(seed, gain=0.8)
+    for certificate in (reactance(lure), small_gain(lure)):
+        assert verify(certificate, lure) > 0
+        assert verify(replace(certificate, rate=1.2 * certificate.rate), lure) < 0
+        assert verify(replace(certificate, P=-certificate.P), lure) == -np.inf
+        if lure.slope.size > 1:
+            with pytest.raises(DesignInfeasible, match="do not fit"):
+                verify(replace(certificate, P=certificate.P[:1]), lure)
+        with pytest.raises(DesignInfeasible, match="do not fit"):
+            verify(replace(certificate, kind="hearsay"), lure)
+    forged = reactance(lure)
+    assert verify(replace(forged, multiplier=0.0 * forged.multiplier), lure) == -np.inf
+    if lure.slope.size > 1:
+        P = forged.P.copy()
+        P[0, 1] += 1e-3 * P[0, 0]
+        assert verify(replace(forged, P=P), lure) == -np.inf
+
+
+@given(seed=seeds, kind=st.sampled_from(["reactance", "small-gain"]))
+def test_fewer_trusted_meters_is_the_harder_claim(seed: int, kind: str) -> None:
+    _, _, lure = random_loop(seed, gain=0.8, spread=2.0)
+    certificate = reactance(lure) if kind == "reactance" else small_gain(lure)
+    trusted = np.random.default_rng(seed).random(lure.slope.size) < 0.5
+    assert verify(certificate, lure, trusted) >= certificate.margin - 1e-9
+    assert verify(certificate, lure, np.zeros_like(trusted)) == certificate.margin
+
+
+def test_single_inverter_in_closed_form() -> None:
+    # n = 1: P = 1, Lambda = 1 / (s tau) makes b = 0, so that the rate is exactly 1 / tau.
+    s, tau, slope = 0.3, 4.0, 2.0
+    one = np.eye(1)
+    lure = Lure(-one / tau, one / tau, -s * one, one, 0 * one, -s * one, one, np.array([slope]), np.tanh)
+    certificate = quadratic(lure, one, np.array([1 / (s * tau)]), 0.9 / tau, kind="lmi", status="by hand")
+    assert certificate.margin == pytest.approx(0.1)
+    assert certificate.noise == pytest.approx(slope / 0.9)
+    assert certificate.load == pytest.approx(np.sqrt(slope / (s * tau) / (2 * 0.9 / tau)))
+    with pytest.raises(DesignInfeasible, match="fails its verification") as caught:
+        quadratic(lure, one, np.array([1 / (s * tau)]), 1.1 / tau, kind="lmi", status="by hand")
+    assert caught.value.margin == pytest.approx(-0.1)
+    # Small gain: rate (1 - s slope) / tau less the back-off, gain slope / that.
+    made = small_gain(lure)
+    assert made.rate == pytest.approx(0.9 * 0.4 / tau)
+    assert made.noise == pytest.approx(slope / (0.9 * 0.4))
+
+
+def test_best_certificate_wins() -> None:
+    _, _, common = random_loop(8, gain=0.5)
+    assert certify(common).kind == "reactance"
+    _, _, apart = random_loop(8, gain=0.2, spread=3000.0)
+    assert certify(apart).kind == "small-gain"
+
+
+def test_meters_without_inverter_and_inverters_without_meter() -> None:
+    feeder = replace(random_feeder(8, customers=4), bus=np.array([1, 1, 2, 0]))
+    droop = fleet(np.array([1, 3]), "vde4105", np.full(2, 10.0), 100.0)
+    lure = close_loop(feeder, droop, np.array([0, 1, 1]))
+    # Meter 0 sits at another customer of the same bus: its load error is another one.
+    assert feeds(lure).tolist() == [[False, True, True], [False, False, False]]
+    certificate = certify(lure)
+    assert verify(certificate, lure, np.array([True, False, False])) == certificate.margin
+    on = np.array([True, True, True])
+    bound = error_bound(lure, on, np.array([9.0, 0.001, 0.002]), np.zeros(4))
+    assert bound[0] == pytest.approx(droop.slope[0] * 0.002)
+    assert bound[1] == 0.0
+
+
+def test_no_inverters_at_all() -> None:
+    feeder = random_feeder(6)
+    none = fleet(np.array([], dtype=np.intp), [], np.zeros(0), 100.0)
+    lure = close_loop(feeder, none, np.arange(len(feeder.customers)))
+    certificate = certify(lure)
+    assert certificate.margin > 0
+    assert verify(certificate, lure) > 0
+    assert verify(small_gain(lure), lure) > 0
+    on = np.ones(len(feeder.customers), bool)
+    assert error_bound(lure, on, 1.0 * on, 1.0 * on).shape == (0,)
+
+
+def test_other_systems_are_refused() -> None:
+    eye = np.eye(2)
+    lure = Lure(-eye, 2 * eye, -eye, eye, 0 * eye, eye, eye, np.ones(2), np.tanh)
+    for attempt in (reactance, small_gain):
+        with pytest.raises(DesignInfeasible, match="not T x'"):
+            attempt(lure)
+    with pytest.raises(DesignInfeasible, match="not T x'"):
+        certify(replace(lure, G=eye, B=eye))
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "create_kerber_landnetz_freileitung_1",
+        "create_kerber_landnetz_kabel_1",
+        "create_kerber_dorfnetz",
+        "create_kerber_vorstadtnetz_kabel_1",
+    ],
+)
+def test_published_village_feeders(name: str) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # pandapower's own, on its own data
+        import pandapower.networks
+
+        net = getattr(pandapower.networks, name)()
+    from tests.gridsec.test_feeder import from_pandapower
+
+    feeder, p, _, _ = from_pandapower(net, int(net.trafo.lv_bus.iloc[0]), 100.0)
+    own = np.arange(p.size)
+    droop = fleet(own, "ieee1547-b", np.full(p.size, 10.0), 100.0)
+    lure = close_loop(feeder, droop, own)
+    certificate = certify(lure)
+    assert certificate.kind == "reactance"
+    assert certificate.rate * droop.tau[0] > 0.98
+    # The statement behind it: S T^-1 Delta Pi S is positive semidefinite for every set and slope.
+    S = 2.0 * lindistflow(feeder).X
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        weight = droop.slope * rng.random(p.size) * (rng.random(p.size) < 0.5)
+        form = S @ (weight[:, None] * S)
+        assert np.linalg.eigvalsh(form + form.T)[0] >= -1e-13 * np.max(np.abs(form))
