@@ -128,6 +128,9 @@ class ErrorModel:
         Distance between the saturated values of each curve, pu.
     mismatch : (m,)
         How far the curve that a real inverter runs, linear in v, can be from K, linear in z, pu.
+    majorant
+        For gains K_J other than direct injection (and L = 0): the largest `|H - K_J C|` (m, m),
+        `|F - K_J D|` (m, N) and `|K_J|` (m, p) over all sets J, entry by entry.
     """
 
     droop: Droop
@@ -138,6 +141,7 @@ class ErrorModel:
     meter_of: Ints
     span: Floats
     mismatch: Floats
+    majorant: tuple[Floats, Floats, Floats] | None = None
 
 
 def error_model(droop: Droop, model: LinDistFlow, meters: Ints, max_attacked: int) -> ErrorModel:
@@ -343,10 +347,15 @@ def _image(model: ErrorModel, now: Uncertainty, motion: Motion, bound: ErrorBoun
     # Readings and loads are held over the step; how far they moved in it is part of their error. In a
     # step far above the time constant only the last time constant counts.
     hold = np.abs(motion.after - motion.before) / np.maximum(1.0, motion.h / droop.tau)
-    through = gap(model, now, bound, droop.customer) + hold
-    own = (now.reading[model.meter_of] if now.reading.size else np.zeros(hold.shape)) + hold
-    low = np.minimum(motion.before, motion.after) - motion.offset - through
-    high = np.maximum(motion.before, motion.after) + motion.offset + through
+    if model.majorant is None:
+        through = gap(model, now, bound, droop.customer) + hold
+        own = (now.reading[model.meter_of] if now.reading.size else np.zeros(hold.shape)) + hold
+    else:
+        H, F, K = model.majorant
+        through = own = H @ bound.free + F @ now.base + K @ now.reading + hold
+    around = gap(model, now, bound, droop.customer) + motion.offset + hold
+    low = np.minimum(motion.before, motion.after) - around
+    high = np.maximum(motion.before, motion.after) + around
 
     def reach(radius: Floats) -> Floats:
         steep = np.minimum(droop.slope * radius, droop(high + radius) - droop(low - radius))

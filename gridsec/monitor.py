@@ -24,13 +24,13 @@ import numpy as np
 from gridsec import bank as banks
 from gridsec import detect
 from gridsec.arrays import Bools, Floats, Ints
-from gridsec.certificates import Certificate, certify, verify
+from gridsec.certificates import Certificate, certify, small_gain, verify
 from gridsec.detect import ErrorBound, Motion
 from gridsec.errors import DesignInfeasible
 from gridsec.feeder import LinDistFlow, lindistflow, loss_correction
 from gridsec.frames import NO_VOLTAGE, Inputs, clean, injections
 from gridsec.judge import Situation, Tally, count, decide, residual_excess
-from gridsec.lure import close_loop
+from gridsec.lure import Lure, close_loop
 from gridsec.online import Cause, Decision, Estimate, Frame, Verdict
 from gridsec.plant import MonitorDesign, MonitorState, Options, Plant
 
@@ -59,8 +59,8 @@ def design(
         after one frame instead of two, unless `options` say otherwise.
     gains
         `direct`: the inverter of a trusted meter is driven by that meter's reading. Or stacked gains
-        of circle-criterion observers in the order of `bank.subsets(p, M).masks()`; the error bounds
-        are those of direct injection for gains between zero and it.
+        of circle-criterion observers with L = 0, in the order of `bank.subsets(p, M).masks()`; all of
+        them together must then satisfy the small-gain condition.
     options
         The numbers that decide.
     certificate
@@ -73,7 +73,8 @@ def design(
     DesignInfeasible
         If no certificate holds, the bank would be too large, or the gains detect nothing.
     ValueError
-        If two meters sit at one customer, or the accuracy is that of other meters.
+        If two meters sit at one customer, the accuracy is that of other meters, or gains inject into
+        the states.
 
     References
     ----------
@@ -93,16 +94,42 @@ def design(
     lure = close_loop(plant.feeder, plant.droop, meters)
     model = lindistflow(plant.feeder)
     bank = banks.design(lure, max_attacked, gains=gains, reactive=_reactive(model, meters, gains))
-    proof = certify(lure) if certificate is None else certificate
-    margin = verify(proof, lure)
+    errors = detect.error_model(plant.droop, model, meters, max_attacked)
+    proven = lure
+    if bank.gains is not None:
+        majorant = _majorant(lure, bank.gains)
+        errors = replace(errors, majorant=majorant, quota=meters.size)
+        proven = replace(lure, H=-majorant[0])
+    proof = certificate
+    if proof is None:
+        proof = certify(proven) if bank.direct else small_gain(proven)
+    margin = verify(proof, proven)
     if not margin > 0:
         raise DesignInfeasible(f"{proof.kind} certificate", "it fails its verification", margin)
-    errors = detect.error_model(plant.droop, model, meters, max_attacked)
-    return MonitorDesign(plant, model, bank, errors, proof, step_s, options)
+    return MonitorDesign(plant, model, bank, errors, proof, proven, step_s, options)
 
 
 def _reactive(model: LinDistFlow, meters: Ints, gains: object) -> Floats | None:
     return -2.0 * model.X[:, meters] if isinstance(gains, str) else None
+
+
+def _majorant(lure: Lure, gains: banks.Gains) -> tuple[Floats, Floats, Floats]:
+    """Largest `|H - K C|`, `|F - K D|`, `|K|` over all observers and any of their meters silent."""
+    if gains.L.any():
+        raise ValueError("the monitor's error bounds need L = 0; inject into the nonlinearities only")
+    H, F = np.abs(lure.H), np.abs(lure.F)
+    for K in gains.K:
+        np.maximum(H, _extreme(lure.H, K, lure.C), out=H)
+        np.maximum(F, _extreme(lure.F, K, lure.D), out=F)
+    return H, F, np.abs(gains.K).max(axis=0)
+
+
+def _extreme(M: Floats, K: Floats, N: Floats) -> Floats:
+    """Largest `|M - K N|`, entry by entry, over all ways to drop columns of K."""
+    terms = -K[:, :, None] * N
+    return np.maximum(
+        np.abs(M + np.maximum(terms, 0.0).sum(axis=1)), np.abs(M + np.minimum(terms, 0.0).sum(axis=1))
+    )
 
 
 def init(design: MonitorDesign, t: float) -> MonitorState:
@@ -118,7 +145,7 @@ def init(design: MonitorDesign, t: float) -> MonitorState:
     """
     m, p = design.plant.droop.tau.size, design.plant.meters.size
     try:
-        valid = verify(design.certificate, design.bank.lure) > 0
+        valid = verify(design.certificate, design.proven) > 0
     except DesignInfeasible:
         valid = False
     widest = detect.widest(design.errors)

@@ -11,6 +11,7 @@ from gridsec.detect import ErrorBound, ErrorModel, MeterAccuracy
 from gridsec.droop import Droop
 from gridsec.feeder import Feeder, LinDistFlow
 from gridsec.judge import Tally
+from gridsec.lure import Lure
 from gridsec.online import Estimate, Verdict
 
 
@@ -89,6 +90,8 @@ class MonitorDesign:
         How errors travel.
     certificate
         Why the observers converge, for all sensor sets at once.
+    proven
+        The system the certificate is about: the closed loop, or one that majorises all observers.
     step_s
         Expected interval between frames, s.
     options
@@ -100,6 +103,7 @@ class MonitorDesign:
     bank: banks.Bank
     errors: ErrorModel
     certificate: Certificate
+    proven: Lure
     step_s: float
     options: Options
 
