@@ -1,0 +1,173 @@
+// The alarm list: loaded once, then kept right by the event stream; answers go back with a name.
+
+import { byId, clock, duration, el, getJson, isKnown, signed, volt } from "./dom.js";
+
+const API = "/api/v1/alarms";
+const KIND = {
+  "meter-manipulated": "Meter manipulated",
+  "voltage-limit": "Voltage limit",
+  "data-loss": "Data loss",
+  undecided: "Undecided",
+};
+const PAGE = 50;
+
+export class Alarms {
+  constructor({ onPick, onLink }) {
+    this.alarms = new Map();
+    this.onPick = onPick;
+    this.onLink = onLink;
+    this.feeder = null;
+    this.source = null;
+    this.retry = null;
+    for (const id of ["alarm-state", "alarm-kind"]) byId(id).addEventListener("change", () => this.load());
+    byId("alarm-scope").addEventListener("change", () => this.load());
+    byId("alarm-more").addEventListener("click", () => this.load({ more: true }));
+    byId("ack-cancel").addEventListener("click", () => byId("ack").close());
+    byId("ack-form").addEventListener("submit", (event) => this.answer(event));
+  }
+
+  filters() {
+    const state = { active: ["raised", "acknowledged"], raised: ["raised"], all: [] }[byId("alarm-state").value];
+    const feeder = byId("alarm-scope").value === "this" ? this.feeder : null;
+    return { state, kind: byId("alarm-kind").value, feeder };
+  }
+
+  watch(feeder) {
+    this.feeder = feeder;
+    if (!this.source && this.retry === null) this.connect();
+    else if (byId("alarm-scope").value === "this") this.load();
+  }
+
+  async connect() {
+    this.retry = null;
+    try {
+      const after = await this.load();
+      this.source?.close();
+      this.source = new EventSource(`${API}/stream?after=${after}`);
+      this.source.addEventListener("open", () => this.onLink(true));
+      this.source.addEventListener("alarm", (event) => this.take(JSON.parse(event.data)));
+      this.source.addEventListener("error", () => {
+        this.onLink(false);
+        if (this.source.readyState === EventSource.CLOSED) this.again();
+      });
+    } catch {
+      this.onLink(false);
+      this.again();
+    }
+  }
+
+  again() {
+    this.source?.close();
+    this.source = null;
+    this.retry ??= setTimeout(() => this.connect(), 3000);
+  }
+
+  async load({ more = false } = {}) {
+    const { state, kind, feeder } = this.filters();
+    const query = new URLSearchParams({ limit: PAGE });
+    for (const value of state) query.append("state", value);
+    if (kind) query.set("kind", kind);
+    if (feeder) query.set("feeder", feeder);
+    if (more && this.next) query.set("cursor", this.next);
+    const asked = query.toString();
+    this.asked = asked;
+    const page = await getJson(`${API}?${asked}`);
+    if (this.asked !== asked) return page.last_event; // A newer choice has overtaken this answer.
+    if (!more) this.alarms.clear();
+    for (const alarm of page.alarms) this.alarms.set(alarm.id, alarm);
+    this.next = page.next;
+    this.render();
+    return page.last_event;
+  }
+
+  take({ alarm }) {
+    this.alarms.set(alarm.id, alarm);
+    this.render();
+  }
+
+  shown() {
+    const { state, kind, feeder } = this.filters();
+    return [...this.alarms.values()]
+      .filter((a) => (!state.length || state.includes(a.state)) && (!kind || a.kind === kind) && (!feeder || a.feeder === feeder))
+      .sort((a, b) => (a.id < b.id ? 1 : -1));
+  }
+
+  render() {
+    const list = this.shown();
+    const open = [...this.alarms.values()].filter((a) => a.state === "raised").length;
+    byId("alarm-count").hidden = open === 0;
+    byId("alarm-count").textContent = `${open} new`;
+    byId("alarm-none").hidden = list.length > 0;
+    byId("alarm-more").hidden = !this.next;
+    const focused = document.activeElement?.closest?.("[data-alarm]")?.dataset.alarm;
+    byId("alarm-list").replaceChildren(...list.map((alarm) => this.item(alarm)));
+    if (focused) byId("alarm-list").querySelector(`[data-alarm="${CSS.escape(focused)}"] button`)?.focus();
+  }
+
+  item(alarm) {
+    const e = alarm.evidence;
+    const numbers = isKnown(e.v_volt_reported) && alarm.kind === "meter-manipulated"
+      ? `${volt(e.v_volt_reported)} reported, ${volt(e.v_volt_estimated)} reconstructed (${signed(e.v_volt_reported - e.v_volt_estimated)} V)`
+      : alarm.reason;
+    const where = alarm.meter ? `${alarm.meter} · ${alarm.feeder}` : alarm.feeder;
+    const since = alarm.state === "cleared"
+      ? `${clock(alarm.t_raised)}, cleared after ${duration(alarm.t_cleared - alarm.t_raised)}`
+      : `since ${clock(alarm.t_raised)}`;
+    const answered = alarm.acknowledged_by
+      ? el("p", { class: "answer" }, `Acknowledged by ${alarm.acknowledged_by}`, alarm.comment ? el("q", { text: alarm.comment }) : null)
+      : null;
+    return el("li", { class: "alarm", "data-alarm": alarm.id, "data-severity": alarm.severity, "data-state": alarm.state },
+      el("div", { class: "what" },
+        el("p", { class: "name" },
+          el("b", { text: KIND[alarm.kind] ?? alarm.kind }),
+          el("span", { class: "severity", text: alarm.severity }),
+          alarm.count > 1 ? el("span", { class: "times", title: "raised so many times", text: `× ${alarm.count}` }) : null),
+        el("p", {}, el("a", { href: `#${encodeURIComponent(alarm.feeder)}`, class: "where", text: where, on: { click: (event) => {
+          event.preventDefault();
+          this.onPick(alarm.feeder, alarm.meter);
+        } } })),
+        el("p", { class: "numbers", text: numbers }),
+        el("p", { class: "quiet since", text: since }), answered),
+      alarm.acknowledged_by === null
+        ? el("button", { type: "button", class: "ack", text: "Acknowledge", on: { click: () => this.ask(alarm) } })
+        : null);
+  }
+
+  ask(alarm) {
+    this.asking = alarm.id;
+    byId("ack-what").textContent = `${KIND[alarm.kind] ?? alarm.kind}: ${alarm.meter ?? alarm.feeder}. ${alarm.reason}`;
+    byId("ack-who").value = localStorage.getItem("gridsec.who") ?? "";
+    byId("ack-comment").value = "";
+    byId("ack-error").hidden = true;
+    byId("ack").showModal();
+  }
+
+  async answer(event) {
+    event.preventDefault();
+    const who = byId("ack-who").value.trim();
+    if (!who) {
+      this.complain("Please enter your name.");
+      return;
+    }
+    localStorage.setItem("gridsec.who", who);
+    try {
+      const response = await fetch(`${API}/${encodeURIComponent(this.asking)}/ack`, {
+        method: "POST",
+        headers: { "Content-Type": "application/json" },
+        body: JSON.stringify({ who, comment: byId("ack-comment").value }),
+      });
+      const body = await response.json();
+      if (!response.ok) throw new Error(body.detail);
+      this.alarms.set(body.id, body);
+      this.render();
+      byId("ack").close();
+    } catch (error) {
+      this.complain(`Not acknowledged: ${error.message}`);
+    }
+  }
+
+  complain(text) {
+    byId("ack-error").textContent = text;
+    byId("ack-error").hidden = false;
+  }
+}

@@ -1,0 +1,232 @@
+// Wires the page: which feeder is shown, its live states, and whether what is shown can still be believed.
+
+import { Alarms } from "./alarms.js";
+import { showDetail } from "./detail.js";
+import { Diagram } from "./diagram.js";
+import { bare, byId, clock, duration, el, getJson, isKnown, signed, status, volt } from "./dom.js";
+
+const API = "/api/v1/feeders";
+const KEPT = 600;
+const SIGNS = {
+  clean: "M5 17l7 7L27 8",
+  attacked: "M16 4L29 28H3zM16 12v8M16 23.500v.5",
+  undecided: "M10 11a6 6 0 1 1 8 6q-2 1-2 4M16 26.500v.5",
+  none: "M16 5a11 11 0 1 0 .01 0M16 9v7l5 3",
+};
+
+const page = { feeder: null, report: null, selected: null, source: null, retry: null, heard: 0, linked: true, past: new Map() };
+const diagram = new Diagram({ onSelect: (id) => select(id === page.selected ? null : id) });
+const alarms = new Alarms({
+  onPick: async (feeder, meter) => {
+    if (feeder !== page.feeder?.name) await show(feeder);
+    const customer = page.feeder?.layout.customers.find((c) => c.meter === meter);
+    if (customer) select(customer.customer);
+  },
+  onLink: (up) => { page.linked = up; },
+});
+
+// ---------------------------------------------------------------- the feeder
+
+async function start() {
+  let feeders;
+  try {
+    ({ feeders } = await getJson(API));
+  } catch {
+    page.linked = false;
+    setTimeout(start, 3000);
+    return;
+  }
+  byId("feeder").replaceChildren(...feeders.map((f) => el("option", { value: f.name, text: f.title || f.name })));
+  byId("feeder").disabled = feeders.length < 2;
+  if (!feeders.length) {
+    byId("reason").textContent = "The service watches no feeder yet.";
+    setTimeout(start, 5000);
+    return;
+  }
+  const wanted = decodeURIComponent(location.hash.slice(1));
+  await show(feeders.some((f) => f.name === wanted) ? wanted : feeders[0].name);
+}
+
+async function show(name) {
+  clearTimeout(page.retry);
+  page.source?.close();
+  try {
+    page.feeder = await getJson(`${API}/${encodeURIComponent(name)}`);
+  } catch {
+    page.linked = false;
+    page.retry = setTimeout(() => show(name), 3000);
+    return;
+  }
+  page.report = null;
+  page.heard = 0;
+  page.past = new Map();
+  page.opened = performance.now();
+  byId("feeder").value = name;
+  history.replaceState(null, "", `#${encodeURIComponent(name)}`);
+  byId("meters").replaceChildren();
+  select(null);
+  diagram.show(page.feeder);
+  verdict();
+  alarms.watch(name);
+  listen(name);
+}
+
+function listen(name) {
+  page.source = new EventSource(`${API}/${encodeURIComponent(name)}/stream`);
+  page.source.addEventListener("open", () => { page.linked = true; });
+  page.source.addEventListener("state", (event) => take(JSON.parse(event.data)));
+  page.source.addEventListener("error", () => {
+    page.linked = false;
+    fresh();
+    if (page.source.readyState === EventSource.CLOSED) page.retry = setTimeout(() => show(name), 3000);
+  });
+}
+
+function take(report) {
+  if (report.feeder !== page.feeder?.name) return;
+  page.report = report;
+  page.heard = performance.now();
+  page.linked = true;
+  for (const meter of report.meters) {
+    const past = page.past.get(meter.meter) ?? [];
+    past.push(point(report.t, meter));
+    if (past.length > KEPT) past.shift();
+    page.past.set(meter.meter, past);
+  }
+  diagram.update(report);
+  verdict();
+  fresh();
+  detail();
+  table();
+}
+
+const point = (t, m) => ({
+  t, reported: m.v_volt_reported, estimated: m.v_volt_estimated, half: isKnown(m.v_volt_std) ? 3 * m.v_volt_std : null,
+});
+
+// --------------------------------------------------------------- the verdict
+
+function verdict() {
+  const { report, feeder } = page;
+  const decision = report?.verdict ?? "none";
+  byId("verdict").dataset.verdict = decision;
+  byId("sign").setAttribute("d", SIGNS[decision]);
+  byId("decision").textContent = report ? decision.toUpperCase() : "NO DATA";
+  byId("reason").textContent = report ? report.reason : "Waiting for the first tick.";
+  document.title = `${report ? decision.toUpperCase() : "…"} – ${feeder?.title || feeder?.name || ""} – gridsec`;
+  if (!report) {
+    byId("chips").replaceChildren();
+    byId("facts").replaceChildren();
+    return;
+  }
+  const customer = new Map(feeder.layout.customers.map((c) => [c.meter, c.customer]));
+  const chip = (meter, kind, text) => el("button", {
+    type: "button", class: "chip", "data-status": kind, text, on: { click: () => select(customer.get(meter) ?? null) },
+  });
+  const suspects = report.meters.filter((m) => m.suspect);
+  byId("chips").replaceChildren(
+    ...suspects.map((m) => chip(m.meter, "suspect", `${m.meter} ${signed(m.attack_volt_estimated)} V`)),
+    ...report.silent.map((s) => chip(s.meter, "silent", `${s.meter} silent ${isKnown(s.seconds) ? duration(s.seconds) : ""}`)));
+  const volts = report.meters.map((m) => m.v_volt_estimated).filter(isKnown);
+  const range = volts.length ? `${bare(Math.min(...volts))} – ${volt(Math.max(...volts))}` : "–";
+  const fact = (name, value) => el("div", {}, el("dt", { text: name }), el("dd", { text: value }));
+  byId("facts").replaceChildren(
+    fact("Meters heard", `${report.meters.filter((m) => m.seen).length} of ${report.meters.length}`),
+    fact("Suspects", String(suspects.length)),
+    fact("Guaranteed up to", `${report.max_attacked} manipulated`),
+    fact("Real voltages", range),
+    fact("Tick", clock(report.t)));
+}
+
+// ------------------------------------------------- can it still be believed?
+
+function fresh() {
+  const tick = page.feeder?.tick_s ?? 1;
+  const age = page.heard ? (performance.now() - page.heard) / 1000 : null;
+  const patience = Math.max(5, 3 * tick);
+  const waiting = page.report === null;
+  const stale = age !== null && age > patience;
+  const state = !page.linked ? "lost" : stale ? "stale" : waiting ? "connecting" : "live";
+  const words = {
+    live: "live",
+    connecting: "waiting for data …",
+    lost: age === null ? "connection lost" : `connection lost, data ${duration(age)} old`,
+    stale: `data stale, ${duration(age ?? 0)} old`,
+  };
+  byId("link").dataset.state = state;
+  byId("link").lastElementChild.textContent = words[state];
+  const believable = state === "live";
+  byId("main").dataset.fresh = believable ? "yes" : "no";
+  if (!believable && !waiting) {
+    // An old answer must not look like an answer.
+    byId("decision").textContent = "NO LIVE DATA";
+    byId("verdict").dataset.verdict = "none";
+    byId("sign").setAttribute("d", SIGNS.none);
+    byId("reason").textContent = `Nothing heard for ${duration(age)}. Last verdict, at ${clock(page.report.t)}: ${page.report.verdict}.`;
+    document.title = `NO LIVE DATA – ${page.feeder.title || page.feeder.name} – gridsec`;
+  } else if (byId("decision").textContent === "NO LIVE DATA") {
+    verdict();
+  }
+}
+
+// ---------------------------------------------------------------- one of them
+
+function select(id) {
+  page.selected = id;
+  diagram.select(id);
+  byId("detail-card").hidden = id === null || !page.report;
+  if (id === null) return;
+  detail();
+  const { meter } = page.feeder.layout.customers.find((c) => c.customer === id);
+  if (meter && page.report) recall(page.feeder.name, meter);
+}
+
+async function recall(feeder, meter) {
+  const until = page.past.get(meter)?.[0]?.t ?? page.report.t;
+  const query = new URLSearchParams({ meter, since: until - 3600, until, limit: 400 });
+  const found = await getJson(`${API}/${encodeURIComponent(feeder)}/history?${query}`).catch(() => ({ points: [] }));
+  if (page.feeder.name !== feeder) return;
+  const old = found.points.filter((p) => p.meter).map((p) => point(p.t, p.meter));
+  const past = (page.past.get(meter) ?? []).filter((p) => p.t >= until);
+  page.past.set(meter, [...old, ...past]);
+  detail();
+}
+
+function detail() {
+  if (page.selected === null || !page.report) return;
+  byId("detail-card").hidden = false;
+  const customer = page.feeder.layout.customers.find((c) => c.customer === page.selected);
+  const meter = page.report.meters.find((m) => m.meter === customer.meter);
+  showDetail(page.feeder, customer, meter, diagram.voltAt(customer), page.past.get(customer.meter) ?? []);
+}
+
+// ------------------------------------------------------------- all of them
+
+function table() {
+  if (!byId("meters-box").open || !page.report) return;
+  const limits = { low: page.feeder.v_min_volt, high: page.feeder.v_max_volt };
+  const customer = new Map(page.feeder.layout.customers.map((c) => [c.meter, c.customer]));
+  const ratio = (m) => m.score / m.threshold;
+  const rank = (m) => (m.suspect ? 1e9 : 0) + (m.seen ? ratio(m) || 0 : 1e6);
+  const rows = [...page.report.meters].sort((a, b) => rank(b) - rank(a)).map((m) => {
+    const now = status(m, limits);
+    return el("tr", { "data-status": now.key },
+      el("th", { scope: "row" }, el("button", { type: "button", class: "plain", text: m.meter, on: { click: () => select(customer.get(m.meter) ?? null) } })),
+      el("td", { class: "num", text: bare(m.v_volt_reported) }),
+      el("td", { class: "num", text: bare(m.v_volt_estimated) }),
+      el("td", { class: "num", text: signed(isKnown(m.v_volt_reported) && isKnown(m.v_volt_estimated) ? m.v_volt_reported - m.v_volt_estimated : null) }),
+      el("td", { class: "num", text: bare(isKnown(m.score) ? ratio(m) : null, 2) }),
+      el("td", {}, el("span", { class: "state", "data-status": now.key, text: now.text })));
+  });
+  byId("meters").replaceChildren(...rows);
+}
+
+byId("feeder").addEventListener("change", (event) => show(event.target.value));
+byId("unselect").addEventListener("click", () => select(null));
+byId("meters-box").addEventListener("toggle", table);
+addEventListener("hashchange", () => {
+  const name = decodeURIComponent(location.hash.slice(1));
+  if (name && name !== page.feeder?.name) show(name);
+});
+setInterval(fresh, 500);
+start();

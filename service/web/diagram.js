@@ -1,0 +1,292 @@
+// The feeder as a drawing: built once per feeder and width, coloured at every tick.
+
+import { byId, el, isKnown, signed, status, svg, volt } from "./dom.js";
+import { hasMap, oneLine } from "./layout.js";
+import { Scale } from "./scale.js";
+
+// Shapes around (0, 0): what a customer is must be readable without any colour.
+const SHAPE = {
+  ok: "M-7 0a7 7 0 1 0 14 0a7 7 0 1 0-14 0z",
+  none: "M-4 0a4 4 0 1 0 8 0a4 4 0 1 0-8 0z",
+  silent: "M-8 0a8 8 0 1 0 16 0a8 8 0 1 0-16 0z",
+  suspect: "M0-12L12 0L0 12L-12 0z",
+  high: "M0-10L10 7H-10z",
+  low: "M0 10L10-7H-10z",
+};
+const SIGN = { suspect: "!", silent: "?" };
+const LEGEND = [
+  ["ok", "honest meter"],
+  ["suspect", "suspect: says something else than the feeder"],
+  ["silent", "silent"],
+  ["high", "above limit"],
+  ["low", "below limit"],
+  ["none", "no meter"],
+];
+
+function sharedPrefix(names) {
+  if (names.length < 2) return 0;
+  let k = 0;
+  while (k < names[0].length && names.every((name) => name[k] === names[0][k])) k += 1;
+  while (k > 0 && /[A-Za-z0-9]/.test(names[0][k - 1])) k -= 1;
+  return k;
+}
+
+export class Diagram {
+  constructor({ onSelect }) {
+    this.box = byId("diagram");
+    this.tip = byId("tip");
+    this.onSelect = onSelect;
+    this.scale = new Scale();
+    this.view = "line";
+    this.selected = null;
+    this.drawn = 0;
+    new ResizeObserver(() => {
+      if (this.feeder && Math.abs(this.box.clientWidth - this.drawn) > 8) this.build();
+    }).observe(this.box);
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
+      this.scale.theme();
+      if (this.feeder) this.rescale();
+      this.paint();
+    });
+    for (const button of byId("view").querySelectorAll("button")) {
+      button.addEventListener("click", () => this.look(button.dataset.view));
+    }
+    byId("legend").replaceChildren(...LEGEND.map(([key, text]) => el("li", {},
+      svg("svg", { viewBox: "-14 -14 28 28", "aria-hidden": true },
+        svg("g", { class: "customer", "data-status": key }, svg("path", { class: "shape", d: SHAPE[key] }),
+          svg("text", { class: "sign", y: 5, text: SIGN[key] ?? "" }))),
+      text)));
+  }
+
+  show(feeder) {
+    this.feeder = feeder;
+    this.limits = { low: feeder.v_min_volt, high: feeder.v_max_volt };
+    this.report = null;
+    this.placed = oneLine(feeder.layout);
+    this.mapped = hasMap(feeder.layout);
+    byId("view").hidden = !this.mapped;
+    this.view = "line";
+    this.cut = sharedPrefix(feeder.layout.customers.map((c) => c.customer));
+    this.scale.fit([], feeder.v_nominal_volt);
+    this.rescale();
+    this.look("line");
+  }
+
+  look(view) {
+    this.view = view;
+    for (const button of byId("view").querySelectorAll("button")) {
+      button.setAttribute("aria-pressed", String(button.dataset.view === view));
+    }
+    this.build();
+  }
+
+  build() {
+    this.drawn = this.box.clientWidth;
+    this.lines = [];
+    this.customers = new Map();
+    const { root, spots, wires } = this.view === "map" ? this.mapParts() : this.lineParts();
+    const [casing, layer] = [svg("g", {}), svg("g", {})];
+    for (const wire of wires) {
+      const path = svg("path", { class: `wire ${wire.kind ?? ""}`, d: wire.d });
+      this.lines.push({ path, bus: wire.bus });
+      casing.append(svg("path", { class: `casing ${wire.kind ?? ""}`, d: wire.d }));
+      layer.append(path);
+    }
+    const names = this.feeder.layout.customers;
+    spots.sort((a, b) => a.order - b.order).forEach((spot, k) => {
+      if (spot.customer === null) return;
+      const customer = names[spot.customer];
+      const shape = svg("path", { class: "shape" });
+      const sign = svg("text", { class: "sign", y: 5 });
+      const note = svg("text", { class: "note", ...spot.note });
+      const group = svg("g", {
+        class: "customer", transform: `translate(${spot.x} ${spot.y}) scale(${spot.size})`, role: "button",
+        tabindex: k === 0 ? 0 : -1,
+        on: {
+          click: () => this.onSelect(customer.customer),
+          keydown: (event) => this.key(event, customer.customer),
+          pointerenter: (event) => this.hover(event.pointerType === "mouse" ? customer.customer : null),
+          pointerleave: () => this.hover(null),
+          focus: () => this.hover(group.matches(":focus-visible") ? customer.customer : null),
+          blur: () => this.hover(null),
+        },
+      }, svg("circle", { class: "hit", r: 13 }), shape, sign, note);
+      this.customers.set(customer.customer, { customer, group, shape, sign, note, labels: spot.labels });
+      layer.append(group);
+    });
+    root.append(casing, layer);
+    this.box.replaceChildren(root);
+    this.paint();
+  }
+
+  lineParts() {
+    const { rows, columns } = this.placed;
+    const width = Math.max(280, this.box.clientWidth);
+    const upright = width < 620 && columns > 8;
+    const clamp = (value, low, high) => Math.min(high, Math.max(low, value));
+    const pad = 26;
+    const along = upright ? 32 : clamp((width - 2 * pad - 10) / columns, 25, 104);
+    const across = upright ? clamp((width - pad - 12) / rows, 62, 120) : clamp(480 / rows, 68, 120);
+    const size = clamp(Math.min(along / 52, across / 76), 1, 1.35);
+    const labels = !upright && along >= 44;
+    const at = (x, row) => (upright
+      ? [pad + row * across, pad + 12 + x * along]
+      : [pad + x * along, pad + 6 + row * across]);
+    const hang = upright ? [28, 0] : [0, 29 * size];
+    const join = (x0, row0, x, row) => {
+      const [ax, ay] = at(x0, row0);
+      const [bx, by] = at(x, row);
+      return upright ? `M${ax} ${ay}H${bx}V${by}` : `M${ax} ${ay}V${by}H${bx}`;
+    };
+    const wires = [];
+    for (const line of this.placed.lines) wires.push({ d: join(line.x0, line.row0, line.x, line.row), bus: line.bus });
+    for (const bus of this.placed.buses) {
+      if (bus.to > bus.x) wires.push({ d: join(bus.x, bus.row, bus.to, bus.row), bus: bus.bus });
+      const [x, y] = at(bus.x, bus.row);
+      wires.push({ d: upright ? `M${x - 5} ${y}h10` : `M${x} ${y - 5}v10`, bus: bus.bus, kind: "bus" });
+    }
+    const spots = this.placed.customers.map((c) => {
+      const [x, y] = at(c.x, c.row);
+      wires.push({ d: `M${x} ${y}l${hang[0]} ${hang[1]}`, bus: c.bus, kind: "drop" });
+      const note = upright ? { x: 17, y: 4, "text-anchor": "start" } : { x: 0, y: 26, "text-anchor": "middle" };
+      return { customer: c.customer, x: x + hang[0], y: y + hang[1], size, note, labels, order: c.row * 1e4 + c.x };
+    });
+    const [x0, y0] = at(0, 0);
+    const [x1, y1] = at(0, rows - 1);
+    wires.push({
+      d: upright ? `M${x0 - 12} ${y0}H${x1 + 12}` : `M${x0} ${y0 - 12}V${y1 + 12}`, bus: 0, kind: "busbar",
+    });
+    const right = at(columns - 1, rows - 1);
+    const extent = upright
+      ? [Math.max(width - 4, right[0] + 78), right[1] + 24]
+      : [Math.max(right[0] + pad, 200), right[1] + 34 + 34 * size];
+    const root = svg("svg", {
+      width: extent[0], height: extent[1], viewBox: `0 0 ${extent[0]} ${extent[1]}`, role: "group",
+      "aria-label": `One-line diagram, ${this.feeder.layout.customers.length} customers`,
+    }, svg("text", { class: "busbar-name", x: 8, y: 14, text: this.feeder.layout.buses[0] }));
+    this.busbarName = root.firstChild;
+    return { root, spots, wires };
+  }
+
+  mapParts() {
+    const { xy, parent, buses, customers } = this.feeder.layout;
+    const width = Math.max(280, this.box.clientWidth);
+    const [xs, ys] = [xy.map((p) => p[0]), xy.map((p) => p[1])];
+    const span = [Math.max(...xs) - Math.min(...xs) || 1, Math.max(...ys) - Math.min(...ys) || 1];
+    const height = Math.min(680, Math.max(320, (width * span[1]) / span[0]));
+    const pad = 30;
+    const factor = Math.min((width - 2 * pad) / span[0], (height - 2 * pad) / span[1]);
+    const at = (k) => [
+      (width - span[0] * factor) / 2 + (xs[k] - Math.min(...xs)) * factor,
+      height - (height - span[1] * factor) / 2 - (ys[k] - Math.min(...ys)) * factor,
+    ];
+    const wires = buses.slice(1).map((_, i) => {
+      const [ax, ay] = at(parent[i + 1] ?? 0);
+      const [bx, by] = at(i + 1);
+      return { d: `M${ax} ${ay}L${bx} ${by}`, bus: i + 1 };
+    });
+    const [bx, by] = at(0);
+    wires.push({ d: `M${bx - 9} ${by}h18M${bx} ${by - 9}v18`, bus: 0, kind: "busbar" });
+    const index = new Map(buses.map((id, k) => [id, k]));
+    const here = new Map();
+    const spots = customers.map((c, k) => {
+      const bus = index.get(c.bus) ?? 0;
+      const count = here.get(bus) ?? 0;
+      here.set(bus, count + 1);
+      const [x, y] = at(bus);
+      const note = { x: 0, y: 24, "text-anchor": "middle" };
+      return { customer: k, x: x + 15 * count, y, size: 1, note, labels: false, order: k };
+    });
+    const root = svg("svg", { width, height, viewBox: `0 0 ${width} ${height}`, role: "group", "aria-label": "Map" });
+    this.busbarName = null;
+    return { root, spots, wires };
+  }
+
+  update(report) {
+    this.report = report;
+    this.meters = new Map(report.meters.map((meter) => [meter.meter, meter]));
+    this.volts = new Map(report.buses.map((bus) => [bus.bus, bus.v_volt]));
+    const all = [...this.volts.values(), ...report.meters.map((m) => m.v_volt_estimated)].filter(isKnown);
+    if (this.scale.fit(all, this.feeder.v_nominal_volt)) this.rescale();
+    this.paint();
+  }
+
+  rescale() {
+    this.scale.draw(this.limits);
+  }
+
+  voltAt(customer) {
+    const meter = this.meters.get(customer.meter);
+    return isKnown(meter?.v_volt_estimated) ? meter.v_volt_estimated : this.volts.get(customer.bus);
+  }
+
+  paint() {
+    if (!this.report || !this.customers) return;
+    const { buses } = this.feeder.layout;
+    for (const { path, bus } of this.lines) {
+      const color = this.scale.color(this.volts.get(buses[bus]));
+      path.classList.toggle("unknown", color === null);
+      path.style.stroke = color ?? "";
+    }
+    for (const [id, part] of this.customers) {
+      const meter = this.meters.get(part.customer.meter);
+      const now = status(meter, this.limits);
+      const v = this.voltAt(part.customer);
+      part.group.setAttribute("data-status", now.key);
+      part.shape.setAttribute("d", SHAPE[now.key]);
+      part.shape.style.fill = now.key === "silent" ? "" : (this.scale.color(v) ?? "");
+      part.sign.textContent = SIGN[now.key] ?? "";
+      const loud = now.key === "suspect";
+      part.note.classList.toggle("loud", loud);
+      const name = id.slice(this.cut);
+      part.note.textContent = loud
+        ? signed(meter.attack_volt_estimated)
+        : part.labels ? (name.length > 8 ? `${name.slice(0, 7)}…` : name) : "";
+      part.group.setAttribute("aria-label", `${id}: ${now.text}, reconstructed ${volt(v)}`);
+      part.group.classList.toggle("selected", id === this.selected);
+    }
+    if (this.busbarName) {
+      this.busbarName.textContent = `${buses[0]}  ${volt(this.volts.get(buses[0]))}`;
+    }
+  }
+
+  select(id) {
+    this.selected = id;
+    this.tip.hidden = true;
+    this.paint();
+  }
+
+  key(event, id) {
+    const step = { ArrowRight: 1, ArrowDown: 1, ArrowLeft: -1, ArrowUp: -1 }[event.key];
+    if (event.key === "Enter" || event.key === " ") {
+      event.preventDefault();
+      this.onSelect(id);
+    } else if (step) {
+      event.preventDefault();
+      const ids = [...this.customers.keys()];
+      const next = this.customers.get(ids[(ids.indexOf(id) + step + ids.length) % ids.length]);
+      this.customers.get(id).group.setAttribute("tabindex", -1);
+      next.group.setAttribute("tabindex", 0);
+      next.group.focus();
+    }
+  }
+
+  hover(id) {
+    const part = id === null || id === this.selected ? null : this.customers.get(id);
+    this.tip.hidden = !part || !this.report;
+    if (this.tip.hidden) return;
+    const meter = this.meters.get(part.customer.meter);
+    const now = status(meter, this.limits);
+    this.tip.replaceChildren(
+      el("b", { text: id }),
+      el("span", { class: "state", "data-status": now.key, text: now.text }),
+      el("span", { text: `meter says ${volt(meter?.v_volt_reported)}` }),
+      el("span", { text: `reconstructed ${volt(this.voltAt(part.customer))}` }),
+    );
+    const card = this.tip.parentElement.getBoundingClientRect();
+    const spot = part.group.getBoundingClientRect();
+    const left = Math.min(Math.max(spot.left - card.left + spot.width / 2, 90), card.width - 90);
+    this.tip.style.left = `${left}px`;
+    this.tip.style.top = `${spot.top - card.top - 8}px`;
+  }
+}

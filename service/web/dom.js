@@ -1,0 +1,60 @@
+// Small helpers. Data enters the page only as text nodes and attribute values, never as markup.
+
+const SVG = "http://www.w3.org/2000/svg";
+
+function fill(node, attributes, children) {
+  for (const [name, value] of Object.entries(attributes)) {
+    if (value === null || value === undefined || value === false) continue;
+    if (name === "on") for (const [event, handler] of Object.entries(value)) node.addEventListener(event, handler);
+    else if (name === "text") node.textContent = value;
+    else node.setAttribute(name, value === true ? "" : value);
+  }
+  node.append(...children.filter((child) => child !== null && child !== undefined));
+  return node;
+}
+
+export const el = (tag, attributes = {}, ...children) => fill(document.createElement(tag), attributes, children);
+export const svg = (tag, attributes = {}, ...children) =>
+  fill(document.createElementNS(SVG, tag), attributes, children);
+export const byId = (id) => document.getElementById(id);
+
+const known = (value) => typeof value === "number" && Number.isFinite(value);
+const minus = (text) => text.replace("-", "−");
+
+export const volt = (value, digits = 1) => (known(value) ? `${minus(value.toFixed(digits))} V` : "–");
+export const bare = (value, digits = 1) => (known(value) ? minus(value.toFixed(digits)) : "–");
+export const signed = (value, digits = 1) =>
+  known(value) ? `${value > 0 ? "+" : ""}${minus(value.toFixed(digits))}` : "–";
+export const isKnown = known;
+
+export function duration(seconds) {
+  const s = Math.max(0, Math.round(seconds));
+  if (s < 120) return `${s} s`;
+  if (s < 7200) return `${Math.round(s / 60)} min`;
+  if (s < 172800) return `${Math.round(s / 3600)} h`;
+  return `${Math.round(s / 86400)} days`;
+}
+
+export function clock(t, { day = false } = {}) {
+  const date = new Date(t * 1000);
+  const time = date.toLocaleTimeString([], { hour: "2-digit", minute: "2-digit", second: "2-digit" });
+  return day || Math.abs(Date.now() - date) > 43200000 ? `${date.toLocaleDateString()} ${time}` : time;
+}
+
+// What a meter is, in one word for people and one for style sheets.
+export function status(meter, limits) {
+  if (!meter) return { key: "none", text: "no meter" };
+  if (meter.suspect) return { key: "suspect", text: "suspect" };
+  if (!meter.seen) return { key: "silent", text: "silent" };
+  const v = meter.v_volt_estimated;
+  if (known(v) && v > limits.high) return { key: "high", text: "above limit" };
+  if (known(v) && v < limits.low) return { key: "low", text: "below limit" };
+  return { key: "ok", text: "honest" };
+}
+
+export async function getJson(url) {
+  const response = await fetch(url, { headers: { Accept: "application/json" } });
+  const body = await response.json().catch(() => ({}));
+  if (!response.ok) throw new Error(body.detail || `${response.status} ${response.statusText}`);
+  return body;
+}

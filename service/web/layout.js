@@ -1,0 +1,108 @@
+// From the tree of a feeder to places on a grid: every line from the busbar becomes a row, customers hang
+// below it. Along a row goes the branch with the most customers; what branches off gets a row of its own,
+// as near as it fits. One grid step along the row is one customer or one bus.
+
+function tree({ buses, parent, customers }) {
+  const n = buses.length;
+  const children = Array.from({ length: n }, () => []);
+  for (let k = 1; k < n; k += 1) children[parent[k] ?? 0].push(k);
+  const index = new Map(buses.map((id, k) => [id, k]));
+  const at = Array.from({ length: n }, () => []);
+  customers.forEach((c, k) => at[index.get(c.bus) ?? 0].push(k));
+  const weight = at.map((here) => here.length);
+  const depth = new Array(n).fill(1);
+  for (let k = n - 1; k > 0; k -= 1) {
+    const p = parent[k] ?? 0;
+    weight[p] += weight[k];
+    depth[p] = Math.max(depth[p], depth[k] + 1);
+  }
+  return { children, at, weight, depth };
+}
+
+export function oneLine(layout) {
+  const { children, at, weight, depth } = tree(layout);
+  const heavier = (a, b) => weight[b] - weight[a] || depth[b] - depth[a] || a - b;
+  const isDrop = (bus) => children[bus].length === 0;
+
+  // A block: items with rows counted from its own first row, and how far each row reaches.
+  function block(start, x0) {
+    const items = { buses: [], customers: [], lines: [] };
+    const reach = [[x0, x0]];
+    const branches = [];
+    let x = x0;
+    let before = null;
+    for (let bus = start; bus !== undefined; ) {
+      const [next, ...others] = [...children[bus]].sort(heavier);
+      const drops = others.filter(isDrop);
+      const sides = others.filter((child) => !isDrop(child));
+      const own = at[bus].map((customer) => ({ customer, bus }));
+      const hanging = drops.flatMap((drop) =>
+        at[drop].length ? at[drop].map((customer) => ({ customer, bus: drop })) : [{ customer: null, bus: drop }],
+      );
+      const slots = [...own, ...hanging];
+      const first = x;
+      if (sides.length) x += 1;
+      slots.forEach(({ customer, bus: where }, k) => {
+        items.customers.push({ customer, bus: where, from: bus, x: x + k, row: 0 });
+      });
+      x = Math.max(first + 1, x + slots.length);
+      items.buses.push({ bus, x: first, to: x - 1, row: 0 });
+      if (before !== null) items.lines.push({ bus, from: before, x: first, row: 0, x0: before.to, row0: 0 });
+      before = { bus, to: x - 1 };
+      for (const side of sides) branches.push({ side, x: first });
+      bus = next;
+    }
+    reach[0][1] = x - 1;
+    // Those that branch off far out are placed first: no connector then crosses a row.
+    for (const { side, x: from } of branches.reverse()) {
+      const inner = block(side, from + 1);
+      let offset = 1;
+      const clash = () =>
+        inner.reach.some((r, k) => {
+          const there = reach[offset + k];
+          return there && r[0] - 1 <= there[1] && there[0] <= r[1] + 1;
+        });
+      while (clash()) offset += 1;
+      merge(items, inner.items, offset);
+      items.lines.push({ bus: side, x: from + 1, row: offset, x0: from, row0: 0 });
+      inner.reach.forEach((r, k) => {
+        const there = (reach[offset + k] ??= [r[0] - 1, r[1]]);
+        there[0] = Math.min(there[0], r[0] - 1);
+        there[1] = Math.max(there[1], r[1]);
+      });
+      for (let k = 1; k < offset; k += 1) reach[k] ??= [from, from];
+    }
+    return { items, reach };
+  }
+
+  function merge(items, inner, offset) {
+    for (const b of inner.buses) items.buses.push({ ...b, row: b.row + offset });
+    for (const c of inner.customers) items.customers.push({ ...c, row: c.row + offset });
+    for (const l of inner.lines) items.lines.push({ ...l, row: l.row + offset, row0: l.row0 + offset });
+  }
+
+  const all = { buses: [], customers: [], lines: [] };
+  let row = 0;
+  let columns = 1;
+  const own = at[0];
+  own.forEach((customer, k) => all.customers.push({ customer, bus: 0, from: 0, x: 1 + k, row }));
+  if (own.length) {
+    all.lines.push({ bus: 0, x: own.length, row, x0: 0, row0: row, busbar: true });
+    columns = own.length + 1;
+    row += 1;
+  }
+  for (const child of [...children[0]].sort((a, b) => a - b)) {
+    const inner = block(child, 1);
+    merge(all, inner.items, row);
+    all.lines.push({ bus: child, x: 1, row, x0: 0, row0: row });
+    columns = Math.max(columns, ...inner.reach.map((r) => r[1] + 1));
+    row += inner.reach.length;
+  }
+  return { ...all, rows: Math.max(row, 1), columns };
+}
+
+// Real places, if every bus has one and they are not all the same.
+export function hasMap({ xy }) {
+  if (!xy || xy.some((p) => !p || !p.every(Number.isFinite))) return false;
+  return new Set(xy.map(String)).size > xy.length / 4;
+}
