@@ -17,7 +17,7 @@ from typing import Literal
 
 import numpy as np
 
-from gridsec import slots, stacked
+from gridsec import slot_steps, slots, stacked
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import DesignInfeasible
 from gridsec.lure import Lure, StepPolicy
@@ -179,7 +179,7 @@ def init(bank: Bank, y: Floats, u: Floats, seen: Bools, *, net: Floats | None = 
         return stacked.settle(bank.lure, bank.gains, state, y=y, u=u, seen=seen, policy=bank.policy)
     lay, base = _structure(bank)
     first = slots.follow(lay, bank.sets, slots.start(lay, bank.sets, base, bank.policy), seen, None)
-    return slots.settle(lay, first, slots.drive(lay, y, u, seen, net), bank.policy)
+    return slot_steps.settle(lay, first, slots.drive(lay, y, u, seen, net), bank.policy)
 
 
 def step(  # noqa: PLR0917  # design and state, then the four inputs that every observer's step has
@@ -223,7 +223,7 @@ def step(  # noqa: PLR0917  # design and state, then the four inputs that every 
     lay, _ = _structure(bank)
     state = slots.follow(lay, bank.sets, state, seen, adopt)
     live = seen if state.plan is not None else np.zeros_like(seen)
-    return slots.advance(lay, state, slots.drive(lay, y, u, live, net), h, bank.policy)
+    return slot_steps.advance(lay, state, slots.drive(lay, y, u, live, net), h, bank.policy)
 
 
 def _structure(bank: Bank) -> tuple[slots.Layout, slots.Plan]:
@@ -269,7 +269,7 @@ def consistency(bank: Bank, state: BankState) -> Floats:
     chong2020, equation (6).
     """
     if isinstance(state, SlotState):
-        return slots.consistency(_structure(bank)[0], bank.sets, state)
+        return slot_steps.consistency(_structure(bank)[0], bank.sets, state)
     if not decided(bank, state):
         return np.zeros(0)
     sets = bank.sets
@@ -329,7 +329,7 @@ def spread(bank: Bank, state: BankState, index: int) -> Floats:
         Deviations, pu; their maximum is `pi_S`.
     """
     if isinstance(state, SlotState):
-        return slots.spread(_structure(bank)[0], bank.sets, state, index)
+        return slot_steps.spread(_structure(bank)[0], bank.sets, state, index)
     members = bank.sets.count_large + bank.sets.pairs[index] % bank.sets.count_small
     return np.asarray(np.abs(state.x[members] - state.x[index]).max(axis=0))
 
@@ -346,5 +346,5 @@ def estimate(bank: Bank, state: BankState, index: int) -> Floats:
         every live meter, and none while 2M or fewer are alive; with other gains, the median of all.
     """
     if isinstance(state, SlotState):
-        return slots.estimate(_structure(bank)[0], bank.sets, state, index)
+        return slot_steps.estimate(_structure(bank)[0], bank.sets, state, index)
     return np.asarray(state.x[index] if index >= 0 else np.median(state.x, axis=0))

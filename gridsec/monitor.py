@@ -127,9 +127,8 @@ def _majorant(lure: Lure, gains: banks.Gains) -> tuple[Floats, Floats, Floats]:
 def _extreme(M: Floats, K: Floats, N: Floats) -> Floats:
     """Largest `|M - K N|`, entry by entry, over all ways to drop columns of K."""
     terms = -K[:, :, None] * N
-    return np.maximum(
-        np.abs(M + np.maximum(terms, 0.0).sum(axis=1)), np.abs(M + np.minimum(terms, 0.0).sum(axis=1))
-    )
+    high, low = np.maximum(terms, 0.0).sum(axis=1), np.minimum(terms, 0.0).sum(axis=1)
+    return np.asarray(np.maximum(np.abs(M + high), np.abs(M + low)))
 
 
 def init(design: MonitorDesign, t: float) -> MonitorState:

@@ -206,7 +206,7 @@ class TestAgainstLoop:
         lure = plant(rng, customers=8, meters=[0, 1, 3, 4, 5, 7])
         kept = banks.design(lure, 2)
         monkeypatch.setattr("gridsec.slots._BLOCK_BYTES", 0)
-        monkeypatch.setattr("gridsec.slots._NEWTON_ENTRIES", 64)
+        monkeypatch.setattr("gridsec.slot_steps._NEWTON_ENTRIES", 64)
         dense = banks.design(lure, 2)
         assert dense.base is not None
         assert dense.base.small.H is None
