@@ -20,7 +20,7 @@ from typing import Final
 
 import numpy as np
 
-from feeders.powerflow import PowerFlow
+from feeders.powerflow import PowerFlow, PowerFlowDiverged
 from feeders.variation import Demand
 from gridsec.arrays import Floats
 from gridsec.droop import Droop
@@ -33,6 +33,9 @@ MAX_ITERATIONS: Final = 200
 
 CONTRACTS: Final = 0.3
 """Plain iteration goes on while the residual falls at least by this factor from one solve to the next."""
+
+SMALLEST_SHARE: Final = 2.0**-7
+"""A Newton step is not shortened below this share of itself."""
 
 PROBE_PU: Final = 1e-3
 """Reactive power by which the sensitivities are measured, pu of the base power."""
@@ -81,6 +84,15 @@ class Point:
     setpoint: Floats
     v_volt: Floats
     v_bus_volt: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Trial:
+    """A point, by how much it misses x = kept + new K(v), and the largest entry of that, pu."""
+
+    point: Point
+    defect: Floats
+    size: float
 
 
 class ClosedLoop:
@@ -197,39 +209,44 @@ class ClosedLoop:
         PowerFlowDiverged
             When the feeder has no voltages at all for these loads.
         """
-        here = self.point(loads, guess)
-        defect = kept + new * here.setpoint - here.x
-        size = _largest(defect)
+        here = self._trial(loads, kept, new, guess)
         for _ in range(MAX_ITERATIONS):
-            if size <= TOLERANCE_PU:
-                return here
-            there = self.point(loads, here.x + defect)
-            defect_there = kept + new * there.setpoint - there.x
-            size_there = _largest(defect_there)
-            if size_there > CONTRACTS * size:
-                there, defect_there, size_there = self._newton(loads, kept, new, here, defect)
-            here, defect, size = there, defect_there, size_there
+            if here.size <= TOLERANCE_PU:
+                return here.point
+            there = self._attempt(loads, kept, new, here.point.x + here.defect)
+            if there is None or there.size > CONTRACTS * here.size:
+                there = self._newton(loads, kept, new, here)
+            here = there
         raise NoEquilibrium(
-            f"inverters and feeder do not settle: {size:.2g} pu of reactive power are left over"
+            f"inverters and feeder do not settle: {here.size:.2g} pu of reactive power are left over"
         )
 
-    def _newton(
-        self, loads: Loads, kept: Floats, new: Floats, here: Point, defect: Floats
-    ) -> tuple[Point, Floats, float]:
+    def _trial(self, loads: Loads, kept: Floats, new: Floats, x: Floats) -> _Trial:
+        point = self.point(loads, x)
+        defect = kept + new * point.setpoint - x
+        return _Trial(point, defect, float(np.max(np.abs(defect), initial=0.0)))
+
+    def _attempt(self, loads: Loads, kept: Floats, new: Floats, x: Floats) -> _Trial | None:
+        """A trial that may overshoot to where the feeder has no voltages at all: then None."""
+        try:
+            return self._trial(loads, kept, new, x)
+        except PowerFlowDiverged:
+            return None
+
+    def _newton(self, loads: Loads, kept: Floats, new: Floats, here: _Trial) -> _Trial:
         """One damped Newton step of `settle`; the curves' slopes are those at the present voltages."""
         if self._sensitivity is None:
-            self._sensitivity = self._measure(loads, here)
-        slope = new * self._slope(here.v_volt)
-        step = np.linalg.solve(np.eye(self.count) - slope[:, None] * self._sensitivity, defect)
-        size, share = _largest(defect), 1.0
-        while True:
-            there = self.point(loads, here.x + share * step)
-            defect_there = kept + new * there.setpoint - there.x
-            size_there = _largest(defect_there)
-            # The last resort still moves, so that a kink at which no step helps is left behind.
-            if size_there < (1.0 - 0.1 * share) * size or share < 2.0**-6:
-                return there, defect_there, size_there
+            self._sensitivity = self._measure(loads, here.point)
+        slope = new * self._slope(here.point.v_volt)
+        step = np.linalg.solve(np.eye(self.count) - slope[:, None] * self._sensitivity, here.defect)
+        share = 1.0
+        while share > SMALLEST_SHARE:
+            there = self._attempt(loads, kept, new, here.point.x + share * step)
+            if there is not None and there.size < (1.0 - 0.1 * share) * here.size:
+                return there
             share *= 0.5
+        # The last resort moves all the same, so that a kink at which no step helps is left behind.
+        return self._trial(loads, kept, new, here.point.x + share * step)
 
     def _slope(self, v_volt: Floats) -> Floats:
         """dK/dv of every inverter, 1, <= 0."""
@@ -245,7 +262,3 @@ class ClosedLoop:
         v, _ = self.flow.solve_batch(p, q, np.full(self.count, loads.v0_volt))
         change = (v - here.v_volt)[:, self._customer]
         return (change / (PROBE_PU * self._base_volt)).T
-
-
-def _largest(values: Floats) -> float:
-    return float(np.max(np.abs(values), initial=0.0))

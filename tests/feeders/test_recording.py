@@ -1,0 +1,182 @@
+"""Recordings: what is written comes back, foreign files are read, broken ones are named."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from feeders.campaign import Kind, random_attacks
+from feeders.meters import BUSBAR, Channel, MeterErrors, Silence
+from feeders.recording import (
+    FORMAT,
+    RecordingInvalid,
+    read_recording,
+    record,
+    scenario_from_json,
+    scenario_to_json,
+    truth_path,
+)
+from feeders.scenario import START, Scenario, by_arrival, simulate
+from feeders.variation import Variation
+from tests.feeders.villages import village
+
+
+def busy() -> Scenario:
+    """Every feature at once."""
+    site = village()
+    attacks = tuple(
+        attack
+        for seed, kind in enumerate(Kind)
+        for attack in random_attacks(site, seed, kind, 2, 0.02, t_on=START + 20.0, t_off=START + 60.0)
+    )
+    return Scenario(
+        seed=3,
+        duration_s=90.0,
+        substep_s=0.5,
+        variation=Variation(busbar_pu=1.03),
+        errors=MeterErrors(report_q=True),
+        channel=Channel(
+            loss=0.05,
+            delay_mean_s=0.7,
+            late=0.05,
+            late_s=20.0,
+            duplicate=0.1,
+            clock_s=0.5,
+            silences=(Silence("m-c1", START + 5.0, np.inf), Silence(BUSBAR, START, START + 3.0)),
+        ),
+        attacks=attacks,
+    )
+
+
+def test_readings_and_truth_come_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("feeders.recording.CHUNK_TICKS", 16)  # late readings cross many chunks
+    site, scenario = village(), busy()
+    recording = record(site, scenario, tmp_path / "day.parquet")
+    samples = list(simulate(site, scenario))
+    expected = list(by_arrival(samples))
+    got = list(recording.readings())
+    assert len(got) == recording.count == len(expected) > 400
+    assert sorted(map(repr, got)) == sorted(map(repr, expected))
+    assert [r.arrival for r in got] == sorted(r.arrival for r in got)
+    assert {r.meter for r in got} == {*site.meter_ids, BUSBAR}
+
+    truth = recording.truth()
+    np.testing.assert_array_equal(truth.t, [s.t for s in samples])
+    for name in ("v_volt", "p_kw", "q_kvar", "v_bus_volt", "x_kvar", "manipulated", "shift_volt"):
+        np.testing.assert_array_equal(getattr(truth, name), np.array([getattr(s, name) for s in samples]))
+    assert truth.manipulated.any()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["day.parquet", "day.truth.parquet"]
+
+
+def test_the_same_scenario_gives_the_same_bytes(tmp_path: Path) -> None:
+    site = village()
+    one = record(site, busy(), tmp_path / "one.parquet").path
+    two = record(site, busy(), tmp_path / "two.parquet").path
+    assert one.read_bytes() == two.read_bytes()
+    assert truth_path(one).read_bytes() == truth_path(two).read_bytes()
+
+
+def test_metadata_tells_how_it_was_made(tmp_path: Path) -> None:
+    site, scenario = village(), busy()
+    recording = read_recording(record(site, scenario, tmp_path / "a.parquet").path)
+    assert (recording.feeder, recording.digest) == ("village", site.digest)
+    assert recording.versions["numpy"] == np.__version__
+    assert recording.scenario is not None
+    # Played again from the file alone, it is the same.
+    again = record(site, recording.scenario, tmp_path / "b.parquet")
+    assert again.path.read_bytes() == recording.path.read_bytes()
+
+
+def test_scenarios_survive_json() -> None:
+    scenario = busy()
+    text = json.dumps(scenario_to_json(scenario), allow_nan=False)
+    back = scenario_from_json(json.loads(text))
+    assert json.dumps(scenario_to_json(back), allow_nan=False) == text
+    assert back.variation == scenario.variation
+    assert back.channel == scenario.channel
+    assert [type(a) for a in back.attacks] == [type(a) for a in scenario.attacks]
+    endless = scenario_from_json(json.loads(json.dumps(scenario_to_json(Scenario(duration_s=np.inf)))))
+    assert endless.duration_s == np.inf
+
+
+def test_pandas_reads_it(tmp_path: Path) -> None:
+    recording = record(village(), Scenario(duration_s=5.0), tmp_path / "a.parquet")
+    frame = recording.frame()
+    assert list(frame.columns) == ["meter", "t", "seq", "arrival", "v_volt", "p_kw", "q_kvar"]
+    assert len(frame) == 5 * 8
+    busbar = frame[frame.meter == BUSBAR]
+    assert len(busbar) == 5
+    assert busbar.p_kw.isna().all()
+    pd.testing.assert_frame_equal(frame, pd.read_parquet(recording.path))
+
+
+def test_foreign_files_need_three_columns_only(tmp_path: Path) -> None:
+    path = tmp_path / "foreign.parquet"
+    frame = pd.DataFrame({"meter": ["m1", "m2"], "t": [1.0, 2.0], "v_volt": [230.0, 231.0], "extra": [1, 2]})
+    frame.to_parquet(path)
+    recording = read_recording(path)
+    assert (recording.feeder, recording.digest, recording.scenario) == (None, None, None)
+    first, second = recording.readings()
+    assert (first.meter, first.t, first.arrival, first.v_volt) == ("m1", 1.0, 1.0, 230.0)
+    assert (second.seq, second.p_kw, second.q_kvar) == (None, None, None)
+    with pytest.raises(RecordingInvalid, match="no truth of this recording"):
+        recording.truth()
+
+
+def test_what_is_no_recording_is_said_to_be_none(tmp_path: Path) -> None:
+    with pytest.raises(RecordingInvalid, match=r"nowhere\.parquet: no recording"):
+        read_recording(tmp_path / "nowhere.parquet")
+    text = tmp_path / "text.parquet"
+    text.write_text("meter,t,v_volt\n")
+    with pytest.raises(RecordingInvalid, match="no recording"):
+        read_recording(text)
+    short = tmp_path / "short.parquet"
+    pd.DataFrame({"meter": ["m1"]}).to_parquet(short)
+    with pytest.raises(RecordingInvalid, match="columns t, v_volt are missing"):
+        read_recording(short)
+
+
+@pytest.mark.parametrize(
+    ("about", "message"),
+    [
+        (json.dumps({"format": FORMAT + 1}), f"format {FORMAT + 1}; this program reads format {FORMAT}"),
+        ("{", "metadata cannot be read"),
+        (json.dumps({"format": FORMAT}), "metadata cannot be read"),
+        (json.dumps({"format": FORMAT, "scenario": {"seed": 1}}), "metadata cannot be read"),
+        (json.dumps([]), "metadata cannot be read"),
+    ],
+)
+def test_broken_metadata_is_named(tmp_path: Path, about: str, message: str) -> None:
+    path = tmp_path / "broken.parquet"
+    table = pa.table({"meter": ["m1"], "t": [1.0], "v_volt": [230.0]})
+    pq.write_table(table.replace_schema_metadata({"gridsec": about}), path)
+    with pytest.raises(RecordingInvalid, match=message):
+        read_recording(path)
+
+
+def test_an_endless_scenario_cannot_be_recorded(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="without an end"):
+        record(village(), Scenario(duration_s=np.inf), tmp_path / "a.parquet")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_failure_leaves_no_half_file(tmp_path: Path) -> None:
+    beyond = Scenario(duration_s=5.0, variation=Variation(busbar_pu=0.02))
+    with pytest.raises(Exception, match="no solution"):
+        record(village(), beyond, tmp_path / "a.parquet")
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(OSError, match="nowhere"):
+        record(village(), Scenario(), tmp_path / "nowhere" / "a.parquet")
+
+
+def test_a_scenario_in_which_nothing_arrives(tmp_path: Path) -> None:
+    recording = record(village(), Scenario(duration_s=3.0, channel=Channel(loss=1.0)), tmp_path / "a.parquet")
+    assert recording.count == 0
+    assert list(recording.readings()) == []
+    assert recording.truth().t.size == 3
