@@ -7,6 +7,7 @@ file. pandapower and simbench are the optional extra `convert`.
 
 from __future__ import annotations
 
+import random
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ from feeders.schema import validate, write
 from gridsec.errors import FeederInvalid, GridsecError
 
 PROFILES = "profiles"
+SEED = 1
 KERBER = "(G. Kerber, dissertation, TU Munich 2011)"
 
 
@@ -157,6 +159,16 @@ def convert(
     return notes
 
 
+def _seeded(make: Callable[[], Any]) -> Any:
+    """Build a network whose maker draws cables at random; the caller's random state stays as it was."""
+    state = random.getstate()
+    random.seed(SEED)
+    try:
+        return make()
+    finally:
+        random.setstate(state)
+
+
 def _convert_profiles(folder: Path) -> tuple[str, ...]:
     columns = convert_simbench.year()
     loads = convert_simbench.load_profiles(columns)
@@ -192,7 +204,7 @@ def _open(origin: str) -> tuple[Any, str]:
         ]
         if not found:
             raise GridsecError(f"pandapower has no network {rest!r}")
-        return found[0](), "pandapower"
+        return _seeded(found[0]), "pandapower"
     path = Path(origin)
     if not path.is_file():
         raise GridsecError(

@@ -62,6 +62,12 @@ def _wrapped(notes: tuple[str, ...]) -> str:
     return "\n".join(f"- {note}" for note in notes) or "- nothing"
 
 
+RANDOM = """
+
+pandapower draws the types of some of the Kerber networks' service cables at random; the random numbers start
+from the seed 1."""
+
+
 def _version(package: str) -> str:
     try:
         return f"{package} {version(package)}"
@@ -101,7 +107,7 @@ def feeder_source(
 - Made by: `{command}`
 - {len(tables.lines)} lines and switches, {len(tables.customers)} customers
 
-{ASSUMED}
+{ASSUMED}{RANDOM if "kerber" in origin else ""}
 
 ## Left out, added, changed
 

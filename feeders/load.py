@@ -234,8 +234,9 @@ def to_frame(site: Site, snapshot: Snapshot) -> Frame:
     Voltages: ``y = v |v|`` in pu, so that a negative reading stays a bad one.
 
     Active power: a register of f = `p_error_percent` and steps of 2 h shows r; the truth is within
-    ``(f |r| + h) / (1 - f)`` of it. Where it is missing, not finite or beyond anything the customer could draw, all that is
-    known is the interval from full generation without load to full load without generation.
+    ``(f |r| + h) / (1 - f)`` of it. Where there is no reading, or one that is not finite or beyond anything
+    the customer could draw, all that is known is the interval from full generation without load to full
+    load without generation.
 
     Reactive power of the load (the inverter's is the observer's business): with net import P, the load
     alone lies in ``[max(P, 0), max(P, min(P + pv, load_kw))]``, each end widened by the error of P;
