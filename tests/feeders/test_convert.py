@@ -1,0 +1,303 @@
+"""Conversion: against pandapower's own admittances and power flow, and nothing dropped in silence."""
+
+from __future__ import annotations
+
+import random
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandapower as pp
+import pytest
+from pandapower import networks
+from pandapower.toolbox import drop_trafos, select_subnet
+
+from feeders.convert import RECIPES, SEED, convert
+from feeders.convert_pandapower import Fleet, from_pandapower
+from feeders.convert_simbench import envelope
+from feeders.load import from_tables, load
+from feeders.profiles import data_root, envelopes
+from feeders.schema import read, validate
+from gridsec.errors import FeederInvalid, GridsecError
+from gridsec.feeder import lindistflow
+
+FROM_PANDAPOWER = [name for name, recipe in RECIPES.items() if recipe.source.startswith("pandapower:")]
+FROM_SIMBENCH = [name for name, recipe in RECIPES.items() if recipe.source.startswith("simbench:")]
+
+
+def below_busbar(net: Any, root: int) -> Any:
+    """The part below a bus, fed there by an ideal source; built by pandapower's own tools."""
+    drop_trafos(net, net.trafo.index)
+    net.ext_grid = net.ext_grid.iloc[0:0]
+    pp.create_ext_grid(net, root, vm_pu=1.0)
+    reached = sorted(pp.topology.connected_component(pp.topology.create_nxgraph(net), root))
+    return select_subnet(net, reached)
+
+
+def original(name: str) -> tuple[Any, int]:
+    maker = RECIPES[name].source.removeprefix("pandapower:")
+    random.seed(SEED)
+    net = getattr(networks, maker)()
+    wanted = RECIPES[name].root
+    if wanted is not None:
+        root = int(net.bus.index[net.bus.name == wanted][0])
+    else:
+        root = int(net.trafo.lv_bus.iloc[0]) if len(net.trafo) else int(net.ext_grid.bus.iloc[0])
+    return below_busbar(net, root), root
+
+
+# --- the project's own feeders ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", FROM_PANDAPOWER)
+def test_recipe_builds_the_committed_folder(name: str, tmp_path: Path) -> None:
+    notes = convert(name, tmp_path / "out")
+    committed = Path(str(data_root())) / "feeders" / name
+    for file in ("feeder.toml", "lines.csv", "customers.csv", "SOURCE.md"):
+        assert (tmp_path / "out" / file).read_text() == (committed / file).read_text(), file
+    source = (committed / "SOURCE.md").read_text()
+    assert all(note in source for note in notes)
+    assert f"gridsec convert {name} data/feeders/{name}" in source
+
+
+@pytest.mark.parametrize("name", FROM_SIMBENCH)
+def test_recipe_builds_the_committed_simbench_folder(name: str, tmp_path: Path) -> None:
+    pytest.importorskip("simbench", reason="the extra `convert` is not installed")
+    convert(name, tmp_path / "out")
+    committed = Path(str(data_root())) / "feeders" / name
+    for file in ("feeder.toml", "lines.csv", "customers.csv"):
+        assert (tmp_path / "out" / file).read_text() == (committed / file).read_text(), file
+
+
+@pytest.mark.parametrize("name", FROM_PANDAPOWER)
+def test_impedances_are_pandapowers_own(name: str) -> None:
+    """Z between customers from the inverse of pandapower's admittance matrix, without cable charging."""
+    net, root = original(name)
+    net.line["c_nf_per_km"] = 0.0
+    pp.runpp(net, numba=False)
+    lookup = net._pd2ppc_lookups["bus"]
+    Y = net._ppc["internal"]["Ybus"].toarray()
+    slack = int(lookup[root])
+    keep = np.delete(np.arange(Y.shape[0]), slack)
+    Z = np.zeros(Y.shape, dtype=complex)
+    Z[np.ix_(keep, keep)] = np.linalg.inv(Y[np.ix_(keep, keep)])
+    at = lookup[net.load.bus.to_numpy()]
+    site = load(name)
+    ids = [str(n) if n is not None else f"load-{i}" for i, n in net.load.name.items()]
+    order = [site.feeder.customers.index(customer) for customer in ids]
+    model = lindistflow(site.feeder)
+    scale = site.feeder.base_kva / 1000.0 / net.sn_mva  # from pandapower's base power to the feeder's
+    np.testing.assert_allclose(
+        model.R[np.ix_(order, order)], Z.real[np.ix_(at, at)] * scale, rtol=1e-7, atol=1e-12
+    )
+    np.testing.assert_allclose(
+        model.X[np.ix_(order, order)], Z.imag[np.ix_(at, at)] * scale, rtol=1e-7, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("name", FROM_PANDAPOWER)
+def test_ids_loads_and_charging_are_kept(name: str) -> None:
+    net, root = original(name)
+    tables = read(Path(str(data_root())) / "feeders" / name)
+    assert tables.meta.voltage_volt == pytest.approx(net.bus.vn_kv[root] * 1000 / np.sqrt(3), rel=1e-8)
+    buses = {str(bus) for bus in net.bus.name}
+    assert {row.bus for row in tables.customers} <= buses
+    assert {line.to_bus for line in tables.lines} | {tables.meta.busbar} == buses
+    assert sorted(row.load_kw for row in tables.customers) == pytest.approx(sorted(net.load.p_mw * 1000))
+    susceptance = 2e-3 * np.pi * net.f_hz * (net.line.c_nf_per_km * net.line.length_km).sum()
+    assert sum(line.b_us for line in tables.lines) == pytest.approx(susceptance, rel=1e-7)
+
+
+def test_open_ties_are_kept_open() -> None:
+    lines = read(Path(str(data_root())) / "feeders" / "case33bw").lines
+    assert sum(not line.closed for line in lines) == 5
+    assert len(lines) == 37
+
+
+# --- anything else ------------------------------------------------------------------------------
+
+
+def street() -> Any:
+    """A net with one of everything that can go wrong."""
+    net = pp.create_empty_network(f_hz=50.0)
+    mv = pp.create_bus(net, 20.0, name="MV")
+    bus = [
+        pp.create_bus(net, 0.4, name=name) for name in ("busbar", "A", "A", "", "far", "dead", "other side")
+    ]
+    pp.create_ext_grid(net, mv)
+    pp.create_transformer(net, mv, bus[0], "0.25 MVA 20/0.4 kV")
+    cable = {"r_ohm_per_km": 0.2, "x_ohm_per_km": 0.08, "c_nf_per_km": 500.0, "max_i_ka": 0.2}
+    for name, a, b, extra in [
+        ("one", 1, 0, {"parallel": 2}),
+        ("two", 1, 2, {}),
+        ("two", 3, 4, {}),
+        (None, 4, 5, {}),
+        ("across", 4, 6, {}),
+    ]:
+        pp.create_line_from_parameters(net, bus[a], bus[b], 0.1, name=name, **cable, **extra)
+    pp.create_switch(net, bus[2], bus[3], "b", name="coupler")
+    pp.create_switch(net, bus[0], bus[4], "b", closed=False, name="two")
+    pp.create_switch(net, bus[4], 4, "l", closed=False)
+    net.bus.loc[bus[5], "in_service"] = False
+    pp.create_load(net, bus[1], 0.004, 0.003, name="house")
+    pp.create_load(net, bus[1], 0.002, -0.001, name="house", scaling=0.5)
+    pp.create_load(net, bus[2], -0.001, name="seller")
+    pp.create_load(net, bus[6], 0.1, name="beyond")
+    pp.create_sgen(net, bus[1], 0.006, sn_mva=0.007, name="roof")
+    pp.create_sgen(net, bus[4], 0.003, q_mvar=0.001, name="field")
+    pp.create_shunt(net, bus[2], 0.01)
+    pp.create_gen(net, bus[4], 0.01)
+    pp.create_storage(net, bus[1], 0.001, 0.01)
+    return net
+
+
+def test_everything_is_carried_over_or_named() -> None:
+    tables, notes = from_pandapower(street(), "street", title="A street")
+    assert validate(tables) == ()
+    lines = {line.line: line for line in tables.lines}
+    assert set(lines) == {"one", "two", "two-1", "two-2", "coupler"}
+    assert lines["one"].r_ohm == pytest.approx(0.01)
+    assert lines["one"].b_us == pytest.approx(2 * 2 * np.pi * 50 * 500e-9 * 0.1 * 1e6)
+    assert lines["one"].rating_a == pytest.approx(400.0)
+    assert (lines["one"].from_bus, lines["one"].to_bus) == ("busbar", "A-2")
+    assert (lines["coupler"].r_ohm, lines["coupler"].x_ohm, lines["coupler"].closed) == (0.0, 0.0, True)
+    assert sum(not line.closed for line in tables.lines) == 1  # the tie between busbar and far
+    customers = {row.customer: row for row in tables.customers}
+    assert set(customers) == {"house-0", "house-1", "seller", "field"}
+    assert customers["house-0"].power_factor == pytest.approx(0.8)
+    assert customers["house-0"].bus == customers["house-1"].bus == "A-2"
+    assert (customers["house-0"].pv_kw, customers["house-0"].inverter_kva) == (6.0, 7.0)
+    assert customers["house-0"].droop == "vde4105"
+    assert customers["house-1"].load_kw == pytest.approx(1.0)
+    assert (customers["field"].load_kw, customers["field"].pv_kw) == (0.0, 3.0)
+    assert customers["field"].droop == "vde4105-small"
+    assert len({row.meter for row in tables.customers}) == 4
+    said = "\n".join(notes)
+    for part in (
+        "house-1 has a leading power factor",
+        "seller feeds in 1 kW",
+        "field has no load at its bus",
+        "fixed reactive power of field",
+        "row(s) of the table shunt",
+        "row(s) of the table gen",
+        "row(s) of the table storage",
+        "across, open towards a part",
+        "buses that the busbar does not feed",
+    ):
+        assert part in said, part
+    from_tables(tables)
+
+
+def test_power_factor_interval_holds_the_profiles_history() -> None:
+    tables, _ = from_pandapower(street(), "street")
+    for row in tables.customers:
+        if row.load_kw == 0.0 or row.power_factor is None:
+            continue
+        assert row.power_factor_min is not None
+        assert row.power_factor_max is not None
+        assert row.q_floor_kvar is not None
+        history = envelopes()[row.load_profile]
+        tan = np.tan(np.arccos(row.power_factor))
+        assert np.tan(np.arccos(row.power_factor_min)) >= history.high * tan * (1 - 1e-12)
+        assert np.tan(np.arccos(row.power_factor_max)) <= history.low * tan * (1 + 1e-12)
+        assert row.q_floor_kvar >= history.floor * tan * row.load_kw
+
+
+def test_synthetic_fleet() -> None:
+    net = networks.create_kerber_landnetz_freileitung_1()
+    tables, notes = from_pandapower(net, "fleet", fleet=Fleet(3, 0.0, "asnzs4777-a"))
+    with_inverter = [k for k, row in enumerate(tables.customers) if row.inverter_kva > 0]
+    assert with_inverter == list(range(0, 13, 3))
+    assert {row.inverter_kva for row in tables.customers} == {0.0, 4.0}
+    assert any("synthetic PV inverter with droop curve asnzs4777-a" in note for note in notes)
+
+
+def test_ambiguous_and_unknown_busbars() -> None:
+    net = networks.create_cigre_network_lv()
+    with pytest.raises(GridsecError, match="Bus R1, Bus I1, Bus C1"):
+        from_pandapower(net, "x")
+    with pytest.raises(GridsecError, match="0 buses are called 'Bus X'"):
+        from_pandapower(net, "x", root="Bus X")
+    commercial, _ = from_pandapower(net, "x", root="Bus C1")
+    assert all(row.customer.startswith("Load C") for row in commercial.customers)
+    by_index, _ = from_pandapower(net, "x", root=str(net.bus.index[net.bus.name == "Bus C1"][0]))
+    assert by_index == commercial
+
+
+def test_loop_in_the_source_is_refused(tmp_path: Path) -> None:
+    net = networks.case33bw()
+    net.line.loc[36, "in_service"] = True
+    path = tmp_path / "looped.json"
+    pp.to_json(net, str(path))
+    with pytest.raises(FeederInvalid, match="form a loop"):
+        convert(str(path), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_pandapower_file(tmp_path: Path) -> None:
+    path = tmp_path / "street.json"
+    pp.to_json(street(), str(path))
+    notes = convert(str(path), tmp_path / "my street", droop="ieee1547-a")
+    site = load(tmp_path / "my street")
+    assert site.feeder.name == "my-street"
+    assert {row.droop for row in site.tables.customers} == {"", "ieee1547-a"}
+    source = (tmp_path / "my street" / "SOURCE.md").read_text()
+    assert all(note in source for note in notes)
+
+
+def test_any_pandapower_network_by_name(tmp_path: Path) -> None:
+    convert("pandapower:kerber_landnetz_kabel_1", tmp_path / "cable", name="cable")
+    assert load(tmp_path / "cable").feeder.name == "cable"
+
+
+def test_unknown_sources(tmp_path: Path) -> None:
+    (tmp_path / "text.json").write_text("no json")
+    (tmp_path / "list.json").write_text("[1, 2]")
+    for source, words in [
+        ("pandapower:no_such_network", "no network"),
+        ("nonsense", "is no source"),
+        (str(tmp_path / "text.json"), "pandapower"),
+        (str(tmp_path / "list.json"), "pandapower"),
+    ]:
+        with pytest.raises(GridsecError, match=words):
+            convert(source, tmp_path / "out")
+
+
+def test_without_the_extra_the_error_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "simbench", None)
+    with pytest.raises(GridsecError, match=r"gridsec\[convert\]"):
+        convert("simbench-lv-rural1", tmp_path / "out")
+    monkeypatch.setitem(sys.modules, "pandapower", None)
+    with pytest.raises(GridsecError, match=r"gridsec\[convert\]"):
+        convert("kerber-landnetz", tmp_path / "out")
+
+
+# --- envelopes ----------------------------------------------------------------------------------
+
+
+def test_envelope_is_the_smallest_wedge() -> None:
+    """Brute force over slopes: no other wedge that holds all points is narrower at the stated load."""
+    rng = np.random.default_rng(5)
+    p = rng.uniform(0, 1, 400) ** 2
+    q = p * rng.uniform(0.5, 1.6, 400) + rng.uniform(-0.1, 0.1, 400)
+    found = envelope(p, q)
+    assert (found.low * p - found.floor <= q).all()
+    assert (q <= found.high * p + found.floor).all()
+    weight = max(p.mean(), 0.3)
+    best = np.inf
+    for low in np.linspace(0, 1, 101):
+        for high in np.linspace(1, 3, 201):
+            floor = max((low * p - q).max(), (q - high * p).max(), 0.0)
+            best = min(best, (high - low) * weight + 2 * floor)
+    width = (found.high - found.low) * weight + 2 * found.floor
+    assert best - 0.02 <= width <= best + 6e-3  # rounded outwards to three digits, on a grid of 0.01
+
+
+def test_envelope_of_a_straight_profile() -> None:
+    p = np.linspace(0, 1, 50)
+    found = envelope(p, p)
+    assert (found.low, found.high) == (1.0, 1.0)
+    assert found.floor <= 2e-3
