@@ -23,7 +23,7 @@ import zenoh
 from gridsec.errors import GridsecError
 
 RING = 8192
-"""Samples that zenoh keeps for us, for each of the three kinds of keys."""
+"""Samples that zenoh keeps for us."""
 
 BATCH = 1024
 _HEAD = 1024
@@ -206,23 +206,21 @@ class Bus:
         """Open the session, subscribe, answer queries."""
         with ExitStack() as stack:
             live = stack.enter_context(session(self._config))
-            readings = [
-                f"{self._prefix}/*/meter/*/reading",
-                f"{self._prefix}/*/substation/reading",
-                f"{self._prefix}/*/concentrator/*/readings",
-            ]
-            for key in readings:
-                # A ring that is full drops the oldest samples; the gap shows in their numbers.
-                channel = (
-                    zenoh.handlers.FifoChannel(RING) if self._lossless else zenoh.handlers.RingChannel(RING)
-                )
-                subscriber = live.declare_subscriber(key, channel)
-                stack.callback(subscriber.undeclare)
-                self._start(f"zenoh {key}", self._receive, subscriber.handler)
+            # One subscription for every kind of reading keeps them in the order they were sent. It also
+            # hears keys that are almost right, and those deserve an answer in the bad readings.
+            key = f"{self._prefix}/*/**/reading$*"
+            # A ring that is full drops the oldest samples; the gap shows in their numbers.
+            subscriber = (
+                live.declare_subscriber(key, zenoh.handlers.FifoChannel(RING))
+                if self._lossless
+                else live.declare_subscriber(key, zenoh.handlers.RingChannel(RING))
+            )
+            stack.callback(subscriber.undeclare)
+            self._start("zenoh readings", self._receive, subscriber.handler)
             for key in (f"{self._prefix}/*/estimate", f"{self._prefix}/*/alarm/*"):
                 queryable = live.declare_queryable(key, zenoh.handlers.FifoChannel(QUERIES_WAITING))
                 stack.callback(queryable.undeclare)
-                self._start(f"zenoh query {key}", self._answer, queryable.handler)
+                self._start(f"zenoh queries {key}", self._answer, queryable.handler)
             token = live.liveliness().declare_token(f"{self._prefix}/service/{live.zid()}")
             stack.callback(token.undeclare)
             publishing = self._start("zenoh publish", self._publish, live)

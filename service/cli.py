@@ -1,0 +1,480 @@
+"""The command line. Every command is a thin layer over a module that does the work.
+
+Exit codes: 0 done; 1 a check failed or something unexpected; 2 wrong usage or settings; 3 a feeder is invalid
+or cannot be watched; 4 the database cannot be used; 5 an address cannot be used (HTTP or zenoh); 6 a file is
+no recording or cannot be written.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+import os
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from gridsec.errors import DesignInfeasible, FeederInvalid, GridsecError, NotObservable
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from feeders.load import Site
+    from feeders.scenario import Scenario
+    from gridsec.attack import Attack
+    from service.app import Running
+
+app = typer.Typer(
+    name="gridsec",
+    help="Watches the voltages of distribution feeders and names the meters that lie.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+feeders_app = typer.Typer(no_args_is_help=True, help="List, show and check feeders.")
+app.add_typer(feeders_app, name="feeders")
+_out = Console(highlight=False)
+_err = Console(stderr=True, highlight=False)
+
+FAILED, USAGE, FEEDER, DATABASE, ADDRESS, FILE = 1, 2, 3, 4, 5, 6
+
+
+def main() -> None:
+    """Run the command line; errors made on purpose become one clear message and an exit code."""
+    # The observers are memory-bound: more BLAS threads only fight with each other.
+    for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")
+    try:
+        app()
+    except GridsecError as error:
+        _complain(str(error))
+        sys.exit(exit_code(error))
+    except OSError as error:
+        _complain(f"{error.filename or ''}: {error.strerror or error}".removeprefix(": "))
+        sys.exit(FILE)
+
+
+def exit_code(error: GridsecError) -> int:
+    """Return the exit code of an error.
+
+    Parameters
+    ----------
+    error
+        The error.
+    """
+    from feeders.recording import RecordingInvalid
+    from service.app import AddressUnavailable
+    from service.ingest import BusUnavailable
+    from service.settings import SettingsInvalid
+    from service.store import StoreUnavailable
+
+    codes: dict[type[GridsecError], int] = {
+        SettingsInvalid: USAGE,
+        FeederInvalid: FEEDER,
+        NotObservable: FEEDER,
+        DesignInfeasible: FEEDER,
+        StoreUnavailable: DATABASE,
+        AddressUnavailable: ADDRESS,
+        BusUnavailable: ADDRESS,
+        RecordingInvalid: FILE,
+    }
+    return next((code for kind, code in codes.items() if isinstance(error, kind)), FAILED)
+
+
+def _complain(message: str) -> None:
+    _err.print(f"[bold red]gridsec:[/] {escape(message)}")
+
+
+# ---------------------------------------------------------------------------------------------------- serve
+
+Feeder = Annotated[str, typer.Argument(help="A feeder's folder, or the name of one that comes with gridsec.")]
+Endpoints = Annotated[
+    list[str] | None, typer.Option(help="zenoh endpoint to connect to, e.g. tcp/127.0.0.1:7447.")
+]
+
+
+@app.command()
+def serve(
+    *,
+    feeder: Annotated[
+        list[str] | None, typer.Option(help="Folder or name of a feeder; may be repeated.")
+    ] = None,
+    zenoh_listen: Annotated[
+        list[str] | None, typer.Option(help="zenoh endpoint to listen on. [default: tcp/127.0.0.1:7447]")
+    ] = None,
+    zenoh_connect: Endpoints = None,
+    zenoh_mode: Annotated[str | None, typer.Option(help="router, peer or client. [default: router]")] = None,
+    zenoh_config: Annotated[
+        Path | None, typer.Option(help="Your own zenoh configuration (json5): TLS, access rules, ...")
+    ] = None,
+    prefix: Annotated[str | None, typer.Option(help="First chunks of all keys. [default: gridsec]")] = None,
+    http: Annotated[
+        str | None, typer.Option(help="Address of REST and web page. [default: 127.0.0.1:8000]")
+    ] = None,
+    database: Annotated[
+        str | None,
+        typer.Option(help="sqlite:///file or postgresql+psycopg://... [default: sqlite:///gridsec.db]"),
+    ] = None,
+    clock: Annotated[
+        str | None, typer.Option(help="wall, or events: the readings tell the time. [default: wall]")
+    ] = None,
+    max_skew: Annotated[
+        float | None,
+        typer.Option(help="Refuse readings whose time is further off, s. [default: 60 or 2 ticks]"),
+    ] = None,
+    grace: Annotated[
+        float | None, typer.Option(help="How long a tick waits for readings, s. [default: half a tick]")
+    ] = None,
+    max_payload: Annotated[int | None, typer.Option(help="Largest payload, bytes. [default: 262144]")] = None,
+    queue: Annotated[int | None, typer.Option(help="Payloads that may wait. [default: 20000]")] = None,
+    log_level: Annotated[
+        str | None, typer.Option(help="debug, info, warning or error. [default: info]")
+    ] = None,
+    log_format: Annotated[str | None, typer.Option(help="console or json. [default: console]")] = None,
+    until_eof: Annotated[bool, typer.Option(hidden=True, help="End when standard input ends.")] = False,
+) -> None:
+    """Watch feeders until interrupted. Every option can also be set as GRIDSEC_..., e.g. GRIDSEC_HTTP."""
+    from service import logs
+    from service.app import serve as run
+    from service.settings import settings
+
+    chosen = settings(
+        {
+            "feeders": tuple(feeder) if feeder else None,
+            "zenoh_listen": tuple(zenoh_listen) if zenoh_listen else None,
+            "zenoh_connect": tuple(zenoh_connect) if zenoh_connect else None,
+            "zenoh_mode": zenoh_mode,
+            "zenoh_config": zenoh_config,
+            "prefix": prefix,
+            "http": http,
+            "database": database,
+            "clock": clock,
+            "max_skew_s": max_skew,
+            "grace_s": grace,
+            "max_payload": max_payload,
+            "queue": queue,
+            "log_level": log_level,
+            "log_format": log_format,
+        }
+    )
+    logs.set_up(chosen.log_level, chosen.log_format)
+
+    def announce(running: Running) -> None:
+        print(running.url, flush=True)
+        if until_eof:
+            _stop_at_eof(asyncio.get_running_loop(), running.stop)
+
+    asyncio.run(run(chosen, announce=announce))
+
+
+def _stop_at_eof(loop: asyncio.AbstractEventLoop, stop: Callable[[], None]) -> None:
+    """Stop when whoever started us has gone: its end of our standard input closes."""
+
+    def wait() -> None:
+        while os.read(sys.stdin.fileno(), 4096):
+            pass
+        loop.call_soon_threadsafe(stop)
+
+    threading.Thread(target=wait, name="gridsec-eof", daemon=True).start()
+
+
+# ----------------------------------------------------------------------------------------------------- demo
+
+
+@app.command()
+def demo(
+    *,
+    feeder: Annotated[str, typer.Option(help="Folder or name of a feeder.")] = "simbench-lv-rural1",
+    duration: Annotated[float, typer.Option(min=30.0, help="How long it plays, s.")] = 120.0,
+    attacked: Annotated[int, typer.Option(min=1, help="How many meters lie.")] = 2,
+    size: Annotated[
+        float, typer.Option(help="By how much at least, as a part of the nominal voltage.")
+    ] = 0.03,
+    kind: Annotated[
+        str, typer.Option(help="bias, scaling, drift, stuck, replay, random, coordinated, coordinated-power.")
+    ] = "bias",
+    seed: Annotated[int, typer.Option(min=0, help="Chooses meters, loads and errors.")] = 1,
+    http: Annotated[
+        str, typer.Option(help="Address of the web page; another free port if it is taken.")
+    ] = "127.0.0.1:8000",
+    check: Annotated[
+        bool,
+        typer.Option(
+            "--check", help="Exit 0 only if exactly the manipulated meters were named and all alarms cleared."
+        ),
+    ] = False,
+    keep: Annotated[bool, typer.Option("--keep", help="Go on until interrupted.")] = False,
+) -> None:
+    """Show it: a service, virtual meters on zenoh of which some begin to lie, and a web page."""
+    from service.demo import Plan, run, verdict
+
+    plan = Plan(feeder, duration, attacked, size, kind, seed, http)
+    try:
+        outcome = run(plan, _out, check=check, keep=keep)
+    except KeyboardInterrupt:
+        _out.print("Interrupted.")
+        raise typer.Exit(130) from None
+    _out.print(f"Manipulated:          {', '.join(sorted(outcome.lied)) or 'none'}")
+    _out.print(f"Named by the service: {', '.join(sorted(outcome.named)) or 'none'}")
+    if check:
+        problems = verdict(outcome)
+        for problem in problems:
+            _complain(problem)
+        if problems:
+            raise typer.Exit(FAILED)
+        _out.print("[green]Exactly the manipulated meters were named, and all alarms have cleared.[/]")
+
+
+# ------------------------------------------------------------------------------------------------- simulate
+
+Attacks = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--attack",
+        help="kind:count:size:from:to, e.g. bias:2:0.03:20:55 (size as a part of nominal, times in s after "
+        "the start); may be repeated.",
+    ),
+]
+
+
+@app.command()
+def simulate(
+    feeder: Feeder,
+    *,
+    connect: Endpoints = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Write a recording (Parquet) instead of publishing.")
+    ] = None,
+    duration: Annotated[float, typer.Option(min=0.0, help="How long, s; 0 is without end.")] = 600.0,
+    dt: Annotated[
+        float | None, typer.Option(help="Interval between readings, s. [default: the tick]")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Chooses everything random.")] = 0,
+    attack: Attacks = None,
+    start: Annotated[
+        float | None, typer.Option(help="Unix time of the first tick, s. [default: now]")
+    ] = None,
+    speed: Annotated[float, typer.Option(min=0.0, help="Virtual seconds per second; 0 is no limit.")] = 1.0,
+    lockstep: Annotated[
+        int | None,
+        typer.Option(min=2, help="Stay within so many ticks of the service's published estimates."),
+    ] = None,
+    loss: Annotated[float, typer.Option(min=0.0, max=1.0, help="Part of the readings that is lost.")] = 0.0,
+    report_q: Annotated[bool, typer.Option("--report-q", help="Meters report reactive power.")] = False,
+    prefix: Annotated[str, typer.Option(help="First chunks of all keys.")] = "gridsec",
+) -> None:
+    """Play a feeder's meters by full AC power flow: onto zenoh, or into a file.
+
+    Faster than real time needs a service with `--clock events`.
+    """
+    from feeders.load import load
+    from feeders.meters import Channel, MeterErrors
+    from feeders.scenario import Scenario
+
+    site = load(feeder)
+    tick = dt or site.tables.meta.monitor.tick_s
+    first = math.ceil(time.time() / tick) * tick if start is None else start
+    scenario = Scenario(
+        seed=seed,
+        start=first,
+        duration_s=duration or math.inf,
+        dt_s=tick,
+        errors=MeterErrors(report_q=report_q),
+        channel=Channel(loss=loss),
+    )
+    scenario = _with_attacks(site, scenario, attack or [])
+    if out is not None:
+        from feeders.recording import record
+
+        recording = record(site, scenario, out)
+        _out.print(f"{recording.path}: {recording.count} readings of {site.feeder.name}")
+        return
+    _publish(site, scenario, tuple(connect or ("tcp/127.0.0.1:7447",)), prefix, (speed or math.inf, lockstep))
+
+
+def _with_attacks(site: Site, scenario: Scenario, texts: list[str]) -> Scenario:
+    from dataclasses import replace
+
+    from feeders.campaign import Kind, random_attacks
+
+    attacks: list[Attack] = []
+    for number, text in enumerate(texts):
+        try:
+            kind, count, size, begin, end = text.split(":")
+            numbers = int(count), float(size), float(begin), float(end)
+            known = Kind(kind)
+        except ValueError:
+            kinds = ", ".join(Kind)
+            raise typer.BadParameter(
+                f"{text!r}: expected kind:count:size:from:to with a kind of {kinds}", param_hint="--attack"
+            ) from None
+        how_many, part, on, off = numbers
+        attacks += random_attacks(
+            site,
+            scenario.seed + number,
+            known,
+            how_many,
+            part,
+            t_on=scenario.start + on,
+            t_off=scenario.start + off,
+            scenario=scenario,
+        )
+    return replace(scenario, attacks=tuple(attacks))
+
+
+def _publish(
+    site: Site, scenario: Scenario, connect: tuple[str, ...], prefix: str, pace: tuple[float, int | None]
+) -> None:
+    from service.ingest import BusConfig, Meters
+    from service.simulate import OutOfStep, Pace, play
+
+    ticks = 0
+    if pace[0] == 1.0:
+        time.sleep(max(0.0, scenario.start - time.time()))
+    try:
+        with Meters(BusConfig("client", connect=connect), prefix) as meters:
+            for _ in play(site, scenario, meters, Pace(*pace)):
+                ticks += 1
+    except OutOfStep as error:
+        _complain(f"the service does not keep step: {error}")
+        raise typer.Exit(FAILED) from None
+    except KeyboardInterrupt:
+        pass
+    _out.print(f"{ticks} ticks of {len(site.meter_ids)} meters and the busbar published")
+
+
+# --------------------------------------------------------------------------------------------------- replay
+
+
+@app.command()
+def replay(
+    file: Annotated[Path, typer.Argument(help="A recording (Parquet).")],
+    feeder: Annotated[
+        str | None, typer.Option(help="Folder or name. [default: the one it was recorded on]")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object per alarm transition.")] = False,
+) -> None:
+    """Run a recording through the same chain as the live service, and show what it would have said."""
+    from feeders.load import load
+    from feeders.recording import read_recording
+    from service.alarms import to_json
+    from service.replay import Tally
+    from service.replay import replay as run
+
+    recording = read_recording(file)
+    name = feeder or recording.feeder
+    if name is None:
+        raise typer.BadParameter("the file does not say which feeder it belongs to", param_hint="--feeder")
+    site = load(name)
+    if recording.digest not in {None, site.digest}:
+        _err.print(f"[yellow]{escape(name)} has changed since this was recorded.[/]")
+    tally = Tally()
+    began: float | None = None
+    for result in run(site, recording.readings(), tally):
+        began = result.report.t if began is None else began
+        for transition in result.transitions:
+            alarm = transition.alarm
+            if as_json:
+                record = {"t": transition.t, "change": str(transition.change), "alarm": to_json(alarm)}
+                print(json.dumps(record))
+            else:
+                about = escape(f"{alarm.kind} {alarm.meter or alarm.feeder}: {alarm.reason}")
+                _out.print(f"{transition.t - began:10.1f} s  {transition.change:<12} {about}")
+    if not as_json:
+        _out.print(f"ticks:    {_counts(tally.ticks)}")
+        _out.print(f"readings: {_counts(tally.readings)}, never arrived {tally.lost}")
+
+
+def _counts(counts: dict[str, int]) -> str:
+    return ", ".join(f"{name} {count}" for name, count in sorted(counts.items()) if count) or "none"
+
+
+# -------------------------------------------------------------------------------------------------- feeders
+
+
+@feeders_app.command("list")
+def feeders_list() -> None:
+    """List the feeders that come with gridsec."""
+    from feeders.load import load, names
+
+    table = Table("name", "title", "customers", "meters", "inverters", "M")
+    for name in names():
+        site = load(name)
+        counts = (len(site.feeder.customers), len(site.meter_ids), site.droop.customer.size)
+        cells = (*map(str, counts), str(site.tables.meta.monitor.max_attacked))
+        table.add_row(name, escape(site.tables.meta.title), *cells)
+    _out.print(table)
+
+
+@feeders_app.command("show")
+def feeders_show(feeder: Feeder) -> None:
+    """Show a feeder and its customers."""
+    from feeders.load import load
+
+    site = load(feeder)
+    meta, tree = site.tables.meta, site.feeder
+    _out.print(f"[bold]{escape(meta.name)}[/] {escape(meta.title)}")
+    _out.print(
+        f"{meta.voltage_volt:g} V phase to neutral, {len(tree.buses)} buses, "
+        f"{len(tree.customers)} customers, {len(site.meter_ids)} meters, watched every {meta.monitor.tick_s:g} s "
+        f"for up to {meta.monitor.max_attacked} manipulated meters"
+    )
+    table = Table("customer", "bus", "meter", "load kW", "PV kW", "inverter kVA", "droop")
+    for row in site.tables.customers:
+        numbers = (f"{row.load_kw:g}", f"{row.pv_kw:g}", f"{row.inverter_kva:g}")
+        table.add_row(escape(row.customer), escape(row.bus), row.meter, *numbers, row.droop)
+    _out.print(table)
+
+
+@feeders_app.command("validate")
+def feeders_validate(
+    folder: Annotated[list[Path], typer.Argument(help="Folders of feeders.")],
+) -> None:
+    """Check feeders and name every problem at once."""
+    from feeders.load import from_tables
+    from feeders.schema import examine
+
+    invalid = False
+    for path in folder:
+        found = examine(path)
+        problems = found.problems
+        if found.tables is not None:
+            try:
+                from_tables(found.tables)
+            except FeederInvalid as error:
+                problems = error.problems
+        for note in found.notes:
+            _out.print(f"{escape(str(path))}: note: {escape(note)}")
+        if problems:
+            invalid = True
+            _complain(str(FeederInvalid(f"{path}: {problem}" for problem in problems)))
+        else:
+            _out.print(f"[green]{escape(str(path))}: valid[/]")
+    if invalid:
+        raise typer.Exit(FEEDER)
+
+
+@app.command()
+def convert(
+    source: Annotated[str, typer.Argument(help="E.g. pandapower:create_kerber_dorfnetz, or a file.")],
+    out: Annotated[Path, typer.Argument(help="Folder to write.")],
+    root: Annotated[str | None, typer.Option(help="Bus that is the metered busbar.")] = None,
+    name: Annotated[
+        str | None, typer.Option(help="Name of the feeder. [default: that of the folder]")
+    ] = None,
+    droop: Annotated[str | None, typer.Option(help="Droop preset of the source's generators.")] = None,
+) -> None:
+    """Convert a network of pandapower or SimBench into a feeder's folder."""
+    from feeders.convert import convert as run
+
+    for note in run(source, out, root=root, name=name, droop=droop):
+        _out.print(f"note: {escape(note)}")
+    _out.print(f"[green]{escape(str(out))} written[/]")

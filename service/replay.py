@@ -1,0 +1,95 @@
+"""A recording through the same chain as in the live service, in its own time and as fast as it goes."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+
+from feeders.load import Site
+from feeders.meters import BUSBAR
+from feeders.scenario import Reading as Recorded
+from service.alarms import AlarmBook
+from service.align import Clock, Outcome
+from service.reading import Findings, Reading, judge, to_reading
+from service.watch import TickResult, Watch, align_rules, design, known_of
+
+
+@dataclass(slots=True)
+class Tally:
+    """What a replay has seen so far: readings by outcome or reason, ticks by verdict."""
+
+    readings: Counter[str] = field(default_factory=Counter)
+    ticks: Counter[str] = field(default_factory=Counter)
+    lost: int = 0
+
+
+def replay(
+    site: Site, recorded: Iterable[Recorded], tally: Tally, *, grace_s: float | None = None
+) -> Iterator[TickResult]:
+    """Yield what the service would have made of recorded readings.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    recorded
+        Readings in the order of their arrival.
+    tally
+        Filled on the way.
+    grace_s
+        As in `align.rules`.
+
+    Raises
+    ------
+    NotObservable, DesignInfeasible
+        If the feeder cannot be watched.
+    """
+    watch = Watch(site, align_rules(site, Clock.EVENTS, grace_s=grace_s), AlarmBook(site.feeder.name))
+    watch.install(design(site))
+    for reading in (checked(site, one, tally) for one in recorded):
+        if reading is not None:
+            # The arrival times of the recording do not matter: its readings tell the time.
+            outcome, results = watch.take(reading, 0.0)
+            tally.readings[outcome] += 1
+            yield from _counted(results, tally)
+            refused = len(watch.aligner.refused())
+            tally.readings[Outcome.ACCEPTED] -= refused
+            tally.readings[Outcome.CLOCK_OFF] += refused
+    yield from _counted(watch.flush(), tally)
+    tally.lost = watch.aligner.lost
+
+
+def _counted(results: list[TickResult], tally: Tally) -> list[TickResult]:
+    tally.ticks.update(str(result.report.verdict) for result in results)
+    return results
+
+
+def checked(site: Site, recorded: Recorded, tally: Tally) -> Reading | None:
+    """Return a recorded reading as it would have come off the wire, or None (counted) if it is a bad one.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    recorded
+        The reading.
+    tally
+        Where bad ones are counted.
+    """
+    known = known_of(site)
+    if recorded.meter != BUSBAR and recorded.meter not in known.meters:
+        tally.readings["unknown-meter"] += 1
+        return None
+    fields = {
+        "t": recorded.t,
+        "v_volt": recorded.v_volt,
+        "p_kw": recorded.p_kw,
+        "q_kvar": recorded.q_kvar,
+        "seq": recorded.seq,
+    }
+    found = judge(fields, known, in_batch=False)
+    if isinstance(found, Findings):
+        tally.readings[found.reason] += 1
+        return None
+    return to_reading(site.feeder.name, None if recorded.meter == BUSBAR else recorded.meter, found)
