@@ -262,27 +262,27 @@ def test_the_reactance_matrix_proves_direct_injection_for_every_set(
         kva=float(rng.uniform(5.0, 200.0)),
     )
     lure, tau = of.lure, 2.0
-    S, d = -lure.H, lure.slope
+    S, d = -lure.H, float(np.max(lure.slope))
     J = np.flatnonzero(rng.random(count) < 0.5)
     if len(J) == 0:
         J = np.array([0])
-    alpha = part / tau
-    # S may be singular (shared buses, the busbar); the bound on eps is the one of the proof.
-    eps = 0.5 * (1.0 - part) / float(np.max(d))
-    P = S + eps * np.eye(count)
     off = ~np.isin(np.arange(count), J)
-    size = float(np.linalg.norm(P, 2)) ** 2 * float(np.max(d)) / ((1.0 - part) * eps * tau)
-    Lambda = np.where(off, 1.0 / tau, 1e2 * size + 1.0)
+    # The constants of the proof, each a little better than it asks for.
+    eps = 0.9 * (1.0 - part) / d
+    P = S + eps * np.eye(count)
+    norm = float(np.linalg.norm(P, 2))
+    large = 1.1 * 2.0 * d * norm / (tau * (1.0 - part))
+    Lambda = np.where(off, 1.0 / tau, large)
     g = CircleGains(
         J=J,
         L=np.zeros((count, len(J))),
         K=np.eye(count)[:, J],
         P=P,
         Lambda=Lambda,
-        nu=1e-3 * eps * (1.0 - part) / tau,
-        mu=10.0 * float(np.max(Lambda * d)),
-        mu_delta=10.0 * float(np.max(d)) / tau,
-        alpha=alpha,
+        nu=0.9 * eps * (1.0 - part) / (2.0 * tau),
+        mu=1.1 * large * d,
+        mu_delta=1.1 * d / tau,
+        alpha=part / tau,
         noise=np.ones(len(J)),
         load=np.eye(count),
         weight=np.eye(count),
@@ -323,6 +323,39 @@ def test_the_inequality_as_printed_certifies_a_false_bound() -> None:
     level = g.mu * (attack / g.noise[0]) ** 2 / (2 * g.alpha)
     assert error <= np.sqrt(level / g.P[0, 0])
     assert margin(lure, g.J, replace(g, mu=0.5 * g.mu)) < 0.0
+
+
+def test_the_inequality_as_printed_ignores_the_size_of_the_injection() -> None:
+    """Its third column taken literally, -P (which fits where J is everything): L does not matter in it."""
+    d, tau, loop, P = 0.3, 2.0, 0.5, 1.0
+    lure = scalar(d, tau, loop)
+    H = C = float(lure.H[0, 0])
+    L, K = 1000.0 / C, (H + P) / C
+    nu, mu = 1000.0, 1.1e-3
+    printed = np.array(
+        [
+            [2 * P * (-1 / tau - L * C) + nu, P + (H - K * C), -P],
+            [P + (H - K * C), -2 * tau / d, 0.0],
+            [-P, 0.0, -mu],
+        ]
+    )
+    assert np.linalg.eigvalsh(printed)[-1] < 0.0
+    attack = 0.05
+    g = replace(prove_direct(lure), K=np.array([[K]]), L=np.array([[L]]))
+    signals = (nothing(1), nothing(1), constant(np.full(1, attack)))
+    x, xhat = simulate(lure, g, (np.zeros(1), np.zeros(1)), signals, np.linspace(0.0, 4.0, 5))
+    assert abs(float(x[-1, 0] - xhat[-1, 0])) > 100.0 * np.sqrt(mu / nu) * attack
+
+
+@pytest.mark.parametrize("ratio", [0.5, 0.8])
+def test_noise_below_the_load_error_gives_one_and_above_it_zero(ratio: float) -> None:
+    """A loop too weak to matter: the cost is ((1 - kappa) s_d + kappa s_n)^2, so kappa is 1 or 0."""
+    lure = scalar(loop=1e-3)
+    size = 1e-2
+    g = circle(lure, [0], rate=0.1, noise=ratio * size, load=np.array([size]), weight=np.eye(1))
+    np.testing.assert_allclose(g.K, 1.0, atol=1e-2)
+    with pytest.raises(DesignInfeasible, match="degenerate"):
+        circle(lure, [0], rate=0.1, noise=size / ratio, load=np.array([size]), weight=np.eye(1))
 
 
 def prove_direct(lure: Lure) -> CircleGains:
