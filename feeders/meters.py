@@ -168,7 +168,8 @@ class Meters:
     busbar_bias
         The same for the busbar's.
     p_gain, q_gain : (p,)
-        Fixed relative errors of the power registers, 1.
+        Fixed relative errors of the power registers, 1: the truth is the reading times 1 + gain, because
+        data sheets state the error as a fraction of the reading.
     """
 
     def __init__(self, site: Site, errors: MeterErrors, channel: Channel, seed: int) -> None:
@@ -212,9 +213,9 @@ class Meters:
             [v_volt[:, self._customer] * (1.0 + self.bias), v0_volt * (1.0 + self.busbar_bias)]
         )
         shown = _round(true + self._jitter * self._normal(ticks), self._step)
-        p = _round(p_kw[:, self._customer] * (1.0 + self.p_gain), np.full(self.count, self._p_step))
+        p = _round(p_kw[:, self._customer] / (1.0 + self.p_gain), np.full(self.count, self._p_step))
         if self._errors.report_q:
-            q = _round(q_kvar[:, self._customer] * (1.0 + self.q_gain), np.full(self.count, self._p_step))
+            q = _round(q_kvar[:, self._customer] / (1.0 + self.q_gain), np.full(self.count, self._p_step))
         else:
             q = np.full(p.shape, np.nan)
         return Registers(shown[:, :-1], p, q, shown[:, -1])

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from feeders.load import Site
 
 __all__ = [
-    "NOON_S",
     "START",
+    "SUNNY_NOON_S",
     "Reading",
     "Sample",
     "Scenario",
@@ -41,7 +41,9 @@ __all__ = [
 START: Final = 1_780_272_000.0
 """Monday, 1 June 2026, 00:00 UTC."""
 
-NOON_S: Final = 43_200.0
+SUNNY_NOON_S: Final = 216_000.0
+"""Noon of the first Wednesday of the profiles, a sunny day in June."""
+
 LONGEST_LOOK_BACK_S: Final = 7 * 86_400.0
 
 
@@ -60,7 +62,8 @@ class Scenario:
     dt_s
         Interval between readings, s.
     profile_s
-        Position within the fourteen days of the profiles at `start`, s; noon of the first Monday by default.
+        Position within the fourteen days of the profiles at `start`, s; they begin on a Monday at 00:00. By
+        default a sunny noon.
     substep_s
         Longest step of the integrator, s; None: half the smallest time constant of the inverters, or one
         quasi-static step where a tick is more than ten of the largest.
@@ -74,7 +77,7 @@ class Scenario:
     start: float = START
     duration_s: float = 600.0
     dt_s: float = 1.0
-    profile_s: float = NOON_S
+    profile_s: float = SUNNY_NOON_S
     substep_s: float | None = None
     variation: Variation = field(default_factory=Variation)
     errors: MeterErrors = field(default_factory=MeterErrors)

@@ -75,9 +75,11 @@ def truth(site: Site, scenario: Scenario, first: int, end: float) -> Iterator[Bl
         ticks = np.arange(begin, min(begin + BLOCK_TICKS, end), dtype=np.intp)
         t = scenario.start + ticks.astype(np.float64) * scenario.dt_s
         back = scenario.dt_s * np.arange(steps - 1, -1, -1) / steps
-        fine = customers.at((t[:, None] - back).ravel())
+        # The very first tick is where the course begins: nothing has to lead up to it.
+        skip = steps - 1 if begin == first else 0
+        fine = customers.at((t[:, None] - back).ravel()[skip:])
         v_volt, v_bus_volt, x = course.run(fine)
-        at = slice(steps - 1, None, steps)
+        at = slice(steps - 1 - skip, None, steps)
         demand = Demand(fine.p_kw[at], fine.q_kvar[at], fine.v0_volt[at])
         yield Block(ticks, t, v_volt[at], v_bus_volt[at], x[at], demand)
         begin += ticks.size

@@ -12,7 +12,7 @@ from feeders.inverters import ClosedLoop, Loads
 from feeders.load import Site, load, names, to_frame
 from feeders.meters import BUSBAR, Channel, MeterErrors, Silence
 from feeders.powerflow import PowerFlow
-from feeders.scenario import NOON_S, START, Sample, Scenario, by_arrival, simulate, snapshots
+from feeders.scenario import START, SUNNY_NOON_S, Sample, Scenario, by_arrival, simulate, snapshots
 from feeders.truth import substeps
 from feeders.variation import Customers, Variation
 from gridsec.attack import Bias, Replay, Stuck
@@ -146,7 +146,7 @@ def test_a_tick_of_a_minute_takes_substeps() -> None:
     for one, other in zip(slow, fast, strict=True):
         assert one.t == other.t
         np.testing.assert_allclose(one.p_kw, other.p_kw, rtol=1e-12)
-        np.testing.assert_allclose(one.v_volt, other.v_volt, rtol=2e-5)
+        np.testing.assert_allclose(one.v_volt, other.v_volt, rtol=4e-5)
 
 
 def test_same_seed_same_numbers_and_another_seed_others() -> None:
@@ -210,20 +210,24 @@ def test_snapshots_hold_what_arrived() -> None:
         assert frame.seen.sum() == len(set(by_meter) - {BUSBAR})
 
 
-def test_the_truth_lies_inside_what_a_frame_claims() -> None:
+@pytest.mark.parametrize("name", ["village", *names()])
+def test_the_truth_lies_inside_what_a_frame_claims(name: str) -> None:
     """Loads, powers and their stated intervals: what estimators build their thresholds on."""
-    site = village()
+    site = village() if name == "village" else load(name)
     base = site.feeder.base_kva
     inverters = np.zeros(len(site.tables.customers))
-    for seed in range(5):
-        scenario = Scenario(seed=seed, duration_s=86_400.0, dt_s=600.0, profile_s=0.0, variation=HIGH)
+    for seed in range(2):
+        scenario = Scenario(seed=seed, duration_s=2 * 86_400.0, dt_s=900.0, profile_s=0.0, variation=HIGH)
         samples = play(site, scenario)
         for sample, snapshot in zip(samples, snapshots(samples), strict=True):
             frame = to_frame(site, snapshot)
-            assert np.all(np.abs(-sample.p_kw / base - frame.p) <= frame.p_error + 1e-12)
+            metered = site.meters
+            # The rounding of a reading is scaled with it: a hundredth of half a step.
+            slack = (site.loads.p_fraction * site.loads.p_floor)[metered] + 1e-12
+            assert np.all(np.abs(-sample.p_kw / base - frame.p)[metered] <= frame.p_error[metered] + slack)
             inverters[site.droop.customer] = sample.x_kvar
             load_q = sample.q_kvar + inverters
-            assert np.all(np.abs(-load_q / base - frame.q) <= frame.q_error + 1e-12)
+            assert np.all(np.abs(-load_q / base - frame.q)[metered] <= frame.q_error[metered] + 1e-12)
 
 
 def test_replay_and_stuck_repeat_what_was_honestly_read() -> None:
@@ -246,7 +250,7 @@ def test_an_hour_before_the_beginning_can_be_replayed() -> None:
     replay = Replay(np.array([0, 2]), START + 5.0, START + 15.0, delay_s=600.0)
     stuck = Stuck(np.array([3]), START - 50.0, START + 15.0)
     samples = play(site, Scenario(duration_s=20.0, attacks=(replay, stuck)))
-    earlier = play(site, Scenario(start=START - 600.0, profile_s=NOON_S - 600.0, duration_s=600.0))
+    earlier = play(site, Scenario(start=START - 600.0, profile_s=SUNNY_NOON_S - 600.0, duration_s=600.0))
     # Loads and busbar are functions of time; meters' biases belong to the seed, jitter to the tick.
     for k in range(5, 15):
         told = samples[k].reported.v_volt[0, [0, 2]]
