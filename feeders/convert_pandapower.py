@@ -182,7 +182,7 @@ def _lines(source: _Source) -> list[LineRow]:
     outside = len(source.net.bus) - len(level)
     if outside:
         source.notes.append(
-            f"left out: {outside} buses that the busbar does not feed, with what is connected there"
+            f"left out: {outside} bus(es) that the busbar does not feed, with what is connected there"
         )
     return kept
 
@@ -365,8 +365,11 @@ def _with_fleet(customers: list[CustomerRow], fleet: Fleet, notes: list[str]) ->
                 inverter_kva=kva,
                 droop=fleet.droop,
             )
-    added = [rows[k].customer for k in bare if rows[k].inverter_kva > 0.0]
-    notes.append(f"added: synthetic PV inverter with droop curve {fleet.droop} at {', '.join(added)}")
+    added = [f"{rows[k].customer} ({rows[k].inverter_kva:g} kVA)" for k in bare if rows[k].inverter_kva > 0.0]
+    notes.append(
+        f"added, not in the source: {len(added)} synthetic PV inverters with droop curve {fleet.droop}, at "
+        + ", ".join(added)
+    )
     return rows
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from importlib.metadata import PackageNotFoundError, version
 
 from feeders.schema import FeederTables
@@ -54,12 +55,16 @@ Every customer has a meter. The transformer is upstream of the metered busbar an
 Where the source gives no load profile or no reactive power, the load follows a profile of the library
 (data/profiles), dealt out in the order of the loads: households H0, above 30 kW or at medium voltage trade
 G and agriculture L; its power factor at the peak is then 0.93, as everywhere in SimBench's low voltage.
-power_factor_min, power_factor_max and q_floor_kvar hold every point of the profile's history
+power_factor_min, power_factor_max and q_floor_kvar hold every point of the profile's history in SimBench
 (data/profiles/envelopes.csv)."""
 
 
 def _wrapped(notes: tuple[str, ...]) -> str:
-    return "\n".join(f"- {note}" for note in notes) or "- nothing"
+    lines = (
+        textwrap.fill(note, 108, initial_indent="- ", subsequent_indent="  ", break_on_hyphens=False)
+        for note in notes
+    )
+    return "\n".join(lines) or "- nothing"
 
 
 RANDOM = """

@@ -11,7 +11,6 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 
@@ -201,7 +200,7 @@ def from_tables(tables: FeederTables) -> Site:
         meters=_indices(metered),
         meter_ids=tuple(tables.customers[k].meter for k in metered),
         accuracy=_accuracy(tables, metered),
-        bus_of_file=MappingProxyType(found.group),
+        bus_of_file=found.group,
         xy=_positions(tables, found),
         loads=_load_model(tables),
         digest=hashlib.sha256(

@@ -21,6 +21,8 @@ from feeders.raw import CUSTOMERS_FILE, LINES_FILE, META_FILE, Rows
 from feeders.records import Parsed, Record
 from gridsec.errors import FeederInvalid
 
+MAX_PROBLEMS = 1000
+
 
 @dataclass(frozen=True, slots=True)
 class LineRow:
@@ -250,7 +252,7 @@ def _examine(given: raw.Raw) -> Examination:
     problems.extend(more)
     notes.extend(remarks)
     if problems or meta is None or lines is None or customers is None:
-        return Examination(None, tuple(dict.fromkeys(problems)), tuple(notes))
+        return Examination(None, _capped(problems), tuple(notes))
     sections: dict[str, Any] = {
         "limits": Limits(**meta["limits"]),
         "meters": MeterDefaults(**meta["meters"]),
@@ -263,6 +265,14 @@ def _examine(given: raw.Raw) -> Examination:
         tuple(CustomerRow(**record.cells) for record in customers),
     )
     return Examination(tables, (), tuple(notes))
+
+
+def _capped(problems: list[str]) -> tuple[str, ...]:
+    """Each problem once, and no more of them than somebody will read."""
+    once = tuple(dict.fromkeys(problems))
+    if len(once) <= MAX_PROBLEMS:
+        return once
+    return (*once[:MAX_PROBLEMS], f"and {len(once) - MAX_PROBLEMS} more problems")
 
 
 def _parse_meta(given: raw.Raw, problems: list[str], notes: list[str]) -> dict[str, dict[str, Any]] | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -358,6 +359,21 @@ def test_oversized_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     write(read(CASES / "good" / "three-customers"), tmp_path)
     monkeypatch.setattr("feeders.raw.MAX_BYTES", 100)
     assert any("feeder.toml: larger than" in problem for problem in validate(tmp_path))
+
+
+def test_huge_input_is_answered_quickly_and_briefly() -> None:
+    """A megabyte of mistakes: no quadratic search, no endless report."""
+    count = 6000
+    lines = [
+        {"line": "x", "from_bus": str(k), "to_bus": str((k * 7919) % count), "r_ohm": -1, "x_ohm": 1}
+        for k in range(count)
+    ]
+    customers = [{"customer": "x", "bus": f"b{k}", "load_kw": "many"} for k in range(count)]
+    start = time.perf_counter()
+    problems = examine({"feeder": {"busbar": "0"}, "lines": lines, "customers": customers}).problems
+    assert time.perf_counter() - start < 5.0
+    assert len(problems) == 1001
+    assert problems[-1].endswith("more problems")
 
 
 def test_file_with_a_byte_order_mark_and_crlf(tmp_path: Path) -> None:
