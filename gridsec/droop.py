@@ -19,7 +19,7 @@ from math import log
 
 import numpy as np
 
-from gridsec.arrays import Floats, Ints, frozen, frozen_ints
+from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints
 from gridsec.errors import FeederInvalid
 
 
@@ -179,27 +179,29 @@ def _problems(droop: Droop) -> list[str]:
         return out
     if not (np.isfinite(droop.vbar) and droop.vbar > 0):
         out.append(f"droop: vbar is {droop.vbar}; it must be a positive number")
-    for i in range(count):
-        out.extend(f"inverter {i}: {text}" for text in _row_problems(droop.v[i], droop.q[i], droop.tau[i]))
+    for wrong, text in _row_problems(droop.v, droop.q, droop.tau):
+        out.extend(
+            f"inverter {i}: {text}; v {droop.v[i].tolist()}, q {droop.q[i].tolist()}, tau {droop.tau[i]} s"
+            for i in np.flatnonzero(wrong)
+        )
     if np.any(droop.customer < 0):
         out.append("droop: a customer index is negative")
     return out
 
 
-def _row_problems(v: Floats, q: Floats, tau: float) -> list[str]:
-    """What is wrong with one inverter's breakpoints or time constant."""
-    out = []
-    if not (np.all(np.isfinite(v)) and np.all(np.isfinite(q))):
-        out.append("breakpoints must be finite")
-    elif v[0] <= 0 or np.any(np.diff(v) < 0):
-        out.append(f"voltages {v.tolist()} must be positive and ascending")
-    elif np.any(np.diff(q) > 0):
-        out.append(f"reactive powers {q.tolist()} must not increase with the voltage")
-    elif np.any((np.diff(v) == 0) & (np.diff(q) < 0)):
-        out.append(f"voltages {v.tolist()}: the reactive power jumps where two of them are equal")
-    if not (np.isfinite(tau) and tau > 0):
-        out.append(f"time constant {tau} s must be positive")
-    return out
+def _row_problems(v: Floats, q: Floats, tau: Floats) -> tuple[tuple[Bools, str], ...]:
+    """Which inverters' breakpoints or time constants are wrong, and why."""
+    finite = np.all(np.isfinite(v), axis=1) & np.all(np.isfinite(q), axis=1)
+    # Infinite entries are named as such, and not again for what their differences are.
+    steps = np.diff(np.where(finite[:, None], v, 1.0), axis=1)
+    falls = np.diff(np.where(finite[:, None], q, 0.0), axis=1)
+    return (
+        (~finite, "breakpoints must be finite"),
+        (finite & ((v[:, 0] <= 0) | np.any(steps < 0, axis=1)), "voltages must be positive and ascending"),
+        (np.any(falls > 0, axis=1), "reactive power must not increase with the voltage"),
+        (np.any((steps == 0) & (falls < 0), axis=1), "reactive power jumps where two voltages are equal"),
+        (~(np.isfinite(tau) & (tau > 0)), "time constant must be positive"),
+    )
 
 
 @dataclass(frozen=True, slots=True)

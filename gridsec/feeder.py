@@ -12,6 +12,7 @@ References
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -109,8 +110,8 @@ def _problems(feeder: Feeder) -> list[str]:
                 f"customer {feeder.customers[j]!r}: bus {bus} does not exist; expected 0 to {branches}"
             )
     for what, names in (("customer", feeder.customers), ("bus", feeder.buses)):
-        twice = sorted({name for name in names if names.count(name) > 1})
-        out.extend(f"{what} {name!r} is named twice" for name in twice)
+        counted = Counter(names)
+        out.extend(f"{what} {name!r} is named {times} times" for name, times in counted.items() if times > 1)
     return out
 
 

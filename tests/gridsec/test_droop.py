@@ -109,9 +109,9 @@ def test_two_readings_of_a_curve_stay_within_the_gap(seed: int) -> None:
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_gap_of_the_presets_is_small(name: str) -> None:
-    # docs/theory-model.md quotes this: below 0.8 % of the rating, below 1.4 % of the limit.
+    # docs/theory-model.md quotes this: at most 0.55 % of the rating, 1.4 % of the limit.
     droop = fleet(np.array([0]), name, np.array([100.0]), 100.0)
-    assert curve_gap(droop)[0] < 0.008
+    assert curve_gap(droop)[0] < 0.0055
     assert curve_gap(droop)[0] < 0.014 * droop.limit[0] + 1e-12
 
 
@@ -219,7 +219,7 @@ def test_no_inverters_at_all() -> None:
         ({"q": [[0.1, 0.2, 0.0, -0.1]]}, "must not increase"),
         ({"v": [[0.9, 0.9, 1.0, 1.1]]}, "jumps"),
         ({"q": [[0.1, 0.0, 0.0, np.nan]]}, "finite"),
-        ({"tau": [0.0]}, "time constant"),
+        ({"tau": [0.0]}, "inverter 0: time constant"),
         ({"tau": [np.inf]}, "time constant"),
         ({"tau": [1.0, 1.0]}, "tau has shape"),
         ({"vbar": 0.0}, "vbar"),
@@ -236,6 +236,21 @@ def test_impossible_curves_are_refused(change: dict[str, object], text: str) -> 
     }
     with pytest.raises(FeederInvalid, match=text):
         Droop(**(good | change))
+
+
+def test_every_problem_of_a_fleet_is_named_at_once() -> None:
+    v, q = np.array([[0.9, 0.98, 1.02, 1.1]] * 3), np.array([[0.1, 0.0, 0.0, -0.1]] * 3)
+    v[1] = v[1, ::-1]
+    q[2, 0] = np.inf
+    with pytest.raises(FeederInvalid) as caught:
+        Droop(np.arange(3), v, q, np.array([0.0, 1.0, -1.0]))
+    said = [problem.split(";")[0] for problem in caught.value.problems]
+    assert sorted(said) == [
+        "inverter 0: time constant must be positive",
+        "inverter 1: voltages must be positive and ascending",
+        "inverter 2: breakpoints must be finite",
+        "inverter 2: time constant must be positive",
+    ]
 
 
 @pytest.mark.parametrize(

@@ -252,7 +252,7 @@ def test_every_problem_is_named_at_once() -> None:
         "bus 99",
         "bus -1",
         "base_kva is 0.0",
-        "'a' is named twice",
+        "'a' is named 2 times",
     ):
         assert part in text
 
