@@ -1,9 +1,9 @@
 """Readings in the order they arrive become ticks of a feeder: who said what at this moment.
 
 A tick is a multiple of the feeder's `tick_s`. A meter is seen at a tick if its latest reading at or before it
-is not older than `max_age_s`, so that a single lost reading does no harm. A tick is let go as soon as every
-source that is not silent has reported for it, and at the latest `grace_s` after it. What comes later is late:
-counted, and used for the next tick if it is still fresh. Silence does not stop the ticks.
+is younger than `max_age_s`, so that at short ticks a single lost reading does no harm. A tick is let go as
+soon as every source that is not silent has reported for it, and at the latest `grace_s` after it. What comes
+later is late: counted, and used for the next tick if it is still fresh. Silence does not stop the ticks.
 
 There is no clock in here. `now` is an argument (the wall clock), or is told by the readings themselves
 (`Clock.EVENTS`: the latest time that at least half of the sources have reached, so that a few wild clocks
@@ -27,6 +27,9 @@ HELD_PER_SOURCE = 512
 
 BACKLOG_TICKS = 3600
 """After a longer gap (a suspended machine, a hole in a recording) the older ticks are skipped."""
+
+BRIDGED_TICK_S = 2.0
+"""Up to this tick, a lost reading is replaced by the one before."""
 
 _ACTIVE_ROUNDS = 4
 
@@ -58,7 +61,7 @@ class AlignRules:
     tick_s
         Interval between ticks.
     max_age_s
-        A reading older than this at a tick does not count as seen.
+        A reading of this age or older at a tick does not count as seen.
     grace_s
         How long after a tick to wait for those who have not reported.
     lead_s
@@ -98,8 +101,9 @@ def rules(
 ) -> AlignRules:
     """Return the rules that follow from a feeder's tick.
 
-    Staleness beyond the regular interval is limited to 2 s: at 1 s ticks that bridges single losses, at
-    15 min a lost reading is a lost reading, because a voltage of a quarter of an hour ago says nothing.
+    Up to `BRIDGED_TICK_S` a reading serves for two and a half ticks, which bridges single losses. At longer
+    ticks it serves for one: a lost reading is a lost reading there, because a voltage of a quarter of an
+    hour ago says nothing about now.
 
     Parameters
     ----------
@@ -112,14 +116,16 @@ def rules(
     grace_s
         None: half a tick, at most a minute.
     """
-    max_age_s = tick_s + min(1.5 * tick_s, 2.0)
+    lead_s = min(0.1 * tick_s, 1.0)
+    max_age_s = 2.5 * tick_s if tick_s <= BRIDGED_TICK_S else tick_s - lead_s
     return AlignRules(
         tick_s=tick_s,
         max_age_s=max_age_s,
         grace_s=min(0.5 * tick_s, 60.0) if grace_s is None else grace_s,
-        lead_s=min(0.1 * tick_s, 1.0),
+        lead_s=lead_s,
         max_skew_s=max(60.0, 2.0 * tick_s) if max_skew_s is None else max_skew_s,
-        silence_s=max(silence_s, max_age_s),
+        # Nobody is silent before two ticks have gone by without a reading; the silent are not waited for.
+        silence_s=max(silence_s, tick_s + max_age_s),
         clock=clock,
     )
 
@@ -397,4 +403,4 @@ class Aligner:
         if index == 0:
             return None
         reading = source.held[index - 1]
-        return reading if t - reading.t <= self.rules.max_age_s else None
+        return reading if t - reading.t < self.rules.max_age_s else None

@@ -199,7 +199,8 @@ def load_sites(names: Iterable[str]) -> dict[str, Site]:
         try:
             site = load(name)
         except FeederInvalid as error:
-            problems.extend(f"{name}: {problem}" for problem in error.problems)
+            start = f"{name}: "
+            problems.extend(start + problem.removeprefix(start) for problem in error.problems)
             continue
         if site.feeder.name in sites:
             problems.append(f"{name}: a feeder named {site.feeder.name} has been given already")

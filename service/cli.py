@@ -41,8 +41,8 @@ app = typer.Typer(
 )
 feeders_app = typer.Typer(no_args_is_help=True, help="List, show and check feeders.")
 app.add_typer(feeders_app, name="feeders")
-_out = Console(highlight=False)
-_err = Console(stderr=True, highlight=False)
+_out = Console(highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() else 160)
+_err = Console(stderr=True, highlight=False, soft_wrap=True)
 
 FAILED, USAGE, FEEDER, DATABASE, ADDRESS, FILE = 1, 2, 3, 4, 5, 6
 
@@ -424,8 +424,8 @@ def feeders_show(feeder: Feeder) -> None:
     _out.print(f"[bold]{escape(meta.name)}[/] {escape(meta.title)}")
     _out.print(
         f"{meta.voltage_volt:g} V phase to neutral, {len(tree.buses)} buses, "
-        f"{len(tree.customers)} customers, {len(site.meter_ids)} meters, watched every {meta.monitor.tick_s:g} s "
-        f"for up to {meta.monitor.max_attacked} manipulated meters"
+        f"{len(tree.customers)} customers, {len(site.meter_ids)} meters, "
+        f"watched every {meta.monitor.tick_s:g} s for up to {meta.monitor.max_attacked} manipulated meters"
     )
     table = Table("customer", "bus", "meter", "load kW", "PV kW", "inverter kVA", "droop")
     for row in site.tables.customers:
