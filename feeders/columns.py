@@ -79,16 +79,14 @@ class Column:
         """What would be right, in words."""
         if self.choices is not None:
             return "one of " + ", ".join(self.choices)
-        limits = []
-        if self.above is not None:
-            limits.append(f"above {self.above:g}")
         if self.low is not None and self.low == self.high:
             return f"{self.low:g}"
-        if self.low is not None:
-            limits.append(f"at least {self.low:g}")
-        if self.high is not None:
-            limits.append(f"at most {self.high:g}")
-        return " ".join([self.kind.value, " and ".join(limits)]).strip()
+        if self.low is not None and self.high is not None:
+            limits = f"from {self.low:.10g} to {self.high:.10g}"
+        else:
+            parts = [("above", self.above), ("at least", self.low), ("at most", self.high)]
+            limits = " and ".join(f"{word} {value:.10g}" for word, value in parts if value is not None)
+        return f"{self.kind.value} {limits}".strip()
 
     def complaint(self, what: str) -> str:
         """Return a problem of this column's cell as a sentence, with what would be right."""
@@ -102,16 +100,16 @@ LINE_COLUMNS: tuple[Column, ...] = (
     Column("from_bus", Kind.ID, "bus at one end"),
     Column("to_bus", Kind.ID, "bus at the other end"),
     Column("phases", Kind.TEXT, "conductors", "abc", choices=PHASES),
-    Column("r_ohm", Kind.NUMBER, "series resistance of the whole line, per phase, ohm", low=0.0),
-    Column("x_ohm", Kind.NUMBER, "series reactance of the whole line, per phase, ohm", low=0.0),
-    Column("r0_ohm", Kind.NUMBER, "zero-sequence resistance, ohm", None, low=0.0),
-    Column("x0_ohm", Kind.NUMBER, "zero-sequence reactance, ohm", None, low=0.0),
-    Column("b_us", Kind.NUMBER, "total shunt susceptance, microsiemens per phase", 0.0, low=0.0),
-    Column("tap", Kind.NUMBER, "ratio of an ideal transformer at from_bus", 1.0, above=0.0),
+    Column("r_ohm", Kind.NUMBER, "series resistance of the whole line, per phase, ohm", low=0.0, high=1e6),
+    Column("x_ohm", Kind.NUMBER, "series reactance of the whole line, per phase, ohm", low=0.0, high=1e6),
+    Column("r0_ohm", Kind.NUMBER, "zero-sequence resistance, ohm", None, low=0.0, high=1e6),
+    Column("x0_ohm", Kind.NUMBER, "zero-sequence reactance, ohm", None, low=0.0, high=1e6),
+    Column("b_us", Kind.NUMBER, "total shunt susceptance, microsiemens per phase", 0.0, low=0.0, high=1e9),
+    Column("tap", Kind.NUMBER, "ratio of an ideal transformer at from_bus", 1.0, low=0.001, high=1e3),
     Column("closed", Kind.TRUTH, "whether the line carries current", True),
-    Column("rating_a", Kind.NUMBER, "thermal limit, ampere", None, above=0.0),
-    Column("to_x", Kind.NUMBER, "horizontal position of to_bus, any unit", None),
-    Column("to_y", Kind.NUMBER, "vertical position of to_bus, any unit", None),
+    Column("rating_a", Kind.NUMBER, "thermal limit, ampere", None, above=0.0, high=1e9),
+    Column("to_x", Kind.NUMBER, "horizontal position of to_bus, any unit", None, low=-1e12, high=1e12),
+    Column("to_y", Kind.NUMBER, "vertical position of to_bus, any unit", None, low=-1e12, high=1e12),
 )
 
 CUSTOMER_COLUMNS: tuple[Column, ...] = (
@@ -119,22 +117,42 @@ CUSTOMER_COLUMNS: tuple[Column, ...] = (
     Column("bus", Kind.ID, "bus of the connection point"),
     Column("phases", Kind.TEXT, "connected phases", "abc", choices=PHASES),
     Column("meter", Kind.NAME, "id of the meter; empty: no meter", ""),
-    Column("class_percent", Kind.NUMBER, "accuracy class of the voltage register, %", None, above=0.0),
-    Column("resolution_volt", Kind.NUMBER, "resolution of the voltage register, V", None, low=0.0),
-    Column("jitter_percent", Kind.NUMBER, "1 sigma noise of the voltage, % of nominal", None, low=0.0),
+    Column(
+        "class_percent", Kind.NUMBER, "accuracy class of the voltage register, %", None, above=0.0, high=100.0
+    ),
+    Column("resolution_volt", Kind.NUMBER, "resolution of the voltage register, V", None, low=0.0, high=1e6),
+    Column(
+        "jitter_percent", Kind.NUMBER, "1 sigma noise of the voltage, % of nominal", None, low=0.0, high=100.0
+    ),
     Column("p_error_percent", Kind.NUMBER, "error of the active power, % of it", None, low=0.0, high=50.0),
-    Column("q_error_percent", Kind.NUMBER, "error of the reactive power, % of range", None, low=0.0),
-    Column("load_kw", Kind.NUMBER, "expected peak of the load, kW", low=0.0),
+    Column(
+        "q_error_percent", Kind.NUMBER, "error of the reactive power, % of range", None, low=0.0, high=100.0
+    ),
+    Column("load_kw", Kind.NUMBER, "expected peak of the load, kW", low=0.0, high=1e9),
     Column("load_profile", Kind.TEXT, "load profile of the library", ""),
-    Column("power_factor", Kind.NUMBER, "expected power factor of the load", None, above=0.0, high=1.0),
-    Column("power_factor_min", Kind.NUMBER, "its smallest value", None, above=0.0, high=1.0),
-    Column("power_factor_max", Kind.NUMBER, "its largest value", None, above=0.0, high=1.0),
-    Column("q_floor_kvar", Kind.NUMBER, "load's reactive power that does not follow p, kvar", None, low=0.0),
-    Column("pv_kw", Kind.NUMBER, "peak of the generation, kW", 0.0, low=0.0),
+    Column("power_factor", Kind.NUMBER, "expected power factor of the load", None, low=0.01, high=1.0),
+    Column("power_factor_min", Kind.NUMBER, "its smallest value", None, low=0.01, high=1.0),
+    Column("power_factor_max", Kind.NUMBER, "its largest value", None, low=0.01, high=1.0),
+    Column(
+        "q_floor_kvar",
+        Kind.NUMBER,
+        "load's reactive power that does not follow p, kvar",
+        None,
+        low=0.0,
+        high=1e9,
+    ),
+    Column("pv_kw", Kind.NUMBER, "peak of the generation, kW", 0.0, low=0.0, high=1e9),
     Column("pv_profile", Kind.TEXT, "generation profile of the library", ""),
-    Column("inverter_kva", Kind.NUMBER, "rating of the droop inverter, kVA; 0: none", 0.0, low=0.0),
+    Column("inverter_kva", Kind.NUMBER, "rating of the droop inverter, kVA; 0: none", 0.0, low=0.0, high=1e9),
     Column("droop", Kind.TEXT, "droop preset of the inverter", ""),
-    Column("tau_s", Kind.NUMBER, "time constant of the inverter, s; empty: the preset's", None, above=0.0),
+    Column(
+        "tau_s",
+        Kind.NUMBER,
+        "time constant of the inverter, s; empty: the preset's",
+        None,
+        low=0.001,
+        high=1e6,
+    ),
 )
 
 ESTIMATORS = ("exact-bank",)
@@ -145,15 +163,29 @@ META_COLUMNS: dict[str, tuple[Column, ...]] = {
         Column("format", Kind.WHOLE, "version of this format", low=1, high=1),
         Column("name", Kind.NAME, "name of the feeder"),
         Column("title", Kind.TEXT, "title for people", ""),
-        Column("voltage_volt", Kind.NUMBER, "nominal voltage, phase to neutral, V", above=0.0),
+        Column("voltage_volt", Kind.NUMBER, "nominal voltage, phase to neutral, V", low=0.001, high=1e6),
         Column(
-            "base_kva", Kind.NUMBER, "three-phase base power of the per-unit system, kVA", 100.0, above=0.0
+            "base_kva",
+            Kind.NUMBER,
+            "three-phase base power of the per-unit system, kVA",
+            100.0,
+            low=0.001,
+            high=1e9,
         ),
         Column("busbar", Kind.ID, "bus whose voltage the busbar meter reads; root of the feeder"),
         Column("busbar_xy", Kind.PAIR, "position of the busbar", None),
-        Column("busbar_class_percent", Kind.NUMBER, "accuracy class of the busbar meter, %", 0.1, above=0.0),
-        Column("busbar_resolution_volt", Kind.NUMBER, "its resolution, V", 0.1, low=0.0),
-        Column("busbar_jitter_percent", Kind.NUMBER, "its 1 sigma noise, % of nominal", 0.02, low=0.0),
+        Column(
+            "busbar_class_percent",
+            Kind.NUMBER,
+            "accuracy class of the busbar meter, %",
+            0.1,
+            above=0.0,
+            high=100.0,
+        ),
+        Column("busbar_resolution_volt", Kind.NUMBER, "its resolution, V", 0.1, low=0.0, high=1e6),
+        Column(
+            "busbar_jitter_percent", Kind.NUMBER, "its 1 sigma noise, % of nominal", 0.02, low=0.0, high=100.0
+        ),
         Column("accept", Kind.NAMES, "suspicions that were checked and are right", (), choices=SUSPICIONS),
     ),
     "limits": (
@@ -161,34 +193,70 @@ META_COLUMNS: dict[str, tuple[Column, ...]] = {
         Column("v_max_pu", Kind.NUMBER, "highest allowed voltage, pu", 1.1, above=0.0, high=2.0),
     ),
     "meters": (
-        Column("class_percent", Kind.NUMBER, "accuracy class of the voltage registers, %", 0.5, above=0.0),
-        Column("resolution_volt", Kind.NUMBER, "resolution of the voltage registers, V", 0.1, low=0.0),
-        Column("jitter_percent", Kind.NUMBER, "1 sigma noise of the voltage, % of nominal", 0.05, low=0.0),
+        Column(
+            "class_percent",
+            Kind.NUMBER,
+            "accuracy class of the voltage registers, %",
+            0.5,
+            above=0.0,
+            high=100.0,
+        ),
+        Column(
+            "resolution_volt", Kind.NUMBER, "resolution of the voltage registers, V", 0.1, low=0.0, high=1e6
+        ),
+        Column(
+            "jitter_percent",
+            Kind.NUMBER,
+            "1 sigma noise of the voltage, % of nominal",
+            0.05,
+            low=0.0,
+            high=100.0,
+        ),
         Column("p_error_percent", Kind.NUMBER, "error of the active power, % of it", 1.0, low=0.0, high=50.0),
-        Column("q_error_percent", Kind.NUMBER, "error of the reactive power, % of range", 2.0, low=0.0),
-        Column("p_resolution_kw", Kind.NUMBER, "resolution of the active power, kW", 0.01, low=0.0),
+        Column(
+            "q_error_percent",
+            Kind.NUMBER,
+            "error of the reactive power, % of range",
+            2.0,
+            low=0.0,
+            high=100.0,
+        ),
+        Column("p_resolution_kw", Kind.NUMBER, "resolution of the active power, kW", 0.01, low=0.0, high=1e6),
     ),
     "load": (
-        Column("power_factor", Kind.NUMBER, "expected power factor, lagging", 0.95, above=0.0, high=1.0),
-        Column("power_factor_min", Kind.NUMBER, "its smallest value", 0.9, above=0.0, high=1.0),
-        Column("power_factor_max", Kind.NUMBER, "its largest value", 1.0, above=0.0, high=1.0),
+        Column("power_factor", Kind.NUMBER, "expected power factor, lagging", 0.95, low=0.01, high=1.0),
+        Column("power_factor_min", Kind.NUMBER, "its smallest value", 0.9, low=0.01, high=1.0),
+        Column("power_factor_max", Kind.NUMBER, "its largest value", 1.0, low=0.01, high=1.0),
         Column(
             "q_floor_percent",
             Kind.NUMBER,
             "reactive power that does not follow p, % of load_kw",
             2.0,
             low=0.0,
+            high=100.0,
         ),
     ),
     "monitor": (
         Column("estimator", Kind.TEXT, "estimator family", "exact-bank", choices=ESTIMATORS),
-        Column("max_attacked", Kind.WHOLE, "manipulated meters to withstand", 1, low=0),
-        Column("tick_s", Kind.NUMBER, "period of the frames, s", 1.0, above=0.0),
+        Column("max_attacked", Kind.WHOLE, "manipulated meters to withstand", 1, low=0, high=1000),
+        Column("tick_s", Kind.NUMBER, "period of the frames, s", 1.0, low=0.01, high=1e5),
         Column(
-            "on_delay_s", Kind.NUMBER, "how long a condition must last to raise an alarm, s", 2.0, low=0.0
+            "on_delay_s",
+            Kind.NUMBER,
+            "how long a condition must last to raise an alarm, s",
+            2.0,
+            low=0.0,
+            high=1e6,
         ),
-        Column("off_delay_s", Kind.NUMBER, "how long it must be gone to clear it, s", 5.0, low=0.0),
-        Column("silence_s", Kind.NUMBER, "silence after which a meter counts as lost, s", 10.0, above=0.0),
+        Column("off_delay_s", Kind.NUMBER, "how long it must be gone to clear it, s", 5.0, low=0.0, high=1e6),
+        Column(
+            "silence_s",
+            Kind.NUMBER,
+            "silence after which a meter counts as lost, s",
+            10.0,
+            above=0.0,
+            high=1e6,
+        ),
     ),
 }
 

@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 import zipfile
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from feeders.columns import CUSTOMER_COLUMNS, LINE_COLUMNS, META_COLUMNS, SUSPICIONS, Kind
 from feeders.load import Site, Snapshot, from_tables, load, names, plant, to_frame, volts
-from feeders.schema import CustomerRow, FeederTables, read, write
+from feeders.schema import CustomerRow, FeederTables, from_json, read, to_json, write
 from gridsec.errors import FeederInvalid
 from gridsec.feeder import lindistflow
 from gridsec.online import Frame
@@ -124,6 +125,42 @@ def test_tables_made_in_memory_are_checked(three: Site) -> None:
     with pytest.raises(FeederInvalid) as caught:
         from_tables(broken)
     assert len(caught.value.problems) == 2
+
+
+EXTREMES = [
+    (table, column, value)
+    for table, columns in [("lines", LINE_COLUMNS), ("customers", CUSTOMER_COLUMNS), *META_COLUMNS.items()]
+    for column in columns
+    if column.kind is Kind.NUMBER
+    for value in (column.low, column.high, column.above and column.above + 1e-300, 1e-300, 1e300)
+    if value is not None
+]
+
+
+def test_extreme_numbers_are_refused_or_give_a_finite_model() -> None:
+    """Every number of the format at its limits, every doubt accepted: no overflow, no NaN, no traceback."""
+    taken = 0
+    for table, column, value in EXTREMES:
+        obj = to_json(read(THREE))
+        obj["feeder"]["accept"] = list(SUSPICIONS)
+        if table in ("lines", "customers"):
+            cells = obj[table][1]
+        else:
+            cells = obj["feeder"][table] if table else obj["feeder"]
+        cells[column.name] = value
+        try:
+            site = from_tables(from_json(obj))
+        except FeederInvalid:
+            continue
+        taken += 1
+        frame = to_frame(
+            site, Snapshot(0.0, np.full(2, 230.0), np.array([1e300, 0.1]), np.array([np.nan, -1e300]), 1e300)
+        )
+        arrays = [site.feeder.r, site.feeder.x, site.feeder.charging, site.droop.q, site.droop.tau]
+        arrays += [getattr(site.loads, field.name) for field in fields(site.loads)]
+        arrays += [frame.y, frame.p, frame.p_error, frame.q, frame.q_error, frame.q_net_error]
+        assert all(np.isfinite(array).all() for array in arrays), (table, column.name, value)
+    assert taken > 50
 
 
 # --- finding feeders ----------------------------------------------------------------------------

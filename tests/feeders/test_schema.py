@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import time
 from dataclasses import fields, replace
 from pathlib import Path
@@ -426,3 +427,23 @@ def test_graph_against_networkx(ends: list[tuple[str, str, bool]]) -> None:
         ring.add_edges_from((of[lines[k].from_bus], of[lines[k].to_bus]) for k in loop)
         assert nx.is_connected(ring)
         assert all(degree == 2 for _, degree in ring.degree())
+
+
+# --- the document -------------------------------------------------------------------------------
+
+
+def test_document_names_every_column_and_its_meaning() -> None:
+    text = (Path(__file__).parent.parent.parent / "docs" / "feeder-format.md").read_text(encoding="utf-8")
+    for columns in (LINE_COLUMNS, CUSTOMER_COLUMNS, *META_COLUMNS.values()):
+        for column in columns:
+            assert f"| `{column.name}` | {column.meaning} |" in text, column.name
+    assert all(f"| `{suspicion}` |" in text for suspicion in SUSPICIONS)
+
+
+def test_examples_of_the_document_are_valid(tmp_path: Path) -> None:
+    text = (Path(__file__).parent.parent.parent / "docs" / "feeder-format.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"```(toml|csv|json)\n(.*?)```", text, flags=re.DOTALL)
+    for name, (_, block) in zip(("feeder.toml", "lines.csv", "customers.csv"), blocks[:3], strict=True):
+        (tmp_path / name).write_text(block, encoding="utf-8")
+    assert validate(tmp_path) == ()
+    assert from_json(json.loads(blocks[3][1])).meta == read(tmp_path).meta
