@@ -17,7 +17,7 @@ from feeders.schema import CustomerRow, FeederMeta, FeederTables, LineRow, LoadD
 from gridsec.errors import GridsecError
 
 # Tables of a net that are carried over; every other table with rows below the busbar earns a note.
-CARRIED = {"bus", "line", "load", "sgen", "switch"}
+CARRIED = {"bus", "line", "load", "asymmetric_load", "sgen", "switch"}
 SURROUNDINGS = {"trafo", "trafo3w", "ext_grid"}  # upstream of the busbar
 UNLIMITED_KA = 1000.0
 HOUSEHOLDS = ("H0-A", "H0-B", "H0-C", "H0-G", "H0-L")
@@ -265,12 +265,39 @@ def _customers(source: _Source, droop: str | None) -> list[CustomerRow]:
     names = _ids(net.load, "load")
     loads = [int(i) for i in net.load.index if int(net.load.at[i, "bus"]) in inside]
     rows = [_load_row(source, i, names[i], k) for k, i in enumerate(loads)]
+    rows.extend(_phase_rows(source, inside, len(rows)))
     at_bus: dict[str, list[int]] = defaultdict(list)
     for k, customer in enumerate(rows):
         at_bus[customer.bus].append(k)
     _generators(source, rows, at_bus, droop)
     digits = max(2, len(str(len(rows))))
     return [replace(row, meter=f"m{k:0{digits}d}") for k, row in enumerate(rows, start=1)]
+
+
+def _phase_rows(source: _Source, inside: set[int], number: int) -> Iterable[CustomerRow]:
+    """Loads of single phases: one customer for each phase that draws power."""
+    net = source.net
+    names = _ids(net.asymmetric_load, "phase load", _ids(net.load, "load").values())
+    for i in map(int, net.asymmetric_load.index):
+        row = net.asymmetric_load.loc[i]
+        if int(row.bus) not in inside:
+            continue
+        scale = float(row.scaling) * float(row.in_service) * 1000.0
+        drawn = {phase: (float(row[f"p_{phase}_mw"]), float(row[f"q_{phase}_mvar"])) for phase in "abc"}
+        used = [phase for phase, (p, _) in drawn.items() if p > 0]
+        if any(p < 0 or q < 0 for p, q in drawn.values()):
+            source.notes.append(f"left out: negative powers of {names[i]}")
+        for phase in used:
+            p, q = drawn[phase]
+            customer = CustomerRow(
+                customer=names[i] if len(used) == 1 else f"{names[i]}-{phase}",
+                bus=source.names[int(row.bus)],
+                load_kw=_round(p * scale),
+                phases=phase,
+                load_profile=HOUSEHOLDS[number % len(HOUSEHOLDS)],
+            )
+            number += 1
+            yield _reactive(customer, p / math.hypot(p, q) if q > 0 else None)
 
 
 def _load_row(source: _Source, index: int, name: str, number: int) -> CustomerRow:

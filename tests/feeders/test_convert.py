@@ -204,6 +204,23 @@ def test_power_factor_interval_holds_the_profiles_history() -> None:
         assert row.q_floor_kvar >= history.floor * tan * row.load_kw
 
 
+def test_single_phase_loads_become_single_phase_customers() -> None:
+    net = networks.ieee_european_lv_asymmetric("on_peak_566")
+    tables, notes = from_pandapower(net, "european")
+    assert validate(tables) == ()
+    loads = net.asymmetric_load
+    for phase in "abc":
+        drawn = loads[f"p_{phase}_mw"][loads[f"p_{phase}_mw"] > 0] * 1000
+        assert sorted(row.load_kw for row in tables.customers if row.phases == phase) == pytest.approx(
+            sorted(drawn)
+        )
+    assert len(tables.customers) == 55
+    assert all(line.r0_ohm is not None and line.x0_ohm is not None for line in tables.lines)
+    assert not any("asymmetric_load" in note for note in notes)
+    with pytest.raises(FeederInvalid, match="phases 'a': the model is balanced"):
+        from_tables(tables)
+
+
 def test_synthetic_fleet() -> None:
     net = networks.create_kerber_landnetz_freileitung_1()
     tables, notes = from_pandapower(net, "fleet", fleet=Fleet(3, 0.0, "asnzs4777-a"))
