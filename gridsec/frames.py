@@ -45,13 +45,14 @@ def clean(design: MonitorDesign, state: MonitorState, frame: Frame) -> Inputs:
     at = plant.meters
     live = frame.seen & np.isfinite(frame.y)
     y = np.where(live, frame.y, 0.0)
-    told = live & _credible(design, frame)
+    low, high = options.v2_limits
+    busbar = bool(np.isfinite(frame.v0_squared) and low <= frame.v0_squared <= high)
+    # Without a busbar voltage the meters have to imply it, and then nobody's reactive power is believed.
+    told = live & _credible(design, frame) & busbar
     net = np.where(told, frame.q_net[at] - frame.q[at], np.nan) if told.any() else None
     q_all = injections(plant, frame, state.x, told)
     q_error = frame.q_error.copy()
     q_error[at] = np.where(told, frame.q_net_error[at], q_error[at])
-    low, high = options.v2_limits
-    busbar = bool(np.isfinite(frame.v0_squared) and low <= frame.v0_squared <= high)
     v0 = frame.v0_squared if busbar else state.v0_squared
     correction, rest = _losses(plant, frame.p, q_all, v0, p_error=frame.p_error, q_error=q_error)
     base = design.errors.R2 @ frame.p_error + design.errors.X2 @ q_error + rest

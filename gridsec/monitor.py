@@ -264,7 +264,7 @@ def _conclude(  # noqa: PLR0917  # the chain's three values, then what this step
     error = view.error
     if np.count_nonzero(tally.named) > design.bank.sets.max_attacked:
         # More liars than the bank can take: only saturation bounds what they did to the estimate.
-        error = inputs.now.base + design.errors.X2[:, plant.droop.customer] @ design.errors.span
+        error = _saturated(design, inputs, frame)
     estimate = Estimate(t=frame.t, v2=view.v2, bound=error, v2_bus=view.v2_bus, trusted=trusted, x=view.x)
     accused = tally.named & live
     attack = np.where(accused, inputs.y - view.v2[plant.meters], 0.0)
@@ -363,7 +363,7 @@ def _view(  # noqa: PLR0917  # as _conclude
         error = detect.gap(errors, now, bound) + offset
     else:
         bound, level = state.bound, state.level
-        error = now.base + errors.X2[:, own] @ errors.span
+        error = _saturated(design, inputs, frame)
     threshold = detect.reading_error(plant.accuracy, v2[at] + error[at], design.options.sigmas) + error[at]
     score = np.where(inputs.live, np.abs(inputs.y - v2[at]), np.nan)
     settled = state.settled
@@ -372,6 +372,15 @@ def _view(  # noqa: PLR0917  # as _conclude
         transient = detect.gap(errors, now, bound)[at] - detect.gap(errors, now, rest)[at]
         settled = bool(np.all(transient <= design.options.settled * threshold))
     return _View(index, x, z, spread, bound, level, settled, v2, v2_bus, error, score, threshold)
+
+
+def _saturated(design: MonitorDesign, inputs: Inputs, frame: Frame) -> Floats:
+    """Error of the estimate (N,) that holds whoever lies: inverters saturate, and reports are credible."""
+    plant, X2 = design.plant, design.errors.X2
+    told = np.where(inputs.now.told, 2.0 * frame.q_error[plant.meters], 0.0)
+    return np.asarray(
+        inputs.now.base + X2[:, plant.droop.customer] @ design.errors.span + X2[:, plant.meters] @ told
+    )
 
 
 def _unusable(

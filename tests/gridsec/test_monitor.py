@@ -1,0 +1,500 @@
+"""The monitor against AC power flow, meters with flaws, and liars."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gridsec import bank as banks
+from gridsec import monitor
+from gridsec.certificates import Certificate
+from gridsec.errors import DesignInfeasible, NotObservable
+from gridsec.monitor import MonitorDesign, MonitorState, Options
+from gridsec.online import Cause, Decision, Estimate, Frame, Verdict
+from tests.gridsec.street import Street, make_plant
+
+Answers = list[tuple[Estimate, Verdict]]
+
+
+def watch(
+    street: Street,
+    design: MonitorDesign,
+    frames: int,
+    *,
+    h: float = 1.0,
+    state: MonitorState | None = None,
+    lies: dict[int, float] | None = None,
+    silent: tuple[int, ...] = (),
+    change: object = None,
+    sound: bool = True,
+) -> tuple[MonitorState, Answers]:
+    """Run the street and its monitor; check on every frame what must always hold."""
+    state = monitor.init(design, street.t) if state is None else state
+    answers = []
+    for _ in range(frames):
+        street.advance(h)
+        frame = street.frame(lies, silent)
+        if callable(change):
+            frame = change(frame)
+        state, estimate, verdict = monitor.step(design, state, frame)
+        assert estimate.t == frame.t
+        for values in (
+            estimate.v2,
+            estimate.bound,
+            estimate.v2_bus,
+            estimate.x,
+            verdict.threshold,
+            verdict.attack,
+        ):
+            assert np.isfinite(values).all()
+        assert np.array_equal(np.isnan(verdict.score), ~frame.seen | ~np.isfinite(frame.y))
+        assert not (estimate.trusted & verdict.suspects).any()
+        assert not (estimate.trusted & ~frame.seen).any()
+        assert (verdict.attack[~verdict.suspects] == 0).all()
+        if sound:
+            assert (np.abs(estimate.v2 - street.truth()) <= estimate.bound).all()
+            honest = np.setdiff1d(np.arange(frame.y.size), list(lies or {}))
+            assert not (verdict.score[honest] > verdict.threshold[honest]).any()
+            # Who lied before is cleared after `release` honest readings.
+            assert not (verdict.suspects & (state.tally.below != 1))[honest].any()
+        answers.append((estimate, verdict))
+    return state, answers
+
+
+def decisions(answers: Answers) -> list[Decision]:
+    return [verdict.decision for _, verdict in answers]
+
+
+class TestHonestStreets:
+    @settings(max_examples=25)
+    @given(
+        seed=st.integers(0, 2**32 - 1),
+        drop=st.sampled_from([0.005, 0.02, 0.06]),
+        h=st.sampled_from([0.5, 1.0, 5.0, 900.0]),
+        inverters=st.sampled_from([0, 3, 9]),
+    )
+    def test_worst_case_errors_name_nobody(self, seed: int, drop: float, h: float, inverters: int) -> None:
+        """Meters at the ends of their classes, loads at the ends of their intervals: inside all bounds."""
+        rng = np.random.default_rng(seed)
+        plant = make_plant(rng, drop=drop, inverters=np.sort(rng.choice(9, inverters, replace=False)))
+        design = monitor.design(plant, max_attacked=2, step_s=h)
+        street = Street(plant, rng, extreme=True)
+        _, answers = watch(street, design, 30, h=h)
+        assert set(decisions(answers)) <= {Decision.CLEAN, Decision.UNDECIDED}
+        assert answers[-1][1].decision is Decision.CLEAN
+        assert answers[-1][1].cause is Cause.AGREEMENT
+
+    def test_settling_ends_within_a_few_time_constants(self) -> None:
+        rng = np.random.default_rng(1)
+        plant = make_plant(rng)
+        design = monitor.design(plant, max_attacked=2, step_s=1.0)
+        _, answers = watch(Street(plant, rng), design, 40)
+        causes = [verdict.cause for _, verdict in answers]
+        settling = causes.index(Cause.AGREEMENT)
+        assert 0 < settling <= 6 * plant.droop.tau.max()
+        assert all(cause is Cause.SETTLING for cause in causes[:settling])
+        assert all(cause is Cause.AGREEMENT for cause in causes[settling:])
+
+    def test_starting_with_inverters_off_their_rest(self) -> None:
+        """The bound knows that the true initial state is unknown."""
+        rng = np.random.default_rng(2)
+        plant = make_plant(rng, drop=0.05)
+        design = monitor.design(plant, max_attacked=1, step_s=1.0)
+        street = Street(plant, rng)
+        street.x = -np.sign(street.x + 1e-9) * plant.droop.limit
+        watch(street, design, 30)
+
+    @pytest.mark.parametrize("steps", [0, 1, 2])
+    def test_losses(self, steps: int) -> None:
+        rng = np.random.default_rng(3)
+        plant = make_plant(rng, drop=0.06, loss_correction=steps)
+        design = monitor.design(plant, max_attacked=1, step_s=1.0)
+        _, answers = watch(Street(plant, rng), design, 20)
+        widths = {0: 1.0, 1: 0.5, 2: 0.5}
+        assert answers[-1][0].bound.max() < 0.05 * widths[steps] * 2
+
+    @settings(max_examples=15)
+    @given(seed=st.integers(0, 2**32 - 1), inverters=st.sampled_from([3, 9]))
+    def test_metered_reactive_power(self, seed: int, inverters: int) -> None:
+        rng = np.random.default_rng(seed)
+        plant = make_plant(rng, drop=0.04, inverters=np.sort(rng.choice(9, inverters, replace=False)))
+        design = monitor.design(plant, max_attacked=2, step_s=1.0)
+        told = np.sort(rng.choice(9, 5, replace=False))
+        street = Street(plant, rng, extreme=True, metered_q=told)
+        _, answers = watch(street, design, 30)
+        assert answers[-1][1].decision is Decision.CLEAN
+
+    def test_metered_reactive_power_narrows_the_bounds(self) -> None:
+        widths = []
+        for told in (None, np.arange(9)):
+            rng = np.random.default_rng(4)
+            plant = make_plant(rng, drop=0.03, inverters=np.array([], dtype=int))
+            design = monitor.design(plant, max_attacked=0, step_s=1.0)
+            _, answers = watch(Street(plant, rng, metered_q=told), design, 5)
+            widths.append(answers[-1][0].bound.max())
+        assert widths[1] < 0.9 * widths[0]
+
+
+class TestLiars:
+    @settings(max_examples=25)
+    @given(
+        seed=st.integers(0, 2**32 - 1),
+        drop=st.sampled_from([0.01, 0.02, 0.03]),
+        M=st.integers(1, 2),
+        inverters=st.sampled_from([3, 9]),
+    )
+    def test_three_percent_are_named_and_nobody_else(
+        self, seed: int, drop: float, M: int, inverters: int
+    ) -> None:
+        rng = np.random.default_rng(seed)
+        plant = make_plant(rng, drop=drop, inverters=np.sort(rng.choice(9, inverters, replace=False)))
+        design = monitor.design(plant, max_attacked=M, step_s=1.0)
+        street = Street(plant, rng, load_kw=2.5)
+        state, _ = watch(street, design, 40)
+        liars = rng.choice(9, M, replace=False)
+        lies = {int(j): float(rng.choice([-1, 1]) * rng.uniform(0.03, 0.05)) for j in liars}
+        state, answers = watch(street, design, 12, state=state, lies=lies)
+        for k, (estimate, verdict) in enumerate(answers):
+            assert verdict.suspects[liars].all() == (k >= 1)
+            assert (verdict.decision is Decision.ATTACKED) == (k >= 1)
+            if k >= 1:
+                assert verdict.cause is Cause.RESIDUALS
+                assert all(f"c{j}" in verdict.reason for j in liars)
+                assert np.abs(np.sqrt(estimate.v2) - np.sqrt(street.truth())).max() < 0.01
+        size = np.array([(1 + lies[int(j)]) ** 2 - 1 for j in liars])
+        assert np.abs(answers[-1][1].attack[liars] - size).max() < 0.03
+        _, answers = watch(street, design, 4, state=state)
+        assert answers[0][1].suspects[liars].all()
+        assert decisions(answers)[1:] == [Decision.CLEAN] * 3
+
+    @settings(max_examples=25)
+    @given(
+        seed=st.integers(0, 2**32 - 1), M=st.integers(1, 3), size=st.sampled_from([0.006, 0.02, 0.5, 50.0])
+    )
+    def test_bounds_hold_whatever_liars_say(self, seed: int, M: int, size: float) -> None:
+        """Up to M meters say anything, changing by the second, reactive power included."""
+        rng = np.random.default_rng(seed)
+        plant = make_plant(rng, drop=0.03)
+        design = monitor.design(plant, max_attacked=M, step_s=1.0)
+        street = Street(plant, rng, extreme=True, metered_q=np.arange(0, 9, 2))
+        liars = rng.choice(9, M, replace=False)
+
+        def distort(frame: Frame) -> Frame:
+            y, q_net = frame.y.copy(), frame.q_net.copy()
+            y[liars] = y[liars] * (1.0 + size * rng.uniform(-1.0, 1.0, M))
+            q_net[liars] = q_net[liars] + size * rng.uniform(-1.0, 1.0, M)
+            return replace(frame, y=y, q_net=q_net)
+
+        watch(street, design, 40, lies={int(j): 0.0 for j in liars}, change=distort)
+
+    def test_lie_inside_the_deadband(self) -> None:
+        """It moves no estimate, so every set agrees; the residual names it."""
+        rng = np.random.default_rng(5)
+        plant = make_plant(rng, drop=0.005, presets=("asnzs4777-a",))
+        design = monitor.design(plant, max_attacked=2, step_s=1.0)
+        street = Street(plant, rng)
+        street.v0 = 1.0
+        state, _ = watch(street, design, 30)
+        state, answers = watch(street, design, 5, state=state, lies={3: -0.03})
+        assert state.bank is not None
+        assert banks.consistency(design.bank, state.bank).max() == 0.0
+        assert answers[-1][1].suspects.tolist() == [j == 3 for j in range(9)]
+        assert not answers[-1][0].trusted[3]
+
+    def test_jitter_alone_never_names(self) -> None:
+        """One reading above the threshold is not believed; two in a row are."""
+        rng = np.random.default_rng(6)
+        plant = make_plant(rng)
+        design = monitor.design(plant, max_attacked=2, step_s=1.0)
+        street = Street(plant, rng)
+        state, _ = watch(street, design, 30)
+        state, once = watch(street, design, 1, state=state, lies={2: 0.2})
+        assert once[0][1].cause is Cause.AMBIGUOUS
+        assert "c2" in once[0][1].reason
+        assert not once[0][0].trusted[2] or once[0][1].score[2] > once[0][1].threshold[2]
+        state, after = watch(street, design, 1, state=state)
+        assert after[0][1].decision is Decision.CLEAN
+
+    def test_single_frame_is_enough_for_long_intervals(self) -> None:
+        rng = np.random.default_rng(7)
+        plant = make_plant(rng)
+        design = monitor.design(plant, max_attacked=2, step_s=900.0)
+        street = Street(plant, rng)
+        state, _ = watch(street, design, 3, h=900.0)
+        state, answers = watch(street, design, 1, h=900.0, state=state, lies={1: 0.04, 6: -0.04})
+        assert answers[0][1].decision is Decision.ATTACKED
+        assert np.flatnonzero(answers[0][1].suspects).tolist() == [1, 6]
+
+    def test_a_liar_that_falls_silent_stays_named(self) -> None:
+        rng = np.random.default_rng(8)
+        plant = make_plant(rng)
+        design = monitor.design(plant, max_attacked=2, step_s=1.0)
+        street = Street(plant, rng)
+        state, _ = watch(street, design, 30)
+        state, _ = watch(street, design, 3, state=state, lies={4: 0.05})
+        state, answers = watch(street, design, 3, state=state, silent=(4,), lies={4: 0.0})
+        assert answers[-1][1].decision is Decision.ATTACKED
+        assert answers[-1][1].suspects[4]
+        assert answers[-1][1].attack[4] == 0.0
+        _, answers = watch(street, design, 3, state=state)
+        assert answers[-1][1].decision is Decision.CLEAN
+
+    def test_thresholds_are_not_drowned(self) -> None:
+        """Each term of a threshold on a typical street, and their sum against a lie of 3 %."""
+        rng = np.random.default_rng(9)
+        plant = make_plant(rng, customers=13, drop=0.02, inverters=np.arange(0, 13, 2))
+        design = monitor.design(plant, max_attacked=2, step_s=1.0)
+        state, answers = watch(Street(plant, rng, load_kw=3.0), design, 40)
+        estimate, verdict = answers[-1]
+        meter = verdict.threshold - estimate.bound
+        assert 0.014 < meter.min() <= meter.max() < 0.016  # class 0.5: 0.010, jitter 0.004, resolution 0.0004
+        assert estimate.bound.max() < 0.012
+        lie = 1.0 - 0.97**2
+        # Named for certain: whatever the honest errors are.
+        assert (2.0 * verdict.threshold < lie).all()
+        assert state.settled
+
+
+class TestUndecided:
+    def start(self, seed: int, M: int = 2, **options: int) -> tuple[Street, MonitorDesign, MonitorState]:
+        rng = np.random.default_rng(seed)
+        plant = make_plant(rng, **options)
+        design = monitor.design(plant, max_attacked=M, step_s=1.0)
+        street = Street(plant, rng)
+        state, answers = watch(street, design, 40)
+        assert answers[-1][1].decision is Decision.CLEAN
+        return street, design, state
+
+    def test_silent_meter(self) -> None:
+        street, design, state = self.start(20)
+        state, answers = watch(street, design, 10, state=state, silent=(2,))
+        assert {verdict.cause for _, verdict in answers} == {Cause.SILENT_METERS}
+        assert "c2" in answers[0][1].reason
+        # Back again: no new settling.
+        state, answers = watch(street, design, 5, state=state)
+        assert set(decisions(answers)) == {Decision.CLEAN}
+
+    def test_silence_and_lies_together(self) -> None:
+        street, design, state = self.start(21)
+        state, answers = watch(street, design, 6, state=state, silent=(0, 8), lies={3: 0.04, 5: 0.04})
+        assert np.flatnonzero(answers[-1][1].suspects).tolist() == [3, 5]
+        assert answers[-1][1].decision is Decision.ATTACKED
+
+    @settings(max_examples=15)
+    @given(seed=st.integers(0, 2**32 - 1))
+    def test_meters_come_and_go(self, seed: int) -> None:
+        """Bounds hold through any pattern of losses."""
+        rng = np.random.default_rng(seed)
+        plant = make_plant(rng, drop=0.03)
+        design = monitor.design(plant, max_attacked=1, step_s=1.0)
+        street = Street(plant, rng, extreme=True)
+        state = None
+        for _ in range(12):
+            lost = tuple(int(j) for j in np.flatnonzero(rng.random(9) < 0.4))
+            state, _ = watch(street, design, int(rng.integers(1, 4)), state=state, silent=lost)
+
+    def test_too_few_meters(self) -> None:
+        street, design, state = self.start(22)
+        state, answers = watch(street, design, 5, state=state, silent=(0, 1, 2, 3, 4), lies={5: 0.2})
+        assert {verdict.cause for _, verdict in answers} == {Cause.TOO_FEW_METERS}
+        assert not answers[-1][0].trusted.any()
+        assert not answers[-1][1].suspects.any()
+        state, answers = watch(street, design, 40, state=state)
+        assert answers[0][1].cause is Cause.SETTLING
+        assert answers[-1][1].decision is Decision.CLEAN
+
+    def test_nothing_at_all(self) -> None:
+        street, design, state = self.start(23)
+        change = lambda frame: replace(frame, v0_squared=float("nan"))  # noqa: E731
+        state, answers = watch(street, design, 5, state=state, silent=tuple(range(9)), change=change)
+        assert {verdict.cause for _, verdict in answers} == {Cause.TOO_FEW_METERS}
+
+    @pytest.mark.parametrize("value", [float("nan"), 0.0, -1.0, 1e9, float("inf")])
+    def test_no_busbar(self, value: float) -> None:
+        """The meters imply the busbar voltage, and up to M of them may lie about it."""
+        street, design, state = self.start(24)
+
+        def blind(frame: Frame) -> Frame:
+            return replace(frame, v0_squared=value)
+
+        state, answers = watch(street, design, 10, state=state, change=blind, lies={1: 0.3, 2: 0.3})
+        assert {verdict.cause for _, verdict in answers} == {Cause.NO_BUSBAR}
+        assert np.flatnonzero(answers[-1][1].suspects).tolist() == [1, 2]
+        state, answers = watch(street, design, 3, state=state)
+        assert answers[-1][1].decision is Decision.CLEAN
+
+    def test_no_busbar_from_the_start(self) -> None:
+        rng = np.random.default_rng(25)
+        plant = make_plant(rng)
+        design = monitor.design(plant, max_attacked=2, step_s=1.0)
+        change = lambda frame: replace(frame, v0_squared=float("nan"))  # noqa: E731
+        watch(Street(plant, rng), design, 20, change=change)
+
+    def test_too_many_suspects(self) -> None:
+        street, design, state = self.start(26)
+        lies = {0: 0.1, 3: -0.1, 5: 0.1}
+        state, answers = watch(street, design, 5, state=state, lies=lies, sound=False)
+        verdict = answers[-1][1]
+        assert verdict.cause is Cause.TOO_MANY_SUSPECTS
+        assert verdict.suspects[[0, 3, 5]].all()
+        assert "switch" in verdict.reason
+        # The liars moved the estimate by what saturation allows, and the bound says so.
+        assert (np.abs(answers[-1][0].v2 - street.truth()) <= answers[-1][0].bound).all()
+        state, answers = watch(street, design, 30, state=state, sound=False)
+        assert answers[-1][1].decision is Decision.CLEAN
+
+    def test_wrong_busbar_reading_is_not_blamed_on_two_meters(self) -> None:
+        street, design, state = self.start(27)
+        shift = lambda frame: replace(frame, v0_squared=frame.v0_squared * 1.1)  # noqa: E731
+        _, answers = watch(street, design, 5, state=state, change=shift, sound=False)
+        assert answers[-1][1].cause is Cause.TOO_MANY_SUSPECTS
+
+    def test_invalid_design(self) -> None:
+        street, design, _ = self.start(28)
+        good = design.certificate
+        claims_too_much = Certificate(
+            kind=good.kind,
+            P=good.P,
+            rate=100.0 * good.rate,
+            noise=good.noise,
+            load=good.load,
+            attack=good.attack,
+            margin=good.margin,
+            status=good.status,
+            multiplier=good.multiplier,
+        )
+        unknown = replace(good, kind="hearsay")
+        for certificate in (claims_too_much, unknown):
+            _, answers = watch(street, replace(design, certificate=certificate), 40)
+            assert {verdict.cause for _, verdict in answers} == {Cause.DESIGN_INVALID}
+            with pytest.raises(DesignInfeasible):
+                monitor.design(design.plant, max_attacked=2, step_s=1.0, certificate=certificate)
+
+    def test_loads_too_uncertain(self) -> None:
+        street, design, state = self.start(29)
+
+        def vague(frame: Frame) -> Frame:
+            return replace(frame, p_error=np.full(9, 0.3))
+
+        _, answers = watch(street, design, 3, state=state, change=vague)
+        assert {verdict.cause for _, verdict in answers} == {Cause.AMBIGUOUS}
+        assert "not known well enough" in answers[-1][1].reason
+
+    def test_collapse(self) -> None:
+        """Loads far beyond what the feeder carries: no answer, and no exception."""
+        street, design, state = self.start(30)
+
+        def absurd(frame: Frame) -> Frame:
+            return replace(frame, p=frame.p * 1e4, q=frame.q * 1e4)
+
+        _, answers = watch(street, design, 3, state=state, change=absurd, sound=False)
+        assert {verdict.decision for _, verdict in answers} == {Decision.UNDECIDED}
+
+    def test_time_does_not_run_backwards(self) -> None:
+        street, design, state = self.start(31)
+        street.advance(1.0)
+        frame = street.frame()
+        state, estimate, verdict = monitor.step(design, state, frame)
+        assert verdict.decision is Decision.CLEAN
+        for t in (frame.t, frame.t - 100.0, float("nan")):
+            same, again, answer = monitor.step(design, state, replace(frame, t=t, y=frame.y * 2.0))
+            assert same is state
+            assert again is estimate
+            assert answer.decision is Decision.UNDECIDED
+            assert "not used" in answer.reason
+        fresh, estimate, verdict = monitor.step(
+            design, monitor.init(design, 0.0), replace(frame, t=float("nan"))
+        )
+        assert verdict.decision is Decision.UNDECIDED
+        assert fresh.last is None
+        assert np.isfinite(estimate.bound).all()
+
+    @pytest.mark.parametrize("value", [float("inf"), float("-inf"), 1e300, -5.0, 0.0])
+    def test_absurd_readings(self, value: float) -> None:
+        street, design, state = self.start(32)
+
+        def absurd(frame: Frame) -> Frame:
+            y = frame.y.copy()
+            y[6] = value
+            return replace(frame, y=y)
+
+        _, answers = watch(street, design, 4, state=state, change=absurd, lies={6: 0.0})
+        wanted = Cause.RESIDUALS if np.isfinite(value) else Cause.SILENT_METERS
+        assert answers[-1][1].cause is wanted
+
+
+class TestDesign:
+    def test_not_observable(self) -> None:
+        plant = make_plant(np.random.default_rng(40), customers=4)
+        with pytest.raises(NotObservable, match="more than 4 meters"):
+            monitor.design(plant, max_attacked=2, step_s=1.0)
+
+    def test_wrong_plants(self) -> None:
+        plant = make_plant(np.random.default_rng(41), customers=4)
+        with pytest.raises(ValueError, match="two meters"):
+            monitor.design(replace(plant, meters=np.array([0, 1, 1, 2])), max_attacked=1, step_s=1.0)
+        with pytest.raises(ValueError, match="accuracy"):
+            monitor.design(replace(plant, meters=np.array([0, 1, 2])), max_attacked=1, step_s=1.0)
+        with pytest.raises(ValueError, match="step_s"):
+            monitor.design(plant, max_attacked=1, step_s=0.0)
+
+    def test_stacked_gains(self) -> None:
+        """Gains between none and direct injection: other observers, other bounds, the same verdicts."""
+        rng = np.random.default_rng(42)
+        plant = make_plant(rng, customers=7)
+        direct = monitor.design(plant, max_attacked=2, step_s=1.0)
+        gains = banks.direct_gains(direct.bank.lure, direct.bank.masks)
+        soft = banks.Gains(gains.L, 0.8 * gains.K)
+        design = monitor.design(plant, max_attacked=2, step_s=1.0, gains=soft)
+        assert design.certificate.kind == "small-gain"
+        street = Street(plant, rng, extreme=True)
+        state, answers = watch(street, design, 40)
+        assert answers[-1][1].decision is Decision.CLEAN
+        state, answers = watch(street, design, 5, state=state, silent=(0,))
+        assert answers[-1][1].cause is Cause.SILENT_METERS
+        state, answers = watch(street, design, 5, state=state, lies={3: 0.05, 5: -0.05})
+        assert np.flatnonzero(answers[-1][1].suspects).tolist() == [3, 5]
+        state, answers = watch(street, design, 3, state=state, silent=(0, 1, 2), sound=False)
+        assert answers[-1][1].cause is Cause.TOO_FEW_METERS
+        with pytest.raises(ValueError, match="L = 0"):
+            monitor.design(
+                plant, max_attacked=2, step_s=1.0, gains=banks.Gains(gains.L + 1e-3 * gains.K, gains.K)
+            )
+
+    def test_no_liar_allowed(self) -> None:
+        rng = np.random.default_rng(43)
+        plant = make_plant(rng, customers=3)
+        design = monitor.design(plant, max_attacked=0, step_s=1.0)
+        street = Street(plant, rng)
+        state, answers = watch(street, design, 30)
+        assert answers[-1][1].decision is Decision.CLEAN
+        _, answers = watch(street, design, 3, state=state, lies={0: 0.1}, sound=False)
+        assert answers[-1][1].cause is Cause.TOO_MANY_SUSPECTS
+
+    def test_options_decide(self) -> None:
+        rng = np.random.default_rng(44)
+        plant = make_plant(rng)
+        design = monitor.design(plant, max_attacked=1, step_s=1.0, options=Options(confirm=4, release=1))
+        street = Street(plant, rng)
+        state, _ = watch(street, design, 30)
+        state, answers = watch(street, design, 6, state=state, lies={1: 0.1})
+        assert [bool(verdict.suspects[1]) for _, verdict in answers] == [False] * 3 + [True] * 3
+        _, answers = watch(street, design, 1, state=state)
+        assert not answers[0][1].suspects.any()
+
+    def test_same_numbers_from_the_same_inputs(self) -> None:
+        """No clock, no hidden state: a step can be repeated from any kept state."""
+        rng = np.random.default_rng(45)
+        plant = make_plant(rng)
+        design = monitor.design(plant, max_attacked=1, step_s=1.0)
+        street = Street(plant, rng)
+        state, _ = watch(street, design, 10)
+        street.advance(1.0)
+        frame = street.frame({3: 0.04}, (5,))
+        first, second = monitor.step(design, state, frame), monitor.step(design, state, frame)
+        assert np.array_equal(first[1].v2, second[1].v2)
+        assert np.array_equal(first[2].threshold, second[2].threshold)
