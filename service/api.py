@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import json
+import secrets
 from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable
 from functools import partial
 from pathlib import Path as FilePath
@@ -96,10 +97,11 @@ def create_api(backend: Backend) -> FastAPI:
         docs_url=None,
         redoc_url=None,
         openapi_url="/api/v1/openapi.json",
-        responses={"default": {"model": models.Problem, "description": "Any error, as problem+json."}},
+        responses={"default": {"model": models.Problem, "description": "Any error."}},
     )
     app.state.backend = backend
     app.state.streams = 0
+    app.state.run = secrets.token_hex(4)
     app.add_middleware(Guard, max_body=MAX_BODY)
     for error, status in _STATUS.items():
         app.add_exception_handler(error, _gridsec_handler(status))
@@ -109,8 +111,30 @@ def create_api(backend: Backend) -> FastAPI:
     app.include_router(_feeders)
     app.include_router(_alarms)
     app.include_router(_operations)
-    app.mount("/", StaticFiles(directory=_WEB, html=True), name="web")
+    app.mount("/", _Web(directory=_WEB, html=True), name="web")
+    _describe(app)
     return app
+
+
+class _Web(StaticFiles):
+    """The page. Browsers ask each time whether it has changed, so that an upgrade is seen at once."""
+
+    def file_response(self, *args: Any, **kwargs: Any) -> Response:
+        response = super().file_response(*args, **kwargs)
+        response.headers["Cache-Control"] = "no-cache"
+        return response
+
+
+def _describe(app: FastAPI) -> None:
+    """Write the OpenAPI description once, with errors as the problems that they are."""
+    schema = app.openapi()
+    error = {"$ref": "#/components/schemas/Problem"}
+    for path in schema["paths"].values():
+        for operation in path.values():
+            operation["responses"].pop("422", None)
+            operation["responses"]["default"]["content"] = {"application/problem+json": {"schema": error}}
+    for unused in ("HTTPValidationError", "ValidationError"):
+        schema["components"]["schemas"].pop(unused, None)
 
 
 def _backend(request: Request) -> Backend:
@@ -281,6 +305,7 @@ _alarms = APIRouter(prefix="/api/v1/alarms", tags=["alarms"])
 
 @_alarms.get("", response_model=models.Alarms, responses=_NOT_MODIFIED)
 def list_alarms(
+    request: Request,
     backend: BackendHere,
     response: Response,
     *,
@@ -297,7 +322,8 @@ def list_alarms(
 ) -> Any:
     """A page of alarms, those that began last first; `since` and `until` are about `t_raised`."""
     last_event = backend.store.last_event
-    if known := _unchanged(response, f'W/"{last_event}"', if_none_match):
+    # Event numbers say what has changed within one database, and a run has only one.
+    if known := _unchanged(response, f'W/"{request.app.state.run}-{last_event}"', if_none_match):
         return known
     page, following = backend.store.alarms(
         state=state or (),

@@ -111,7 +111,9 @@ export class Diagram {
           blur: () => this.hover(null),
         },
       }, svg("circle", { class: "hit", r: 13 }), shape, sign, note);
-      this.customers.set(customer.customer, { customer, group, shape, sign, note, labels: spot.labels });
+      this.customers.set(customer.customer, {
+        customer, group, shape, sign, note, labels: spot.labels, place: spot.note, order: spot.order,
+      });
       layer.append(group);
     });
     root.append(casing, layer);
@@ -143,7 +145,7 @@ export class Diagram {
     for (const bus of this.placed.buses) {
       if (bus.to > bus.x) wires.push({ d: join(bus.x, bus.row, bus.to, bus.row), bus: bus.bus });
       const [x, y] = at(bus.x, bus.row);
-      wires.push({ d: upright ? `M${x - 5} ${y}h10` : `M${x} ${y - 5}v10`, bus: bus.bus, kind: "bus" });
+      if (bus.bare) wires.push({ d: upright ? `M${x - 5} ${y}h10` : `M${x} ${y - 5}v10`, bus: bus.bus, kind: "bus" });
     }
     const spots = this.placed.customers.map((c) => {
       const [x, y] = at(c.x, c.row);
@@ -228,6 +230,7 @@ export class Diagram {
       path.classList.toggle("unknown", color === null);
       path.style.stroke = color ?? "";
     }
+    let before = null;
     for (const [id, part] of this.customers) {
       const meter = this.meters.get(part.customer.meter);
       const now = status(meter, this.limits);
@@ -237,6 +240,10 @@ export class Diagram {
       part.shape.style.fill = now.key === "silent" ? "" : (this.scale.color(v) ?? "");
       part.sign.textContent = SIGN[now.key] ?? "";
       const loud = now.key === "suspect";
+      // Neighbours that both have something to say must not say it in the same place.
+      const low = loud && !part.labels && before?.loud && !before.low && before.near(part);
+      if (part.place.y > 10) part.note.setAttribute("y", part.place.y + (low ? 11 : 0));
+      before = { loud, low, near: (other) => other.order - part.order === 1 };
       part.note.classList.toggle("loud", loud);
       const name = id.slice(this.cut);
       part.note.textContent = loud

@@ -32,7 +32,10 @@ export function oneLine(layout) {
     let x = x0;
     let before = null;
     for (let bus = start; bus !== undefined; ) {
-      const [next, ...others] = [...children[bus]].sort(heavier);
+      let [next, ...others] = [...children[bus]].sort(heavier);
+      if (next !== undefined && isDrop(next) && !at[bus].length && bus !== start) {
+        [next, others] = [undefined, [next, ...others]]; // A pole at the end of a line: all its houses hang.
+      }
       const drops = others.filter(isDrop);
       const sides = others.filter((child) => !isDrop(child));
       const own = at[bus].map((customer) => ({ customer, bus }));
@@ -46,7 +49,7 @@ export function oneLine(layout) {
         items.customers.push({ customer, bus: where, from: bus, x: x + k, row: 0 });
       });
       x = Math.max(first + 1, x + slots.length);
-      items.buses.push({ bus, x: first, to: x - 1, row: 0 });
+      items.buses.push({ bus, x: first, to: x - 1, row: 0, bare: !slots.length });
       if (before !== null) items.lines.push({ bus, from: before, x: first, row: 0, x0: before.to, row0: 0 });
       before = { bus, to: x - 1 };
       for (const side of sides) branches.push({ side, x: first });

@@ -1,0 +1,578 @@
+from __future__ import annotations
+
+import json
+import math
+import socket
+import sqlite3
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import fastapi.routing
+import httpx
+import pytest
+
+from gridsec.online import Cause
+from service import api, models
+from service import store as store_module
+from service.alarms import Change, Transition
+from service.report import to_json as report_json
+from service.store import Rejected
+
+T0 = 1_795_212_000.0
+LIE = {"H3": 9.0}
+ACK = f"/api/v1/alarms/{'0' * 26}/ack"
+
+
+class Setup:
+    def __init__(self, service: Any, server: Any) -> None:
+        self.service, self.server = service, server
+        self.village = next(iter(service.villages.values()))
+        self.http = httpx.Client(base_url=server.url, timeout=20)
+
+    def attack(self, t: float = T0, ticks: int = 4, **changes: Any) -> None:
+        for k in range(ticks):
+            self.service.tick(self.village.report(t + k, **({"lies": LIE} | changes)))
+
+    def calm(self, t: float, ticks: int = 8) -> None:
+        self.attack(t, ticks, lies={})
+
+    def get(self, path: str, **arguments: Any) -> httpx.Response:
+        return self.http.get(f"/api/v1{path}", **arguments)
+
+    def one(self) -> dict[str, Any]:
+        (alarm,) = self.get("/alarms").json()["alarms"]
+        return alarm
+
+
+@pytest.fixture
+def setup(village: type, small_service: Callable[..., Any], serve: Callable[..., Any]) -> Iterator[Setup]:
+    service = small_service(village("village"), village("town", 4))
+    made = Setup(service, serve(service))
+    with made.http:
+        yield made
+
+
+def is_problem(response: httpx.Response, status: int) -> dict[str, Any]:
+    assert response.status_code == status, (response.request.url, response.text)
+    assert response.headers["content-type"] == "application/problem+json"
+    body: dict[str, Any] = response.json()
+    assert models.Problem.model_validate(body).status == status
+    assert body["instance"] == response.request.url.path
+    assert body["detail"]
+    return body
+
+
+# ----------------------------------------------------------------------- feeders
+
+
+def test_feeders_and_their_verdicts(setup: Setup) -> None:
+    setup.attack(ticks=1)
+    found = models.Feeders.model_validate(setup.get("/feeders").json()).feeders
+    assert [(f.name, f.verdict, f.t) for f in found] == [("village", "attacked", T0), ("town", None, None)]
+
+
+def test_a_feeder_with_its_tree_and_an_etag(setup: Setup) -> None:
+    first = setup.get("/feeders/village")
+    detail = models.FeederDetail.model_validate(first.json())
+    assert detail.layout.buses[0] == "busbar"
+    assert detail.layout.parent[0] is None
+    assert len(detail.layout.customers) == 13
+    again = setup.get("/feeders/village", headers={"If-None-Match": first.headers["etag"]})
+    assert (again.status_code, again.content) == (304, b"")
+    other = setup.get("/feeders/town", headers={"If-None-Match": first.headers["etag"]})
+    assert other.status_code == 200
+
+
+def test_state_is_the_report(setup: Setup) -> None:
+    is_problem(setup.get("/feeders/village/state"), 503)
+    setup.attack(ticks=1)
+    response = setup.get("/feeders/village/state")
+    assert response.json() == report_json(setup.service.report("village"))
+    assert response.headers["cache-control"] == "no-store"
+    contract = {"feeder", "t", "verdict", "reason", "max_attacked", "meters"}
+    meter = {
+        *("meter", "bus", "seen", "suspect", "score", "threshold", "v_volt_reported", "v_volt_estimated"),
+        *("v_volt_std", "v2_pu_estimated", "attack_volt_estimated"),
+    }
+    assert contract <= set(response.json())
+    assert all(set(item) == meter for item in response.json()["meters"])
+
+
+def test_nan_never_leaves(setup: Setup) -> None:
+    report = setup.village.report(T0)
+    broken = replace(report.meters[0], score=math.nan, v_volt_estimated=math.inf, threshold=-math.inf)
+    setup.service.tick(replace(report, meters=(broken, *report.meters[1:])))
+    for path in ("state", "meters/H0", "history?meter=H0"):
+        json.loads(setup.get(f"/feeders/village/{path}").text, parse_constant=pytest.fail)
+    assert setup.get("/feeders/village/meters/H0").json()["score"] is None
+
+
+def test_one_meter(setup: Setup) -> None:
+    setup.attack(ticks=1)
+    found = models.MeterNow.model_validate(setup.get("/feeders/village/meters/H3").json())
+    assert (found.meter, found.feeder, found.verdict, found.suspect) == ("H3", "village", "attacked", True)
+    is_problem(setup.get("/feeders/village/meters/nobody"), 404)
+    is_problem(setup.get("/feeders/nowhere/meters/H3"), 404)
+
+
+def test_history_of_a_feeder_and_of_a_meter(setup: Setup) -> None:
+    setup.calm(T0, 30)
+    setup.attack(T0 + 30, 10)
+    whole = models.History.model_validate(setup.get("/feeders/village/history").json())
+    assert [p.t - T0 for p in whole.points] == [0, 10, 20, 30]
+    assert [p.suspects for p in whole.points] == [[], [], [], ["H3"]]
+    last = whole.points[-1]
+    assert last.meter is None
+    assert last.seen == 13
+    assert last.v_volt_lowest is not None
+    assert last.v_volt_highest is not None
+    assert 200 < last.v_volt_lowest < last.v_volt_highest < 240
+    part = setup.get("/feeders/village/history", params={"meter": "H3", "since": T0 + 5, "until": T0 + 31})
+    points = models.History.model_validate(part.json()).points
+    assert [p.t - T0 for p in points] == [10, 20, 30]
+    meter = points[-1].meter
+    assert meter is not None
+    assert meter.v_volt_reported == pytest.approx(meter.v_volt_estimated + 9.0, abs=1e-3)
+    two = models.History.model_validate(setup.get("/feeders/village/history?limit=2").json())
+    assert ([p.t - T0 for p in two.points], two.more) == ([20, 30], True)
+
+
+def test_a_feeder_can_be_put(setup: Setup) -> None:
+    made = setup.http.put("/api/v1/feeders/hamlet", json={"customers": 3})
+    assert made.status_code == 200
+    assert models.FeederDetail.model_validate(made.json()).name == "hamlet"
+    assert [f["name"] for f in setup.get("/feeders").json()["feeders"]] == ["village", "town", "hamlet"]
+
+
+def test_every_problem_of_a_feeder_is_told_at_once(setup: Setup) -> None:
+    body = is_problem(setup.http.put("/api/v1/feeders/hamlet", json={}), 422)
+    assert body["problems"] == ["customers.csv: missing", "lines.csv: missing"]
+    nan = b'{"customers": [{"load_kw": NaN}]}'
+    header = {"Content-Type": "application/json"}
+    body = is_problem(setup.http.put("/api/v1/feeders/hamlet", content=nan, headers=header), 422)
+    assert "NaN" in body["problems"][0]
+    assert setup.get("/feeders/hamlet").status_code == 404
+
+
+# ------------------------------------------------------------------------ alarms
+
+
+def test_an_alarm_and_its_fields(setup: Setup) -> None:
+    assert setup.get("/alarms").json() == {"alarms": [], "next": None, "last_event": 0}
+    setup.attack()
+    alarm = setup.one()
+    contract = {
+        *("id", "kind", "feeder", "meter", "severity", "state", "count", "t_event", "t_raised", "t_cleared"),
+        "evidence",
+    }
+    assert contract <= set(alarm)
+    assert set(alarm["evidence"]) == {
+        *("score", "threshold", "v_volt_reported", "v_volt_estimated", "attack_volt_estimated"),
+    }
+    assert (alarm["kind"], alarm["meter"], alarm["state"]) == ("meter-manipulated", "H3", "raised")
+    assert (alarm["t_event"], alarm["t_raised"], alarm["t_cleared"]) == (T0, T0 + 2, None)
+    assert setup.get(f"/alarms/{alarm['id']}").json() == alarm
+    setup.calm(T0 + 4)
+    assert setup.one()["t_cleared"] == T0 + 9
+    events = models.AlarmEvents.model_validate(setup.get(f"/alarms/{alarm['id']}/events").json()).events
+    assert [(e.seq, e.change, e.t - T0) for e in events] == [(1, "raised", 2.0), (2, "cleared", 9.0)]
+    assert events[0].alarm.state == "raised"
+
+
+def test_filters_and_pages(setup: Setup) -> None:
+    setup.attack(lies={f"H{k}": 8.0 for k in range(7)})
+    setup.calm(T0 + 4)
+    setup.attack(T0 + 1000, silent=("H9",))
+    pages, cursor = [], None
+    while True:
+        parameters = {"limit": 4} | ({"cursor": cursor} if cursor else {})
+        page = setup.get("/alarms", params=parameters).json()
+        pages.append([a["id"] for a in page["alarms"]])
+        cursor = page["next"]
+        if cursor is None:
+            break
+    assert [len(page) for page in pages] == [4, 4, 1]
+    ids = [name for page in pages for name in page]
+    assert len(set(ids)) == 9
+    assert ids == sorted(ids, reverse=True)
+
+    def count(query: str) -> int:
+        return len(setup.get(f"/alarms?{query}").json()["alarms"])
+
+    assert count("state=cleared") == 7
+    assert count("state=raised") == 2
+    assert count("state=raised&state=cleared") == 9
+    assert count("kind=data-loss") == 1
+    assert count("severity=critical&feeder=village") == 8
+    assert count("feeder=town") == 0
+    assert count("meter=H3") == 2
+    assert count(f"since={T0 + 500}") == 2
+    assert count(f"until={T0 + 500}") == 7
+
+
+def test_the_list_is_not_sent_twice(setup: Setup) -> None:
+    first = setup.get("/alarms")
+    header = {"If-None-Match": first.headers["etag"]}
+    assert setup.get("/alarms", headers=header).status_code == 304
+    setup.attack()
+    assert setup.get("/alarms", headers=header).status_code == 200
+
+
+def test_acknowledging(setup: Setup) -> None:
+    setup.attack()
+    alarm = setup.one()
+    path = f"/api/v1/alarms/{alarm['id']}/ack"
+    answered = setup.http.post(path, json={"who": "  Ada ", "comment": "on my way"}).json()
+    assert (answered["state"], answered["acknowledged_by"]) == ("acknowledged", "Ada")
+    assert answered["comment"] == "on my way"
+    assert setup.one() == answered
+    assert "Ada" in is_problem(setup.http.post(path, json={"who": "Grace"}), 409)["detail"]
+    event = setup.get(f"/alarms/{alarm['id']}/events").json()["events"][1]
+    assert (event["change"], event["who"], event["comment"]) == ("acknowledged", "Ada", "on my way")
+    is_problem(setup.http.post(f"/api/v1/alarms/{'0' * 26}/ack", json={"who": "Ada"}), 404)
+
+
+# ------------------------------------------------------------------------ errors
+
+
+JSON = {"Content-Type": "application/json"}
+ERRORS: list[tuple[str, str, bytes | None, dict[str, str], int]] = [
+    ("GET", "/nothing", None, {}, 404),
+    ("GET", "/api/v1/nothing", None, {}, 404),
+    ("GET", "/../service/api.py", None, {}, 404),
+    ("GET", "/api/v1/feeders/nowhere", None, {}, 404),
+    ("GET", "/api/v1/feeders/nowhere/state", None, {}, 404),
+    ("GET", "/api/v1/feeders/nowhere/stream", None, {}, 404),
+    ("GET", "/api/v1/feeders/not%20a%20name", None, {}, 422),
+    ("GET", "/api/v1/feeders/village/history?limit=0", None, {}, 422),
+    ("GET", "/api/v1/feeders/village/history?since=nan", None, {}, 422),
+    ("GET", "/api/v1/alarms?state=sleeping", None, {}, 422),
+    ("GET", "/api/v1/alarms?limit=100000", None, {}, 422),
+    ("GET", "/api/v1/alarms?cursor=%27;drop", None, {}, 422),
+    ("GET", "/api/v1/alarms/short", None, {}, 422),
+    ("GET", f"/api/v1/alarms/{'0' * 26}", None, {}, 404),
+    ("GET", f"/api/v1/alarms/{'0' * 26}/events", None, {}, 404),
+    ("GET", "/api/v1/alarms/stream?after=-1", None, {}, 422),
+    ("GET", "/api/v1/alarms/stream", None, {"Last-Event-ID": "x"}, 422),
+    ("DELETE", "/api/v1/feeders", None, {}, 405),
+    ("POST", "/healthz", None, {}, 405),
+    ("POST", "/index.html", None, {}, 405),
+    ("PUT", "/api/v1/feeders/x", b"{}", {}, 415),
+    ("PUT", "/api/v1/feeders/x", b"{}", {"Content-Type": "text/plain"}, 415),
+    ("PUT", "/api/v1/feeders/x", b"{", JSON, 400),
+    ("PUT", "/api/v1/feeders/x", b"\xff\xfe", JSON, 400),
+    ("PUT", "/api/v1/feeders/x", b"[" * 100_000, JSON, 400),
+    ("PUT", "/api/v1/feeders/x", b"[1]", JSON, 422),
+    ("PUT", "/api/v1/feeders/x", b"", JSON, 422),
+    ("PUT", "/api/v1/feeders/x", b" " * (5 << 20), JSON, 413),
+    (
+        "POST",
+        f"/api/v1/alarms/{'0' * 26}/ack",
+        b'{"who": " "}',
+        JSON,
+        422,
+    ),
+    ("POST", f"/api/v1/alarms/{'0' * 26}/ack", b'{"who": 1}', JSON, 422),
+    (
+        *("POST", f"/api/v1/alarms/{'0' * 26}/ack", b'{"who": "Ada", "state": "cleared"}'),
+        *(JSON, 422),
+    ),
+]
+
+
+def test_every_error_is_a_problem(setup: Setup) -> None:
+    for method, path, content, headers, status in ERRORS:
+        response = setup.http.request(method, path, content=content, headers=headers)
+        is_problem(response, status)
+        assert response.headers["x-content-type-options"] == "nosniff", (method, path)
+        if status == 405:
+            assert "GET" in response.headers["allow"], (method, path)
+
+
+def test_a_long_body_without_a_length_is_stopped(setup: Setup) -> None:
+    sent = 0
+
+    def endless() -> Iterator[bytes]:
+        nonlocal sent
+        while sent < 200 << 20:
+            sent += 1 << 16
+            yield b" " * (1 << 16)
+
+    header = {"Content-Type": "application/json"}
+    try:
+        response = setup.http.put("/api/v1/feeders/x", content=endless(), headers=header)
+        is_problem(response, 413)
+    except httpx.WriteError:
+        pass  # The server hung up while we were still talking.
+    assert sent < 64 << 20
+    assert setup.get("/feeders").status_code == 200
+
+
+def test_what_nobody_foresaw_is_a_problem_without_details(setup: Setup) -> None:
+    setup.service.metrics = lambda: 1 / 0
+    body = is_problem(setup.http.get("/metrics"), 500)
+    assert "ZeroDivisionError" not in json.dumps(body)
+    assert setup.http.get("/healthz").status_code == 200
+
+
+def test_a_store_that_cannot_be_used_is_503(setup: Setup) -> None:
+    setup.attack()
+    alarm = setup.one()
+    path = setup.service.store.name.removeprefix("sqlite:///")
+    raw = sqlite3.connect(path)
+    raw.execute("ALTER TABLE alarm RENAME TO away")
+    response = setup.get(f"/alarms/{alarm['id']}")
+    assert "no such table" in is_problem(response, 503)["detail"]
+    assert response.headers["retry-after"] == "5"
+    is_problem(setup.http.post(f"/api/v1/alarms/{alarm['id']}/ack", json={"who": "Ada"}), 503)
+    raw.execute("ALTER TABLE away RENAME TO alarm")
+    raw.close()
+    assert setup.get(f"/alarms/{alarm['id']}").json() == alarm
+
+
+# ------------------------------------------------------------------- operations
+
+
+def test_probes(setup: Setup) -> None:
+    assert setup.http.get("/healthz").json() == {"ok": True, "reasons": []}
+    assert setup.http.get("/readyz").json() == {"ok": True, "reasons": []}
+    setup.service.is_ready = (False, ["feeder village has no design"])
+    body = is_problem(setup.http.get("/readyz"), 503)
+    assert (body["ok"], body["reasons"]) == (False, ["feeder village has no design"])
+    setup.service.is_healthy = (False, ["the runtime task has ended"])
+    assert is_problem(setup.http.get("/healthz"), 503)["reasons"] == ["the runtime task has ended"]
+
+
+def test_not_ready_while_the_store_cannot_be_written(
+    monkeypatch: pytest.MonkeyPatch,
+    village: type,
+    small_service: Callable[..., Any],
+    serve: Callable[..., Any],
+) -> None:
+    monkeypatch.setattr(store_module, "WAIT_S", 0.2)
+    service = small_service(village())
+    server = serve(service)
+    blocker = sqlite3.connect(service.store.name.removeprefix("sqlite:///"), isolation_level=None)
+    blocker.execute("BEGIN IMMEDIATE")
+    response = httpx.get(f"{server.url}/readyz")
+    assert "locked" in is_problem(response, 503)["reasons"][0]
+    blocker.execute("ROLLBACK")
+    blocker.close()
+    assert httpx.get(f"{server.url}/readyz").status_code == 200
+
+
+def test_metrics_and_bad_readings(setup: Setup) -> None:
+    response = setup.http.get("/metrics")
+    assert response.headers["content-type"] == "text/plain; version=0.0.4; charset=utf-8"
+    assert "gridsec_up 1.0" in response.text
+    setup.service.store.commit(rejected=[Rejected(T0, "gridsec/x", "no JSON", b"\xff{")])
+    (one,) = models.RejectedReadings.model_validate(setup.get("/bad-readings").json()).readings
+    assert (one.key, one.reason, one.payload) == ("gridsec/x", "no JSON", "\ufffd{")
+
+
+def test_the_description_tells_of_problems(setup: Setup) -> None:
+    schema = setup.get("/openapi.json").json()
+    operations = [op for path in schema["paths"].values() for op in path.values()]
+    assert len(operations) == 16
+    for operation in operations:
+        assert list(operation["responses"]["default"]["content"]) == ["application/problem+json"]
+        assert "422" not in operation["responses"]
+        assert operation["description"]
+    # Every reference leads somewhere.
+    references = {part.split('"')[0] for part in json.dumps(schema).split("#/components/schemas/")[1:]}
+    assert references <= set(schema["components"]["schemas"])
+
+
+def test_the_page_allows_no_foreign_code(setup: Setup) -> None:
+    response = setup.http.get("/")
+    assert response.headers["content-type"] == "text/html; charset=utf-8"
+    policy = dict(
+        part.strip().split(" ", 1) for part in response.headers["content-security-policy"].split(";")
+    )
+    assert policy["default-src"] == "'none'"
+    assert policy["script-src"] == policy["style-src"] == policy["connect-src"] == "'self'"
+    assert "://" not in response.text
+    again = setup.http.get("/", headers={"If-None-Match": response.headers["etag"]})
+    assert again.status_code == 304
+
+
+# --------------------------------------------------------------------- streams
+
+
+class Stream:
+    """A client of server-sent events that parses what the standard says."""
+
+    def __init__(self, setup: Setup, path: str, **headers: str) -> None:
+        self.context = setup.http.stream("GET", f"/api/v1{path}", headers=headers)
+        self.response = self.context.__enter__()
+        self.lines = self.response.iter_lines()
+
+    def next(self) -> dict[str, str]:
+        event: dict[str, str] = {}
+        for line in self.lines:
+            if line.startswith(":"):
+                event["comment"] = line[1:].strip()
+            elif line:
+                name, _, value = line.partition(": ")
+                event[name] = value
+            elif event:
+                return event
+        return {"end": "true"}
+
+    def alarms(self, count: int) -> list[tuple[int, str]]:
+        found = []
+        while len(found) < count:
+            event = self.next()
+            if "data" in event:
+                data = models.AlarmEvent.model_validate_json(event["data"])
+                assert event["event"] == "alarm"
+                assert int(event["id"]) == data.seq
+                found.append((data.seq, str(data.change)))
+        return found
+
+    def close(self) -> None:
+        self.context.__exit__(None, None, None)
+
+
+def test_alarms_arrive_as_they_happen(setup: Setup) -> None:
+    stream = Stream(setup, "/alarms/stream")
+    assert stream.response.headers["content-type"].startswith("text/event-stream")
+    assert stream.next() == {"comment": "connected", "id": "0", "retry": "2000"}
+    setup.attack()
+    event = stream.next()
+    assert json.loads(event["data"])["alarm"] == setup.one()
+    setup.http.post(f"/api/v1/alarms/{setup.one()['id']}/ack", json={"who": "Ada"})
+    assert stream.alarms(1) == [(2, "acknowledged")]
+    setup.calm(T0 + 10)
+    assert stream.alarms(1) == [(3, "cleared")]
+    stream.close()
+
+
+def test_a_client_that_comes_back_misses_nothing(setup: Setup) -> None:
+    setup.attack()
+    stream = Stream(setup, "/alarms/stream?after=0")
+    assert stream.alarms(1) == [(1, "raised")]
+    stream.close()
+    for k in range(1, 4):
+        setup.calm(T0 + 1000 * k)
+        setup.attack(T0 + 1000 * k + 20)
+    again = Stream(setup, "/alarms/stream?after=0", **{"Last-Event-ID": "1"})
+    expected = [(n, "cleared" if n % 2 == 0 else "raised") for n in range(2, 8)]
+    assert again.alarms(6) == expected
+    again.close()
+
+
+def test_a_number_from_another_database_begins_now(setup: Setup) -> None:
+    setup.attack()
+    stream = Stream(setup, "/alarms/stream", **{"Last-Event-ID": "999999999999999999999"})
+    assert stream.next()["id"] == "1"
+    setup.calm(T0 + 10)
+    assert stream.alarms(1) == [(2, "cleared")]
+    stream.close()
+
+
+def test_a_stream_of_one_feeder(setup: Setup) -> None:
+    stream = Stream(setup, "/alarms/stream?feeder=town")
+    setup.attack()
+    town = setup.service.villages["town"]
+    for k in range(4):
+        setup.service.tick(town.report(T0 + k, lies={"H1": 9.0}))
+    assert stream.alarms(1) == [(2, "raised")]
+    stream.close()
+
+
+def test_states_arrive_and_begin_with_the_latest(setup: Setup) -> None:
+    setup.attack(ticks=3)
+    stream = Stream(setup, "/feeders/village/stream")
+    assert stream.next()["comment"] == "connected"
+    first = stream.next()
+    assert first["event"] == "state"
+    assert json.loads(first["data"]) == report_json(setup.service.report("village"))
+    setup.calm(T0 + 5, 1)
+    assert json.loads(stream.next()["data"])["t"] == T0 + 5
+    stream.close()
+
+
+def test_a_quiet_stream_has_a_heartbeat(setup: Setup, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fastapi.routing, "_PING_INTERVAL", 0.1)
+    stream = Stream(setup, "/alarms/stream")
+    assert [stream.next()["comment"] for _ in range(3)] == ["connected", "ping", "ping"]
+    stream.close()
+
+
+def test_a_slow_client_costs_nothing_and_loses_nothing(setup: Setup) -> None:
+    setup.attack()
+    alarm = setup.service.books["village"].active[0]
+    transition = Transition(alarm, Change.RAISED, T0, None, "x" * 60_000)
+    with socket.create_connection(("127.0.0.1", setup.server.port)) as client:
+        client.sendall(b"GET /api/v1/alarms/stream?after=1 HTTP/1.1\r\nHost: x\r\n\r\n")
+        time.sleep(0.2)
+        for _ in range(20):  # 18 MB for a client that reads nothing, more than the sockets hold
+            setup.service.store.commit([transition] * 15)
+            setup.service.wake({"type": "alarm", "data": None})
+            assert setup.http.get("/healthz", timeout=5).status_code == 200
+        assert max(queue.qsize() for queue in setup.service.queues) <= 8
+        client.settimeout(20)
+        data = b""
+        while data.count(b"\nid: ") < 301:
+            data += client.recv(1 << 20)
+    seen = [int(line[4:]) for line in data.split(b"\n") if line.startswith(b"id: ")]
+    assert seen == list(range(1, 302))
+
+
+def test_streams_are_counted(setup: Setup, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(api, "MAX_STREAMS", 2)
+    one, two = Stream(setup, "/alarms/stream"), Stream(setup, "/feeders/village/stream")
+    assert one.next()["comment"] == two.next()["comment"] == "connected"
+    is_problem(setup.get("/alarms/stream"), 503)
+    two.close()
+    deadline = time.monotonic() + 10
+    while True:
+        third = Stream(setup, "/alarms/stream")
+        if third.response.status_code == 200:
+            break
+        third.close()
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    assert third.next()["comment"] == "connected"
+    third.close()
+    one.close()
+
+
+def test_streams_end_when_the_service_stops(setup: Setup) -> None:
+    stream = Stream(setup, "/alarms/stream")
+    assert stream.next()["comment"] == "connected"
+    time.sleep(0.1)
+    begun = time.perf_counter()
+    setup.server.stop()
+    assert stream.next() == {"end": "true"}
+    assert time.perf_counter() - begun < 5
+    assert setup.service.queues == set()
+    stream.close()
+
+
+def test_a_stream_gives_way_when_the_store_fails(setup: Setup) -> None:
+    stream = Stream(setup, "/alarms/stream")
+    assert stream.next()["comment"] == "connected"
+    raw = sqlite3.connect(setup.service.store.name.removeprefix("sqlite:///"))
+    setup.attack(ticks=2)
+    setup.service.queues, quiet = set(), setup.service.queues
+    setup.attack(T0 + 2, ticks=1)
+    raw.execute("ALTER TABLE event RENAME TO away")
+    setup.service.queues = quiet
+    setup.service.wake({"type": "alarm", "data": None})
+    assert stream.next() == {"end": "true"}
+    raw.execute("ALTER TABLE away RENAME TO event")
+    raw.close()
+    again = Stream(setup, "/alarms/stream", **{"Last-Event-ID": "0"})
+    assert again.alarms(1) == [(1, "raised")]
+    again.close()
+    stream.close()
+
+
+def test_undecided_is_shown_as_such(setup: Setup) -> None:
+    setup.attack(ticks=1, lies={}, cause=Cause.AMBIGUOUS)
+    state = setup.get("/feeders/village/state").json()
+    assert (state["verdict"], state["cause"]) == ("undecided", "ambiguous")
