@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import csv
+import datetime
+import gzip
+import io
 import random
 import sys
 from pathlib import Path
@@ -15,7 +19,7 @@ from pandapower.toolbox import drop_trafos, select_subnet
 
 from feeders.convert import RECIPES, SEED, convert
 from feeders.convert_pandapower import Fleet, from_pandapower
-from feeders.convert_simbench import envelope
+from feeders.convert_simbench import envelope, envelopes_csv, library_csv
 from feeders.load import from_tables, load
 from feeders.profiles import data_root, envelopes
 from feeders.schema import read, validate
@@ -318,3 +322,48 @@ def test_envelope_of_a_straight_profile() -> None:
     found = envelope(p, p)
     assert (found.low, found.high) == (1.0, 1.0)
     assert found.floor <= 2e-3
+
+
+# --- the profile library ------------------------------------------------------------------------
+
+
+def test_library_is_the_right_fortnight() -> None:
+    """A year that counts its own quarters: the slice starts at the Monday's midnight."""
+    clock = np.arange(366 * 96) / 1e5
+    columns = {"H0-A_pload": clock, "H0-A_qload": clock / 2, "PV1": clock / 4}
+    text = gzip.decompress(library_csv(columns)).decode("ascii")
+    header, *rows = csv.reader(io.StringIO(text))
+    assert header == ["t_s", "H0-A_p", "H0-A_q", "PV1"]
+    table = np.array(rows, dtype=float)
+    np.testing.assert_array_equal(table[:, 0], np.arange(14 * 96) * 900.0)
+    # 1 January 2016 was a Friday; one hour is missing since the end of March.
+    first = ((datetime.date(2016, 6, 6) - datetime.date(2016, 1, 1)).days * 24 - 1) * 4
+    assert datetime.date(2016, 6, 6).weekday() == 0
+    np.testing.assert_allclose(table[:, 1], clock[first : first + 14 * 96], rtol=5e-4)
+    np.testing.assert_allclose(table[:, 3], clock[first : first + 14 * 96] / 4, rtol=5e-4)
+    assert library_csv(columns) == library_csv(columns)
+    assert envelopes_csv({**columns, "H0-A_qload": clock}).splitlines()[1].startswith("H0-A,1.0,1.0,")
+
+
+def test_profiles_build_the_committed_library(tmp_path: Path) -> None:
+    pytest.importorskip("simbench", reason="the extra `convert` is not installed")
+    convert("profiles", tmp_path)
+    committed = Path(str(data_root())) / "profiles"
+    for path in committed.iterdir():
+        made = (tmp_path / path.name).read_bytes()
+        if path.suffix == ".gz":  # compressed bytes depend on the version of zlib
+            assert gzip.decompress(made) == gzip.decompress(path.read_bytes())
+        else:
+            assert made == path.read_bytes(), path.name
+
+
+def test_other_infeeds_and_deeper_transformers_are_named() -> None:
+    net = street()
+    net.ext_grid.loc[0, "bus"] = 1
+    pp.create_ext_grid(net, 2)
+    below = pp.create_bus(net, 0.23, name="below")
+    pp.create_transformer_from_parameters(net, 2, below, 0.05, 0.4, 0.23, 1.0, 4.0, 0.1, 0.5)
+    _, notes = from_pandapower(net, "x", root="busbar")
+    said = "\n".join(notes)
+    assert "1 more infeed(s) of an external grid" in said
+    assert "1 transformer(s) that the feeder's buses supply" in said
