@@ -146,7 +146,7 @@ _SAMPLE = to_bytes(solve_many(STREET.lure, _FEW, OPTIONS, workers=1), OPTIONS)
 
 
 @given(st.integers(0, len(_SAMPLE) - 1), st.integers(0, 255))
-@settings(max_examples=60)
+@settings(max_examples=25)
 def test_whatever_a_disk_does_to_the_bytes_what_comes_back_holds(position: int, value: int) -> None:
     blob = bytearray(_SAMPLE)
     blob[position] = value
