@@ -383,8 +383,8 @@ class _Template:
                 cp.multiply(self.at, Gamma) >= options.floor * cp.multiply(self.at, Lam @ np.ones((m, k)))
             )
         # The noise column is written for unit noise and weighted here: its size changes the optimum,
-        # not the conditioning.
-        loud = (self.noise_unit / z) ** 2
+        # not the conditioning. Beyond a hundred load errors it changes neither.
+        loud = min((self.noise_unit / z) ** 2, 1e4)
         self.problem = cp.Problem(cp.Minimize(k * loud * mu + r * mu_delta), constraints)
         self.variables = (P, Y, lam, Gamma, mu, mu_delta)
 
