@@ -120,6 +120,10 @@ class ErrorModel:
         2M: how many meters an observer without liars may leave out.
     R2, X2 : (N, N)
         `2 |R|`, `2 |X|`.
+    inverters, reach : (N, m), (N, p)
+        Columns of X2 of the inverters' customers and of the meters' customers.
+    inverters_own, reach_own : (m, m), (m, p)
+        Their rows at the inverters' customers.
     meters : (p,)
         Customer of each meter.
     meter_of : (m,)
@@ -137,6 +141,10 @@ class ErrorModel:
     quota: int
     R2: Floats
     X2: Floats
+    inverters: Floats
+    reach: Floats
+    inverters_own: Floats
+    reach_own: Floats
     meters: Ints
     meter_of: Ints
     span: Floats
@@ -159,11 +167,16 @@ def error_model(droop: Droop, model: LinDistFlow, meters: Ints, max_attacked: in
         M.
     """
     at = {int(c): j for j, c in reversed(list(enumerate(meters)))}
+    own, X2 = droop.customer, 2.0 * np.abs(model.X)
     return ErrorModel(
         droop=droop,
         quota=2 * max_attacked,
         R2=frozen(2.0 * np.abs(model.R)),
-        X2=frozen(2.0 * np.abs(model.X)),
+        X2=frozen(X2),
+        inverters=frozen(X2[:, own]),
+        reach=frozen(X2[:, meters]),
+        inverters_own=frozen(X2[np.ix_(own, own)]),
+        reach_own=frozen(X2[np.ix_(own, meters)]),
         meters=meters,
         meter_of=np.array([at.get(int(c), -1) for c in droop.customer], dtype=np.intp),
         span=frozen(droop.q[:, 0] - droop.q[:, 3]),
@@ -246,7 +259,7 @@ def widest(model: ErrorModel) -> ErrorBound:
     return ErrorBound(model.span.copy(), model.span.copy())
 
 
-def gap(model: ErrorModel, now: Uncertainty, bound: ErrorBound, rows: Ints | None = None) -> Floats:
+def gap(model: ErrorModel, now: Uncertainty, bound: ErrorBound, *, own: bool = False) -> Floats:
     """Error of the squared voltages that any liar-free observer with at most 2M meters left out sees.
 
     `base_i + sum over undriven inverters 2 X_ik free_k + sum over meters 2 X_ij driven_j
@@ -256,26 +269,24 @@ def gap(model: ErrorModel, now: Uncertainty, bound: ErrorBound, rows: Ints | Non
     ----------
     model, now, bound
         Plant, what is not known, and the bound on the observers' error.
-    rows : (r,), optional
-        Customers; all by default.
+    own
+        At the customers of the inverters instead of all.
 
     Returns
     -------
-    (r,) or (N,)
+    (N,) or (m,)
         Bounds, squared pu.
     """
-    every = slice(None) if rows is None else rows
-    X2, base = model.X2[every], now.base[every]
-    own = model.droop.customer
+    inverters, column = (model.inverters_own, model.reach_own) if own else (model.inverters, model.reach)
+    base = now.base[model.droop.customer] if own else now.base
     metered = (model.meter_of >= 0) & now.live[model.meter_of] if now.live.size else model.meter_of >= 0
-    out = base + X2[:, own[~metered]] @ bound.free[~metered]
+    out = base + inverters @ np.where(metered, 0.0, bound.free)
     driven, free = np.zeros((2, now.live.size))
     np.add.at(driven, model.meter_of[metered], bound.driven[metered])
     np.add.at(free, model.meter_of[metered], bound.free[metered])
     # While the net is metered and trusted, the inverter's own state does not matter to the voltage.
     driven = np.where(now.told, 0.0, driven)
     swing = np.maximum(np.where(now.told, free + now.extra, free) - driven, 0.0)
-    column = X2[:, model.meters]
     return np.asarray(out + column @ driven + largest(column * swing, model.quota))
 
 
@@ -347,15 +358,15 @@ def _image(model: ErrorModel, now: Uncertainty, motion: Motion, bound: ErrorBoun
     # Readings and loads are held over the step; how far they moved in it is part of their error. In a
     # step far above the time constant only the last time constant counts.
     hold = np.abs(motion.after - motion.before) / np.maximum(1.0, motion.h / droop.tau)
+    around = gap(model, now, bound, own=True) + hold
     if model.majorant is None:
-        through = gap(model, now, bound, droop.customer) + hold
+        through = around
         own = (now.reading[model.meter_of] if now.reading.size else np.zeros(hold.shape)) + hold
     else:
         H, F, K = model.majorant
         through = own = H @ bound.free + F @ now.base + K @ now.reading + hold
-    around = gap(model, now, bound, droop.customer) + motion.offset + hold
-    low = np.minimum(motion.before, motion.after) - around
-    high = np.maximum(motion.before, motion.after) + around
+    low = np.minimum(motion.before, motion.after) - motion.offset - around
+    high = np.maximum(motion.before, motion.after) + motion.offset + around
 
     def reach(radius: Floats) -> Floats:
         steep = np.minimum(droop.slope * radius, droop(high + radius) - droop(low - radius))

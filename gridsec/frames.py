@@ -126,9 +126,9 @@ def _implied(
     at most the largest honest one.
     """
     use = now.live & ~state.tally.named
-    if np.count_nonzero(use) <= design.errors.quota:
+    if np.count_nonzero(use) <= 2 * design.bank.sets.max_attacked:
         use = now.live
-    if np.count_nonzero(use) <= design.errors.quota:
+    if np.count_nonzero(use) <= 2 * design.bank.sets.max_attacked:
         return last, NO_VOLTAGE
     # The estimate of the injections is that of the last frame; in between each may have moved by its span.
     stale = detect.gap(design.errors, now, detect.widest(design.errors))[design.plant.meters]

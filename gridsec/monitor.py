@@ -349,11 +349,11 @@ def _view(  # noqa: PLR0917  # as _conclude
     z = plant.droop.vbar**2 - v2[own]
     # What the selected set takes from its meters and a liar-free subset may not: the estimate differs by
     # `spread`, and metered reactive power of at most M meters is replaced.
-    offset = errors.X2[:, own] @ spread
+    offset = errors.inverters @ spread
     if told.any():
         held = np.bincount(own, weights=x, minlength=v2.size)[at] + inputs.q[at]
         doubt = np.where(told, np.abs(frame.q_net[at] - held), 0.0)
-        offset = offset + detect.largest(errors.X2[:, at] * np.nan_to_num(doubt), errors.quota // 2)
+        offset = offset + detect.largest(errors.reach * np.nan_to_num(doubt), errors.quota // 2)
     moved = np.abs(correction - inputs.correction)[plant.feeder.bus]
     now = replace(inputs.now, base=inputs.now.base + moved)
     before = z if state.bank is None else state.z
@@ -376,11 +376,9 @@ def _view(  # noqa: PLR0917  # as _conclude
 
 def _saturated(design: MonitorDesign, inputs: Inputs, frame: Frame) -> Floats:
     """Error of the estimate (N,) that holds whoever lies: inverters saturate, and reports are credible."""
-    plant, X2 = design.plant, design.errors.X2
-    told = np.where(inputs.now.told, 2.0 * frame.q_error[plant.meters], 0.0)
-    return np.asarray(
-        inputs.now.base + X2[:, plant.droop.customer] @ design.errors.span + X2[:, plant.meters] @ told
-    )
+    errors = design.errors
+    told = np.where(inputs.now.told, 2.0 * frame.q_error[design.plant.meters], 0.0)
+    return np.asarray(inputs.now.base + errors.inverters @ errors.span + errors.reach @ told)
 
 
 def _unusable(

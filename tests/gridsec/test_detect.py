@@ -143,13 +143,15 @@ class TestGap:
                 worst = np.maximum(worst, now.base + model.X2 @ each)
         np.testing.assert_allclose(detect.gap(model, now, bound), worst, rtol=1e-12)
 
-    def test_rows(self) -> None:
+    def test_at_the_inverters(self) -> None:
         rng = np.random.default_rng(2)
-        model, now = problem(rng)
-        bound = detect.widest(model)
-        rows = np.array([3, 3, 0])
-        np.testing.assert_array_equal(
-            detect.gap(model, now, bound, rows), detect.gap(model, now, bound)[rows]
+        plant = make_plant(rng, customers=6, inverters=np.array([1, 4, 4]), meters=np.array([0, 1, 3, 4, 5]))
+        model = detect.error_model(plant.droop, lindistflow(plant.feeder), plant.meters, 1)
+        live, none = np.ones(5, dtype=bool), np.zeros(5, dtype=bool)
+        now = Uncertainty(rng.uniform(0.0, 0.01, 6), np.full(5, 0.01), live, none, np.zeros(5))
+        bound = ErrorBound(rng.uniform(0.0, 0.01, 3), rng.uniform(0.0, 0.02, 3))
+        np.testing.assert_allclose(
+            detect.gap(model, now, bound, own=True), detect.gap(model, now, bound)[[1, 4, 4]], rtol=1e-13
         )
 
 

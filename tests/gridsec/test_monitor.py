@@ -460,6 +460,10 @@ class TestDesign:
         assert np.flatnonzero(answers[-1][1].suspects).tolist() == [3, 5]
         state, answers = watch(street, design, 3, state=state, silent=(0, 1, 2), sound=False)
         assert answers[-1][1].cause is Cause.TOO_FEW_METERS
+        blind = lambda frame: replace(frame, v0_squared=float("nan"))  # noqa: E731
+        state, answers = watch(street, design, 3, state=state, change=blind)
+        assert answers[-1][1].cause is Cause.NO_BUSBAR
+        assert answers[-1][0].bound.max() < 0.1
         with pytest.raises(ValueError, match="L = 0"):
             monitor.design(
                 plant, max_attacked=2, step_s=1.0, gains=banks.Gains(gains.L + 1e-3 * gains.K, gains.K)

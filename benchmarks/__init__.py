@@ -1,0 +1,1 @@
+"""What is fast, measured. Run `python -m benchmarks`."""
