@@ -1,6 +1,6 @@
 """zenoh, and nothing but zenoh: samples in, estimates and alarms out, queries answered.
 
-The rest of the service sees plain Python: `Sample`s in batches, and `Outbox.latest` / `Outbox.event` to
+The rest of the service sees plain Python: `Sample`s in batches, and `Bus.telemetry` and `Bus.event` to
 publish. What the binding demands is kept in here: samples are drained by one blocking receive and then
 non-blocking ones, callbacks are not used at all (they collapse under a busy interpreter, and calling zenoh
 from one can deadlock), every session is closed explicitly (or the process hangs at exit).
@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
@@ -30,9 +30,10 @@ _HEAD = 1024
 QUERIES_WAITING = 256
 _ESTIMATES = 1024
 EVENTS_WAITING = 10_000
+TELEMETRY_WAITING = 2_000
 _MAX_SESSIONS = 100_000
 _ACCEPT_PENDING = 1_000
-_OPEN_TIMEOUT_MS = 10_000
+_OPEN_TIMEOUT_MS = 5_000
 JSON = "application/json"
 
 
@@ -154,9 +155,9 @@ class BusCounts:
 
 @dataclass(slots=True)
 class _Outgoing:
-    """What is waiting to be published: the newest value of each telemetry key, every event in order."""
+    """What is waiting to be published; of telemetry the oldest goes when there is too much."""
 
-    latest: OrderedDict[str, bytes] = field(default_factory=OrderedDict)
+    telemetry: deque[tuple[str, bytes]] = field(default_factory=lambda: deque(maxlen=TELEMETRY_WAITING))
     events: deque[tuple[str, bytes | None, Callable[[], None] | None]] = field(default_factory=deque)
     closing: bool = False
 
@@ -265,8 +266,8 @@ class Bus:
 
     # ---------------------------------------------------------------- out
 
-    def latest(self, key: str, payload: bytes) -> None:
-        """Publish the newest value of a key; an older one that is still waiting is replaced.
+    def telemetry(self, key: str, payload: bytes) -> None:
+        """Publish the newest value of a key, and let queries find it.
 
         Parameters
         ----------
@@ -278,7 +279,7 @@ class Bus:
         with self._answers_lock:
             self._answers[f"{self._prefix}/{key}"] = payload
         with self._wakeup:
-            self._outgoing.latest[f"{self._prefix}/{key}"] = payload
+            self._outgoing.telemetry.append((f"{self._prefix}/{key}", payload))
             self._wakeup.notify()
 
     def event(self, key: str, payload: bytes, *, last: bool, done: Callable[[], None] | None = None) -> bool:
@@ -333,12 +334,12 @@ class Bus:
         while True:
             with self._wakeup:
                 out = self._outgoing
-                while not (out.latest or out.events or out.closing):
+                while not (out.telemetry or out.events or out.closing):
                     self._wakeup.wait()
-                if not (out.latest or out.events):
+                if not (out.telemetry or out.events):
                     return
                 event = out.events.popleft() if out.events else None
-                value = None if event else out.latest.popitem(last=False)
+                value = None if event else out.telemetry.popleft()
             try:
                 if event is not None:
                     _put_event(live, event[0], event[1])

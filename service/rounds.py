@@ -48,7 +48,7 @@ class Publisher(Protocol):
     failure: str | None
     counts: BusCounts
 
-    def latest(self, key: str, payload: bytes) -> None:
+    def telemetry(self, key: str, payload: bytes) -> None:
         """Publish the newest value of a key."""
 
     def event(self, key: str, payload: bytes, *, last: bool, done: Callable[[], None] | None = None) -> bool:
@@ -327,8 +327,9 @@ class Rounds:
     def _publish_estimates(self, results: list[TickResult]) -> None:
         if self.publisher is None:
             return
-        for report in {result.report.feeder: result.report for result in results}.values():
-            self.publisher.latest(f"{report.feeder}/estimate", msgspec.json.encode(report_json(report)))
+        for result in results:
+            key = f"{result.report.feeder}/estimate"
+            self.publisher.telemetry(key, msgspec.json.encode(report_json(result.report)))
         self.metrics.count_bus(self.publisher.counts)
 
     def _publish_alarms(self) -> None:

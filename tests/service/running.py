@@ -1,0 +1,124 @@
+"""A running service for tests: in this process with a thread of its own, on free ports."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+from service.app import Running, serve
+from service.ingest import BusConfig, Meters
+from service.settings import settings
+
+FEEDER = "simbench-lv-rural1"
+PATIENCE_S = 20.0
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def until(condition: Callable[[], Any], what: str = "it", patience_s: float = PATIENCE_S) -> Any:
+    """Return the first truthy value of a condition."""
+    end = time.monotonic() + patience_s
+    while time.monotonic() < end:
+        value = condition()
+        if value:
+            return value
+        time.sleep(0.02)
+    raise AssertionError(f"{what} did not happen within {patience_s:g} s")
+
+
+class InProcess:
+    """A service, an HTTP client of it, and a zenoh client of it."""
+
+    def __init__(self, http: httpx.Client, meters: Meters, zenoh: str) -> None:
+        self.http, self.meters, self.zenoh = http, meters, zenoh
+
+    def get(self, path: str, **params: Any) -> Any:
+        answer = self.http.get(path, params=params)
+        assert answer.status_code == 200, answer.text
+        return answer.json()
+
+    def state(self, feeder: str = FEEDER) -> dict[str, Any]:
+        answer = self.http.get(f"/api/v1/feeders/{feeder}/state")
+        return dict(answer.json()) if answer.status_code == 200 else {}
+
+    def alarms(self, **params: Any) -> list[dict[str, Any]]:
+        return list(self.get("/api/v1/alarms", **params)["alarms"])
+
+    def rejected(self) -> list[dict[str, Any]]:
+        return list(self.get("/api/v1/bad-readings")["readings"])
+
+    def metric(self, name: str, **labels: str) -> float:
+        """Return the value of a metric, 0 if it is not there."""
+        for line in self.http.get("/metrics").text.splitlines():
+            key, _, value = line.rpartition(" ")
+            if key.partition("{")[0] == name and all(f'{k}="{v}"' in key for k, v in labels.items()):
+                return float(value)
+        return 0.0
+
+    def put(self, key: str, payload: object, encoding: str = "application/json") -> None:
+        self.meters.put(
+            key, payload if isinstance(payload, bytes) else json.dumps(payload).encode(), encoding
+        )
+
+
+@contextmanager
+def service(folder: Path, feeders: Iterable[str] = (FEEDER,), **given: Any) -> Iterator[InProcess]:
+    """Run a service until the block ends; it must end within 3 s."""
+    zenoh = f"tcp/127.0.0.1:{free_port()}"
+    chosen = settings(
+        {
+            "feeders": tuple(feeders),
+            "zenoh_listen": (zenoh,),
+            "http": "127.0.0.1:0",
+            "database": f"sqlite:///{folder / 'gridsec.db'}",
+            **given,
+        }
+    )
+    up = threading.Event()
+    found: dict[str, Any] = {}
+
+    def announce(running: Running) -> None:
+        found.update(running=running, loop=asyncio.get_running_loop())
+        up.set()
+
+    def run() -> None:
+        try:
+            asyncio.run(serve(chosen, announce=announce, signals=False))
+        except Exception as error:  # noqa: BLE001 - handed over to the test
+            found["error"] = error
+            up.set()
+
+    thread = threading.Thread(target=run, name="service under test")
+    thread.start()
+    try:
+        assert up.wait(PATIENCE_S)
+        if "error" in found:
+            raise found["error"]
+        config = BusConfig("client", connect=(zenoh,))
+        with (
+            httpx.Client(base_url=found["running"].url, timeout=10.0) as http,
+            Meters(config, chosen.prefix) as meters,
+        ):
+            yield InProcess(http, meters, zenoh)
+    finally:
+        begin = time.monotonic()
+        if "loop" in found:
+            found["loop"].call_soon_threadsafe(found["running"].stop)
+        thread.join(timeout=PATIENCE_S)
+        assert not thread.is_alive()
+        assert time.monotonic() - begin < 3.0
+    if "error" in found:
+        raise found["error"]

@@ -1,0 +1,280 @@
+"""The whole service: real zenoh, real HTTP, real database, virtual meters by full AC power flow."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cbor2
+import httpx
+import numpy as np
+import pytest
+
+from feeders.load import Site, from_tables, load
+from feeders.meters import Channel, Silence
+from feeders.scenario import Sample, Scenario, random_attacks, simulate
+from feeders.schema import to_json, write
+from service.simulate import Pace, key_of, payload_of, play
+from tests.service.running import FEEDER, InProcess, service, until
+
+START = 1_795_212_000.0
+STEP = Pace(float("inf"), ahead=3)
+
+
+@pytest.fixture(scope="module")
+def site() -> Site:
+    return load(FEEDER)
+
+
+def run(live: InProcess, site: Site, scenario: Scenario) -> list[Sample]:
+    """Play a scenario in step with the service and wait until it has seen the end."""
+    samples = list(play(site, scenario, live.meters, STEP))
+    until(lambda: live.state(site.feeder.name).get("t", 0.0) >= samples[-1].t - 2 * scenario.dt_s, "the end")
+    return samples
+
+
+def variant(site: Site, folder: Path, **monitor: Any) -> Site:
+    """Write a variant of a feeder into a folder and load it."""
+    meta = replace(site.tables.meta, monitor=replace(site.tables.meta.monitor, **monitor))
+    write(replace(site.tables, meta=meta), folder)
+    return load(folder)
+
+
+def test_from_readings_to_the_right_alarm_and_back(site: Site, tmp_path: Path) -> None:
+    attacks = random_attacks(site, 5, "scaling", 2, 0.03, t_on=START + 20, t_off=START + 40)
+    scenario = Scenario(seed=4, start=START, duration_s=80.0, attacks=attacks)
+    with service(tmp_path, clock="events") as live:
+        events: list[tuple[str, dict[str, Any]]] = []
+        listening = threading.Event()
+        listener = threading.Thread(target=lambda: _listen(live, events, listening))
+        listener.start()
+        assert listening.wait(10.0)
+        samples = list(play(site, scenario, live.meters, STEP))
+        lying = {site.meter_ids[k] for k in np.flatnonzero(samples[25].manipulated)}
+        alarms = until(lambda: _all_cleared(live))
+        assert {a["meter"] for a in alarms} == lying
+        assert {a["kind"] for a in alarms} == {"meter-manipulated"}
+        for alarm in alarms:
+            assert START + 20 <= alarm["t_event"] <= alarm["t_raised"] <= START + 25
+            assert START + 40 <= alarm["t_cleared"] <= START + 52
+            k = site.meter_ids.index(alarm["meter"])
+            true = samples[22].v_volt[site.meters[k]]
+            assert alarm["evidence"]["v_volt_estimated"] == pytest.approx(true, abs=0.003 * 230.94)
+            assert abs(alarm["evidence"]["attack_volt_estimated"]) > 0.02 * 230.94
+        assert live.state()["verdict"] == "clean"
+        assert json.loads(live.meters.query(f"{FEEDER}/estimate", 2.0)[f"gridsec/{FEEDER}/estimate"])[
+            "t"
+        ] >= (samples[-1].t - 2.0)
+        assert live.meters.query(f"{FEEDER}/alarm/*", 2.0) == {}
+        until(lambda: len([1 for kind, _ in events if kind == "alarm"]) >= 4, "events of both alarms")
+        assert [e["change"] for kind, e in events if kind == "alarm"] == ["raised"] * 2 + ["cleared"] * 2
+        assert live.metric("gridsec_readings_total", outcome="accepted") == 14 * 80
+        assert live.metric("gridsec_readings_lost_total") == 0
+    listener.join(5.0)
+    assert not listener.is_alive()
+
+
+def _all_cleared(live: InProcess) -> list[dict[str, Any]]:
+    alarms = live.alarms()
+    return alarms if alarms and all(a["state"] == "cleared" for a in alarms) else []
+
+
+def _listen(live: InProcess, events: list[tuple[str, dict[str, Any]]], listening: threading.Event) -> None:
+    base = str(live.http.base_url).rstrip("/")
+    with httpx.stream("GET", f"{base}/api/v1/alarms/stream", timeout=30.0) as stream:
+        kind = ""
+        listening.set()
+        for line in stream.iter_lines():
+            if line.startswith("event:"):
+                kind = line[6:].strip()
+            elif line.startswith("data:"):
+                events.append((kind, json.loads(line[5:])))
+
+
+def test_acknowledged_published_and_found_by_query(site: Site, tmp_path: Path) -> None:
+    attacks = random_attacks(site, 6, "bias", 1, 0.03, t_on=START + 10, t_off=START + 1000)
+    with service(tmp_path, clock="events") as live:
+        run(live, site, Scenario(seed=4, start=START, duration_s=25.0, attacks=attacks))
+        (alarm,) = live.alarms()
+        key = f"gridsec/{FEEDER}/alarm/{alarm['id']}"
+        assert json.loads(live.meters.query(f"{FEEDER}/alarm/*", 2.0)[key]) == alarm
+        answer = live.http.post(f"/api/v1/alarms/{alarm['id']}/ack", json={"who": "Ada", "comment": "seen"})
+        assert answer.status_code == 200, answer.text
+        assert (answer.json()["state"], answer.json()["acknowledged_by"]) == ("acknowledged", "Ada")
+        assert live.alarms() == [answer.json()]
+        until(lambda: json.loads(live.meters.query(f"{FEEDER}/alarm/*", 2.0)[key]) == answer.json())
+        again = live.http.post(f"/api/v1/alarms/{alarm['id']}/ack", json={"who": "Bob"})
+        assert again.status_code == 409
+    with service(tmp_path, clock="events") as live:
+        assert live.alarms() == [answer.json()]
+        assert json.loads(live.meters.query(f"{FEEDER}/alarm/*", 2.0)[key]) == answer.json()
+
+
+BAD = {
+    "syntax": (f"{FEEDER}/meter/m01/reading", b'{"t": 1795212001.0, "v_volt": 230', "application/json"),
+    "type": (f"{FEEDER}/meter/m01/reading", b'{"t": "now", "v_volt": "230"}', "application/json"),
+    "value": (f"{FEEDER}/meter/m01/reading", b'{"t": 1795212001.0, "v_volt": NaN}', "application/json"),
+    "oversize": (f"{FEEDER}/meter/m01/reading", b"x" * (1 << 20), "application/json"),
+    "empty": (f"{FEEDER}/concentrator/k1/readings", b"[]", "application/json"),
+    "encoding": (f"{FEEDER}/meter/m01/reading", b"1", "image/png"),
+    "unknown-meter": (f"{FEEDER}/meter/m99/reading", b'{"t": 1795212001.0, "v_volt": 230}', ""),
+    "unknown-feeder": ("nowhere/meter/m01/reading", b'{"t": 1795212001.0, "v_volt": 230}', ""),
+    "key": (f"{FEEDER}/meter/*/reading", b'{"t": 1795212001.0, "v_volt": 230}', ""),
+    "clock-off": (f"{FEEDER}/meter/m01/reading", b'{"t": 1795912001.0, "v_volt": 230}', ""),
+}
+
+
+def test_nothing_malformed_stops_the_service(site: Site, tmp_path: Path) -> None:
+    with service(tmp_path, clock="events") as live:
+        run(live, site, Scenario(seed=1, start=START, duration_s=5.0))
+        for key, payload, encoding in BAD.values():
+            live.put(key, payload, encoding)
+        for reason in BAD:
+            until(
+                lambda reason=reason: live.metric("gridsec_bad_readings_total", reason=reason) == 1.0, reason
+            )
+        kept = {r["reason"].partition(":")[0]: r for r in live.rejected()}
+        assert set(kept) == set(BAD)
+        assert "v_volt = nan" in kept["value"]["reason"]
+        assert "t is a string" in kept["type"]["reason"]
+        assert "v_volt is a string" in kept["type"]["reason"]
+        assert "1048576 bytes" in kept["oversize"]["reason"]
+        assert kept["unknown-feeder"]["key"] == "gridsec/nowhere/meter/m01/reading"
+        run(live, site, Scenario(seed=1, start=START + 5.0, duration_s=10.0))
+        assert live.state()["verdict"] == "clean"
+        assert live.http.get("/readyz").status_code == 200
+        assert live.alarms() == []
+
+
+def test_concentrators(site: Site, tmp_path: Path) -> None:
+    """A concentrator's columns give the same estimates as single readings."""
+    states = []
+    for name in ("single", "columns"):
+        folder = tmp_path / name
+        folder.mkdir()
+        with service(folder, clock="events") as live:
+            for sample in simulate(site, Scenario(seed=2, start=START, duration_s=5.0)):
+                _send(live, sample, together=name == "columns")
+            until(lambda live=live: live.state().get("t", 0.0) >= START + 4.0)
+            states.append(live.state())
+    assert states[0] == states[1]
+    assert states[0]["verdict"] == "clean"
+
+
+def _send(live: InProcess, sample: Sample, *, together: bool) -> None:
+    rows = [r for r in sample.readings if r.meter]
+    for r in sample.readings:
+        if not (r.meter and together):
+            live.put(key_of(FEEDER, r.meter), payload_of(r))
+    if together:
+        names = ("meter", "t", "seq", "v_volt", "p_kw", "q_kvar")
+        columns = {name: [getattr(r, name) for r in rows] for name in names}
+        live.put(f"{FEEDER}/concentrator/k1/readings", cbor2.dumps(columns), "application/cbor")
+
+
+def test_a_silent_meter_is_data_loss_and_never_clean(site: Site, tmp_path: Path) -> None:
+    mute = site.meter_ids[4]
+    channel = Channel(silences=(Silence(mute, START + 10, START + 40),))
+    verdicts = []
+    with service(tmp_path, clock="events") as live:
+        for sample in play(
+            site, Scenario(seed=3, start=START, duration_s=70.0, channel=channel), live.meters, STEP
+        ):
+            state = live.state()
+            if state and sample.t - START > 12:
+                verdicts.append((state["t"] - START, state["verdict"]))
+        (alarm,) = until(lambda: _all_cleared(live))
+    assert (alarm["kind"], alarm["meter"]) == ("data-loss", mute)
+    assert START + 20 <= alarm["t_raised"] <= START + 24
+    assert START + 40 <= alarm["t_cleared"] <= START + 48
+    assert {v for t, v in verdicts if 13 <= t < 39.5} == {"undecided"}
+    assert verdicts[-1][1] == "clean"
+
+
+def test_readings_every_quarter_of_an_hour(site: Site, tmp_path: Path) -> None:
+    slow = variant(site, tmp_path / "slow", tick_s=900.0, on_delay_s=0.0, off_delay_s=900.0)
+    start = START - START % 900.0
+    attacks = random_attacks(slow, 7, "bias", 2, 0.03, t_on=start + 20 * 900, t_off=start + 40 * 900)
+    with service(tmp_path, [str(tmp_path / "slow")], clock="events") as live:
+        samples = run(
+            live, slow, Scenario(seed=8, start=start, duration_s=60 * 900.0, dt_s=900.0, attacks=attacks)
+        )
+        lying = {slow.meter_ids[k] for k in np.flatnonzero(samples[25].manipulated)}
+        alarms = until(lambda: _all_cleared(live))
+        assert {a["meter"] for a in alarms} == lying
+        assert all(a["t_raised"] <= start + 21 * 900 for a in alarms)
+        assert live.metric("gridsec_ticks_total", verdict="undecided") <= 3
+
+
+def test_wall_clock(site: Site, tmp_path: Path) -> None:
+    """Readings in real time: reports follow within a fraction of a second; old ones are refused."""
+    start = float(int(time.time())) + 1.0
+    with service(tmp_path) as live:
+        assert live.http.get("/healthz").status_code == 200
+        time.sleep(max(0.0, start - time.time()))
+        for sample in play(site, Scenario(seed=9, start=start, duration_s=6.0), live.meters, Pace(1.0)):
+            until(lambda t=sample.t: live.state().get("t", 0.0) >= t, patience_s=0.9)
+        assert live.state()["verdict"] == "clean"
+        live.put(f"{FEEDER}/meter/m01/reading", {"t": start - 3600.0, "v_volt": 230.0})
+        until(lambda: live.metric("gridsec_bad_readings_total", reason="clock-off") == 1.0)
+        assert live.metric("gridsec_report_delay_seconds_count") >= 6
+        # Nobody sends any more: reports go on, and none of them is clean for long.
+        until(lambda: live.state()["verdict"] == "undecided", patience_s=6.0)
+
+
+def test_feeders_over_rest(tmp_path: Path) -> None:
+    other = load("kerber-landnetz")
+    tables = to_json(other.tables)
+    wrong = to_json(other.tables)
+    wrong["feeder"]["voltage_volt"] = -1.0
+    wrong["customers"][0]["load_kw"] = "much"
+    wrong["customers"][1]["bus"] = "nowhere"
+    with service(tmp_path, clock="events") as live:
+        refused = live.http.put(f"/api/v1/feeders/{other.feeder.name}", json=wrong)
+        assert refused.status_code == 422
+        assert len(refused.json()["problems"]) >= 3
+        misplaced = live.http.put("/api/v1/feeders/elsewhere", json=tables)
+        assert misplaced.status_code == 422
+        answer = live.http.put(f"/api/v1/feeders/{other.feeder.name}", json=tables)
+        assert answer.status_code == 200, answer.text
+    with service(tmp_path, clock="events") as live:
+        names = {f["name"] for f in live.get("/api/v1/feeders")["feeders"]}
+        assert names == {FEEDER, other.feeder.name}
+        run(live, other, Scenario(seed=1, start=START, duration_s=8.0))
+        assert live.state(other.feeder.name)["verdict"] == "clean"
+        detail = live.get(f"/api/v1/feeders/{other.feeder.name}")
+        assert from_tables(load("kerber-landnetz").tables).digest == other.digest
+        assert len(detail["layout"]["parent"]) == len(detail["layout"]["buses"]) == len(other.feeder.buses)
+
+
+@pytest.fixture
+def impossible(site: Site, tmp_path: Path) -> Iterator[Path]:
+    """A feeder that asks for more than 13 meters can give: N > 2 M does not hold."""
+    meta = replace(site.tables.meta, name="impossible")
+    meta = replace(meta, monitor=replace(meta.monitor, max_attacked=7))
+    write(replace(site.tables, meta=meta), tmp_path / "impossible")
+    yield tmp_path / "impossible"
+    shutil.rmtree(tmp_path / "impossible")
+
+
+def test_a_feeder_that_cannot_be_watched_is_undecided_and_stops_no_other(
+    site: Site, impossible: Path, tmp_path: Path
+) -> None:
+    with service(tmp_path, [FEEDER, str(impossible)], clock="events") as live:
+        run(live, site, Scenario(seed=1, start=START, duration_s=8.0))
+        assert live.state()["verdict"] == "clean"
+        for r in next(simulate(site, Scenario(seed=1, start=START))).readings:
+            live.put(key_of("impossible", r.meter), payload_of(r))
+        state = until(lambda: live.state("impossible"))
+        assert (state["verdict"], state["cause"]) == ("undecided", "design-invalid")
+        ready = live.http.get("/readyz")
+        assert ready.status_code == 503
+        assert "impossible" in ready.text
+        phases = {f["name"]: f["phase"] for f in live.get("/api/v1/feeders")["feeders"]}
+        assert phases == {FEEDER: "watching", "impossible": "failed"}

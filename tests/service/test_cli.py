@@ -1,0 +1,302 @@
+"""The command line as a user has it: processes, exit codes, one clear message instead of a traceback."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx
+import pytest
+
+from feeders.load import load
+from feeders.recording import read_recording
+from feeders.scenario import Scenario, random_attacks
+from service.demo import Outcome, verdict
+from service.ingest import BusConfig, Meters
+from service.simulate import Pace, play
+from tests.service.running import FEEDER, free_port, until
+
+ENVIRONMENT = {k: v for k, v in os.environ.items() if not k.startswith("GRIDSEC_")}
+CASES = Path(__file__).parents[1] / "cases"
+COMMAND = [sys.executable, "-c", "from service.cli import main; main()"]
+
+
+def gridsec(*arguments: str, env: dict[str, str] | None = None) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [*COMMAND, *arguments],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+        env=ENVIRONMENT | (env or {}),
+    )
+
+
+def refused(code: int, *arguments: str, env: dict[str, str] | None = None) -> str:
+    """Run something that must fail with a code, one message and no traceback; return the message."""
+    done = gridsec(*arguments, env=env)
+    assert done.returncode == code, done.stdout + done.stderr
+    assert "Traceback" not in done.stderr
+    assert done.stderr.count("gridsec:") == 1
+    return done.stderr
+
+
+@contextmanager
+def serving(folder: Path, *options: str) -> Iterator[tuple[subprocess.Popen[str], str, str]]:
+    """Run `gridsec serve`; yields the process, its URL and its zenoh endpoint."""
+    zenoh = f"tcp/127.0.0.1:{free_port()}"
+    log = (folder / "log").open("w")
+    process = subprocess.Popen(
+        [*COMMAND, "serve", "--feeder", FEEDER, "--zenoh-listen", zenoh, "--http", "127.0.0.1:0",
+         "--database", f"sqlite:///{folder / 'gridsec.db'}", *options],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True,
+        env=ENVIRONMENT,
+    )  # fmt: skip
+    try:
+        assert process.stdout is not None
+        url = process.stdout.readline().strip()
+        assert url.startswith("http://"), (folder / "log").read_text()
+        until(lambda: httpx.get(f"{url}/readyz").status_code == 200)
+        yield process, url, zenoh
+    finally:
+        process.kill()
+        process.wait()
+        for pipe in (process.stdin, process.stdout, log):
+            if pipe is not None:
+                pipe.close()
+
+
+def ended(process: subprocess.Popen[str]) -> float:
+    """Wait for the end; return how long it took, s."""
+    begin = time.monotonic()
+    process.wait(timeout=10.0)
+    return time.monotonic() - begin
+
+
+# --- errors -----------------------------------------------------------------------------------------
+
+
+def test_an_http_port_in_use(tmp_path: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        address = f"127.0.0.1:{taken.getsockname()[1]}"
+        message = refused(
+            5, "serve", "--feeder", FEEDER, "--http", address,
+            "--zenoh-listen", f"tcp/127.0.0.1:{free_port()}", "--database", f"sqlite:///{tmp_path / 'a.db'}",
+        )  # fmt: skip
+    assert f"HTTP cannot listen on {address}: Address already in use" in message
+
+
+def test_a_zenoh_port_in_use(tmp_path: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        end = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+        message = refused(
+            5, "serve", "--feeder", FEEDER, "--http", "127.0.0.1:0", "--zenoh-listen", end,
+            "--database", f"sqlite:///{tmp_path / 'a.db'}",
+        )  # fmt: skip
+    assert end in message
+    assert "Address already in use" in message
+
+
+def test_a_database_that_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "folder.db").mkdir()
+    for url in ("sqlite:////proc/gridsec.db", f"sqlite:///{tmp_path}/folder.db", "mysql://x", "what"):
+        assert url in refused(4, "serve", "--feeder", FEEDER, "--database", url)
+
+
+def test_a_database_that_another_service_writes(tmp_path: Path) -> None:
+    with serving(tmp_path):
+        database = f"sqlite:///{tmp_path / 'gridsec.db'}"
+        assert "gridsec.db" in refused(4, "serve", "--feeder", FEEDER, "--database", database)
+
+
+def test_a_feeder_with_five_mistakes() -> None:
+    folder = CASES / "broken" / "five-mistakes"
+    expected = (folder / "problems.txt").read_text().splitlines()
+    assert len(expected) == 5
+    for command in (["serve", "--feeder", str(folder)], ["feeders", "validate", str(folder)]):
+        message = refused(3, *command)
+        assert "5 problems" in message
+        for problem in expected:
+            assert problem in message
+
+
+def test_unknown_feeders_are_all_named() -> None:
+    message = refused(3, "serve", "--feeder", "atlantis", "--feeder", "utopia", "--feeder", FEEDER)
+    assert "2 problems" in message
+    assert "atlantis" in message
+    assert "utopia" in message
+
+
+def test_wrong_settings_are_all_named() -> None:
+    message = refused(2, "serve", "--http", "nowhere", env={"GRIDSEC_CLOCK": "sundial"})
+    assert "--http or GRIDSEC_HTTP" in message
+    assert "--clock or GRIDSEC_CLOCK" in message
+
+
+def test_nobody_to_connect_to() -> None:
+    end = f"tcp/127.0.0.1:{free_port()}"
+    assert end in refused(5, "simulate", FEEDER, "--connect", end, "--duration", "1")
+
+
+def test_no_recording(tmp_path: Path) -> None:
+    file = tmp_path / "notes.parquet"
+    file.write_text("no parquet")
+    assert "notes.parquet" in refused(6, "replay", str(file))
+    assert "missing.parquet" in refused(6, "replay", str(tmp_path / "missing.parquet"))
+    assert "folder" in refused(
+        6, "simulate", FEEDER, "--duration", "2", "--out", str(tmp_path / "folder/x.parquet")
+    )
+
+
+def test_wrong_usage() -> None:
+    done = gridsec("simulate", FEEDER, "--attack", "bias:2", "--out", "x")
+    assert done.returncode == 2
+    assert "kind:count:size:from:to" in done.stderr
+    assert gridsec("demo", "--duration", "1").returncode == 2
+
+
+def test_conversion_of_nothing(tmp_path: Path) -> None:
+    assert "nonsense" in refused(1, "convert", "pandapower:nonsense", str(tmp_path / "x"))
+
+
+# --- work ---------------------------------------------------------------------------------------------
+
+
+def test_feeders() -> None:
+    listed = gridsec("feeders", "list").stdout
+    assert all(name in listed for name in ("simbench-lv-rural1", "kerber-dorfnetz", "case33bw"))
+    shown = gridsec("feeders", "show", FEEDER).stdout
+    assert "13 customers, 13 meters" in shown
+    valid = gridsec("feeders", "validate", str(CASES.parents[1] / "data/feeders" / FEEDER))
+    assert (valid.returncode, "valid" in valid.stdout) == (0, True)
+
+
+def test_a_feeder_converted_is_a_feeder(tmp_path: Path) -> None:
+    pytest.importorskip("pandapower")
+    folder = tmp_path / "landnetz"
+    done = gridsec("convert", "kerber-landnetz", str(folder))
+    assert done.returncode == 0, done.stderr
+    assert gridsec("feeders", "validate", str(folder)).returncode == 0
+    assert load(folder).feeder.name == "kerber-landnetz"
+
+
+def test_a_recording_replayed_names_the_liars(tmp_path: Path) -> None:
+    file = tmp_path / "day.parquet"
+    made = gridsec(
+        "simulate", FEEDER, "--out", str(file), "--duration", "60", "--seed", "3", "--loss", "0.02",
+        "--attack", "bias:2:0.03:20:40", "--start", "1795212000",
+    )  # fmt: skip
+    assert made.returncode == 0, made.stderr
+    told = gridsec("replay", str(file), "--json")
+    assert told.returncode == 0, told.stderr
+    transitions = [json.loads(line) for line in told.stdout.splitlines()]
+    truth = read_recording(file).truth()
+    lying = {load(FEEDER).meter_ids[k] for k in truth.manipulated.any(axis=0).nonzero()[0]}
+    assert len(lying) == 2
+    for change in ("raised", "cleared"):
+        assert {t["alarm"]["meter"] for t in transitions if t["change"] == change} == lying
+    summary = gridsec("replay", str(file)).stdout
+    assert "never arrived" in summary
+    assert "attacked" in summary
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_service_in_time_even_with_a_stream_open(number: int, tmp_path: Path) -> None:
+    with serving(tmp_path) as (process, url, zenoh):
+        with (
+            Meters(BusConfig("client", connect=(zenoh,)), "gridsec"),
+            httpx.stream("GET", f"{url}/api/v1/alarms/stream", timeout=10.0) as stream,
+        ):
+            assert stream.status_code == 200
+            process.send_signal(number)
+            assert ended(process) < 3.0
+        assert process.returncode == 0
+        assert "Traceback" not in (tmp_path / "log").read_text()
+
+
+def test_the_service_of_a_starter_that_has_gone_ends(tmp_path: Path) -> None:
+    with serving(tmp_path, "--until-eof") as (process, _url, _zenoh):
+        assert process.stdin is not None
+        process.stdin.close()
+        assert ended(process) < 3.0
+        assert process.returncode == 0
+
+
+def test_an_acknowledged_alarm_survives_kill_9(tmp_path: Path) -> None:
+    site = load(FEEDER)
+    start = 1_795_212_000.0
+    attacks = random_attacks(site, 2, "bias", 1, 0.03, t_on=start + 10, t_off=start + 1e6)
+    scenario = Scenario(seed=1, start=start, duration_s=30.0, attacks=attacks)
+    with serving(tmp_path, "--clock", "events") as (process, url, zenoh):
+        with Meters(BusConfig("client", connect=(zenoh,)), "gridsec") as meters:
+            for _ in play(site, scenario, meters, Pace(float("inf"), ahead=3)):
+                pass
+            (alarm,) = until(lambda: httpx.get(f"{url}/api/v1/alarms").json()["alarms"])
+            answer = httpx.post(f"{url}/api/v1/alarms/{alarm['id']}/ack", json={"who": "Ada"})
+            process.kill()
+            process.wait()
+        assert answer.status_code == 200
+        assert answer.json()["state"] == "acknowledged"
+    with serving(tmp_path, "--clock", "events") as (_process, url, zenoh):
+        assert httpx.get(f"{url}/api/v1/alarms").json()["alarms"] == [answer.json()]
+        events = httpx.get(f"{url}/api/v1/alarms/{alarm['id']}/events").json()["events"]
+        assert [e["change"] for e in events] == ["raised", "acknowledged"]
+        # Still lying: the same alarm stands, no second one is raised.
+        with Meters(BusConfig("client", connect=(zenoh,)), "gridsec") as meters:
+            later = Scenario(seed=1, start=start + 30.0, duration_s=20.0, attacks=attacks)
+            for _ in play(site, later, meters, Pace(float("inf"), ahead=3)):
+                pass
+        assert [a["id"] for a in httpx.get(f"{url}/api/v1/alarms").json()["alarms"]] == [alarm["id"]]
+
+
+def test_simulate_onto_zenoh_in_step_with_a_service(tmp_path: Path) -> None:
+    with serving(tmp_path, "--clock", "events") as (_process, url, zenoh):
+        done = gridsec(
+            "simulate", FEEDER, "--connect", zenoh, "--duration", "120", "--speed", "0", "--lockstep", "3",
+            "--start", "1795212000",
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        assert "120 ticks" in done.stdout
+        until(lambda: httpx.get(f"{url}/api/v1/feeders/{FEEDER}/state").json()["t"] >= 1_795_212_000.0 + 118)
+        assert 'outcome="accepted"} 1680.0' in httpx.get(f"{url}/metrics").text
+
+
+@pytest.mark.slow
+def test_demo_shows_and_checks() -> None:
+    """A short demo; the port of the web page is taken, so it has to find another."""
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        address = f"127.0.0.1:{taken.getsockname()[1]}"
+        done = gridsec("demo", "--duration", "36", "--check", "--http", address, "--seed", "4")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "begin to lie" in done.stdout
+    assert "alarm: meter-manipulated" in done.stdout
+    assert f"http://{address}/" not in done.stdout
+
+
+def test_demo_fails_for_every_kind_of_mistake() -> None:
+    assert verdict(Outcome({"a", "b"}, {"a", "b"})) == ()
+    assert verdict(Outcome({"a", "b"}, {"a", "c"}, ["alarms still stand: undecided x"])) == (
+        "alarms still stand: undecided x",
+        "manipulated and not named: b",
+        "named and not manipulated: c",
+    )
+    assert verdict(Outcome()) == ("no meter was manipulated",)
+
+
+@pytest.mark.slow
+def test_demo_of_a_feeder_that_is_none() -> None:
+    assert "atlantis" in refused(3, "demo", "--feeder", "atlantis", "--duration", "30")

@@ -1,0 +1,299 @@
+"""Rounds over a real database: what is stored, what is kept when it cannot be, and what is published."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sqlite3
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from feeders.load import Site, load
+from feeders.scenario import Scenario, by_arrival, random_attacks, simulate
+from gridsec import monitor
+from service import store as store_module
+from service.alarms import AlarmState, AlarmUnknown, AlreadyAcknowledged
+from service.align import Clock
+from service.ingest import BusCounts, Sample
+from service.rounds import BAD_PER_ROUND, Rounds, RuntimeConfig
+from service.runtime import Runtime
+from service.simulate import key_of, payload_of
+from service.store import Store, StoreUnavailable
+from service.watch import Phase, design
+
+FEEDER = "simbench-lv-rural1"
+START = 1_795_212_000.0
+
+
+class Outlet:
+    """Keeps what is published; confirms it at once, or when told to."""
+
+    def __init__(self, *, confirms: bool = True) -> None:
+        self.failure: str | None = None
+        self.counts = BusCounts()
+        self.estimates: list[dict[str, Any]] = []
+        self.events: list[tuple[dict[str, Any], bool]] = []
+        self.answers: list[str] = []
+        self.confirms = confirms
+
+    def telemetry(self, key: str, payload: bytes) -> None:
+        assert key == f"{FEEDER}/estimate"
+        self.estimates.append(json.loads(payload))
+
+    def event(self, key: str, payload: bytes, *, last: bool, done: Callable[[], None] | None = None) -> bool:
+        alarm = json.loads(payload)
+        assert key == f"{FEEDER}/alarm/{alarm['id']}"
+        self.events.append((alarm, last))
+        if self.confirms and done is not None:
+            done()
+        return True
+
+    def answer(self, key: str, payload: bytes) -> None:
+        self.answers.append(f"{key} {json.loads(payload)['id']}")
+
+
+@pytest.fixture(scope="module")
+def site() -> Site:
+    return load(FEEDER)
+
+
+@pytest.fixture(scope="module")
+def attacked(site: Site) -> list[Sample]:
+    """Forty seconds with two liars from the tenth to the twentieth."""
+    attacks = random_attacks(site, 2, "bias", 2, 0.03, t_on=START + 10, t_off=START + 20)
+    scenario = Scenario(seed=1, start=START, duration_s=40.0, attacks=attacks)
+    return [
+        Sample(f"gridsec/{key_of(FEEDER, r.meter)}", payload_of(r), "", r.arrival, 1)
+        for r in by_arrival(simulate(site, scenario))
+    ]
+
+
+def rounds(
+    store: Store, site: Site, outlet: Outlet | None = None, stored: Callable[[], None] = lambda: None
+) -> Rounds:
+    made = Rounds(RuntimeConfig(clock=Clock.EVENTS), store, [site], wall=lambda: START, stored=stored)
+    made.publisher = outlet
+    made.watches[FEEDER].install(design(site))
+    made.begin()
+    return made
+
+
+def until(samples: list[Sample], t: float) -> tuple[list[Sample], list[Sample]]:
+    return [s for s in samples if s.arrival < START + t], [s for s in samples if s.arrival >= START + t]
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "gridsec.db"
+
+
+@pytest.fixture
+def locked(path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], sqlite3.Connection]]:
+    """Let somebody else hold the database's lock, as a backup gone wrong would."""
+    monkeypatch.setattr(store_module, "WAIT_S", 0.1)
+    open_ones: list[sqlite3.Connection] = []
+
+    def lock() -> sqlite3.Connection:
+        other = sqlite3.connect(path, isolation_level=None)
+        other.execute("BEGIN IMMEDIATE")
+        open_ones.append(other)
+        return other
+
+    yield lock
+    for one in open_ones:
+        one.close()
+
+
+def test_alarms_are_stored_before_they_are_published(site: Site, attacked: list[Sample], path: Path) -> None:
+    outlet, woken = Outlet(), []
+    with Store(f"sqlite:///{path}") as store:
+        live = rounds(store, site, outlet, stored=lambda: woken.append(store.last_event))
+        before, after = until(attacked, 15.0)
+        live.round(before)
+        assert [a["state"] for a, _ in outlet.events] == ["raised", "raised"]
+        assert {a["id"] for a, _ in outlet.events} == {a.id for a in store.active(FEEDER)}
+        assert woken
+        live.round(after)
+        assert [(a["state"], last) for a, last in outlet.events[2:]] == [("cleared", True)] * 2
+        live.round([])
+        assert store.outbox_pending() == []
+        assert [e["t"] for e in outlet.estimates] == [START + k for k in range(len(outlet.estimates))]
+        assert len(outlet.estimates) >= 39
+
+
+def test_what_was_not_published_is_published_after_a_restart(
+    site: Site, attacked: list[Sample], path: Path
+) -> None:
+    with Store(f"sqlite:///{path}") as store:
+        rounds(store, site, Outlet(confirms=False)).round(until(attacked, 15.0)[0])
+        assert len(store.outbox_pending()) == 2
+    outlet = Outlet()
+    with Store(f"sqlite:///{path}") as store:
+        live = rounds(store, site, outlet)
+        assert [a["state"] for a, _ in outlet.events] == ["raised", "raised"]
+        assert len(outlet.answers) == 2
+        live.round([])
+        assert store.outbox_pending() == []
+        # The alarms are known: the attack that goes on raises no new ones.
+        live.round(until(attacked, 15.0)[1])
+        assert len(store.alarms()[0]) == 2
+
+
+def test_a_database_that_goes_away_and_comes_back_loses_nothing(
+    site: Site,
+    attacked: list[Sample],
+    path: Path,
+    locked: Callable[[], sqlite3.Connection],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("service.rounds.RETRY_S", 0.0)
+    outlet = Outlet()
+    with Store(f"sqlite:///{path}") as store:
+        live = rounds(store, site, outlet)
+        before, rest = until(attacked, 8.0)
+        live.round(before)
+        assert live.store_problem is None
+        other = locked()
+        during, after = until(rest, 30.0)
+        for k in range(0, len(during), 100):
+            live.round(during[k : k + 100])
+        assert live.store_problem is not None
+        assert "locked" in live.store_problem
+        assert outlet.events == []
+        assert live.watches[FEEDER].book.alarms
+        assert outlet.estimates[-1]["t"] >= START + 28
+        with pytest.raises(StoreUnavailable):
+            live.acknowledge(live.watches[FEEDER].book.alarms[0].id, "Ada", "")
+        assert all(a.state is not AlarmState.ACKNOWLEDGED for a in live.watches[FEEDER].book.alarms)
+        other.close()
+        live.round(after)
+        assert live.store_problem is None
+        assert [a["state"] for a, _ in outlet.events] == ["raised"] * 2 + ["cleared"] * 2
+        assert len(store.alarms()[0]) == 2
+        stored = [e.t for e in store.events_after(0)]
+        assert max(stored) - min(stored) > 8.0
+        metrics = live.metrics.exposition().decode()
+        assert "gridsec_store_failures_total 0.0" not in metrics
+        assert "gridsec_transitions_unstored 0.0" in metrics
+
+
+def test_an_idle_service_notices_that_the_database_is_back(
+    site: Site,
+    attacked: list[Sample],
+    path: Path,
+    locked: Callable[[], sqlite3.Connection],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("service.rounds.RETRY_S", 0.0)
+    with Store(f"sqlite:///{path}") as store:
+        live = rounds(store, site)
+        other = locked()
+        live.round(until(attacked, 5.0)[0])
+        live.round([])
+        assert live.store_problem is not None
+        other.close()
+        live.round([])
+        assert live.store_problem is None
+
+
+def test_acknowledgements(site: Site, attacked: list[Sample], path: Path) -> None:
+    outlet = Outlet()
+    with Store(f"sqlite:///{path}") as store:
+        live = rounds(store, site, outlet)
+        live.round(until(attacked, 15.0)[0])
+        first, second = (a.id for a in store.active(FEEDER))
+        assert live.acknowledge(first, "Ada", "on my way")["acknowledged_by"] == "Ada"
+        with pytest.raises(AlreadyAcknowledged):
+            live.acknowledge(first, "Bob", "")
+        with pytest.raises(AlarmUnknown):
+            live.acknowledge("0" * 26, "Ada", "")
+        live.round(until(attacked, 15.0)[1])
+    with Store(f"sqlite:///{path}") as store:
+        # The feeder is not watched any more: the store alone knows its alarm.
+        live = Rounds(RuntimeConfig(), store, [], wall=lambda: START + 100, stored=lambda: None)
+        live.publisher = outlet
+        live.begin()
+        known = store.alarm(second)
+        assert known is not None
+        assert known.state is AlarmState.CLEARED
+        assert live.acknowledge(second, "Bob", "")["acknowledged_by"] == "Bob"
+        assert outlet.events[-1][0]["acknowledged_by"] == "Bob"
+
+
+def test_a_flood_of_bad_readings_is_counted_in_full_and_stored_in_part(site: Site, path: Path) -> None:
+    flood = [Sample(f"gridsec/{FEEDER}/meter/m01/reading", b"{", "", START, 1)] * 400
+    with Store(f"sqlite:///{path}") as store:
+        live = rounds(store, site)
+        live.round(flood)
+        assert len(store.rejected(1000)) == BAD_PER_ROUND
+        assert f'gridsec_bad_readings_total{{feeder="{FEEDER}",reason="syntax"}} 400.0' in (
+            live.metrics.exposition().decode()
+        )
+
+
+def test_a_defect_in_one_feeder_s_monitor_is_shown_and_blinds_no_other(
+    site: Site, attacked: list[Sample], path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError("a defect")
+
+    outlet = Outlet()
+    with Store(f"sqlite:///{path}") as store:
+        live = rounds(store, site, outlet)
+        other = live.add(load("kerber-landnetz"))
+        other.install(design(other.site))
+        before, after = until(attacked, 5.0)
+        live.round(before)
+        with monkeypatch.context() as patch:
+            patch.setattr(monitor, "step", broken)
+            live.round(after[:100])
+        live.round(after[100:])
+        watch = live.watches[FEEDER]
+        assert watch.phase is Phase.FAILED
+        assert "a defect" in watch.problem
+        assert other.phase is Phase.WATCHING
+        assert outlet.estimates[-1]["cause"] == "design-invalid"
+        assert outlet.estimates[-1]["verdict"] == "undecided"
+
+
+def test_the_task_ends_cleanly_and_refuses_commands_afterwards(site: Site, path: Path) -> None:
+    async def scene(store: Store) -> None:
+        runtime = Runtime(RuntimeConfig(clock=Clock.EVENTS), store, [site])
+        assert not runtime.ready()[0]
+        task = asyncio.create_task(runtime.run())
+        while not runtime.ready()[0]:  # noqa: ASYNC110 - readiness is what is tested
+            await asyncio.sleep(0.01)
+        assert runtime.healthy() == (True, [])
+        wakes = runtime.subscribe()
+        waiting = asyncio.ensure_future(anext(wakes, None))
+        await asyncio.sleep(0)
+        with pytest.raises(AlarmUnknown):
+            await runtime.acknowledge("0" * 26, "Ada", "")
+        runtime.stop()
+        assert await waiting is None
+        await asyncio.wait_for(task, 2.0)
+        with pytest.raises(StoreUnavailable, match="stopping"):
+            await runtime.acknowledge("0" * 26, "Ada", "")
+
+    with Store(f"sqlite:///{path}") as store:
+        asyncio.run(scene(store))
+
+
+def test_a_dead_task_is_not_healthy(site: Site, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError("a defect")
+
+    async def scene(store: Store) -> None:
+        runtime = Runtime(RuntimeConfig(), store, [site])
+        monkeypatch.setattr(Rounds, "round", broken)
+        with pytest.raises(ZeroDivisionError):
+            await asyncio.wait_for(runtime.run(), 5.0)
+        alive, problems = runtime.healthy()
+        assert not alive
+        assert "a defect" in problems[0]
+
+    with Store(f"sqlite:///{path}") as store:
+        asyncio.run(scene(store))

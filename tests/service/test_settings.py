@@ -1,0 +1,69 @@
+"""Settings by command line and environment; every problem at once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from service.align import Clock
+from service.settings import Settings, SettingsInvalid, settings, split_address
+
+
+@pytest.fixture(autouse=True)
+def _clean(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in Settings.model_fields:
+        monkeypatch.delenv(f"GRIDSEC_{name.upper()}", raising=False)
+
+
+def test_defaults() -> None:
+    found = settings({})
+    assert found.zenoh_listen == ("tcp/127.0.0.1:7447",)
+    assert (found.http, found.database, found.clock) == ("127.0.0.1:8000", "sqlite:///gridsec.db", Clock.WALL)
+
+
+def test_what_is_given_goes_before_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GRIDSEC_HTTP", "0.0.0.0:80")
+    monkeypatch.setenv("GRIDSEC_CLOCK", "events")
+    monkeypatch.setenv("GRIDSEC_FEEDERS", "one, two")
+    monkeypatch.setenv("GRIDSEC_GRACE_S", "0.25")
+    found = settings({"http": "[::1]:8001", "clock": None, "grace_s": None})
+    assert found.http == "[::1]:8001"
+    assert found.clock is Clock.EVENTS
+    assert found.feeders == ("one", "two")
+    assert found.grace_s == 0.25
+
+
+def test_every_problem_at_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("GRIDSEC_QUEUE", "few")
+    with pytest.raises(SettingsInvalid) as caught:
+        settings(
+            {
+                "http": "localhost",
+                "clock": "sundial",
+                "zenoh_listen": ("127.0.0.1:7447",),
+                "zenoh_config": tmp_path / "none.json5",
+                "max_skew_s": -1.0,
+                "prefix": "a//b",
+            }
+        )
+    problems = "\n".join(caught.value.problems)
+    assert len(caught.value.problems) == 7
+    for words in (
+        "--http or GRIDSEC_HTTP: 'localhost'",
+        "--clock or GRIDSEC_CLOCK",
+        "tcp/127.0.0.1:7447",
+        "none.json5 is no file",
+        "--max-skew or GRIDSEC_MAX_SKEW_S",
+        "--prefix or GRIDSEC_PREFIX",
+        "--queue or GRIDSEC_QUEUE",
+    ):
+        assert words in problems
+
+
+def test_addresses() -> None:
+    assert split_address("127.0.0.1:0") == ("127.0.0.1", 0)
+    assert split_address("[fe80::1]:65535") == ("fe80::1", 65535)
+    for wrong in ("", ":80", "host:", "host:65536", "host:-1", "host:8o", "host:²"):
+        with pytest.raises(ValueError, match="looks like"):
+            split_address(wrong)
