@@ -44,8 +44,8 @@ function trend(points, limits, nominal) {
 }
 
 function gauge(meter) {
-  const ratio = meter.score / meter.threshold;
-  if (!isKnown(ratio)) return el("p", { class: "quiet", text: "No score: the meter is silent." });
+  const ratio = isKnown(meter.score) && isKnown(meter.threshold) ? meter.score / meter.threshold : null;
+  if (!isKnown(ratio)) return el("p", { class: "quiet", text: "No score at this tick." });
   const words = ratio > 1
     ? `${ratio >= 10 ? Math.round(ratio) : ratio.toFixed(1)} times what an honest meter can reach`
     : `${Math.round(100 * ratio)} % of what an honest meter can reach`;

@@ -165,7 +165,7 @@ export class Diagram {
     const root = svg("svg", {
       width: extent[0], height: extent[1], viewBox: `0 0 ${extent[0]} ${extent[1]}`, role: "group",
       "aria-label": `One-line diagram, ${this.feeder.layout.customers.length} customers`,
-    }, svg("text", { class: "busbar-name", x: 8, y: 14, text: this.feeder.layout.buses[0] }));
+    }, svg("text", { class: "busbar-name", x: 8, y: 12, text: this.feeder.layout.buses[0] }));
     this.busbarName = root.firstChild;
     return { root, spots, wires };
   }
@@ -253,7 +253,7 @@ export class Diagram {
       part.group.classList.toggle("selected", id === this.selected);
     }
     if (this.busbarName) {
-      this.busbarName.textContent = `${buses[0]}  ${volt(this.volts.get(buses[0]))}`;
+      this.busbarName.textContent = `Busbar (${buses[0]}): ${volt(this.volts.get(buses[0]))}`;
     }
   }
 

@@ -24,10 +24,10 @@ export function oneLine(layout) {
   const heavier = (a, b) => weight[b] - weight[a] || depth[b] - depth[a] || a - b;
   const isDrop = (bus) => children[bus].length === 0;
 
-  // A block: items with rows counted from its own first row, and how far each row reaches.
+  // A block: items with rows counted from its own first row, and what each row has taken already.
   function block(start, x0) {
     const items = { buses: [], customers: [], lines: [] };
-    const reach = [[x0, x0]];
+    const taken = [];
     const branches = [];
     let x = x0;
     let before = null;
@@ -55,27 +55,20 @@ export function oneLine(layout) {
       for (const side of sides) branches.push({ side, x: first });
       bus = next;
     }
-    reach[0][1] = x - 1;
+    taken[0] = [[x0, x - 1]];
     // Those that branch off far out are placed first: no connector then crosses a row.
     for (const { side, x: from } of branches.reverse()) {
       const inner = block(side, from + 1);
+      const overlap = (a, row) => (taken[row] ?? []).some((b) => a[0] <= b[1] && b[0] <= a[1]);
+      const wider = inner.taken.map((row) => row.map(([a, b]) => [a - 1, b]));
       let offset = 1;
-      const clash = () =>
-        inner.reach.some((r, k) => {
-          const there = reach[offset + k];
-          return there && r[0] - 1 <= there[1] && there[0] <= r[1] + 1;
-        });
-      while (clash()) offset += 1;
+      while (wider.some((row, k) => row.some((a) => overlap(a, offset + k)))) offset += 1;
       merge(items, inner.items, offset);
       items.lines.push({ bus: side, x: from + 1, row: offset, x0: from, row0: 0 });
-      inner.reach.forEach((r, k) => {
-        const there = (reach[offset + k] ??= [r[0] - 1, r[1]]);
-        there[0] = Math.min(there[0], r[0] - 1);
-        there[1] = Math.max(there[1], r[1]);
-      });
-      for (let k = 1; k < offset; k += 1) reach[k] ??= [from, from];
+      wider.forEach((row, k) => (taken[offset + k] ??= []).push(...row));
+      for (let k = 1; k < offset; k += 1) (taken[k] ??= []).push([from, from]);
     }
-    return { items, reach };
+    return { items, taken };
   }
 
   function merge(items, inner, offset) {
@@ -98,8 +91,8 @@ export function oneLine(layout) {
     const inner = block(child, 1);
     merge(all, inner.items, row);
     all.lines.push({ bus: child, x: 1, row, x0: 0, row0: row });
-    columns = Math.max(columns, ...inner.reach.map((r) => r[1] + 1));
-    row += inner.reach.length;
+    columns = Math.max(columns, ...inner.taken.flat().map((span) => span[1] + 1));
+    row += inner.taken.length;
   }
   return { ...all, rows: Math.max(row, 1), columns };
 }

@@ -196,12 +196,12 @@ class SmallService:
 class Server:
     """The HTTP application of a SmallService on a free port of this machine, in a thread."""
 
-    def __init__(self, service: SmallService) -> None:
+    def __init__(self, service: SmallService, port: int = 0) -> None:
         self.service = service
         config = uvicorn.Config(
             create_api(service),
             host="127.0.0.1",
-            port=0,
+            port=port,
             log_level="critical",
             timeout_graceful_shutdown=1,
             lifespan="off",
@@ -256,8 +256,8 @@ def serve() -> Iterator[Callable[[SmallService], Server]]:
     """Serve services over HTTP; each server is stopped at the end."""
     made: list[Server] = []
 
-    def make(service: SmallService) -> Server:
-        made.append(Server(service))
+    def make(service: SmallService, port: int = 0) -> Server:
+        made.append(Server(service, port))
         return made[-1]
 
     yield make

@@ -1,0 +1,463 @@
+from __future__ import annotations
+
+import random
+import re
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from playwright.sync_api import Browser, Page, expect, sync_playwright
+
+from feeders.load import load, names
+from gridsec.online import Cause
+from service.describe import detail
+
+pytestmark = pytest.mark.browser
+
+T0 = 1_795_212_000.0
+FLAGS = [
+    *("--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"),
+    *("--disable-component-update", "--disable-sync"),
+]
+DESKTOP, PHONE = {"width": 1440, "height": 1000}, {"width": 390, "height": 844}
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    found = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if found is None:
+        pytest.skip("no Chromium on this machine")
+    with sync_playwright() as playwright:
+        made = playwright.chromium.launch(executable_path=found, args=FLAGS)
+        yield made
+        made.close()
+
+
+class Site:
+    """A served feeder, and pages that look at it and may neither complain nor call anywhere else."""
+
+    def __init__(self, browser: Browser, service: Any, serve: Callable[..., Any]) -> None:
+        self.browser, self.service, self.serve = browser, service, serve
+        self.server = serve(service)
+        self.village = next(iter(service.villages.values()))
+        self.complaints: list[str] = []
+        self.expected: str | None = None  # what the browser itself may complain about
+        self.pages: list[Page] = []
+
+    def tick(self, t: float, ticks: int = 1, **changes: Any) -> None:
+        for k in range(ticks):
+            self.service.tick(self.village.report(t + k, **changes))
+
+    def open(self, size: dict[str, int] | None = None, path: str = "/", **options: Any) -> Page:
+        context = self.browser.new_context(viewport=size or DESKTOP, **options)  # type: ignore[arg-type]
+        page = context.new_page()
+        page.set_default_timeout(10_000)
+        page.on("console", lambda m: self.complaints.append(m.text) if m.type == "error" else None)
+        page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        page.on("dialog", lambda dialog: self.complaints.append(f"dialog: {dialog.message}"))
+        page.on(
+            "request",
+            lambda r: None if r.url.startswith(self.server.url) else self.complaints.append(r.url),
+        )
+        page.goto(self.server.url + path)
+        self.pages.append(page)
+        return page
+
+    def close(self) -> None:
+        for page in self.pages:
+            page.context.close()
+
+
+@pytest.fixture
+def site_of(
+    browser: Browser, small_service: Callable[..., Any], serve: Callable[..., Any]
+) -> Iterator[Callable[..., Site]]:
+    made: list[Site] = []
+
+    def make(*villages: Any) -> Site:
+        made.append(Site(browser, small_service(*villages), serve))
+        return made[-1]
+
+    yield make
+    for site in made:
+        site.close()
+        wrong = [c for c in site.complaints if site.expected is None or site.expected not in c]
+        assert wrong == []
+
+
+@pytest.fixture
+def site(site_of: Callable[..., Site], village: type) -> Site:
+    return site_of(village())
+
+
+def real(village: type, name: str) -> Any:
+    """A village with the tree of a real feeder."""
+    made = village(name, 0)
+    made.detail = lambda: known
+    known = detail(load(name))
+    layout = known["layout"]
+    made.buses, made.parent, made.customers = layout["buses"], layout["parent"], layout["customers"]
+    made.meters = [c["meter"] for c in made.customers]
+    return made
+
+
+def customer(page: Page, name: str) -> Any:
+    return page.locator(f'#diagram .customer[aria-label^="{name}:"]')
+
+
+def fill_of(page: Page, name: str) -> tuple[int, int, int]:
+    page.wait_for_timeout(400)  # the colour fades over
+    text = customer(page, name).locator(".shape").evaluate("e => getComputedStyle(e).fill")
+    red, green, blue = map(int, re.findall(r"\d+", text)[:3])
+    return red, green, blue
+
+
+# ------------------------------------------------------------------- the verdict
+
+
+def test_a_clean_feeder(site: Site) -> None:
+    site.tick(T0, 3)
+    page = site.open()
+    expect(page.locator("#decision")).to_have_text("CLEAN")
+    expect(page.locator("#reason")).to_have_text("All meters agree with the feeder.")
+    expect(page.locator("#link")).to_have_text("live")
+    expect(page.locator('#diagram .customer[data-status="ok"]')).to_have_count(13)
+    expect(page.locator("#alarm-none")).to_be_visible()
+    expect(page).to_have_title("CLEAN – Village, 13 customers – gridsec")
+
+
+def test_before_the_first_tick_nothing_is_claimed(site: Site) -> None:
+    page = site.open()
+    expect(page.locator("#decision")).to_have_text("NO DATA")
+    expect(page.locator("#link")).to_have_text("waiting for data …")
+    site.tick(T0)
+    expect(page.locator("#decision")).to_have_text("CLEAN")
+
+
+def test_an_attack_shows_without_reloading(site: Site) -> None:
+    site.tick(T0, 3)
+    page = site.open()
+    expect(page.locator("#decision")).to_have_text("CLEAN")
+    site.tick(T0 + 3, 4, lies={"H3": 9.0, "H7": -7.5})
+    expect(page.locator("#decision")).to_have_text("ATTACKED")
+    expect(page.locator('#diagram .customer[data-status="suspect"]')).to_have_count(2)
+    expect(customer(page, "H3").locator(".sign")).to_have_text("!")
+    expect(customer(page, "H3").locator(".note")).to_have_text("+9.0")
+    assert page.locator(".chip").all_text_contents() == ["H3 +9.0 V", "H7 −7.5 V"]
+    expect(page.locator(".alarm")).to_have_count(2)
+    expect(page.locator(".alarm").first).to_contain_text("Meter manipulated")
+    site.tick(T0 + 7, 8)
+    expect(page.locator("#decision")).to_have_text("CLEAN")
+    expect(page.locator(".alarm")).to_have_count(0)
+    page.select_option("#alarm-state", "all")
+    expect(page.locator('.alarm[data-state="cleared"]')).to_have_count(2)
+
+
+def test_undecided_and_silent(site: Site) -> None:
+    site.tick(T0, 4, silent=("H5",))
+    page = site.open()
+    expect(page.locator("#decision")).to_have_text("UNDECIDED")
+    expect(page.locator("#reason")).to_have_text("No verdict: silent meters.")
+    expect(customer(page, "H5")).to_have_attribute("data-status", "silent")
+    expect(customer(page, "H5").locator(".sign")).to_have_text("?")
+    expect(page.locator(".chip")).to_have_text("H5 silent 12 s")
+    expect(page.locator(".alarm")).to_contain_text("Data loss")
+
+
+def test_limits_have_shapes(site: Site) -> None:
+    site.tick(T0, 1, volts={"H1": 255.0, "H2": 206.0})
+    page = site.open()
+    expect(customer(page, "H1")).to_have_attribute("data-status", "high")
+    expect(customer(page, "H2")).to_have_attribute("data-status", "low")
+    shapes = {
+        page.locator(f'#diagram .customer[data-status="{s}"] .shape').first.get_attribute("d")
+        for s in ("high", "low", "ok")
+    }
+    assert len(shapes) == 3
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_low_is_blue_and_high_is_orange(site: Site, scheme: str) -> None:
+    site.tick(T0, 1, volts={"H1": 222.0, "H2": 230.94, "H3": 240.0})
+    page = site.open(color_scheme=scheme)
+    expect(page.locator("#decision")).to_have_text("CLEAN")
+    low, middle, high = (fill_of(page, name) for name in ("H1", "H2", "H3"))
+    assert low[2] > low[0] + 60
+    assert high[0] > high[2] + 60
+    assert max(middle) - min(middle) < 30
+    ticks = page.locator("#scale .tick b").all_text_contents()
+    assert [float(text.removesuffix(" V")) for text in ticks] == pytest.approx(
+        [230.94 * k for k in (0.95, 0.975, 1, 1.025, 1.05)], abs=0.06
+    )
+    background = page.evaluate("getComputedStyle(document.body).backgroundColor")
+    assert (int(re.findall(r"\d+", background)[0]) < 60) is (scheme == "dark")
+
+
+# -------------------------------------------------------------------- one customer
+
+
+def test_a_customer_shows_what_its_meter_says_and_what_is_true(site: Site) -> None:
+    site.tick(T0, 40)
+    site.tick(T0 + 40, 5, lies={"H3": 9.0})
+    page = site.open()
+    box = customer(page, "H3")
+    box.hover()
+    report = site.service.report("village").meters[3]
+    expect(page.locator("#tip")).to_contain_text(f"meter says {report.v_volt_reported:.1f} V")
+    expect(page.locator("#tip")).to_contain_text(f"reconstructed {report.v_volt_estimated:.1f} V")
+    box.click()
+    panel = page.locator("#detail-card")
+    expect(panel).to_contain_text("suspect")
+    expect(panel).to_contain_text(f"{report.v_volt_reported:.2f} V")
+    expect(panel).to_contain_text(f"{report.v_volt_estimated:.2f} V")
+    expect(panel).to_contain_text("+9.00 V")
+    ratio = report.score / report.threshold
+    expect(panel).to_contain_text(f"{ratio:.1f} times what an honest meter can reach")
+    # The trend goes back into the stored history, to before the page was opened.
+    expect(panel.locator(".trend")).to_contain_text("44 s ago")
+    site.tick(T0 + 45, 1)
+    expect(panel).to_contain_text("of what an honest meter can reach")
+    page.locator("#unselect").click()
+    expect(panel).to_be_hidden()
+
+
+def test_the_diagram_works_by_keyboard(site: Site) -> None:
+    site.tick(T0)
+    page = site.open()
+    expect(page.locator("#diagram .customer")).to_have_count(13)
+    assert page.locator('#diagram .customer[tabindex="0"]').count() == 1
+    page.locator('#diagram .customer[tabindex="0"]').focus()
+    for _ in range(3):
+        page.keyboard.press("ArrowRight")
+    page.keyboard.press("Enter")
+    expect(page.locator("#detail-title")).to_have_text("H3")
+
+
+def test_all_meters_as_a_table_with_the_worst_first(site: Site) -> None:
+    site.tick(T0, 1, lies={"H9": 8.0}, silent=("H2",))
+    page = site.open()
+    expect(page.locator("#decision")).to_have_text("ATTACKED")
+    page.locator("#meters-box summary").click()
+    rows = page.locator("#meters tr")
+    expect(rows).to_have_count(13)
+    expect(rows.nth(0)).to_contain_text("H9")
+    expect(rows.nth(0)).to_contain_text("suspect")
+    expect(rows.nth(1)).to_contain_text("silent")
+    rows.nth(0).locator("button").click()
+    expect(page.locator("#detail-title")).to_have_text("H9")
+
+
+# ------------------------------------------------------------------------- alarms
+
+
+def test_an_alarm_is_acknowledged_with_a_name(site: Site) -> None:
+    site.tick(T0, 4, lies={"H3": 9.0})
+    page = site.open()
+    page.locator("button.ack").click()
+    page.locator("#ack-form .primary").click()  # no name: the form stays
+    expect(page.locator("#ack")).to_be_visible()
+    page.fill("#ack-who", "   ")
+    page.locator("#ack-form .primary").click()
+    expect(page.locator("#ack-error")).to_have_text("Please enter your name.")
+    page.fill("#ack-who", "Ada <b>")
+    page.fill("#ack-comment", "van sent")
+    page.locator("#ack-form .primary").click()
+    expect(page.locator("#ack")).to_be_hidden()
+    expect(page.locator(".alarm .answer")).to_have_text("Acknowledged by Ada <b>van sent")
+    expect(page.locator("button.ack")).to_have_count(0)
+    (alarm,) = site.service.store.alarms()[0]
+    assert (alarm.acknowledged_by, alarm.comment) == ("Ada <b>", "van sent")
+
+
+def test_the_second_operator_hears_who_was_first(site: Site) -> None:
+    site.tick(T0, 4, lies={"H3": 9.0})
+    one, two = site.open(), site.open()
+    two.locator("button.ack").click()
+    one.locator("button.ack").click()
+    one.fill("#ack-who", "Ada")
+    one.locator("#ack-form .primary").click()
+    expect(two.locator(".alarm .answer")).to_contain_text("Ada")  # it arrives behind the open dialogue
+    site.expected = "409"
+    two.fill("#ack-who", "Grace")
+    two.locator("#ack-form .primary").click()
+    expect(two.locator("#ack-error")).to_contain_text("already been acknowledged by Ada")
+
+
+def test_filters(site: Site, village: type) -> None:
+    town = village("town", 4)
+    site.service.villages["town"] = town
+    site.service.books["town"] = type(site.service.books["village"])("town")
+    site.tick(T0, 4, lies={"H3": 9.0}, silent=("H5",))
+    for k in range(4):
+        site.service.tick(town.report(T0 + k, lies={"H1": 5.0}))
+    page = site.open()
+    expect(page.locator(".alarm")).to_have_count(3)
+    page.select_option("#alarm-kind", "data-loss")
+    expect(page.locator(".alarm")).to_have_count(1)
+    page.select_option("#alarm-kind", "")
+    page.select_option("#alarm-scope", "this")
+    expect(page.locator(".alarm")).to_have_count(2)
+    page.select_option("#feeder", "town")
+    expect(page.locator(".alarm")).to_have_count(1)
+    page.select_option("#alarm-scope", "")
+    page.locator(".alarm a", has_text="H5 · village").click()
+    expect(page.locator("#detail-title")).to_have_text("H5")
+    expect(page.locator("#feeder")).to_have_value("village")
+
+
+def test_older_alarms_come_page_by_page(site: Site) -> None:
+    for k in range(12):
+        site.tick(T0 + 10_000 * k, 4, lies={f"H{i}": 8.0 for i in range(6)})
+        site.tick(T0 + 10_000 * k + 4, 8)
+    page = site.open()
+    page.select_option("#alarm-state", "all")
+    expect(page.locator(".alarm")).to_have_count(50)
+    page.locator("#alarm-more").click()
+    expect(page.locator(".alarm")).to_have_count(72)
+    expect(page.locator("#alarm-more")).to_be_hidden()
+
+
+# ------------------------------------------------------------ can it be believed?
+
+
+def test_a_lost_connection_is_said_and_healed(site: Site) -> None:
+    site.tick(T0, 4, lies={"H3": 9.0})
+    page = site.open()
+    expect(page.locator("#link")).to_have_text("live")
+    expect(page.locator(".alarm")).to_have_count(1)
+    site.expected = "net::ERR_"
+    site.server.stop()
+    expect(page.locator("#link")).to_contain_text("connection lost")
+    expect(page.locator("#decision")).to_have_text("NO LIVE DATA")
+    expect(page.locator("#reason")).to_contain_text("attacked")
+    expect(page.locator("#main")).to_have_attribute("data-fresh", "no")
+    site.tick(T0 + 4, 8)
+    site.server = site.serve(site.service, site.server.port)
+    expect(page.locator("#link")).to_have_text("live", timeout=20_000)
+    expect(page.locator("#decision")).to_have_text("CLEAN")
+    expect(page.locator(".alarm")).to_have_count(0)
+
+
+def test_old_data_is_not_shown_as_an_answer(site: Site) -> None:
+    site.tick(T0)
+    context = site.browser.new_context()
+    page = context.new_page()
+    page.clock.install()
+    page.goto(site.server.url)
+    expect(page.locator("#decision")).to_have_text("CLEAN")
+    page.clock.fast_forward(10_000)
+    expect(page.locator("#link")).to_contain_text("data stale")
+    expect(page.locator("#decision")).to_have_text("NO LIVE DATA")
+    expect(page.locator("#verdict")).to_have_attribute("data-verdict", "none")
+    site.tick(T0 + 1)
+    expect(page.locator("#decision")).to_have_text("CLEAN")
+    expect(page.locator("#link")).to_have_text("live")
+    context.close()
+
+
+# ------------------------------------------------------------ hostile and large
+
+
+def test_ids_are_text_and_nothing_else(site_of: Callable[..., Site], village: type) -> None:
+    evil = "\"><img src=x onerror=alert(1)><script>alert(2)</script>'"
+    site = site_of(village("village", 13, evil))
+    site.tick(T0, 4, lies={f"{evil}3": 9.0}, silent=(f"{evil}4",))
+    page = site.open()
+    expect(page.locator(".alarm")).to_have_count(2)
+    page.locator('#diagram .customer[data-status="suspect"]').click()
+    expect(page.locator("#detail-title")).to_have_text(f"{evil}3")
+    page.locator("#meters-box summary").click()
+    expect(page.locator("#meters tr")).to_have_count(13)
+    page.locator("button.ack").first.click()
+    assert page.locator("main img, dialog img, main script").count() == 0
+
+
+@pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
+def test_146_customers_can_be_told_apart(
+    site_of: Callable[..., Site], village: type, size: dict[str, int]
+) -> None:
+    site = site_of(real(village, "kerber-vorstadtnetz"))
+    suspects = {site.village.meters[k]: 8.0 for k in range(0, 144, 3)}
+    site.tick(T0, 1, lies=suspects, sag=0.3)
+    page = site.open(size)
+    expect(page.locator("#diagram .customer")).to_have_count(146)
+    expect(page.locator('#diagram .customer[data-status="suspect"]')).to_have_count(48)
+    boxes = page.locator("#diagram .customer .shape").evaluate_all(
+        "all => all.map(e => e.getBoundingClientRect()).map(r => [r.x, r.y, r.right, r.bottom])"
+    )
+    assert len(boxes) == 146
+    for k, (a_left, a_top, a_right, a_bottom) in enumerate(boxes):
+        assert a_right - a_left >= 13
+        for b_left, b_top, b_right, b_bottom in boxes[:k]:
+            assert a_right <= b_left or b_right <= a_left or a_bottom <= b_top or b_bottom <= a_top
+    # Only the diagram scrolls sideways, never the page.
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+
+
+def test_real_feeders_are_drawn_without_crossings(site: Site) -> None:
+    page = site.open()
+    layouts = [detail(load(name))["layout"] for name in names()]
+    draw = random.Random(7)
+    for size in (1, 2, 5, 30, 80):
+        parent = [None, *(draw.randrange(max(0, k - 6), k) for k in range(1, size))]
+        layouts.append(
+            {
+                "buses": [f"b{k}" for k in range(size)],
+                "parent": parent,
+                "customers": [
+                    {"customer": f"c{k}", "bus": f"b{draw.randrange(size)}", "meter": None}
+                    for k in range(size)
+                ],
+            }
+        )
+    for layout in layouts:
+        placed = page.evaluate("async l => (await import('/layout.js')).oneLine(l)", layout)
+        spots = placed["customers"]
+        named = sorted(c["customer"] for c in spots if c["customer"] is not None)
+        assert named == list(range(len(layout["customers"])))
+        cells = [(c["x"], c["row"]) for c in spots]
+        assert len(set(cells)) == len(cells)
+        for bus in placed["buses"]:
+            cells += [(bus["x"], bus["row"])] if bus["bare"] else []
+        drawn = {line["bus"] for line in placed["lines"]} | {c["bus"] for c in spots}
+        assert drawn >= set(range(1, len(layout["buses"])))
+        for line in placed["lines"]:
+            low, high = sorted((line["row0"], line["row"]))
+            if line["x0"] > 0:  # a connector from row to row meets nothing on its way down
+                assert not any(x == line["x0"] and low < row < high for x, row in cells)
+            assert line["x"] >= line["x0"]
+        # Two rows of one line never share a place.
+        spans = [(b["row"], b["x"], b["to"]) for b in placed["buses"]]
+        for k, (row, left, right) in enumerate(spans):
+            assert not any(r == row and left <= b and a <= right for r, a, b in spans[:k])
+
+
+def test_the_map_shows_real_places(site_of: Callable[..., Site], village: type) -> None:
+    site = site_of(real(village, "simbench-lv-rural1"))
+    site.tick(T0, sag=0.3)
+    page = site.open()
+    page.locator('#view button[data-view="map"]').click()
+    expect(page.locator("#diagram .customer")).to_have_count(13)
+    expect(page.locator('#view button[data-view="map"]')).to_have_attribute("aria-pressed", "true")
+    assert page.locator("#diagram .customer").first.get_attribute("aria-label") is not None
+
+
+def test_a_link_leads_to_its_feeder(site_of: Callable[..., Site], village: type) -> None:
+    site = site_of(village("village"), village("town", 4))
+    site.service.tick(site.service.villages["town"].report(T0, cause=Cause.AMBIGUOUS))
+    page = site.open(path="/#town")
+    expect(page.locator("#feeder")).to_have_value("town")
+    expect(page.locator("#decision")).to_have_text("UNDECIDED")
+    page.select_option("#feeder", "village")
+    expect(page.locator("#decision")).to_have_text("NO DATA")
+    assert page.url.endswith("#village")
+
+
+def test_nothing_comes_from_elsewhere() -> None:
+    web = Path(__file__).parents[2] / "service" / "web"
+    foreign = re.compile(r"https?://|(inner|outer)HTML|insertAdjacentHTML|document\.write|eval\(")
+    for file in web.iterdir():
+        text = file.read_text(encoding="utf-8").replace("http://www.w3.org/2000/svg", "")
+        assert not foreign.search(text), file
