@@ -80,7 +80,7 @@ async def serve(
         bus = stack.enter_context(
             Bus(
                 BusConfig(
-                    settings.zenoh_mode, settings.zenoh_listen, settings.zenoh_connect, settings.zenoh_config
+                    settings.zenoh_mode, settings.listen, settings.zenoh_connect, settings.zenoh_config
                 ),
                 settings.prefix,
                 runtime.deliver,

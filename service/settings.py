@@ -17,6 +17,7 @@ from gridsec.errors import GridsecError
 from service.align import Clock
 
 ENV_PREFIX = "GRIDSEC_"
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 _ENDPOINT = re.compile(r"^(tcp|udp|tls|quic|ws|unixsock-stream|unixpipe|vsock|serial)/\S+$")
 _PREFIX = re.compile(r"^[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*$")
 
@@ -44,7 +45,7 @@ class Settings(BaseSettings):
     model_config = SettingsConfigDict(env_prefix=ENV_PREFIX, extra="forbid", frozen=True)
 
     feeders: Listed = ()
-    zenoh_listen: Listed = ("tcp/127.0.0.1:7447",)
+    zenoh_listen: Listed = ()
     zenoh_connect: Listed = ()
     zenoh_mode: Literal["router", "peer", "client"] | None = None
     zenoh_config: Path | None = None
@@ -58,6 +59,13 @@ class Settings(BaseSettings):
     queue: int = Field(default=20_000, ge=100)
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     log_format: Literal["console", "json"] = "console"
+
+    @property
+    def listen(self) -> tuple[str, ...]:
+        """The endpoints to listen on; none by default for clients and with a zenoh file of the user's own."""
+        if self.zenoh_listen or self.zenoh_config is not None or self.zenoh_mode == "client":
+            return self.zenoh_listen
+        return (DEFAULT_ENDPOINT,)
 
     @field_validator("feeders", "zenoh_listen", "zenoh_connect", mode="before")
     @classmethod

@@ -18,7 +18,7 @@ def _clean(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_defaults() -> None:
     found = settings({})
-    assert found.zenoh_listen == ("tcp/127.0.0.1:7447",)
+    assert found.listen == ("tcp/127.0.0.1:7447",)
     assert (found.http, found.database, found.clock) == ("127.0.0.1:8000", "sqlite:///gridsec.db", Clock.WALL)
 
 
@@ -59,6 +59,14 @@ def test_every_problem_at_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
         "--queue or GRIDSEC_QUEUE",
     ):
         assert words in problems
+
+
+def test_a_zenoh_file_of_one_s_own_says_where_to_listen(tmp_path: Path) -> None:
+    file = tmp_path / "zenoh.json5"
+    file.write_text("{}")
+    assert settings({"zenoh_config": file}).listen == ()
+    assert settings({"zenoh_config": file, "zenoh_listen": ("tcp/[::]:1",)}).listen == ("tcp/[::]:1",)
+    assert settings({"zenoh_mode": "client"}).listen == ()
 
 
 def test_addresses() -> None:
