@@ -1,0 +1,164 @@
+"""What a reproduction hands back: claims with the paper's numbers beside ours, and the data of figures.
+
+Every module of this package has `reproduce() -> Reproduction`. Nothing here draws or prints.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from gridsec.arrays import Floats
+
+Style = Literal["solid", "dashed", "dotted", "dashdot", "points", "steps"]
+
+
+@dataclass(frozen=True, slots=True)
+class Claim:
+    """One statement of a paper beside what we get.
+
+    Attributes
+    ----------
+    what
+        The quantity or statement, in words.
+    where
+        Its place in the paper: equation, section, table, figure.
+    printed
+        What the paper says.
+    ours
+        What is computed here.
+    met
+        Whether the two agree, to the printed digits where they are numbers.
+    """
+
+    what: str
+    where: str
+    printed: float | str
+    ours: float | str
+    met: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Line:
+    """One curve.
+
+    Attributes
+    ----------
+    label
+        For the legend; empty: none.
+    x, y : (k,)
+        Its points; NaN in `y` interrupts it.
+    style
+        "points" has markers only, "steps" holds each value until the next point.
+    """
+
+    label: str
+    x: Floats
+    y: Floats
+    style: Style = "solid"
+
+    def __post_init__(self) -> None:
+        x, y = np.asarray(self.x, dtype=np.float64), np.asarray(self.y, dtype=np.float64)
+        if x.ndim != 1 or x.shape != y.shape:
+            raise ValueError(f"line {self.label!r}: x has shape {x.shape}, y has shape {y.shape}")
+        object.__setattr__(self, "x", x)
+        object.__setattr__(self, "y", y)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Panel:
+    """One pair of axes with its curves.
+
+    Attributes
+    ----------
+    title, x_label, y_label
+        Texts, units included.
+    lines
+        The curves.
+    """
+
+    title: str
+    x_label: str
+    y_label: str
+    lines: tuple[Line, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Figure:
+    """Panels that belong together, drawn one below the other.
+
+    Attributes
+    ----------
+    name
+        File stem, for example "kim2018-figure-1"; letters, digits and hyphens.
+    caption
+        What it shows, in one sentence.
+    panels
+        From top to bottom.
+    """
+
+    name: str
+    caption: str
+    panels: tuple[Panel, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reproduction:
+    """Everything that one paper's examples give.
+
+    Attributes
+    ----------
+    paper
+        Short name, for example "kim2018".
+    claims
+        Its numbers and statements beside ours.
+    figures
+        Data of its figures.
+    """
+
+    paper: str
+    claims: tuple[Claim, ...]
+    figures: tuple[Figure, ...] = field(default=())
+
+    @property
+    def unmet(self) -> tuple[Claim, ...]:
+        """The claims that did not come out."""
+        return tuple(claim for claim in self.claims if not claim.met)
+
+
+def number(what: str, where: str, printed: float, ours: float, *, unit: float) -> Claim:
+    """Claim about a printed number, met when ours rounds to it.
+
+    Parameters
+    ----------
+    what, where
+        As in `Claim`.
+    printed
+        The number in the paper.
+    ours
+        The number computed here.
+    unit
+        Worth of one step in the last printed digit: 1.0 for "671", 1e-6 for "4.74e-4".
+
+    Returns
+    -------
+    Claim
+        Met when `|ours - printed| <= unit / 2`, with a part in 1e9 for rounding of the comparison.
+    """
+    half = 0.5 * unit * (1.0 + 1e-9)
+    return Claim(what, where, printed, float(ours), bool(abs(ours - printed) <= half))
+
+
+def statement(what: str, where: str, printed: str, ours: str) -> Claim:
+    """Claim in words, met when both texts are the same.
+
+    Parameters
+    ----------
+    what, where
+        As in `Claim`.
+    printed, ours
+        The two texts, for example "1 -> 2 -> 3".
+    """
+    return Claim(what, where, printed, ours, printed == ours)
