@@ -14,7 +14,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,6 +23,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 from rich.console import Console
+from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
 
@@ -261,13 +262,26 @@ def run(plan: Plan, console: Console, *, check: bool, keep: bool) -> Outcome:
         scenario = Scenario(seed=plan.seed, start=start, duration_s=float("inf"), dt_s=tick, attacks=attacks)
         _introduce(site, service, plan, console)
         time.sleep(max(0.0, start - time.time()))
-        with Meters(BusConfig("client", connect=(service.zenoh,)), "gridsec") as meters:
-            story = _Story(site, service, start, console)
+        with (
+            Meters(BusConfig("client", connect=(service.zenoh,)), "gridsec") as meters,
+            _screen(console) as show,
+        ):
+            story = _Story(site, service, start, console=console, show=show)
             for sample in play(site, scenario, meters, Pace(1.0)):
                 story.tell(sample)
                 if _over(sample.t - start, plan, story, check=check, keep=keep):
                     break
     return story.outcome
+
+
+@contextmanager
+def _screen(console: Console) -> Iterator[Callable[[Table], None] | None]:
+    """Keep a table up to date below what is told, where there is a terminal."""
+    if not console.is_terminal:
+        yield None
+        return
+    with Live(console=console, auto_refresh=False, transient=True) as live:
+        yield lambda table: live.update(table, refresh=True)
 
 
 def _over(elapsed: float, plan: Plan, story: _Story, *, check: bool, keep: bool) -> bool:
@@ -318,13 +332,22 @@ def _introduce(site: Site, service: Service, plan: Plan, console: Console) -> No
 class _Story:
     """Tells what happens: what is done to the meters, and what the service says of it."""
 
-    def __init__(self, site: Site, service: Service, start: float, console: Console) -> None:
+    def __init__(
+        self,
+        site: Site,
+        service: Service,
+        start: float,
+        *,
+        console: Console,
+        show: Callable[[Table], None] | None,
+    ) -> None:
         self.outcome = Outcome()
         self.standing: set[str] = set()
         self._site = site
         self._service = service
         self._start = start
         self._console = console
+        self._show = show
         self._lying: set[str] = set()
         self._states: dict[str, str] = {}
 
@@ -338,11 +361,9 @@ class _Story:
             self._say(sample.t, "red", f"begin to lie: {told}")
         if self._lying - lying:
             self._say(sample.t, "green", f"honest again: {', '.join(sorted(self._lying - lying))}")
-        began = bool(lying - self._lying)
         self._lying = lying
         self._alarms()
-        if began or (round(sample.t - self._start) % 10 == 0):
-            self._picture(sample)
+        self._picture(sample)
 
     def _alarms(self) -> None:
         alarms = self._service.get("/api/v1/alarms?limit=1000")["alarms"]
@@ -364,7 +385,7 @@ class _Story:
         }
 
     def _picture(self, sample: Sample) -> None:
-        if not self._console.is_terminal:
+        if self._show is None:
             return
         state = self._service.get(f"/api/v1/feeders/{self._site.feeder.name}/state")
         if "meters" not in state:
@@ -382,7 +403,7 @@ class _Story:
                 "manipulated" if meter["suspect"] else "",
                 style="bold red" if meter["suspect"] else None,
             )
-        self._console.print(table)
+        self._show(table)
 
     def _say(self, t: float, colour: str, text: str) -> None:
         self._console.print(f"[{colour}]{t - self._start:6.1f} s  {escape(text)}[/]", highlight=False)
