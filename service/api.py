@@ -264,24 +264,9 @@ def get_history(
     limit: Annotated[int, Query(ge=1, le=5000)] = 500,
 ) -> models.History:
     """The newest kept ticks in [since, until), oldest first."""
-    rows = backend.store.history(feeder, since=since, until=until, limit=limit)
-    points = [_point(row, meter) for row in rows]
+    rows = backend.store.history(feeder, since=since, until=until, meter=meter, limit=limit)
+    points = [models.HistoryPoint.model_validate(row) for row in rows]
     return models.History(feeder=feeder, points=points, more=len(rows) == limit)
-
-
-def _point(row: dict[str, Any], meter: str | None) -> models.HistoryPoint:
-    meters = row["meters"]
-    volts = [m["v_volt_estimated"] for m in meters if m["v_volt_estimated"] is not None]
-    return models.HistoryPoint(
-        t=row["t"],
-        verdict=row["verdict"],
-        cause=row["cause"],
-        seen=sum(m["seen"] for m in meters),
-        suspects=[m["meter"] for m in meters if m["suspect"]],
-        v_volt_lowest=min(volts, default=None),
-        v_volt_highest=max(volts, default=None),
-        meter=next((models.HistoryMeter(**m) for m in meters if m["meter"] == meter), None),
-    )
 
 
 @_feeders.get(

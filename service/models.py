@@ -208,7 +208,7 @@ class HistoryPoint(BaseModel):
     suspects: list[str]
     v_volt_lowest: Number = Field(description="Lowest reconstructed voltage at a meter, V.")
     v_volt_highest: Number = Field(description="Highest reconstructed voltage at a meter, V.")
-    meter: HistoryMeter | None = Field(default=None, description="If one was asked for.")
+    meter: HistoryMeter | None = Field(default=None, description="If one was asked for and was there.")
 
 
 class HistoryMeter(BaseModel):

@@ -475,14 +475,14 @@ class Store:
         since, until
             Unix s.
         meter
-            Only this one's numbers; ticks at which the feeder had no such meter are left out.
+            Also this one's numbers; None at ticks at which the feeder had no such meter.
         limit
             At most so many ticks.
 
         Returns
         -------
         list of dict
-            `t`, `verdict`, `cause`, and `meters` as in `state` without what can be computed from it.
+            `t`, `verdict`, `cause`, and what `history.unpack` returns.
         """
         h = _HISTORY.c
         query = (
@@ -498,13 +498,10 @@ class Store:
             query = query.where(h.t < until)
         with self._read() as connection:
             rows = connection.execute(query).all()
-        points = []
-        for t, verdict, cause, data, layout in reversed(rows):
-            meters = unpack(data, json.loads(layout))
-            chosen = [item for item in meters if meter is None or item["meter"] == meter]
-            if chosen or meter is None:
-                points.append({"t": t, "verdict": verdict, "cause": cause, "meters": chosen})
-        return points
+        return [
+            {"t": t, "verdict": verdict, "cause": cause, **unpack(data, json.loads(layout), meter)}
+            for t, verdict, cause, data, layout in reversed(rows)
+        ]
 
     def rejected(self, limit: int = 100) -> list[Rejected]:
         """Return the newest readings that could not be used, newest first.
