@@ -109,6 +109,26 @@ def busbar_error(accuracy: MeterAccuracy, v0_squared: float, sigmas: float) -> f
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Majorant:
+    """Entrywise bounds that hold for the observers of all sets, any of their meters silent.
+
+    Attributes
+    ----------
+    H : (m, m)
+        `|H - K_J C|`.
+    F : (m, N)
+        `|F - K_J D|`.
+    K, L : (m, p)
+        `|K_J|`, and `T |L_J|`: what one pu of output error adds to the target of each state.
+    """
+
+    H: Floats
+    F: Floats
+    K: Floats
+    L: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class ErrorModel:
     """How errors travel through the feeder and the observers. N customers, m inverters, p meters.
 
@@ -133,8 +153,7 @@ class ErrorModel:
     mismatch : (m,)
         How far the curve that a real inverter runs, linear in v, can be from K, linear in z, pu.
     majorant
-        For gains K_J other than direct injection (and L = 0): the largest `|H - K_J C|` (m, m),
-        `|F - K_J D|` (m, N) and `|K_J|` (m, p) over all sets J, entry by entry.
+        For gains other than direct injection.
     """
 
     droop: Droop
@@ -149,7 +168,7 @@ class ErrorModel:
     meter_of: Ints
     span: Floats
     mismatch: Floats
-    majorant: tuple[Floats, Floats, Floats] | None = None
+    majorant: Majorant | None = None
 
 
 def error_model(droop: Droop, model: LinDistFlow, meters: Ints, max_attacked: int) -> ErrorModel:
@@ -248,15 +267,21 @@ class ErrorBound:
     free: Floats
 
 
-def widest(model: ErrorModel) -> ErrorBound:
-    """The bound when nothing is known: curve and estimate both lie between the saturated values.
+def widest(model: ErrorModel, x: Floats | None = None) -> ErrorBound:
+    """The bound when nothing is known: the true injections lie between the saturated values.
 
     Parameters
     ----------
     model
         The plant.
+    x : (…, m), optional
+        The observers' states, where they can leave the range of the curves (gains L); without, they
+        are taken to lie in it as well.
     """
-    return ErrorBound(model.span.copy(), model.span.copy())
+    if x is None:
+        return ErrorBound(model.span.copy(), model.span.copy())
+    far = np.abs(x).reshape(-1, model.span.size).max(axis=0, initial=0.0) + model.droop.limit
+    return ErrorBound(far, far.copy())
 
 
 def gap(model: ErrorModel, now: Uncertainty, bound: ErrorBound, *, own: bool = False) -> Floats:
@@ -359,18 +384,22 @@ def _image(model: ErrorModel, now: Uncertainty, motion: Motion, bound: ErrorBoun
     # step far above the time constant only the last time constant counts.
     hold = np.abs(motion.after - motion.before) / np.maximum(1.0, motion.h / droop.tau)
     around = gap(model, now, bound, own=True) + hold
+    injected: Floats | float = 0.0
     if model.majorant is None:
         through = around
         own = (now.reading[model.meter_of] if now.reading.size else np.zeros(hold.shape)) + hold
     else:
-        H, F, K = model.majorant
-        through = own = H @ bound.free + F @ now.base + K @ now.reading + hold
+        big = model.majorant
+        through = own = big.H @ bound.free + big.F @ now.base + big.K @ now.reading + hold
+        # What meters see moves within the step no more than what the inverters' places see.
+        seen = now.base[model.meters] + now.reading + np.max(hold, initial=0.0)
+        injected = big.L @ (model.inverters[model.meters] @ bound.free + seen)
     low = np.minimum(motion.before, motion.after) - motion.offset - around
     high = np.maximum(motion.before, motion.after) + motion.offset + around
 
     def reach(radius: Floats) -> Floats:
         steep = np.minimum(droop.slope * radius, droop(high + radius) - droop(low - radius))
-        return np.asarray(np.minimum(steep + model.mismatch, model.span))
+        return np.asarray(np.minimum(steep + model.mismatch, model.span) + injected)
 
     return ErrorBound(reach(own), reach(through))
 
@@ -408,18 +437,46 @@ def advance(
     """
     keep = np.exp(-motion.h / model.droop.tau)
     guess = ErrorBound(
-        np.minimum(np.maximum(bound.driven, _ROOM * last.driven), model.span),
-        np.minimum(np.maximum(bound.free, _ROOM * last.free), model.span),
+        np.maximum(bound.driven, _ROOM * last.driven), np.maximum(bound.free, _ROOM * last.free)
     )
     image = _image(model, now, motion, guess)
     if not (np.all(image.free <= guess.free) and np.all(image.driven <= guess.driven)):
-        guess = widest(model)
+        guess = ceiling(model, now, motion, bound)
     top = _above(model, now, motion, guess, bound)
     image = _image(model, now, motion, top)
     after = ErrorBound(
         keep * bound.driven + (1.0 - keep) * image.driven, keep * bound.free + (1.0 - keep) * image.free
     )
     return after, top
+
+
+def ceiling(model: ErrorModel, now: Uncertainty, motion: Motion, floor: ErrorBound) -> ErrorBound:
+    """A level above `floor` that the map of the bounds does not exceed.
+
+    Without output injection that is where the curves saturate. With it, the map is at most
+    `r + A bound` with a matrix A whose spectral radius is below 1 (the certificate), and
+    `(I - A)^-1 r` plus any multiple of `(I - A)^-1 1` is such a level.
+
+    Parameters
+    ----------
+    model, now, motion
+        As in `advance`.
+    floor
+        What it must not be below.
+    """
+    big = model.majorant
+    if big is None or not big.L.any():
+        top = widest(model)
+        return ErrorBound(np.maximum(top.driven, floor.driven), np.maximum(top.free, floor.free))
+    count = model.span.size
+    loop = np.eye(count) - model.droop.slope[:, None] * big.H - big.L @ model.inverters[model.meters]
+    hold = np.abs(motion.after - motion.before) / np.maximum(1.0, motion.h / model.droop.tau)
+    fixed = model.droop.slope * (big.F @ now.base + big.K @ now.reading + hold) + model.mismatch
+    fixed = fixed + big.L @ (now.base[model.meters] + now.reading + np.max(hold, initial=0.0))
+    level, weights = np.linalg.solve(loop, np.stack([fixed, np.ones(count)], axis=1)).T
+    lift = np.max((np.maximum(floor.free, floor.driven) - level) / weights, initial=0.0)
+    high = level + lift * weights
+    return ErrorBound(high, high.copy())
 
 
 def _above(

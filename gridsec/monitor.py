@@ -25,14 +25,16 @@ from gridsec import bank as banks
 from gridsec import detect
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.certificates import Certificate, certify, small_gain, verify
-from gridsec.detect import ErrorBound, Motion
+from gridsec.detect import ErrorBound, Majorant, Motion
 from gridsec.errors import DesignInfeasible
 from gridsec.feeder import LinDistFlow, lindistflow, loss_correction
 from gridsec.frames import NO_VOLTAGE, Inputs, clean, injections
 from gridsec.judge import Situation, Tally, count, decide, residual_excess
+from gridsec.lmi import contraction
 from gridsec.lure import Lure, close_loop
 from gridsec.online import Cause, Decision, Estimate, Frame, Verdict
 from gridsec.plant import MonitorDesign, MonitorState, Options, Plant
+from gridsec.stacked import StackedState
 
 __all__ = ["MonitorDesign", "MonitorState", "Options", "Plant", "design", "init", "step"]
 
@@ -59,12 +61,13 @@ def design(
         after one frame instead of two, unless `options` say otherwise.
     gains
         `direct`: the inverter of a trusted meter is driven by that meter's reading. Or stacked gains
-        of circle-criterion observers with L = 0, in the order of `bank.subsets(p, M).masks()`; all of
-        them together must then satisfy the small-gain condition.
+        of circle-criterion observers in the order of `bank.subsets(p, M).masks()`; an entrywise
+        majorant of all of them must then satisfy the small-gain condition.
     options
         The numbers that decide.
     certificate
-        A proof made elsewhere; by default the best closed form. It is verified here.
+        A proof made elsewhere; by default the best closed form, or the solver's where none applies. It
+        is verified here.
 
     Raises
     ------
@@ -73,8 +76,7 @@ def design(
     DesignInfeasible
         If no certificate holds, the bank would be too large, or the gains detect nothing.
     ValueError
-        If two meters sit at one customer, the accuracy is that of other meters, or gains inject into
-        the states.
+        If two meters sit at one customer, or the accuracy is that of other meters.
 
     References
     ----------
@@ -97,12 +99,12 @@ def design(
     errors = detect.error_model(plant.droop, model, meters, max_attacked)
     proven = lure
     if bank.gains is not None:
-        majorant = _majorant(lure, bank.gains)
-        errors = replace(errors, majorant=majorant, quota=meters.size)
-        proven = replace(lure, H=-majorant[0])
+        big = _majorant(lure, bank.gains)
+        errors = replace(errors, majorant=big, quota=meters.size)
+        proven = replace(lure, H=-_loop(lure, big))
     proof = certificate
     if proof is None:
-        proof = certify(proven) if bank.direct else small_gain(proven)
+        proof = _proof(proven) if bank.direct else small_gain(proven)
     margin = verify(proof, proven)
     if not margin > 0:
         raise DesignInfeasible(f"{proof.kind} certificate", "it fails its verification", margin)
@@ -113,15 +115,36 @@ def _reactive(model: LinDistFlow, meters: Ints, gains: object) -> Floats | None:
     return -2.0 * model.X[:, meters] if isinstance(gains, str) else None
 
 
-def _majorant(lure: Lure, gains: banks.Gains) -> tuple[Floats, Floats, Floats]:
-    """Largest `|H - K C|`, `|F - K D|`, `|K|` over all observers and any of their meters silent."""
-    if gains.L.any():
-        raise ValueError("the monitor's error bounds need L = 0; inject into the nonlinearities only")
+# Decay rate asked of the solver, as a part of the slowest inverter's.
+_RATE = 0.1
+
+
+def _proof(lure: Lure) -> Certificate:
+    """The best closed form, or the solver's certificate where none applies."""
+    try:
+        return certify(lure)
+    except DesignInfeasible:
+        return contraction(lure, rate=_RATE * float(np.min(-np.diagonal(lure.A))))
+
+
+def _majorant(lure: Lure, gains: banks.Gains) -> Majorant:
     H, F = np.abs(lure.H), np.abs(lure.F)
     for K in gains.K:
         np.maximum(H, _extreme(lure.H, K, lure.C), out=H)
         np.maximum(F, _extreme(lure.F, K, lure.D), out=F)
-    return H, F, np.abs(gains.K).max(axis=0)
+    tau = -1.0 / np.diagonal(lure.A)
+    return Majorant(H, F, np.abs(gains.K).max(axis=0), tau[:, None] * np.abs(gains.L).max(axis=0))
+
+
+def _loop(lure: Lure, big: Majorant) -> Floats:
+    """The feedback whose small-gain condition covers all observers: what L adds counts like H / slope."""
+    through = big.L @ np.abs(lure.C)
+    deaf = lure.slope <= 0
+    if through[deaf].any():
+        raise DesignInfeasible(
+            "observer bank", "gains inject into the state of an inverter that does nothing", None
+        )
+    return np.asarray(big.H + through / np.where(deaf, 1.0, lure.slope)[:, None])
 
 
 def _extreme(M: Floats, K: Floats, N: Floats) -> Floats:
@@ -187,17 +210,24 @@ def step(design: MonitorDesign, state: MonitorState, frame: Frame) -> tuple[Moni
     h = 0.0 if state.bank is None else frame.t - state.t
     if state.bank is None:
         bank = banks.init(design.bank, inputs.z, inputs.w, inputs.live, net=inputs.net)
+        unknown = _unknown(design, bank)
+        state = replace(state, bound=unknown, level=unknown)
     else:
         bank = banks.step(
             design.bank, state.bank, inputs.z, inputs.w, inputs.live, h, net=inputs.net, adopt=state.x
         )
         if banks.decided(design.bank, bank) and not banks.decided(design.bank, state.bank):
             # The observers start anew, from one that trusted nobody.
-            widest = detect.widest(design.errors)
-            state = replace(state, bound=widest, level=widest, settled=False)
+            unknown = _unknown(design, bank)
+            state = replace(state, bound=unknown, level=unknown, settled=False)
         else:
             state = replace(state, bound=_handed_over(design, state, inputs.live))
     return _conclude(design, state, frame, inputs, bank, h)
+
+
+def _unknown(design: MonitorDesign, bank: banks.BankState) -> ErrorBound:
+    """Bound on the error of observers that just started."""
+    return detect.widest(design.errors, bank.x if isinstance(bank, StackedState) else None)
 
 
 def _handed_over(design: MonitorDesign, state: MonitorState, live: Bools) -> ErrorBound:
@@ -264,7 +294,7 @@ def _conclude(  # noqa: PLR0917  # the chain's three values, then what this step
     error = view.error
     if np.count_nonzero(tally.named) > design.bank.sets.max_attacked:
         # More liars than the bank can take: only saturation bounds what they did to the estimate.
-        error = _saturated(design, inputs, frame)
+        error = _saturated(design, inputs, frame, view.x)
     estimate = Estimate(t=frame.t, v2=view.v2, bound=error, v2_bus=view.v2_bus, trusted=trusted, x=view.x)
     accused = tally.named & live
     attack = np.where(accused, inputs.y - view.v2[plant.meters], 0.0)
@@ -363,22 +393,25 @@ def _view(  # noqa: PLR0917  # as _conclude
         error = detect.gap(errors, now, bound) + offset
     else:
         bound, level = state.bound, state.level
-        error = _saturated(design, inputs, frame)
+        error = _saturated(design, inputs, frame, x)
     threshold = detect.reading_error(plant.accuracy, v2[at] + error[at], design.options.sigmas) + error[at]
     score = np.where(inputs.live, np.abs(inputs.y - v2[at]), np.nan)
     settled = state.settled
     if index >= 0 and not settled:
-        rest = detect.settled(errors, now, motion, detect.widest(errors))
+        none = np.zeros(x.shape)
+        top = detect.ceiling(errors, now, motion, ErrorBound(none, none))
+        rest = detect.settled(errors, now, motion, top)
         transient = detect.gap(errors, now, bound)[at] - detect.gap(errors, now, rest)[at]
         settled = bool(np.all(transient <= design.options.settled * threshold))
     return _View(index, x, z, spread, bound, level, settled, v2, v2_bus, error, score, threshold)
 
 
-def _saturated(design: MonitorDesign, inputs: Inputs, frame: Frame) -> Floats:
+def _saturated(design: MonitorDesign, inputs: Inputs, frame: Frame, x: Floats) -> Floats:
     """Error of the estimate (N,) that holds whoever lies: inverters saturate, and reports are credible."""
     errors = design.errors
     told = np.where(inputs.now.told, 2.0 * frame.q_error[design.plant.meters], 0.0)
-    return np.asarray(inputs.now.base + errors.inverters @ errors.span + errors.reach @ told)
+    far = detect.widest(errors, None if design.bank.direct else x).free
+    return np.asarray(inputs.now.base + errors.inverters @ far + errors.reach @ told)
 
 
 def _unusable(

@@ -11,8 +11,13 @@ from hypothesis import strategies as st
 
 from gridsec import bank as banks
 from gridsec import monitor
-from gridsec.certificates import Certificate
+from gridsec.certificates import Certificate, certify
+from gridsec.droop import Droop
 from gridsec.errors import DesignInfeasible, NotObservable
+from gridsec.feeder import lindistflow
+from gridsec.gains import stacked
+from gridsec.lmi import circle
+from gridsec.lure import close_loop
 from gridsec.monitor import MonitorDesign, MonitorState, Options
 from gridsec.online import Cause, Decision, Estimate, Frame, Verdict
 from tests.gridsec.street import Street, make_plant
@@ -464,10 +469,64 @@ class TestDesign:
         state, answers = watch(street, design, 3, state=state, change=blind)
         assert answers[-1][1].cause is Cause.NO_BUSBAR
         assert answers[-1][0].bound.max() < 0.1
-        with pytest.raises(ValueError, match="L = 0"):
-            monitor.design(
-                plant, max_attacked=2, step_s=1.0, gains=banks.Gains(gains.L + 1e-3 * gains.K, gains.K)
-            )
+
+    @settings(max_examples=6)
+    @given(seed=st.integers(0, 2**32 - 1), size=st.sampled_from([0.0, 0.01, 0.05]))
+    def test_gains_that_inject_into_states(self, seed: int, size: float) -> None:
+        """Bounds hold for any gains under the small-gain condition, lies and silence included."""
+        rng = np.random.default_rng(seed)
+        plant = make_plant(rng, customers=6, drop=0.02, inverters=np.arange(5))
+        direct = monitor.design(plant, max_attacked=1, step_s=1.0)
+        gains = banks.direct_gains(direct.bank.lure, direct.bank.masks)
+        masks = direct.bank.masks[:, None, :]
+        L = size / plant.droop.tau[:, None] * rng.uniform(-1.0, 1.0, gains.L.shape) * masks
+        K = (0.6 * gains.K + 0.05 * rng.uniform(-1.0, 1.0, gains.K.shape)) * masks
+        design = monitor.design(plant, max_attacked=1, step_s=1.0, gains=banks.Gains(L, K))
+        street = Street(plant, rng, extreme=True)
+        state, answers = watch(street, design, 40)
+        assert answers[-1][1].decision is Decision.CLEAN
+        state, _ = watch(street, design, 6, state=state, lies={2: 0.2})
+        state, _ = watch(street, design, 6, state=state, lies={2: -5.0}, silent=(0, 4))
+        state, _ = watch(street, design, 4, state=state, silent=(0, 1, 2, 3), sound=False)
+        state, _ = watch(street, design, 10, state=state, sound=False)
+        watch(street, design, 10, state=state)
+
+    def test_gains_by_matrix_inequality(self) -> None:
+        """A whole bank designed by the corrected (12), watching the same street."""
+        rng = np.random.default_rng(46)
+        plant = make_plant(rng, customers=4, drop=0.02, presets=("ieee1547-b",))
+        lure = monitor.design(plant, max_attacked=1, step_s=1.0).bank.lure
+        model = lindistflow(plant.feeder)
+        options = {"rate": 0.05, "noise": 5e-4, "load": 2.0 * np.hstack([model.R * 6e-3, model.X * 2e-3])}
+        masks = banks.subsets(4, 1, most=100).masks()
+        designs = [circle(lure, np.flatnonzero(mask), **options) for mask in masks]
+        L, K = stacked(designs, 4)
+        design = monitor.design(plant, max_attacked=1, step_s=1.0, gains=banks.Gains(L, K))
+        street = Street(plant, rng)
+        state, answers = watch(street, design, 60)
+        assert answers[-1][1].decision is Decision.CLEAN
+        _, answers = watch(street, design, 4, state=state, lies={1: -0.05})
+        assert answers[-1][1].suspects.tolist() == [False, True, False, False]
+
+    def test_gains_beyond_the_small_gain_condition(self) -> None:
+        plant = make_plant(np.random.default_rng(47), customers=3, drop=0.03)
+        lure = monitor.design(plant, max_attacked=1, step_s=1.0).bank.lure
+        gains = banks.direct_gains(lure, banks.subsets(3, 1, most=100).masks())
+        with pytest.raises(DesignInfeasible, match="small-gain"):
+            monitor.design(plant, max_attacked=1, step_s=1.0, gains=banks.Gains(gains.L, 1e4 * gains.K))
+
+    def test_certificate_by_solver_where_no_closed_form_applies(self) -> None:
+        """Time constants 40 times apart and a loop gain above 1."""
+        rng = np.random.default_rng(4)
+        plant = make_plant(rng, customers=7, drop=0.4)
+        droop = plant.droop
+        tau = np.where(np.arange(7) % 2 == 0, 0.5, 20.0)
+        plant = replace(plant, droop=Droop(droop.customer, droop.v, droop.q, tau, droop.vbar))
+        with pytest.raises(DesignInfeasible):
+            certify(close_loop(plant.feeder, plant.droop, plant.meters))
+        design = monitor.design(plant, max_attacked=1, step_s=1.0)
+        assert design.certificate.kind == "lmi"
+        watch(Street(plant, rng, load_kw=0.5), design, 20)
 
     def test_no_liar_allowed(self) -> None:
         rng = np.random.default_rng(43)
