@@ -218,6 +218,20 @@ class TestAgainstLoop:
             a, b = banks.step(kept, a, y, u, seen, h), banks.step(dense, b, y, u, seen, h)
             np.testing.assert_allclose(states(kept, a), states(dense, b), rtol=0.0, atol=1e-12)
 
+    @pytest.mark.parametrize("impedance", [0.01, 0.1])
+    def test_equilibria_without_newton(self, impedance: float) -> None:
+        """An online step may not fail: where Newton gives up, relaxation gets there, above gain 1 too."""
+        rng = np.random.default_rng(16)
+        lure = close_loop(tree(6, rng, impedance=impedance), mixed_fleet(np.arange(6), rng), np.arange(6))
+        seen = np.ones(6, dtype=bool)
+        y, u = readings(lure, rng)
+        slow = banks.design(lure, 2, policy=StepPolicy(substep=1.0, settled=1e-6, tol=1e-10, max_iter=0))
+        fast = banks.design(lure, 2)
+        a, b = banks.init(slow, y, u, seen), banks.init(fast, y, u, seen)
+        np.testing.assert_allclose(states(slow, a), states(fast, b), rtol=0.0, atol=1e-6)
+        a, b = banks.step(slow, a, y, u, seen, 1.0), banks.step(fast, b, y, u, seen, 1.0)
+        np.testing.assert_allclose(states(slow, a), states(fast, b), rtol=0.0, atol=1e-6)
+
     def test_differential_equation(self) -> None:
         """With fine substeps every observer follows its differential equation."""
         rng = np.random.default_rng(6)
