@@ -13,9 +13,9 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +43,6 @@ class Live:
     http: httpx.Client
     process: subprocess.Popen[bytes]
     log: Path
-    alarms_cleared: list[dict[str, Any]] = field(default_factory=list)
 
     def get(self, path: str, **params: Any) -> Any:
         answer = self.http.get(path, params=params)
@@ -64,10 +63,20 @@ class Live:
                 return found
         raise AssertionError("the list of alarms does not end")
 
+    def await_state(self, good: Callable[[Any], bool]) -> Any:
+        """The feeder's state once it is good."""
+        end = time.monotonic() + START_S
+        while time.monotonic() < end:
+            answer = self.http.get(f"/api/v1/feeders/{self.feeder}/state")
+            if answer.status_code == 200 and good(answer.json()):
+                return answer.json()
+            time.sleep(0.05)
+        raise AssertionError(f"the state never was as expected: {answer.text[:2000]}")
+
 
 @contextmanager
-def serve(feeder: str, folder: Path, *options: str) -> Iterator[Live]:
-    """Run `gridsec serve` for one feeder, time told by the readings, until the block ends."""
+def serve(feeder: str, folder: Path, *options: str, clock: str = "events") -> Iterator[Live]:
+    """Run `gridsec serve` for one feeder, by default with time told by the readings, until the block ends."""
     zenoh_port, http_port = free_port(), free_port()
     base = f"http://127.0.0.1:{http_port}"
     command = [
@@ -82,7 +91,7 @@ def serve(feeder: str, folder: Path, *options: str) -> Iterator[Live]:
         "--database",
         f"sqlite:///{folder / 'alarms.db'}",
         "--clock",
-        "events",
+        clock,
         *options,
     ]
     log = folder / "service.log"

@@ -1,0 +1,53 @@
+"""What the README shows is run as it stands there."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.acceptance.live import serve
+
+ROOT = Path(__file__).resolve().parents[1]
+README = (ROOT / "README.md").read_text()
+API, PUBLISH = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+
+
+def test_the_python_example_names_the_liars() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", API], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    decision, reason, voltages = done.stdout.split("\n", 2)
+    assert re.fullmatch(r"attacked \['m\d+', 'm\d+'\]", decision)
+    assert reason
+    assert len(re.findall(r"2\d\d\.", voltages)) == 13
+
+
+def test_the_publishing_example_arrives(tmp_path: Path) -> None:
+    with serve("simbench-lv-rural1", tmp_path, clock="wall") as live:
+        code = PUBLISH.replace("7447", str(live.zenoh_port))
+        done = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        query = re.search(r"curl 'http://127\.0\.0\.1:8000([^']+)'", README)
+        assert query is not None
+        assert live.get(query[1])["alarms"] == []
+        meters = {m["meter"]: m for m in live.await_state(lambda s: s["meters"][0]["seen"])["meters"]}
+        assert meters["m01"]["v_volt_reported"] == pytest.approx(231.4)
+        assert not meters["m02"]["seen"]
+
+
+def test_every_link_leads_somewhere() -> None:
+    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+    broken = [
+        f"{page.relative_to(ROOT)}: {target}"
+        for page in pages
+        for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text())
+        if not target.startswith("http") and not (page.parent / target).exists()
+    ]
+    assert not broken
