@@ -494,4 +494,6 @@ async def _validation_handler(request: Request, error: Exception) -> Response:
 
 
 async def _unexpected_handler(request: Request, _error: Exception) -> Response:
-    return problem(request, 500, "something went wrong here; the log of the service says what")
+    # The server hangs up after an error that it did not expect; the client must not be surprised by that.
+    text = "something went wrong here; the log of the service says what"
+    return problem(request, 500, text, headers={"Connection": "close"})

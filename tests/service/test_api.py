@@ -303,8 +303,9 @@ def test_a_long_body_without_a_length_is_stopped(setup: Setup) -> None:
 
 def test_what_nobody_foresaw_is_a_problem_without_details(setup: Setup) -> None:
     setup.service.metrics = lambda: 1 / 0
-    body = is_problem(setup.http.get("/metrics"), 500)
-    assert "ZeroDivisionError" not in json.dumps(body)
+    response = setup.http.get("/metrics")
+    assert "ZeroDivisionError" not in json.dumps(is_problem(response, 500))
+    assert response.headers["connection"] == "close"
     assert setup.http.get("/healthz").status_code == 200
 
 
