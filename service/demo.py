@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -36,7 +36,8 @@ from service.simulate import Pace, play
 START_WITHIN_S = 30.0
 CLEAR_WITHIN_S = 30.0
 FEEDER = "simbench-lv-rural1"
-SHORTEST_S = 30.0
+ADDRESS_CODE = 5
+"""The exit code of a service that found an address taken (see `cli`)."""
 
 
 class DemoFailed(GridsecError):
@@ -163,29 +164,31 @@ def started(feeder: str, address: str) -> Iterator[Service]:
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="gridsec-demo-")))
         log = stack.enter_context((folder / "log").open("w+", encoding="utf-8"))
-        zenoh = "tcp/" + free_address("127.0.0.1:7447")
-        command = [
-            sys.executable, "-c", "from service.cli import main; main()", "serve",
-            "--feeder", feeder,
-            "--zenoh-listen", zenoh,
-            "--http", free_address(address),
-            "--database", f"sqlite:///{folder / 'demo.db'}",
-            "--until-eof",
-        ]  # fmt: skip
-        process = subprocess.Popen(  # noqa: S603 - our own interpreter, our own arguments
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True
-        )
-        try:
+        database = f"sqlite:///{folder / 'demo.db'}"
+        host = address.rpartition(":")[0]
+        # Another program can be faster to take a port that was free a moment ago.
+        for http_wanted, zenoh_wanted in [(address, "127.0.0.1:7447"), *[(f"{host}:0", "127.0.0.1:0")] * 2]:
+            zenoh = "tcp/" + free_address(zenoh_wanted)
+            ends = ("--zenoh-listen", zenoh, "--http", free_address(http_wanted))
+            options = ("--feeder", feeder, *ends, "--database", database, "--until-eof")
+            process = _launch(options, log)
+            stack.callback(_end, process)
             line = _first_line(process)
-            if not line.startswith("http://"):
-                process.wait(timeout=5.0)
-                log.seek(0)
-                raise DemoFailed(f"the service did not start:\n{log.read().strip()}")
-            service = Service(process, line, zenoh)
-            _wait_ready(service)
-            yield service
-        finally:
-            _end(process)
+            if line.startswith("http://") or process.wait(timeout=5.0) != ADDRESS_CODE:
+                break
+        if not line.startswith("http://"):
+            log.seek(0)
+            raise DemoFailed(f"the service did not start:\n{log.read().strip()}")
+        service = Service(process, line, zenoh)
+        _wait_ready(service)
+        yield service
+
+
+def _launch(options: tuple[str, ...], log: IO[str]) -> subprocess.Popen[str]:
+    command = [sys.executable, "-c", "from service.cli import main; main()", "serve", *options]
+    return subprocess.Popen(  # noqa: S603 - our own interpreter, our own arguments
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True
+    )
 
 
 def _first_line(process: subprocess.Popen[str]) -> str:

@@ -15,7 +15,7 @@ from typing import Any
 import httpx
 
 from service.app import Running, serve
-from service.ingest import BusConfig, Meters
+from service.ingest import BusConfig, BusCounts, Meters
 from service.settings import settings
 
 FEEDER = "simbench-lv-rural1"
@@ -37,6 +37,33 @@ def until(condition: Callable[[], Any], what: str = "it", patience_s: float = PA
             return value
         time.sleep(0.02)
     raise AssertionError(f"{what} did not happen within {patience_s:g} s")
+
+
+class Outlet:
+    """Keeps what is published; confirms it at once, or when told to."""
+
+    def __init__(self, *, confirms: bool = True) -> None:
+        self.failure: str | None = None
+        self.counts = BusCounts()
+        self.estimates: list[dict[str, Any]] = []
+        self.events: list[tuple[dict[str, Any], bool]] = []
+        self.answers: list[str] = []
+        self.confirms = confirms
+
+    def telemetry(self, key: str, payload: bytes) -> None:
+        assert key == f"{FEEDER}/estimate"
+        self.estimates.append(json.loads(payload))
+
+    def event(self, key: str, payload: bytes, *, last: bool, done: Callable[[], None] | None = None) -> bool:
+        alarm = json.loads(payload)
+        assert key == f"{FEEDER}/alarm/{alarm['id']}"
+        self.events.append((alarm, last))
+        if self.confirms and done is not None:
+            done()
+        return True
+
+    def answer(self, key: str, payload: bytes) -> None:
+        self.answers.append(f"{key} {json.loads(payload)['id']}")
 
 
 class InProcess:

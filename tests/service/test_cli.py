@@ -9,8 +9,9 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import httpx
@@ -19,6 +20,7 @@ import pytest
 from feeders.load import load
 from feeders.recording import read_recording
 from feeders.scenario import Scenario, random_attacks
+from service.cli import main
 from service.demo import Outcome, verdict
 from service.ingest import BusConfig, Meters
 from service.simulate import Pace, play
@@ -29,8 +31,36 @@ CASES = Path(__file__).parents[1] / "cases"
 COMMAND = [sys.executable, "-c", "from service.cli import main; main()"]
 
 
-def gridsec(*arguments: str, env: dict[str, str] | None = None) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
+@dataclass
+class Done:
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+Run = Callable[..., Done]
+
+
+@pytest.fixture
+def gridsec(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Run:
+    """Run a command in this process, from `main` to its exit code."""
+    for name in [name for name in os.environ if name.startswith("GRIDSEC_")]:
+        monkeypatch.delenv(name)
+
+    def run(*arguments: str) -> Done:
+        monkeypatch.setattr(sys, "argv", ["gridsec", *arguments])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as end:
+            main()
+        told = capsys.readouterr()
+        return Done(int(end.value.code or 0), told.out, told.err)
+
+    return run
+
+
+def process(*arguments: str, env: dict[str, str] | None = None) -> Done:
+    """Run a command as a process of its own."""
+    done = subprocess.run(
         [*COMMAND, *arguments],
         capture_output=True,
         text=True,
@@ -38,11 +68,11 @@ def gridsec(*arguments: str, env: dict[str, str] | None = None) -> subprocess.Co
         check=False,
         env=ENVIRONMENT | (env or {}),
     )
+    return Done(done.returncode, done.stdout, done.stderr)
 
 
-def refused(code: int, *arguments: str, env: dict[str, str] | None = None) -> str:
-    """Run something that must fail with a code, one message and no traceback; return the message."""
-    done = gridsec(*arguments, env=env)
+def refused(code: int, done: Done) -> str:
+    """Check that something failed with a code, one message and no traceback; return the message."""
     assert done.returncode == code, done.stdout + done.stderr
     assert "Traceback" not in done.stderr
     assert done.stderr.count("gridsec:") == 1
@@ -54,30 +84,30 @@ def serving(folder: Path, *options: str) -> Iterator[tuple[subprocess.Popen[str]
     """Run `gridsec serve`; yields the process, its URL and its zenoh endpoint."""
     zenoh = f"tcp/127.0.0.1:{free_port()}"
     log = (folder / "log").open("w")
-    process = subprocess.Popen(
+    child = subprocess.Popen(
         [*COMMAND, "serve", "--feeder", FEEDER, "--zenoh-listen", zenoh, "--http", "127.0.0.1:0",
          "--database", f"sqlite:///{folder / 'gridsec.db'}", *options],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True,
         env=ENVIRONMENT,
     )  # fmt: skip
     try:
-        assert process.stdout is not None
-        url = process.stdout.readline().strip()
+        assert child.stdout is not None
+        url = child.stdout.readline().strip()
         assert url.startswith("http://"), (folder / "log").read_text()
         until(lambda: httpx.get(f"{url}/readyz").status_code == 200)
-        yield process, url, zenoh
+        yield child, url, zenoh
     finally:
-        process.kill()
-        process.wait()
-        for pipe in (process.stdin, process.stdout, log):
+        child.kill()
+        child.wait()
+        for pipe in (child.stdin, child.stdout, log):
             if pipe is not None:
                 pipe.close()
 
 
-def ended(process: subprocess.Popen[str]) -> float:
+def ended(child: subprocess.Popen[str]) -> float:
     """Wait for the end; return how long it took, s."""
     begin = time.monotonic()
-    process.wait(timeout=10.0)
+    child.wait(timeout=10.0)
     return time.monotonic() - begin
 
 
@@ -90,8 +120,8 @@ def test_an_http_port_in_use(tmp_path: Path) -> None:
         taken.listen()
         address = f"127.0.0.1:{taken.getsockname()[1]}"
         message = refused(
-            5, "serve", "--feeder", FEEDER, "--http", address,
-            "--zenoh-listen", f"tcp/127.0.0.1:{free_port()}", "--database", f"sqlite:///{tmp_path / 'a.db'}",
+            5, process("serve", "--feeder", FEEDER, "--http", address,
+            "--zenoh-listen", f"tcp/127.0.0.1:{free_port()}", "--database", f"sqlite:///{tmp_path / 'a.db'}"),
         )  # fmt: skip
     assert f"HTTP cannot listen on {address}: Address already in use" in message
 
@@ -102,8 +132,8 @@ def test_a_zenoh_port_in_use(tmp_path: Path) -> None:
         taken.listen()
         end = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
         message = refused(
-            5, "serve", "--feeder", FEEDER, "--http", "127.0.0.1:0", "--zenoh-listen", end,
-            "--database", f"sqlite:///{tmp_path / 'a.db'}",
+            5, process("serve", "--feeder", FEEDER, "--http", "127.0.0.1:0", "--zenoh-listen", end,
+            "--database", f"sqlite:///{tmp_path / 'a.db'}"),
         )  # fmt: skip
     assert end in message
     assert "Address already in use" in message
@@ -112,69 +142,68 @@ def test_a_zenoh_port_in_use(tmp_path: Path) -> None:
 def test_a_database_that_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "folder.db").mkdir()
     for url in ("sqlite:////proc/gridsec.db", f"sqlite:///{tmp_path}/folder.db", "mysql://x", "what"):
-        assert url in refused(4, "serve", "--feeder", FEEDER, "--database", url)
+        assert url in refused(4, process("serve", "--feeder", FEEDER, "--database", url))
 
 
 def test_a_database_that_another_service_writes(tmp_path: Path) -> None:
     with serving(tmp_path):
         database = f"sqlite:///{tmp_path / 'gridsec.db'}"
-        assert "gridsec.db" in refused(4, "serve", "--feeder", FEEDER, "--database", database)
+        assert "gridsec.db" in refused(4, process("serve", "--feeder", FEEDER, "--database", database))
 
 
-def test_a_feeder_with_five_mistakes() -> None:
+def test_a_feeder_with_five_mistakes(gridsec: Run) -> None:
     folder = CASES / "broken" / "five-mistakes"
     expected = (folder / "problems.txt").read_text().splitlines()
     assert len(expected) == 5
-    for command in (["serve", "--feeder", str(folder)], ["feeders", "validate", str(folder)]):
-        message = refused(3, *command)
+    for done in (process("serve", "--feeder", str(folder)), gridsec("feeders", "validate", str(folder))):
+        message = refused(3, done)
         assert "5 problems" in message
         for problem in expected:
             assert problem in message
 
 
 def test_unknown_feeders_are_all_named() -> None:
-    message = refused(3, "serve", "--feeder", "atlantis", "--feeder", "utopia", "--feeder", FEEDER)
+    message = refused(3, process("serve", "--feeder", "atlantis", "--feeder", "utopia", "--feeder", FEEDER))
     assert "2 problems" in message
     assert "atlantis" in message
     assert "utopia" in message
 
 
 def test_wrong_settings_are_all_named() -> None:
-    message = refused(2, "serve", "--http", "nowhere", env={"GRIDSEC_CLOCK": "sundial"})
+    message = refused(2, process("serve", "--http", "nowhere", env={"GRIDSEC_CLOCK": "sundial"}))
     assert "--http or GRIDSEC_HTTP" in message
     assert "--clock or GRIDSEC_CLOCK" in message
 
 
-def test_nobody_to_connect_to() -> None:
+def test_nobody_to_connect_to(gridsec: Run) -> None:
     end = f"tcp/127.0.0.1:{free_port()}"
-    assert end in refused(5, "simulate", FEEDER, "--connect", end, "--duration", "1")
+    assert end in refused(5, gridsec("simulate", FEEDER, "--connect", end, "--duration", "1"))
 
 
-def test_no_recording(tmp_path: Path) -> None:
+def test_no_recording(gridsec: Run, tmp_path: Path) -> None:
     file = tmp_path / "notes.parquet"
     file.write_text("no parquet")
-    assert "notes.parquet" in refused(6, "replay", str(file))
-    assert "missing.parquet" in refused(6, "replay", str(tmp_path / "missing.parquet"))
-    assert "folder" in refused(
-        6, "simulate", FEEDER, "--duration", "2", "--out", str(tmp_path / "folder/x.parquet")
-    )
+    assert "notes.parquet" in refused(6, gridsec("replay", str(file)))
+    assert "missing.parquet" in refused(6, gridsec("replay", str(tmp_path / "missing.parquet")))
+    out = str(tmp_path / "folder" / "x.parquet")
+    assert "folder" in refused(6, gridsec("simulate", FEEDER, "--duration", "2", "--out", out))
 
 
-def test_wrong_usage() -> None:
+def test_wrong_usage(gridsec: Run) -> None:
     done = gridsec("simulate", FEEDER, "--attack", "bias:2", "--out", "x")
     assert done.returncode == 2
     assert "kind:count:size:from:to" in done.stderr
     assert gridsec("demo", "--duration", "1").returncode == 2
 
 
-def test_conversion_of_nothing(tmp_path: Path) -> None:
-    assert "nonsense" in refused(1, "convert", "pandapower:nonsense", str(tmp_path / "x"))
+def test_conversion_of_nothing(gridsec: Run, tmp_path: Path) -> None:
+    assert "nonsense" in refused(1, gridsec("convert", "pandapower:nonsense", str(tmp_path / "x")))
 
 
 # --- work ---------------------------------------------------------------------------------------------
 
 
-def test_feeders() -> None:
+def test_feeders(gridsec: Run) -> None:
     listed = gridsec("feeders", "list").stdout
     assert all(name in listed for name in ("simbench-lv-rural1", "kerber-dorfnetz", "case33bw"))
     shown = gridsec("feeders", "show", FEEDER).stdout
@@ -183,7 +212,7 @@ def test_feeders() -> None:
     assert (valid.returncode, "valid" in valid.stdout) == (0, True)
 
 
-def test_a_feeder_converted_is_a_feeder(tmp_path: Path) -> None:
+def test_a_feeder_converted_is_a_feeder(gridsec: Run, tmp_path: Path) -> None:
     pytest.importorskip("pandapower")
     folder = tmp_path / "landnetz"
     done = gridsec("convert", "kerber-landnetz", str(folder))
@@ -192,7 +221,7 @@ def test_a_feeder_converted_is_a_feeder(tmp_path: Path) -> None:
     assert load(folder).feeder.name == "kerber-landnetz"
 
 
-def test_a_recording_replayed_names_the_liars(tmp_path: Path) -> None:
+def test_a_recording_replayed_names_the_liars(gridsec: Run, tmp_path: Path) -> None:
     file = tmp_path / "day.parquet"
     made = gridsec(
         "simulate", FEEDER, "--out", str(file), "--duration", "60", "--seed", "3", "--loss", "0.02",
@@ -214,24 +243,24 @@ def test_a_recording_replayed_names_the_liars(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_service_in_time_even_with_a_stream_open(number: int, tmp_path: Path) -> None:
-    with serving(tmp_path) as (process, url, zenoh):
+    with serving(tmp_path) as (child, url, zenoh):
         with (
             Meters(BusConfig("client", connect=(zenoh,)), "gridsec"),
             httpx.stream("GET", f"{url}/api/v1/alarms/stream", timeout=10.0) as stream,
         ):
             assert stream.status_code == 200
-            process.send_signal(number)
-            assert ended(process) < 3.0
-        assert process.returncode == 0
+            child.send_signal(number)
+            assert ended(child) < 3.0
+        assert child.returncode == 0
         assert "Traceback" not in (tmp_path / "log").read_text()
 
 
 def test_the_service_of_a_starter_that_has_gone_ends(tmp_path: Path) -> None:
-    with serving(tmp_path, "--until-eof") as (process, _url, _zenoh):
-        assert process.stdin is not None
-        process.stdin.close()
-        assert ended(process) < 3.0
-        assert process.returncode == 0
+    with serving(tmp_path, "--until-eof") as (child, _url, _zenoh):
+        assert child.stdin is not None
+        child.stdin.close()
+        assert ended(child) < 3.0
+        assert child.returncode == 0
 
 
 def test_an_acknowledged_alarm_survives_kill_9(tmp_path: Path) -> None:
@@ -239,17 +268,17 @@ def test_an_acknowledged_alarm_survives_kill_9(tmp_path: Path) -> None:
     start = 1_795_212_000.0
     attacks = random_attacks(site, 2, "bias", 1, 0.03, t_on=start + 10, t_off=start + 1e6)
     scenario = Scenario(seed=1, start=start, duration_s=30.0, attacks=attacks)
-    with serving(tmp_path, "--clock", "events") as (process, url, zenoh):
+    with serving(tmp_path, "--clock", "events") as (child, url, zenoh):
         with Meters(BusConfig("client", connect=(zenoh,)), "gridsec") as meters:
             for _ in play(site, scenario, meters, Pace(float("inf"), ahead=3)):
                 pass
             (alarm,) = until(lambda: httpx.get(f"{url}/api/v1/alarms").json()["alarms"])
             answer = httpx.post(f"{url}/api/v1/alarms/{alarm['id']}/ack", json={"who": "Ada"})
-            process.kill()
-            process.wait()
+            child.kill()
+            child.wait()
         assert answer.status_code == 200
         assert answer.json()["state"] == "acknowledged"
-    with serving(tmp_path, "--clock", "events") as (_process, url, zenoh):
+    with serving(tmp_path, "--clock", "events") as (_child, url, zenoh):
         assert httpx.get(f"{url}/api/v1/alarms").json()["alarms"] == [answer.json()]
         events = httpx.get(f"{url}/api/v1/alarms/{alarm['id']}/events").json()["events"]
         assert [e["change"] for e in events] == ["raised", "acknowledged"]
@@ -261,8 +290,8 @@ def test_an_acknowledged_alarm_survives_kill_9(tmp_path: Path) -> None:
         assert [a["id"] for a in httpx.get(f"{url}/api/v1/alarms").json()["alarms"]] == [alarm["id"]]
 
 
-def test_simulate_onto_zenoh_in_step_with_a_service(tmp_path: Path) -> None:
-    with serving(tmp_path, "--clock", "events") as (_process, url, zenoh):
+def test_simulate_onto_zenoh_in_step_with_a_service(gridsec: Run, tmp_path: Path) -> None:
+    with serving(tmp_path, "--clock", "events") as (_child, url, zenoh):
         done = gridsec(
             "simulate", FEEDER, "--connect", zenoh, "--duration", "120", "--speed", "0", "--lockstep", "3",
             "--start", "1795212000",
@@ -274,7 +303,7 @@ def test_simulate_onto_zenoh_in_step_with_a_service(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_demo_shows_and_checks() -> None:
+def test_demo_shows_and_checks(gridsec: Run) -> None:
     """A short demo; the port of the web page is taken, so it has to find another."""
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
@@ -297,6 +326,5 @@ def test_demo_fails_for_every_kind_of_mistake() -> None:
     assert verdict(Outcome()) == ("no meter was manipulated",)
 
 
-@pytest.mark.slow
-def test_demo_of_a_feeder_that_is_none() -> None:
-    assert "atlantis" in refused(3, "demo", "--feeder", "atlantis", "--duration", "30")
+def test_demo_of_a_feeder_that_is_none(gridsec: Run) -> None:
+    assert "atlantis" in refused(3, gridsec("demo", "--feeder", "atlantis", "--duration", "30"))

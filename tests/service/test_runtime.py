@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import sqlite3
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -17,42 +15,16 @@ from gridsec import monitor
 from service import store as store_module
 from service.alarms import AlarmState, AlarmUnknown, AlreadyAcknowledged
 from service.align import Clock
-from service.ingest import BusCounts, Sample
+from service.ingest import Sample
 from service.rounds import BAD_PER_ROUND, Rounds, RuntimeConfig
 from service.runtime import Runtime
 from service.simulate import key_of, payload_of
 from service.store import Store, StoreUnavailable
 from service.watch import Phase, design
+from tests.service.running import Outlet
 
 FEEDER = "simbench-lv-rural1"
 START = 1_795_212_000.0
-
-
-class Outlet:
-    """Keeps what is published; confirms it at once, or when told to."""
-
-    def __init__(self, *, confirms: bool = True) -> None:
-        self.failure: str | None = None
-        self.counts = BusCounts()
-        self.estimates: list[dict[str, Any]] = []
-        self.events: list[tuple[dict[str, Any], bool]] = []
-        self.answers: list[str] = []
-        self.confirms = confirms
-
-    def telemetry(self, key: str, payload: bytes) -> None:
-        assert key == f"{FEEDER}/estimate"
-        self.estimates.append(json.loads(payload))
-
-    def event(self, key: str, payload: bytes, *, last: bool, done: Callable[[], None] | None = None) -> bool:
-        alarm = json.loads(payload)
-        assert key == f"{FEEDER}/alarm/{alarm['id']}"
-        self.events.append((alarm, last))
-        if self.confirms and done is not None:
-            done()
-        return True
-
-    def answer(self, key: str, payload: bytes) -> None:
-        self.answers.append(f"{key} {json.loads(payload)['id']}")
 
 
 @pytest.fixture(scope="module")
