@@ -20,6 +20,7 @@ from service.rounds import Rounds, RuntimeConfig
 from service.simulate import key_of, payload_of
 from service.store import Store
 from service.watch import design
+from tests.service.running import Outlet
 
 FEEDER = "simbench-lv-rural1"
 START = 1_795_212_000.0
@@ -44,6 +45,7 @@ def test_the_live_rounds_and_a_replay_agree_to_the_last_bit(
     samples = [
         Sample(f"gridsec/{key_of(FEEDER, r.meter)}", payload_of(r), "", r.arrival, 1) for r in readings
     ]
+    outlet = Outlet()
     with Store(f"sqlite:///{tmp_path / 'gridsec.db'}") as store:
         live = Rounds(
             RuntimeConfig(clock=Clock.EVENTS), store, [site], wall=lambda: START, stored=lambda: None
