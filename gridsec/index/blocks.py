@@ -1,0 +1,191 @@
+"""The direction that the fewest blocks of rows see: one exact search behind cospark, spark and every index.
+
+A block is a matrix with n columns; it *sees* a direction x unless it maps x to zero. With single rows as
+blocks the answer is the cospark of a matrix; with the observability matrices of single sensors as
+blocks it is the dynamic security index; within an eigenspace, what Proposition 3.2.2 of lee2018 needs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gridsec.arrays import Ints
+from gridsec.errors import DesignInfeasible
+
+Matrix = NDArray[np.inexact[Any]]
+Scalar = TypeVar("Scalar", bound=np.inexact[Any])
+
+MOST_NODES = 1_000_000
+"""Nodes of the search after which it gives up with an error instead of running for hours."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sparsest:
+    """A direction and the blocks that see it.
+
+    Attributes
+    ----------
+    count
+        Number of those blocks; infinite if there was no direction to choose from.
+    blocks : (count,)
+        Which they are, ascending; empty if there was no direction.
+    direction : (n,)
+        Unit vector; empty if there was none. Complex only where the blocks or the space are.
+    """
+
+    count: float
+    blocks: Ints
+    direction: Matrix
+
+
+def row_space(block: NDArray[Scalar], tol: float) -> NDArray[Scalar]:
+    """Orthonormal rows that span the rows of a matrix.
+
+    Parameters
+    ----------
+    block : (k, n)
+        Any matrix.
+    tol
+        Singular values up to `tol` times the largest count as zero.
+
+    Returns
+    -------
+    (rank, n)
+        The same kernel as `block`.
+    """
+    if not np.any(block):
+        return block[:0]
+    _, s, vh = np.linalg.svd(block, full_matrices=False)
+    return np.asarray(vh[: int(np.count_nonzero(s > tol * s[0]))])
+
+
+def kernel(matrix: NDArray[Scalar], tol: float) -> NDArray[Scalar]:
+    """Orthonormal basis of `{x : M x = 0}`.
+
+    Parameters
+    ----------
+    matrix : (k, n)
+        Any matrix.
+    tol
+        Singular values up to this size, absolutely, count as zero.
+
+    Returns
+    -------
+    (n, n - rank)
+        The basis in its columns.
+    """
+    columns = matrix.shape[1]
+    if matrix.shape[0] == 0:
+        return np.eye(columns, dtype=matrix.dtype)
+    _, s, vh = np.linalg.svd(matrix, full_matrices=True)
+    return np.asarray(vh[int(np.count_nonzero(s > tol)) :].conj().T)
+
+
+def span(columns: NDArray[Scalar], tol: float) -> NDArray[Scalar]:
+    """Orthonormal basis of the range of a matrix whose columns have norms near one or zero.
+
+    Parameters
+    ----------
+    columns : (n, k)
+        Any matrix.
+    tol
+        Singular values up to this size, absolutely, count as zero.
+    """
+    if columns.shape[1] == 0:
+        return columns
+    u, s, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(u[:, : int(np.count_nonzero(s > tol))])
+
+
+def fewest(
+    rows: Sequence[Matrix], space: Matrix, *, tol: float, most: int = MOST_NODES, below: float = 0.0
+) -> Sparsest:
+    """Minimise, over the x != 0 of a space, the number of blocks that see x.
+
+    Exact branch and bound over flats. At a node the directions left are a subspace N; blocks that
+    vanish on all of N are free, and a generic x of N is seen by every other block, which gives an upper
+    bound. One of the others is then either made to vanish (N shrinks) or paid for. At most n of the
+    former follow each other, and fewer of the latter than the best count so far.
+
+    Parameters
+    ----------
+    rows : p times (k_i, n)
+        Orthonormal rows of each block, from `row_space`.
+    space : (n, d)
+        Orthonormal basis of the space in its columns.
+    tol
+        A block whose product with a unit vector has norm up to this does not see it.
+    most
+        Largest number of nodes.
+    below
+        Stop at the first direction that fewer blocks than this see: enough to answer "fewer than?".
+
+    Returns
+    -------
+    Sparsest
+        An optimal direction. If several are optimal, the first found.
+
+    Raises
+    ------
+    DesignInfeasible
+        If more than `most` nodes would be needed. The general problem is NP-hard.
+    """
+    if space.shape[1] == 0:
+        return Sparsest(np.inf, np.zeros(0, dtype=np.intp), np.zeros(0))
+    blocks = _padded(rows, space.shape[0])
+    best, best_space, nodes = np.inf, space, 0
+    todo = [(space, np.arange(len(rows)), 0)]
+    while todo:
+        here, undecided, paid = todo.pop()
+        nodes += 1
+        if nodes > most:
+            what = f"direction that the fewest of {len(rows)} blocks see"
+            raise DesignInfeasible(
+                what, f"more than {most} nodes of the search; best so far: {best:g} blocks"
+            )
+        seen = blocks[undecided] @ here
+        sizes = np.linalg.svd(seen, compute_uv=False) if seen.size else np.zeros((len(undecided), 1))
+        live = sizes[:, 0] > tol
+        count = paid + int(np.count_nonzero(live))
+        if count < best:
+            best, best_space = count, here
+            if best < below:
+                break
+        if not np.any(live) or here.shape[1] == 1:
+            continue
+        left, ranks = undecided[live], np.count_nonzero(sizes[live] > tol, axis=1)
+        pick = int(np.argmin(ranks))
+        rest = np.delete(left, pick)
+        if paid + 1 < best:
+            todo.append((here, rest, paid + 1))
+        smaller = here @ kernel(seen[live][pick], tol)
+        if smaller.shape[1] > 0 and paid < best:
+            # Pushed last, hence visited first: it lowers the bound soonest.
+            todo.append((smaller, rest, paid))
+    return _generic(blocks, best_space, tol)
+
+
+def _generic(blocks: Matrix, space: Matrix, tol: float) -> Sparsest:
+    """A direction of the space that lies in no block's kernel unless the whole space does."""
+    if space.shape[1] == 1:
+        x = space[:, 0]
+    else:
+        # Any fixed generic mixture serves; the draw is part of the algorithm and always the same.
+        mixture = np.random.default_rng(0).standard_normal(space.shape[1])
+        x = space @ (mixture / np.linalg.norm(mixture))
+    where = np.flatnonzero(np.linalg.norm(blocks @ x, axis=1) > tol)
+    return Sparsest(float(where.size), where, x)
+
+
+def _padded(rows: Sequence[Matrix], n: int) -> Matrix:
+    """The blocks as one array, short ones filled up with zero rows; (p, largest k_i, n)."""
+    tall = max((len(r) for r in rows), default=0)
+    out = np.zeros((len(rows), max(tall, 1), n), dtype=np.result_type(np.float64, *(r.dtype for r in rows)))
+    for i, r in enumerate(rows):
+        out[i, : len(r)] = r
+    return out

@@ -1,0 +1,332 @@
+"""Redundant observability and detectability of a pair (A, C), and the security indices.
+
+Everything comes in two independent forms: by ranks of observability matrices, and by eigenvectors. The
+latter minimise over each whole eigenspace, so repeated eigenvalues, defective or not, are no exception.
+
+References
+----------
+lee2018, chapter 3. What is corrected there: docs/errata/lee2018-chapter-3.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Literal
+
+import numpy as np
+
+from gridsec.arrays import Floats, Ints, frozen_ints
+from gridsec.index.blocks import Matrix, fewest, kernel, row_space, span
+from gridsec.index.spectrum import eigenspaces, unstable_subspace
+
+By = Literal["eigenvectors", "rank"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Index:
+    """How many sensors an attacker must control to stay invisible, and how he would do it.
+
+    Attributes
+    ----------
+    count
+        The index; infinite if no number of sensors suffices.
+    sensors : (count,)
+        A smallest set of sensors; empty if there is none.
+    direction : (n,)
+        What he makes the state appear to be off by; empty if there is none. Complex directions stand
+        for their real part, which the same sensors see.
+    """
+
+    count: float
+    sensors: Ints
+    direction: Matrix
+
+    @property
+    def correctable(self) -> float:
+        """Largest number of manipulated sensors that can be undone: `ceil(count / 2) - 1`.
+
+        For a system that is not even observable this is -1; for an infinite index it is infinite.
+        """
+        return float(np.ceil(self.count / 2.0) - 1.0)
+
+    @property
+    def detectable(self) -> float:
+        """Largest number of manipulated sensors that cannot hide: `count - 1`."""
+        return self.count - 1.0
+
+
+def observability(A: Floats, C: Floats, steps: int | None = None) -> Floats:
+    """Observability matrices of the single sensors, `G_i = [c_i; c_i A; …; c_i A^(k-1)]`.
+
+    Parameters
+    ----------
+    A : (n, n)
+    C : (p, n)
+        The pair.
+    steps
+        k; n by default.
+
+    Returns
+    -------
+    (p, k, n)
+        G_i in `[i]`; reshaped to (p k, n) it is the stacked G of the paper.
+
+    References
+    ----------
+    lee2018 (3.1.3), (3.1.4).
+    """
+    k = A.shape[0] if steps is None else steps
+    out = np.empty((C.shape[0], k, A.shape[0]))
+    row = np.asarray(C, dtype=np.float64)
+    for j in range(k):
+        out[:, j] = row
+        row = row @ A
+    return out
+
+
+def observable_rows(A: Floats, C: Floats, *, tol: float) -> tuple[Floats, ...]:
+    """Orthonormal rows that span the rows of each sensor's observability matrix.
+
+    By Arnoldi's method on A^T, which does not form powers of A, so that ranks stay decidable where
+    G_i itself is hopelessly scaled. The kernel is the unobservable subspace of the pair (A, c_i).
+
+    Parameters
+    ----------
+    A, C : (n, n), (p, n)
+        The pair.
+    tol
+        A new row shorter than this times |A| counts as nothing new.
+
+    Returns
+    -------
+    p times (rank G_i, n)
+        Empty for a sensor that measures nothing.
+    """
+    size = float(np.linalg.norm(A, 2)) or 1.0
+    return tuple(_arnoldi(A.T / size, c, tol) for c in np.asarray(C, dtype=np.float64))
+
+
+def _arnoldi(step: Floats, start: Floats, tol: float) -> Floats:
+    basis = np.zeros((0, start.size))
+    length = float(np.linalg.norm(start))
+    row = start / length if length > 0.0 else start
+    while np.linalg.norm(row) > tol and len(basis) < start.size:
+        basis = np.vstack([basis, row / np.linalg.norm(row)])
+        row = step @ basis[-1]
+        # Twice: once leaves rounding errors that a third of the rows would inherit.
+        for _ in range(2):
+            row = row - basis.T @ (basis @ row)
+    return basis
+
+
+def _sensors(C: Floats) -> list[Matrix]:
+    """Each sensor's row, scaled to length one: the unit of a sensor is no property of the system."""
+    return [row_space(c[None, :], 0.0) for c in np.asarray(C, dtype=np.float64)]
+
+
+def static_index(C: Floats, *, tol: float) -> Index:
+    """alpha_s(C) = cospark(C), the index of one snapshot of readings.
+
+    Parameters
+    ----------
+    C : (p, n)
+        Output matrix.
+    tol
+        A sensor whose unit row has a product with a unit state up to this does not see it.
+
+    References
+    ----------
+    lee2018 (3.2.2).
+    """
+    found = fewest(_sensors(C), np.eye(C.shape[1]), tol=tol)
+    return Index(found.count, frozen_ints(found.blocks), found.direction)
+
+
+def dynamic_index(A: Floats, C: Floats, *, tol: float, by: By = "eigenvectors") -> Index:
+    """alpha_d(A, C): fewest sensors by which an attack stays invisible for all time.
+
+        min over x != 0 of |G x|_{0^n}   =   min over eigenvectors v of A of |C v|_0
+
+    The same number for sampled and for continuous time.
+
+    Parameters
+    ----------
+    A, C : (n, n), (p, n)
+        The pair.
+    tol
+        What counts as zero, relative to unit vectors and |A|.
+    by
+        "eigenvectors": over every eigenspace, (3.2.4). "rank": over all states, (3.2.3).
+
+    References
+    ----------
+    lee2018 (3.2.3), Proposition 3.2.2.
+    """
+    if by == "rank":
+        found = fewest(observable_rows(A, C, tol=tol), np.eye(A.shape[0]), tol=tol)
+        return Index(found.count, frozen_ints(found.blocks), found.direction)
+    return _over(tuple(e.vectors for e in eigenspaces(A, tol=tol)), C, tol)
+
+
+def asymptotic_index(A: Floats, C: Floats, *, discrete: bool, tol: float, by: By = "eigenvectors") -> Index:
+    """alpha_a(A, C): as `dynamic_index`, for attacks whose effect does not die away by itself.
+
+        min over x outside X_s(A) of |G x|_{0^n}   =   min over unstable eigenvectors v of |C v|_0
+
+    Parameters
+    ----------
+    A, C : (n, n), (p, n)
+        The pair.
+    discrete
+        Whether A is the matrix of a sampled system (unstable: |lambda| >= 1) or of a differential
+        equation (Re lambda >= 0).
+    tol
+        What counts as zero. An eigenvalue within this of the border counts as unstable.
+    by
+        As in `dynamic_index`.
+
+    Returns
+    -------
+    Index
+        Infinite for a stable A.
+
+    References
+    ----------
+    lee2018 (3.2.5), Proposition 3.2.4.
+    """
+    if by == "rank":
+        # An invariant kernel is the sum of its stable and its unstable part: X_u is all there is to search.
+        space = unstable_subspace(A, discrete=discrete, tol=tol)
+        found = fewest(observable_rows(A, C, tol=tol), space, tol=tol)
+        return Index(found.count, frozen_ints(found.blocks), found.direction)
+    spaces = eigenspaces(A, tol=tol)
+    return _over(tuple(e.vectors for e in spaces if e.unstable(discrete=discrete, tol=tol)), C, tol)
+
+
+def _over(spaces: Sequence[Matrix], C: Floats, tol: float) -> Index:
+    rows = _sensors(C)
+    best = fewest(rows, np.zeros((C.shape[1], 0)), tol=tol)
+    for space in spaces:
+        found = fewest(rows, space, tol=tol)
+        if found.count < best.count:
+            best = found
+    return Index(best.count, frozen_ints(best.blocks), best.direction)
+
+
+def redundant_observable(A: Floats, C: Floats, q: int, *, tol: float, by: By = "eigenvectors") -> bool:
+    """Whether (A, C) stays observable after the loss of any q sensors.
+
+    Parameters
+    ----------
+    A, C : (n, n), (p, n)
+        The pair.
+    q
+        Number of sensors lost.
+    tol
+        As in `dynamic_index`.
+    by
+        "eigenvectors": `|C v|_0 > q` for every eigenvector. "rank": all C(p, q) stacked matrices.
+
+    References
+    ----------
+    lee2018, Definition 3.1.1, Propositions 3.1.1 (iii) and 3.1.2 (ii).
+    """
+    if by == "eigenvectors":
+        return dynamic_index(A, C, tol=tol).count > q
+    rows = observable_rows(A, C, tol=tol)
+    return all(_lost(rows, kept, A.shape[0], tol).shape[1] == 0 for kept in _survivors(len(rows), q))
+
+
+def redundant_detectable(
+    A: Floats, C: Floats, q: int, *, discrete: bool, tol: float, by: By = "eigenvectors"
+) -> bool:
+    """Whether (A, C) stays detectable after the loss of any q sensors.
+
+    Parameters
+    ----------
+    A, C, q, tol, by
+        As in `redundant_observable`.
+    discrete
+        As in `asymptotic_index`.
+
+    References
+    ----------
+    lee2018, Definition 3.1.3, Propositions 3.1.8 (ii) and 3.1.9 (ii).
+    """
+    if by == "eigenvectors":
+        return asymptotic_index(A, C, discrete=discrete, tol=tol).count > q
+    rows = observable_rows(A, C, tol=tol)
+    space = unstable_subspace(A, discrete=discrete, tol=tol)
+    return all(_lost(rows, kept, 0, tol, space).shape[1] == 0 for kept in _survivors(len(rows), q))
+
+
+def unobservable_subspace(A: Floats, C: Floats, q: int = 0, *, tol: float) -> Floats:
+    """The q-redundant unobservable subspace: what some q lost sensors would make unobservable.
+
+        sum over |Lambda| = p - q of N(G_Lambda)
+
+    Parameters
+    ----------
+    A, C, q, tol
+        As in `redundant_observable`. q >= p: the whole space. Costs C(p, q) kernels.
+
+    Returns
+    -------
+    (n, d)
+        Orthonormal basis. Its orthogonal complement is the redundant observable subspace.
+
+    References
+    ----------
+    lee2018, Definition 3.1.2, Propositions 3.1.4 and 3.1.6.
+    """
+    return _summed(A, C, q, np.eye(A.shape[0]), tol)
+
+
+def undetectable_subspace(A: Floats, C: Floats, q: int = 0, *, discrete: bool, tol: float) -> Floats:
+    """The q-redundant undetectable subspace: the unstable part of the redundant unobservable one.
+
+        sum over |Lambda| = p - q of N(G_Lambda) ∩ X_u(A)
+
+    Parameters
+    ----------
+    A, C, q, discrete, tol
+        As in `redundant_detectable`.
+
+    Returns
+    -------
+    (n, d)
+        Orthonormal basis. Its orthogonal complement is the redundant detectable subspace.
+
+    References
+    ----------
+    lee2018, Definition 3.1.4, Propositions 3.1.11 and 3.1.13.
+    """
+    return _summed(A, C, q, unstable_subspace(A, discrete=discrete, tol=tol), tol)
+
+
+def _summed(A: Floats, C: Floats, q: int, space: Floats, tol: float) -> Floats:
+    rows = observable_rows(A, C, tol=tol)
+    total = np.zeros((A.shape[0], 0))
+    for kept in _survivors(len(rows), q):
+        lost = _lost(rows, kept, A.shape[0], tol, space)
+        # Only what is new is added, so that the basis never exceeds n columns.
+        total = np.asarray(span(np.hstack([total, lost]), np.sqrt(tol)))
+        if total.shape[1] == space.shape[1]:
+            break
+    return total
+
+
+def _survivors(p: int, q: int) -> list[tuple[int, ...]]:
+    return list(combinations(range(p), max(p - q, 0)))
+
+
+def _lost(
+    rows: Sequence[Floats], kept: Sequence[int], n: int, tol: float, space: Floats | None = None
+) -> Floats:
+    """Basis of the directions of a space that none of the kept sensors sees."""
+    start = np.eye(n) if space is None else space
+    if not kept:
+        return start
+    return np.asarray(start @ kernel(np.vstack([rows[i] for i in kept]) @ start, tol))

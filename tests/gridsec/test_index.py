@@ -1,0 +1,442 @@
+"""Security indices against brute force in exact integer arithmetic, and against the geometric theory."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.linalg import block_diag
+
+from gridsec.arrays import Floats
+from gridsec.errors import DesignInfeasible
+from gridsec.index import (
+    asymptotic_index,
+    dynamic_index,
+    eigenspaces,
+    feeder_index,
+    fewest,
+    hidden,
+    linearise,
+    observability,
+    observable_rows,
+    redundant_detectable,
+    redundant_observable,
+    row_space,
+    slopes,
+    stable_subspace,
+    static_index,
+    under_attack,
+    undetectable_subspace,
+    unobservable_subspace,
+    unstable_subspace,
+)
+from gridsec.lure import equilibrium
+from tests.gridsec.plants import line, tree
+
+TOL = 1e-9
+Exact = np.ndarray  # integers of any size, dtype object
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A pair with integer entries: A is half of `twice`, so that eigenvalues 0 and 1/2 are stable."""
+
+    twice: Exact
+    C: Exact
+    # A polynomial of `twice` whose kernel is the stable subspace (discrete time) of A.
+    unstable_part: Exact
+    repeated: bool
+    defective: bool
+
+    @property
+    def a(self) -> Floats:
+        return self.twice.astype(float) / 2.0
+
+    @property
+    def c(self) -> Floats:
+        return self.C.astype(float)
+
+
+def exact_rank(rows: list[list[int]]) -> int:
+    """Rank by elimination without fractions (Bareiss): no rounding, no tolerance."""
+    rows = [list(r) for r in rows]
+    rank, previous, columns = 0, 1, len(rows[0]) if rows else 0
+    for j in range(columns):
+        pivot = next((i for i in range(rank, len(rows)) if rows[i][j]), None)
+        if pivot is None:
+            continue
+        rows[rank], rows[pivot] = rows[pivot], rows[rank]
+        for i in range(rank + 1, len(rows)):
+            rows[i] = [
+                (rows[rank][j] * a - rows[i][j] * b) // previous
+                for a, b in zip(rows[i], rows[rank], strict=True)
+            ]
+        previous, rank = rows[rank][j], rank + 1
+    return rank
+
+
+def power(matrix: Exact, k: int) -> Exact:
+    out = np.array(np.eye(len(matrix), dtype=int), dtype=object)
+    for _ in range(k):
+        out = out @ matrix
+    return out
+
+
+def unimodular(rng: np.random.Generator, n: int) -> tuple[Exact, Exact]:
+    """An integer matrix with an integer inverse."""
+    S, inverse = (np.array(np.eye(n, dtype=int), dtype=object) for _ in range(2))
+    for _ in range(2 * n):
+        i, j = rng.choice(n, 2, replace=False)
+        f = int(rng.integers(-1, 2))
+        S[i] = S[i] + f * S[j]
+        inverse[:, j] = inverse[:, j] - f * inverse[:, i]
+    return S, inverse
+
+
+def random_pair(seed: int, n: int = 4, p: int = 5) -> Pair:
+    """Jordan blocks, repeated values, complex pairs by chance, behind an integer change of basis."""
+    rng = np.random.default_rng(seed)
+    blocks: list[np.ndarray] = []
+    unstable, real = [], []
+    left = n
+    while left:
+        if left >= 2 and rng.random() < 0.2:
+            k = int(rng.integers(1, 3))
+            blocks.append(np.array([[0, -k], [k, 0]]))
+            unstable.append(("pair", k, k >= 2))
+            left -= 2
+            continue
+        size = int(rng.choice([1, 1, 2, 3], p=None))
+        size = min(size, left)
+        value = int(rng.integers(-1, 3))
+        blocks.append(value * np.eye(size, dtype=int) + np.eye(size, k=1, dtype=int))
+        unstable.append(("real", value, abs(value) >= 2))
+        real.append((value, size))
+        left -= size
+    J = np.array(block_diag(*blocks).astype(int), dtype=object)
+    S, inverse = unimodular(rng, n)
+    twice = S @ J @ inverse
+    eye = np.array(np.eye(n, dtype=int), dtype=object)
+    polynomial = eye
+    for kind, value, bad in set(unstable):
+        if not bad:
+            factor = twice @ twice + value**2 * eye if kind == "pair" else twice - value * eye
+            polynomial = polynomial @ power(factor, n)
+    sparse = np.array(rng.integers(-1, 2, (p, n)) * (rng.random((p, n)) < 0.6), dtype=object)
+    values = [v for v, _ in real]
+    return Pair(
+        twice,
+        sparse @ inverse,
+        polynomial,
+        repeated=len(set(values)) < len(values) or any(size > 1 for _, size in real),
+        defective=any(size > 1 for _, size in real),
+    )
+
+
+def brute_force(pair: Pair) -> tuple[int, float]:
+    """Dynamic and asymptotic index by definition: over all sets of sensors, by exact ranks.
+
+    The sensors outside a set see nothing of some x != 0 (of some x outside X_s) if and only if their
+    stacked observability matrix is rank deficient (loses rank against itself stacked on a matrix
+    whose kernel is X_s).
+    """
+    p, n = pair.C.shape
+    G = [np.array([pair.C[i] @ power(pair.twice, k) for k in range(n)], dtype=object) for i in range(p)]
+    dynamic, asymptotic = p + 1, np.inf
+    for size in range(p + 1):
+        for lost in itertools.combinations(range(p), size):
+            rows = [list(r) for i in range(p) if i not in lost for r in G[i]]
+            rank = exact_rank(rows) if rows else 0
+            if rank < n:
+                dynamic = min(dynamic, size)
+            if size < asymptotic:
+                both = exact_rank(rows + [list(r) for r in pair.unstable_part])
+                if both > rank:
+                    asymptotic = size
+    return dynamic, asymptotic
+
+
+@cache
+def cases() -> tuple[tuple[Pair, int, float], ...]:
+    pairs = [random_pair(seed) for seed in range(200)]
+    return tuple((pair, *brute_force(pair)) for pair in pairs)
+
+
+def test_the_random_pairs_are_worth_testing() -> None:
+    pairs = [pair for pair, _, _ in cases()]
+    assert sum(pair.repeated for pair in pairs) > 100
+    assert sum(pair.defective for pair in pairs) > 60
+    assert {dynamic for _, dynamic, _ in cases()} >= {0, 1, 2, 3}
+    assert {asymptotic for _, _, asymptotic in cases()} >= {0, 1, 2, 3, np.inf}
+
+
+def test_indices_equal_exact_brute_force() -> None:
+    """lee2018, Propositions 3.2.2 and 3.2.4: 200 pairs, both ways of computing."""
+    for pair, dynamic, asymptotic in cases():
+        by_vectors = dynamic_index(pair.a, pair.c, tol=TOL)
+        by_rank = dynamic_index(pair.a, pair.c, tol=TOL, by="rank")
+        assert by_vectors.count == by_rank.count == dynamic
+        late_vectors = asymptotic_index(pair.a, pair.c, discrete=True, tol=TOL)
+        late_rank = asymptotic_index(pair.a, pair.c, discrete=True, tol=TOL, by="rank")
+        assert late_vectors.count == late_rank.count == asymptotic
+
+
+def test_the_attack_named_with_an_index_is_one() -> None:
+    """The direction is seen by exactly the named sensors, at all times (lee2018, Definition 3.2.1)."""
+    for pair, _, _ in cases()[::5]:
+        for found in (
+            dynamic_index(pair.a, pair.c, tol=TOL),
+            dynamic_index(pair.a, pair.c, tol=TOL, by="rank"),
+            asymptotic_index(pair.a, pair.c, discrete=True, tol=TOL),
+        ):
+            if not np.isfinite(found.count):
+                assert found.sensors.size == found.direction.size == 0
+                continue
+            assert found.sensors.size == found.count
+            assert np.linalg.norm(found.direction) == pytest.approx(1.0)
+            seen = np.linalg.norm(observability(pair.a, pair.c) @ found.direction, axis=1)
+            assert set(np.flatnonzero(seen > 1e-6)) == set(found.sensors)
+
+
+def test_one_eigenvector_per_eigenvalue_is_not_enough() -> None:
+    """What a search over `numpy.linalg.eig`'s vectors says where an eigenvalue repeats: too much."""
+    A = np.eye(3)
+    C = np.array([[1.0, 1, 0], [0, 1, 1], [1, 0, 1], [1, 1, 1]])
+    vectors = np.linalg.eig(A)[1]
+    assert np.count_nonzero(np.abs(C @ vectors) > 1e-9, axis=0).min() == 3
+    found = dynamic_index(A, C, tol=TOL)
+    assert found.count == 2 == static_index(C, tol=TOL).count
+    assert np.count_nonzero(np.abs(C @ found.direction) > 1e-9) == 2
+
+
+def test_redundancy_by_eigenvectors_and_by_rank_agree_with_the_index() -> None:
+    """lee2018, Propositions 3.1.1, 3.1.2, 3.1.8, 3.1.9, 3.2.1 and 3.2.3, for every q."""
+    for pair, dynamic, asymptotic in cases()[:60]:
+        for q in range(5):
+            for by in ("eigenvectors", "rank"):
+                assert redundant_observable(pair.a, pair.c, q, tol=TOL, by=by) == (dynamic > q)
+                got = redundant_detectable(pair.a, pair.c, q, discrete=True, tol=TOL, by=by)
+                assert got == (asymptotic > q)
+
+
+def test_how_many_lies_can_be_detected_and_undone() -> None:
+    """lee2018, Propositions 3.3.1 and 3.3.2: q can be undone if and only if the index exceeds 2q."""
+    for count, undone in ((0, -1), (1, 0), (2, 0), (3, 1), (4, 1), (5, 2), (np.inf, np.inf)):
+        index = dynamic_index(np.eye(1), np.ones((1, 1)), tol=TOL)
+        index = type(index)(count, index.sensors, index.direction)
+        assert index.correctable == undone
+        assert index.detectable == count - 1
+        if np.isfinite(count) and count > 0:
+            assert count > 2 * undone
+            assert not count > 2 * (undone + 1)
+
+
+def same_space(one: Floats, other: Floats) -> bool:
+    return one.shape[1] == other.shape[1] and np.allclose(one @ one.T, other @ other.T, atol=1e-6)
+
+
+def test_redundant_subspaces_by_definition() -> None:
+    """lee2018, Propositions 3.1.4 to 3.1.7 and 3.1.11 to 3.1.13."""
+    for pair, dynamic, asymptotic in cases()[:40]:
+        A, C = pair.a, pair.c
+        unstable = unstable_subspace(A, discrete=True, tol=TOL)
+        for q in (0, 1, 2):
+            space = unobservable_subspace(A, C, q, tol=TOL)
+            late = undetectable_subspace(A, C, q, discrete=True, tol=TOL)
+            assert (space.shape[1] == 0) == (dynamic > q), "Corollary 3.1.5"
+            assert (late.shape[1] == 0) == (asymptotic > q), "Corollary 3.1.12"
+            for basis in (space, late):
+                assert np.allclose(basis.T @ basis, np.eye(basis.shape[1]), atol=1e-9)
+                assert np.allclose(A @ basis, basis @ (basis.T @ A @ basis), atol=1e-6), "A-invariant"
+            # Proposition 3.1.11: the unstable part of the sum is the sum of the unstable parts.
+            meet = 4 - np.linalg.matrix_rank(np.vstack([complement(space).T, complement(unstable).T]), 1e-6)
+            assert late.shape[1] == meet
+            if late.shape[1]:
+                assert np.allclose(space @ (space.T @ late), late, atol=1e-6)
+                assert np.allclose(unstable @ (unstable.T @ late), late, atol=1e-6)
+            # Proposition 3.1.7.
+            stable = stable_subspace(A, discrete=True, tol=TOL)
+            inside = np.allclose(stable @ (stable.T @ space), space, atol=1e-6)
+            assert inside == (asymptotic > q)
+
+
+def complement(basis: Floats) -> Floats:
+    u, _, _ = np.linalg.svd(np.hstack([basis, np.zeros((basis.shape[0], 1))]), full_matrices=True)
+    return u[:, basis.shape[1] :]
+
+
+def test_stable_and_unstable_subspaces_are_exact() -> None:
+    for pair, _, _ in cases()[:60]:
+        stable = stable_subspace(pair.a, discrete=True, tol=TOL)
+        unstable = unstable_subspace(pair.a, discrete=True, tol=TOL)
+        rank = exact_rank([list(r) for r in pair.unstable_part])
+        assert (stable.shape[1], unstable.shape[1]) == (4 - rank, rank)
+        size = float(np.abs(pair.unstable_part.astype(float)).max())
+        assert np.abs(pair.unstable_part.astype(float) @ stable).max(initial=0.0) <= 1e-8 * size
+
+
+def manipulated_sets(p: int, q: int) -> Iterator[tuple[int, ...]]:
+    return itertools.combinations(range(p), q)
+
+
+def test_equivalence_with_strong_observability() -> None:
+    """lee2018, Proposition 3.1.3: (i) to (iii), and (iv) with F = -C, which hides the most."""
+    for pair, dynamic, _ in cases()[:40]:
+        A, C = pair.a, pair.c
+        for q in (1, 2):
+            systems = [under_attack(A, C, bad, tol=TOL) for bad in manipulated_sets(5, q)]
+            assert all(s.strongly_observable for s in systems) == (dynamic > q)
+            for bad, system in zip(manipulated_sets(5, q), systems, strict=True):
+                good = np.delete(C, bad, axis=0)
+                assert same_space(system.weakly_unobservable, unobservable_subspace(A, good, tol=TOL))
+                F = -C[list(bad)]
+                fed = C.copy()
+                fed[list(bad)] += F
+                observable = dynamic_index(A, fed, tol=TOL).count > 0
+                assert observable == system.strongly_observable
+
+
+def test_equivalence_with_strong_detectability() -> None:
+    """lee2018, Proposition 3.1.10, with the controllable subspace counted from rest (errata)."""
+    for pair, _, asymptotic in cases()[:40]:
+        for q in (1, 2):
+            systems = [under_attack(pair.a, pair.c, bad, tol=TOL) for bad in manipulated_sets(5, q)]
+            assert all(s.controllable.shape[1] == 0 for s in systems)
+            # A defective zero is computed to the root of the rounding error, hence the wide border.
+            verdict = all(s.strongly_detectable(discrete=True, tol=1e-3) for s in systems)
+            assert verdict == (asymptotic > q)
+
+
+def test_erratum_the_controllable_subspace_as_printed_breaks_proposition_3_1_10() -> None:
+    """A state that dies in one step satisfies the printed definition although nothing is wrong with it."""
+    A, C = np.zeros((1, 1)), np.zeros((1, 1))
+    assert redundant_detectable(A, C, 0, discrete=True, tol=TOL)
+    # Printed: all x(0) for which an input makes y = 0 and x(k) = 0 for some finite k. Here x(1) = 0 always.
+    x, input_that_hides_it = np.ones(1), np.zeros(1)
+    assert not np.any(A @ x)
+    assert not np.any(C @ x + input_that_hides_it)
+    assert hidden(A, np.zeros((1, 0)), C, np.zeros((1, 0)), tol=TOL).controllable.shape[1] == 0
+    assert under_attack(A, C, (), tol=TOL).strongly_detectable(discrete=True, tol=TOL)
+
+
+def test_hidden_subspaces_of_systems_with_inputs() -> None:
+    """Textbook cases: a double integrator seen in its position, and one with an unstable zero."""
+    A, B = np.array([[0.0, 1], [0, 0]]), np.array([[0.0], [1]])
+    position = hidden(A, B, np.array([[1.0, 0]]), np.zeros((1, 1)), tol=TOL)
+    assert position.strongly_observable
+    zero = hidden(A, B, np.array([[-1.0, 1]]), np.zeros((1, 1)), tol=TOL)
+    assert zero.weakly_unobservable.shape[1] == 1
+    assert zero.controllable.shape[1] == 0
+    assert zero.zeros == pytest.approx([1.0])
+    assert not zero.strongly_detectable(discrete=False, tol=TOL)
+    speed = hidden(A, B, np.array([[1.0, 1]]), np.zeros((1, 1)), tol=TOL)
+    assert speed.zeros == pytest.approx([-1.0])
+    assert speed.strongly_detectable(discrete=False, tol=TOL)
+    assert not speed.strongly_detectable(discrete=True, tol=TOL)
+    blind = hidden(A, B, np.zeros((1, 2)), np.zeros((1, 1)), tol=TOL)
+    assert blind.controllable.shape[1] == 2
+    assert blind.zeros.size == 0
+    assert not blind.strongly_detectable(discrete=False, tol=TOL)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_eigenspaces_of_matrices_with_known_jordan_form(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    jordan = {
+        2.0: (3, 1),
+        0.5: (1, 1, 1),
+        -1.0: (2,),
+        0.5001: (1,),
+    }
+    J = block_diag(*(v * np.eye(k) + np.eye(k, k=1) for v, sizes in jordan.items() for k in sizes))
+    S = np.linalg.qr(rng.standard_normal((10, 10)))[0] @ np.diag(rng.uniform(0.5, 2.0, 10))
+    A = S @ J @ np.linalg.inv(S)
+    spaces = eigenspaces(A, tol=TOL)
+    assert len(spaces) == len(jordan)
+    for space in spaces:
+        value = min(jordan, key=lambda v: abs(v - space.value))
+        assert space.value == pytest.approx(value, abs=1e-8)
+        assert space.vectors.shape[1] == len(jordan[value])
+        assert space.invariant.shape[1] == sum(jordan[value])
+        assert np.abs(A @ space.vectors - value * space.vectors).max() < 1e-7
+
+
+def test_eigenvalues_in_even_spacing_are_told_apart() -> None:
+    """Gaps of equal width, one of them centred: distances and the mean alone would merge them."""
+    values = np.array([0.9, 0.901, 0.902, 0.903])
+    spaces = eigenspaces(np.diag(values), tol=TOL)
+    assert sorted(s.value.real for s in spaces) == pytest.approx(values)
+    ring = np.array([[0.0, -1], [1, 0]])
+    spaces = eigenspaces(block_diag(ring, ring, 1.0), tol=TOL)
+    assert sorted(s.vectors.shape[1] for s in spaces) == [1, 2, 2]
+    assert eigenspaces(np.zeros((0, 0)), tol=TOL) == ()
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_fewest_equals_a_search_over_all_subsets(seed: int) -> None:
+    """Blocks of unequal height, dependent ones, empty ones; integer entries and exact ranks."""
+    rng = np.random.default_rng(seed)
+    n, p = 3, 6
+    blocks = [rng.integers(-1, 2, (int(rng.integers(0, 3)), n)) for _ in range(p)]
+    found = fewest([row_space(b.astype(float), TOL) for b in blocks], np.eye(n), tol=TOL)
+    best = next(
+        size
+        for size in range(p + 1)
+        for lost in itertools.combinations(range(p), size)
+        if exact_rank([list(map(int, r)) for i in range(p) if i not in lost for r in blocks[i]]) < n
+    )
+    assert found.count == best
+    seen = [i for i in range(p) if np.abs(blocks[i] @ found.direction).max(initial=0.0) > 1e-9]
+    assert list(found.blocks) == seen
+
+
+def test_fewest_stops_early_and_gives_up_loudly() -> None:
+    rng = np.random.default_rng(0)
+    rows = [row_space(r[None, :], TOL) for r in rng.standard_normal((14, 7))]
+    assert fewest(rows, np.eye(7), tol=TOL).count == 14 - 6
+    assert fewest(rows, np.eye(7), tol=TOL, below=13).count <= 12
+    with pytest.raises(DesignInfeasible, match="more than 50 nodes"):
+        fewest(rows, np.eye(7), tol=TOL, most=50)
+    assert fewest(rows, np.zeros((7, 0)), tol=TOL).count == np.inf
+
+
+def test_observable_rows_where_powers_of_a_overflow_all_scales() -> None:
+    """The rank of G_i is decided although its rows differ by twelve orders of magnitude."""
+    A = np.diag([1e-3, 1.0, 30.0, 1000.0]) + np.eye(4, k=1)
+    C = np.vstack([np.eye(4)[0], np.eye(4)[3]])
+    first, last = observable_rows(A, C, tol=1e-12)
+    assert len(first) == 4
+    assert len(last) == 1
+    assert np.allclose(first @ first.T, np.eye(4))
+
+
+def test_feeder_in_its_deadband_falls_back_to_the_static_index() -> None:
+    """Equal time constants, all slopes zero: one eigenspace, in which the attacker may choose."""
+    lure = line(6).lure
+    quiet = feeder_index(lure, np.zeros(6), tol=1e-9)
+    assert quiet.static.count == quiet.dynamic.count == 1
+    assert quiet.asymptotic.count == np.inf
+    steep = feeder_index(lure, lure.slope, tol=1e-9)
+    assert steep.dynamic.count == 6, "a mode of the closed loop is seen by every meter of the street"
+    assert steep.asymptotic.count == np.inf
+
+
+def test_linearisation_is_the_derivative_of_the_closed_loop() -> None:
+    lure = tree().lure
+    rng = np.random.default_rng(1)
+    u = rng.normal(0.0, 0.03, lure.F.shape[1])
+    x = equilibrium(lure, u, tol=1e-12, max_iter=200)
+    z = lure.H @ x + lure.F @ u
+    A, C = linearise(lure, slopes(lure, z, step=1e-7))
+
+    def motion(state: Floats) -> Floats:
+        return lure.A @ state + lure.G @ lure.phi(lure.H @ state + lure.F @ u)
+
+    h = 1e-6
+    numeric = np.stack([(motion(x + h * e) - motion(x - h * e)) / (2 * h) for e in np.eye(x.size)], axis=1)
+    assert np.allclose(A, numeric, atol=1e-6)
+    assert np.array_equal(C, lure.C)
