@@ -31,30 +31,14 @@ from gridsec.errors import DesignInfeasible
 from gridsec.gains import (
     CircleGains,
     CircleOptions,
-    circle_matrix,
     margin,
     options_for,
     refuse_blind,
     sensitivity,
-    stacked,
-    state_bound,
 )
 from gridsec.lure import Lure
 
-__all__ = [
-    "CircleGains",
-    "CircleOptions",
-    "circle",
-    "circle_matrix",
-    "contraction",
-    "margin",
-    "options_for",
-    "prove",
-    "sensitivity",
-    "solve_many",
-    "stacked",
-    "state_bound",
-]
+__all__ = ["BACKOFF", "circle", "contraction", "prove", "settle", "solve_many"]
 
 # Slack of the scaled inequality, whose entries are of order one: a hundred times the solver's
 # tolerance, so that its last digits cannot decide the sign of the margin.
