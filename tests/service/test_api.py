@@ -15,10 +15,9 @@ import pytest
 
 from gridsec.online import Cause
 from service import api, models
-from service import store as store_module
 from service.alarms import Change, Transition
 from service.report import to_json as report_json
-from service.store import Rejected
+from service.store import Rejected, connect
 
 T0 = 1_795_212_000.0
 LIE = {"H3": 9.0}
@@ -343,7 +342,7 @@ def test_not_ready_while_the_store_cannot_be_written(
     small_service: Callable[..., Any],
     serve: Callable[..., Any],
 ) -> None:
-    monkeypatch.setattr(store_module, "WAIT_S", 0.2)
+    monkeypatch.setattr(connect, "WAIT_S", 0.2)
     service = small_service(village())
     server = serve(service)
     blocker = sqlite3.connect(service.store.name.removeprefix("sqlite:///"), isolation_level=None)

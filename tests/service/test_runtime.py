@@ -12,14 +12,13 @@ import pytest
 from feeders.load import Site, load
 from feeders.scenario import Scenario, by_arrival, random_attacks, simulate
 from gridsec import monitor
-from service import store as store_module
 from service.alarms import AlarmState, AlarmUnknown, AlreadyAcknowledged
 from service.align import Clock
 from service.ingest import Sample
 from service.rounds import BAD_PER_ROUND, Rounds, RuntimeConfig
 from service.runtime import Runtime
 from service.simulate import key_of, payload_of
-from service.store import Store, StoreUnavailable
+from service.store import Store, StoreUnavailable, connect
 from service.watch import Phase, design
 from tests.service.running import Outlet
 
@@ -65,7 +64,7 @@ def path(tmp_path: Path) -> Path:
 @pytest.fixture
 def locked(path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], sqlite3.Connection]]:
     """Let somebody else hold the database's lock, as a backup gone wrong would."""
-    monkeypatch.setattr(store_module, "WAIT_S", 0.1)
+    monkeypatch.setattr(connect, "WAIT_S", 0.1)
     open_ones: list[sqlite3.Connection] = []
 
     def lock() -> sqlite3.Connection:

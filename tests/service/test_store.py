@@ -18,7 +18,6 @@ import psycopg
 import pytest
 
 from gridsec.online import Cause, Decision
-from service import store as store_module
 from service.alarms import (
     Alarm,
     AlarmKind,
@@ -32,7 +31,7 @@ from service.alarms import (
     acknowledged,
 )
 from service.report import FeederReport, MeterReport
-from service.store import BAD_READINGS_KEPT, HistoryRules, Rejected, Store, StoreUnavailable
+from service.store import BAD_READINGS_KEPT, HistoryRules, Rejected, Store, StoreUnavailable, connect, schema
 
 T0 = 1_795_212_000.0
 NOBODY = 65534
@@ -433,7 +432,7 @@ def test_a_file_that_is_no_database_is_left_alone(tmp_path: Path) -> None:
 
 @both
 def test_only_one_process_writes(url: str, family: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(store_module, "WAIT_S", 1.0)
+    monkeypatch.setattr(connect, "WAIT_S", 1.0)
     words = "another process writes it" if family == "sqlite" else "lock timeout"
     with Store(url), pytest.raises(StoreUnavailable, match=words):
         Store(url)
@@ -445,7 +444,7 @@ def test_only_one_process_writes(url: str, family: str, monkeypatch: pytest.Monk
 def test_readers_cannot_write(store: Store, family: str) -> None:
     words = "readonly" if family == "sqlite" else "read-only"
     with pytest.raises(StoreUnavailable, match=words), store._read() as connection:
-        connection.execute(store_module._FEEDER.delete())
+        connection.execute(schema.FEEDER.delete())
 
 
 def test_sqlite_is_as_safe_as_it_says(tmp_path: Path) -> None:
@@ -467,11 +466,11 @@ def test_older_schemas_are_brought_forward_and_newer_ones_refused(
     def step(connection: object) -> None:
         connection.exec_driver_sql("ALTER TABLE feeder ADD COLUMN note TEXT")  # type: ignore[attr-defined]
 
-    monkeypatch.setattr(store_module, "MIGRATIONS", (step,))
+    monkeypatch.setattr(schema, "MIGRATIONS", (step,))
     for _ in range(2):  # the second time there is nothing left to do, and the step would fail
         with Store(url) as two:
             assert two.alarm(an_alarm().id) == an_alarm()
-    monkeypatch.setattr(store_module, "MIGRATIONS", ())
+    monkeypatch.setattr(schema, "MIGRATIONS", ())
     with pytest.raises(StoreUnavailable, match=r"version 2.* too old"):
         Store(url)
 
@@ -486,10 +485,10 @@ def test_a_failed_migration_leaves_the_database_as_it_was(
         connection.exec_driver_sql("ALTER TABLE feeder ADD COLUMN note TEXT")  # type: ignore[attr-defined]
         connection.exec_driver_sql("nonsense")  # type: ignore[attr-defined]
 
-    monkeypatch.setattr(store_module, "MIGRATIONS", (step,))
+    monkeypatch.setattr(schema, "MIGRATIONS", (step,))
     with pytest.raises(StoreUnavailable, match="syntax error"):
         Store(url)
-    monkeypatch.setattr(store_module, "MIGRATIONS", ())
+    monkeypatch.setattr(schema, "MIGRATIONS", ())
     with Store(url) as store:
         store.put_feeder("village", {})
     with sqlite3.connect(tmp_path / "m.db") as raw:

@@ -1,0 +1,161 @@
+"""Connections: one that writes, some that only read, and words for what the database refuses."""
+
+from __future__ import annotations
+
+import fcntl
+import sqlite3
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+from urllib.parse import quote
+
+import sqlalchemy as sa
+from sqlalchemy.dialects import postgresql, sqlite
+
+from service.store.records import StoreUnavailable
+
+WAIT_S = 5.0
+"""How long to wait for a lock or a connection before saying that the database cannot be used, s."""
+_ADVISORY_LOCK = 0x6772_6964_7365_6300
+
+
+class Connections:
+    """The one writer and the readers of a database.
+
+    Parameters
+    ----------
+    url
+        As in `Store`.
+
+    Attributes
+    ----------
+    name
+        The address without its password.
+    insert
+        The family's INSERT, which knows ON CONFLICT.
+
+    Raises
+    ------
+    StoreUnavailable
+        If it cannot be opened, or another process writes it.
+    """
+
+    def __init__(self, url: str) -> None:
+        self._lock_file: IO[bytes] | None = None
+        self._engines: tuple[sa.Engine, ...] = ()
+        try:
+            parsed = sa.make_url(url)
+        except sa.exc.ArgumentError as error:
+            raise StoreUnavailable(f"{url!r} is no database address: {error}") from error
+        self.name = parsed.render_as_string(hide_password=True)
+        family = parsed.get_backend_name()
+        if family not in {"sqlite", "postgresql"}:
+            raise StoreUnavailable(f"{self.name}: only sqlite and postgresql are supported, not {family}")
+        self.insert: Any = sqlite.insert if family == "sqlite" else postgresql.insert
+        try:
+            with self._guard("open"):
+                self._engines = self._open_sqlite(parsed) if family == "sqlite" else _open_postgresql(parsed)
+        except StoreUnavailable:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Let go of the database. Closing twice is fine."""
+        for engine in self._engines:
+            engine.dispose()
+        if self._lock_file is not None:
+            self._lock_file.close()
+            self._lock_file = None
+
+    @contextmanager
+    def write(self, doing: str = "write") -> Iterator[sa.Connection]:
+        """Begin a transaction of the writer; it is on the disk when the block has ended.
+
+        Parameters
+        ----------
+        doing
+            What cannot be done, should it fail.
+        """
+        with self._guard(doing), self._engines[0].begin() as connection:
+            yield connection
+
+    @contextmanager
+    def read(self) -> Iterator[sa.Connection]:
+        """Open a connection that cannot write."""
+        with self._guard("read"), self._engines[1].connect() as connection:
+            yield connection
+
+    @contextmanager
+    def _guard(self, doing: str) -> Iterator[None]:
+        try:
+            yield
+        except (sa.exc.SQLAlchemyError, sqlite3.Error, OSError) as error:
+            cause = getattr(error, "orig", None) or error
+            text = " ".join(str(cause).split()) or type(cause).__name__
+            raise StoreUnavailable(f"cannot {doing} {self.name}: {text}") from error
+
+    def _open_sqlite(self, url: sa.URL) -> tuple[sa.Engine, sa.Engine]:
+        if not url.database or url.database == ":memory:":
+            raise StoreUnavailable(f"{self.name}: name a file; what is in memory does not survive")
+        path = Path(url.database).absolute()
+        lock = self._lock_file = path.with_name(path.name + ".lock").open("ab")
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise StoreUnavailable(f"cannot open {self.name}: another process writes it") from error
+
+        def connect(mode: str) -> Callable[[], sqlite3.Connection]:
+            def connection() -> sqlite3.Connection:
+                made = sqlite3.connect(
+                    f"file:{quote(str(path))}?mode={mode}",
+                    uri=True,
+                    timeout=WAIT_S,
+                    isolation_level=None,
+                    check_same_thread=False,
+                )
+                made.execute("PRAGMA foreign_keys = ON")
+                if mode == "rwc":
+                    made.execute("PRAGMA journal_mode = WAL")
+                    made.execute("PRAGMA synchronous = FULL")
+                return made
+
+            return connection
+
+        writer = sa.create_engine(
+            "sqlite://", creator=connect("rwc"), poolclass=sa.QueuePool, pool_size=1, max_overflow=0
+        )
+        sa.event.listen(writer, "begin", lambda connection: connection.exec_driver_sql("BEGIN IMMEDIATE"))
+        reader = sa.create_engine(
+            "sqlite://", creator=connect("ro"), poolclass=sa.QueuePool, pool_size=4, pool_timeout=WAIT_S
+        )
+        return writer, reader
+
+
+def _open_postgresql(url: sa.URL) -> tuple[sa.Engine, sa.Engine]:
+    if url.get_driver_name() != "psycopg":
+        url = url.set(drivername="postgresql+psycopg")
+    wait = {"connect_timeout": int(WAIT_S)}
+    writer = sa.create_engine(
+        url,
+        pool_size=1,
+        max_overflow=0,
+        pool_pre_ping=True,
+        connect_args={**wait, "options": f"-c synchronous_commit=on -c lock_timeout={int(WAIT_S * 1e3)}"},
+    )
+
+    def lock(connection: Any, _record: object) -> None:
+        # Held for as long as the connection lives: the one writer.
+        with connection.cursor() as cursor:
+            cursor.execute("SELECT pg_advisory_lock(%s)", (_ADVISORY_LOCK,))
+        connection.commit()
+
+    sa.event.listen(writer, "connect", lock)
+    reader = sa.create_engine(
+        url,
+        pool_size=4,
+        pool_timeout=WAIT_S,
+        pool_pre_ping=True,
+        connect_args={**wait, "options": "-c default_transaction_read_only=on"},
+    )
+    return writer, reader

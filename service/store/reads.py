@@ -1,0 +1,235 @@
+"""Everything that is asked of the store."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import sqlalchemy as sa
+
+from service.alarms import Alarm, AlarmState, Change, from_json
+from service.history import unpack
+from service.store.connect import Connections
+from service.store.records import Event, Rejected
+from service.store.schema import ALARM, BAD, EVENT, FEEDER, HISTORY, LAYOUT, OUTBOX
+
+
+class Reader:
+    """What a store knows. Its connections cannot write.
+
+    Parameters
+    ----------
+    connections
+        The open database.
+    """
+
+    def __init__(self, connections: Connections) -> None:
+        self._connections = connections
+        self.name = connections.name
+
+    @contextmanager
+    def _read(self) -> Iterator[sa.Connection]:
+        with self._connections.read() as connection:
+            yield connection
+
+    def alarm(self, alarm_id: str) -> Alarm | None:
+        """Return an alarm by its id.
+
+        Parameters
+        ----------
+        alarm_id
+            The id.
+        """
+        with self._read() as connection:
+            data = connection.scalar(sa.select(ALARM.c.data).where(ALARM.c.id == alarm_id))
+        return None if data is None else from_json(json.loads(data))
+
+    def alarms(
+        self,
+        *,
+        state: Collection[str] = (),
+        kind: Collection[str] = (),
+        severity: Collection[str] = (),
+        feeder: str | None = None,
+        meter: str | None = None,
+        since: float | None = None,
+        until: float | None = None,
+        cursor: str | None = None,
+        limit: int = 100,
+    ) -> tuple[list[Alarm], str | None]:
+        """Return a page of alarms, those that began last first.
+
+        Parameters
+        ----------
+        state, kind, severity
+            Only these; empty: all.
+        feeder, meter
+            Only of these.
+        since, until
+            Only those raised in [since, until), Unix s.
+        cursor
+            Where the last page ended; pages stay right while alarms come and change.
+        limit
+            Length of a page.
+
+        Returns
+        -------
+        alarms, cursor
+            The cursor is None on the last page.
+        """
+        a = ALARM.c
+        query = sa.select(a.id, a.data).order_by(a.id.desc()).limit(limit + 1)
+        for column, allowed in ((a.state, state), (a.kind, kind), (a.severity, severity)):
+            if allowed:
+                query = query.where(column.in_([str(value) for value in allowed]))
+        for column, wanted in ((a.feeder, feeder), (a.meter, meter)):
+            if wanted is not None:
+                query = query.where(column == wanted)
+        if since is not None:
+            query = query.where(a.t_raised >= since)
+        if until is not None:
+            query = query.where(a.t_raised < until)
+        if cursor is not None:
+            query = query.where(a.id < cursor)
+        with self._read() as connection:
+            rows = connection.execute(query).all()
+        page = [from_json(json.loads(row.data)) for row in rows[:limit]]
+        return page, (page[-1].id if len(rows) > limit else None)
+
+    def active(self, feeder: str, *, cleared_since: float | None = None) -> list[Alarm]:
+        """Return what `alarms.restore` needs.
+
+        Parameters
+        ----------
+        feeder
+            Whose alarms.
+        cleared_since
+            Also those that cleared at or after this time, Unix s.
+        """
+        a = ALARM.c
+        stands: sa.ColumnElement[bool] = a.state != str(AlarmState.CLEARED)
+        if cleared_since is not None:
+            stands = stands | (a.t_cleared >= cleared_since)
+        query = sa.select(a.data).where(a.feeder == feeder, stands).order_by(a.id)
+        with self._read() as connection:
+            return [from_json(json.loads(data)) for data in connection.scalars(query)]
+
+    def events(self, alarm_id: str) -> list[Event]:
+        """Return everything that happened to an alarm, oldest first.
+
+        Parameters
+        ----------
+        alarm_id
+            The id.
+        """
+        with self._read() as connection:
+            query = sa.select(EVENT).where(EVENT.c.alarm_id == alarm_id).order_by(EVENT.c.seq)
+            return [_event(row) for row in connection.execute(query).mappings()]
+
+    def events_after(self, number: int, *, feeder: str | None = None, limit: int = 100) -> list[Event]:
+        """Return the events after a number, oldest first.
+
+        Parameters
+        ----------
+        number
+            The last event that is known already.
+        feeder
+            Only of this one.
+        limit
+            At most so many.
+        """
+        query = sa.select(EVENT).where(EVENT.c.seq > number).order_by(EVENT.c.seq).limit(limit)
+        if feeder is not None:
+            query = query.where(EVENT.c.feeder == feeder)
+        with self._read() as connection:
+            return [_event(row) for row in connection.execute(query).mappings()]
+
+    def outbox_pending(self, limit: int = 1000) -> list[Event]:
+        """Return the events that have not been published yet, oldest first.
+
+        Parameters
+        ----------
+        limit
+            At most so many.
+        """
+        query = sa.select(EVENT).join(OUTBOX, OUTBOX.c.seq == EVENT.c.seq).order_by(EVENT.c.seq)
+        with self._read() as connection:
+            return [_event(row) for row in connection.execute(query.limit(limit)).mappings()]
+
+    def history(
+        self,
+        feeder: str,
+        *,
+        since: float | None = None,
+        until: float | None = None,
+        meter: str | None = None,
+        limit: int = 1000,
+    ) -> list[dict[str, Any]]:
+        """Return the newest kept ticks of a feeder in [since, until), oldest first.
+
+        Parameters
+        ----------
+        feeder
+            Name.
+        since, until
+            Unix s.
+        meter
+            Also this one's numbers; None at ticks at which the feeder had no such meter.
+        limit
+            At most so many ticks.
+
+        Returns
+        -------
+        list of dict
+            `t`, `verdict`, `cause`, and what `history.unpack` returns.
+        """
+        h = HISTORY.c
+        query = (
+            sa.select(h.t, h.verdict, h.cause, h.data, LAYOUT.c.meters)
+            .join(LAYOUT, LAYOUT.c.id == h.layout)
+            .where(h.feeder == feeder)
+            .order_by(h.t.desc())
+            .limit(limit)
+        )
+        if since is not None:
+            query = query.where(h.t >= since)
+        if until is not None:
+            query = query.where(h.t < until)
+        with self._read() as connection:
+            rows = connection.execute(query).all()
+        return [
+            {"t": t, "verdict": verdict, "cause": cause, **unpack(data, json.loads(layout), meter)}
+            for t, verdict, cause, data, layout in reversed(rows)
+        ]
+
+    def rejected(self, limit: int = 100) -> list[Rejected]:
+        """Return the newest readings that could not be used, newest first.
+
+        Parameters
+        ----------
+        limit
+            At most so many.
+        """
+        b = BAD.c
+        query = sa.select(b.t, b.key, b.reason, b.payload).order_by(b.seq.desc()).limit(limit)
+        with self._read() as connection:
+            return [Rejected(*row) for row in connection.execute(query)]
+
+    def feeders(self) -> dict[str, dict[str, Any]]:
+        """Return the tables that `put_feeder` kept, by name."""
+        with self._read() as connection:
+            rows = connection.execute(sa.select(FEEDER.c.name, FEEDER.c.tables).order_by(FEEDER.c.name))
+            return {name: json.loads(tables) for name, tables in rows}
+
+
+def _event(row: sa.RowMapping) -> Event:
+    return Event(
+        row["seq"],
+        row["t"],
+        Change(row["change"]),
+        row["who"],
+        row["comment"],
+        from_json(json.loads(row["data"])),
+    )

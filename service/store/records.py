@@ -1,0 +1,34 @@
+"""What the store hands out besides alarms and reports."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gridsec.errors import GridsecError
+from service.alarms import Alarm, Change
+
+
+class StoreUnavailable(GridsecError):
+    """The database cannot be opened, read or written; the message says which one and why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """One stored transition. `seq` rises by the order of commits and is never used twice."""
+
+    seq: int
+    t: float
+    change: Change
+    who: str | None
+    comment: str | None
+    alarm: Alarm
+
+
+@dataclass(frozen=True, slots=True)
+class Rejected:
+    """A reading that could not be used: arrival time (Unix s), key, why, and the start of its bytes."""
+
+    t: float
+    key: str
+    reason: str
+    payload: bytes = b""

@@ -1,0 +1,111 @@
+"""The tables, and how an older database becomes one of this version."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import sqlalchemy as sa
+
+from service.store.records import StoreUnavailable
+
+META = sa.MetaData()
+SEQ = sa.BigInteger().with_variant(sa.Integer(), "sqlite")
+
+VERSION = sa.Table("schema_version", META, sa.Column("version", sa.Integer, nullable=False))
+ALARM = sa.Table(
+    "alarm",
+    META,
+    sa.Column("id", sa.String(26), primary_key=True),
+    sa.Column("kind", sa.String(32), nullable=False),
+    sa.Column("feeder", sa.String(64), nullable=False),
+    sa.Column("meter", sa.String(64)),
+    sa.Column("severity", sa.String(16), nullable=False),
+    sa.Column("state", sa.String(16), nullable=False),
+    sa.Column("t_raised", sa.Double, nullable=False),
+    sa.Column("t_cleared", sa.Double),
+    sa.Column("data", sa.Text, nullable=False),
+    sa.Index("alarm_by_feeder", "feeder", "state"),
+)
+EVENT = sa.Table(
+    "event",
+    META,
+    sa.Column("seq", SEQ, primary_key=True, autoincrement=True),
+    sa.Column("alarm_id", sa.String(26), sa.ForeignKey("alarm.id"), nullable=False, index=True),
+    sa.Column("feeder", sa.String(64), nullable=False),
+    sa.Column("t", sa.Double, nullable=False),
+    sa.Column("change", sa.String(16), nullable=False),
+    sa.Column("who", sa.Text),
+    sa.Column("comment", sa.Text),
+    sa.Column("data", sa.Text, nullable=False),
+    sqlite_autoincrement=True,
+)
+OUTBOX = sa.Table(
+    "outbox",
+    META,
+    sa.Column("seq", SEQ, sa.ForeignKey("event.seq"), primary_key=True, autoincrement=False),
+)
+LAYOUT = sa.Table(
+    "history_layout",
+    META,
+    sa.Column("id", SEQ, primary_key=True, autoincrement=True),
+    sa.Column("meters", sa.Text, nullable=False, unique=True),
+)
+HISTORY = sa.Table(
+    "history",
+    META,
+    sa.Column("feeder", sa.String(64), primary_key=True),
+    sa.Column("t", sa.Double, primary_key=True),
+    sa.Column("verdict", sa.String(16), nullable=False),
+    sa.Column("cause", sa.String(32), nullable=False),
+    sa.Column("layout", SEQ, sa.ForeignKey("history_layout.id"), nullable=False),
+    sa.Column("data", sa.LargeBinary, nullable=False),
+)
+BAD = sa.Table(
+    "bad_reading",
+    META,
+    sa.Column("seq", SEQ, primary_key=True, autoincrement=True),
+    sa.Column("t", sa.Double, nullable=False),
+    sa.Column("key", sa.Text, nullable=False),
+    sa.Column("reason", sa.Text, nullable=False),
+    sa.Column("payload", sa.LargeBinary, nullable=False),
+    sqlite_autoincrement=True,
+)
+FEEDER = sa.Table(
+    "feeder",
+    META,
+    sa.Column("name", sa.String(64), primary_key=True),
+    sa.Column("tables", sa.Text, nullable=False),
+)
+
+MIGRATIONS: tuple[Callable[[sa.Connection], None], ...] = ()
+"""Step k leads from schema version k + 1 to k + 2. A new database starts at the newest version."""
+
+
+def migrate(connection: sa.Connection, name: str) -> None:
+    """Make the tables, or bring those of an older version forward.
+
+    Parameters
+    ----------
+    connection
+        A transaction of the writer.
+    name
+        What the database is called in a message.
+
+    Raises
+    ------
+    StoreUnavailable
+        If the database is newer than this program.
+    """
+    newest = 1 + len(MIGRATIONS)
+    if not sa.inspect(connection).has_table(VERSION.name):
+        META.create_all(connection)
+        connection.execute(VERSION.insert().values(version=newest))
+        return
+    version = int(connection.execute(sa.select(VERSION.c.version)).scalar_one())
+    if version > newest:
+        raise StoreUnavailable(
+            f"{name} has schema version {version}; this program knows {newest} and is too old for it"
+        )
+    for step in MIGRATIONS[version - 1 :]:
+        step(connection)
+    connection.execute(VERSION.update().values(version=newest))

@@ -1,0 +1,260 @@
+"""Everything that the store keeps, each matter in one transaction."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import sqlalchemy as sa
+
+from service.alarms import AlarmUnknown, Transition, acknowledged, to_json
+from service.history import HistoryRules, Mark, mark, pack, worth_keeping
+from service.report import FeederReport
+from service.store.connect import Connections
+from service.store.reads import Reader
+from service.store.records import Rejected, StoreUnavailable
+from service.store.schema import ALARM, BAD, EVENT, FEEDER, HISTORY, LAYOUT, OUTBOX, VERSION, migrate
+
+BAD_READINGS_KEPT = 1000
+_PAYLOAD_KEPT = 256
+_PRUNE_EVERY = 500
+
+
+class Store(Reader):
+    """The database of one service.
+
+    Parameters
+    ----------
+    url
+        `sqlite:///file`, `sqlite:////absolute/file` or `postgresql+psycopg://user@host/name`.
+    history
+        How much of the past is kept.
+
+    Raises
+    ------
+    StoreUnavailable
+        If the database cannot be opened and written, if another process writes it, or if it is newer than
+        this program.
+    """
+
+    def __init__(self, url: str, *, history: HistoryRules | None = None) -> None:
+        super().__init__(Connections(url))
+        self._history_rules = history or HistoryRules()
+        self._lock = threading.RLock()
+        self._marks: dict[str, Mark] = {}
+        self._since_prune: dict[str, int] = {}
+        try:
+            with self._connections.write("open") as connection:
+                migrate(connection, self.name)
+                newest = connection.scalar(sa.select(sa.func.max(EVENT.c.seq)))
+        except BaseException:
+            self._connections.close()
+            raise
+        self._last_event = int(newest or 0)
+
+    def __enter__(self) -> Store:
+        """Return itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close."""
+        self.close()
+
+    def close(self) -> None:
+        """Let go of the database. Closing twice is fine."""
+        with self._lock:
+            self._connections.close()
+
+    @property
+    def last_event(self) -> int:
+        """Number of the newest event; costs nothing."""
+        return self._last_event
+
+    @contextmanager
+    def _write(self) -> Iterator[sa.Connection]:
+        with self._connections.write() as connection:
+            yield connection
+
+    def commit(
+        self,
+        transitions: Iterable[Transition] = (),
+        *,
+        reports: Iterable[FeederReport] = (),
+        rejected: Iterable[Rejected] = (),
+    ) -> tuple[int, ...]:
+        """Store what a tick brought, in one transaction; it is on the disk when this returns.
+
+        Parameters
+        ----------
+        transitions
+            Alarms that changed: state, event and outbox entry of each.
+        reports
+            Reports of the feeders; those worth keeping go into the history.
+        rejected
+            Readings that could not be used; the newest `BAD_READINGS_KEPT` are kept.
+
+        Returns
+        -------
+        tuple of int
+            The event number of each transition.
+
+        Raises
+        ------
+        StoreUnavailable
+            If nothing was stored.
+        """
+        transitions, rejected = tuple(transitions), tuple(rejected)
+        with self._lock:
+            kept = [(now, report) for report in reports if (now := self._keep(report))]
+            if not (transitions or kept or rejected):
+                return ()
+            with self._write() as connection:
+                numbers = tuple(self._put_transition(connection, item) for item in transitions)
+                for _, report in kept:
+                    self._put_history(connection, report)
+                if rejected:
+                    _put_rejected(connection, rejected)
+            self._marks.update({report.feeder: now for now, report in kept})
+            self._last_event = max((self._last_event, *numbers))
+            return numbers
+
+    def acknowledge(self, alarm_id: str, who: str, comment: str, t: float) -> Transition:
+        """Answer an alarm that no book holds any more.
+
+        For an alarm of a running book use `alarms.acknowledge` and `commit`, or the book will not know.
+
+        Parameters
+        ----------
+        alarm_id, who, comment, t
+            Which alarm, who answers it, with what words, and when (Unix s).
+
+        Raises
+        ------
+        AlarmUnknown, AlreadyAcknowledged
+            If there is no such alarm, or somebody was faster.
+        """
+        with self._lock:
+            alarm = self.alarm(alarm_id)
+            if alarm is None:
+                raise AlarmUnknown(alarm_id)
+            transition = acknowledged(alarm, who, comment, t)
+            self.commit((transition,))
+            return transition
+
+    def outbox_done(self, numbers: Iterable[int]) -> None:
+        """Forget outbox entries that have been published.
+
+        Parameters
+        ----------
+        numbers
+            Their event numbers.
+        """
+        rows = [{"number": number} for number in numbers]
+        if rows:
+            with self._lock, self._write() as connection:
+                connection.execute(OUTBOX.delete().where(OUTBOX.c.seq == sa.bindparam("number")), rows)
+
+    def put_feeder(self, name: str, tables: Mapping[str, Any]) -> None:
+        """Keep the tables of a feeder, in place of those it had.
+
+        Parameters
+        ----------
+        name, tables
+            The feeder, and JSON of the columns of its files.
+        """
+        row = {"name": name, "tables": json.dumps(tables, allow_nan=False)}
+        statement = self._connections.insert(FEEDER).values(row)
+        with self._lock, self._write() as connection:
+            connection.execute(statement.on_conflict_do_update(index_elements=["name"], set_=row))
+
+    def check(self) -> None:
+        """Write something and see.
+
+        Raises
+        ------
+        StoreUnavailable
+            If the database cannot be written.
+        """
+        with self._lock, self._write() as connection:
+            connection.execute(VERSION.update().values(version=VERSION.c.version))
+
+    def writable(self) -> bool:
+        """Whether the database can be written now; `check` says why not."""
+        try:
+            self.check()
+        except StoreUnavailable:
+            return False
+        return True
+
+    def _put_transition(self, connection: sa.Connection, transition: Transition) -> int:
+        alarm = transition.alarm
+        data = json.dumps(to_json(alarm), allow_nan=False)
+        row = {
+            "id": alarm.id,
+            "kind": str(alarm.kind),
+            "feeder": alarm.feeder,
+            "meter": alarm.meter,
+            "severity": str(alarm.severity),
+            "state": str(alarm.state),
+            "t_raised": alarm.t_raised,
+            "t_cleared": alarm.t_cleared,
+            "data": data,
+        }
+        connection.execute(
+            self._connections.insert(ALARM).values(row).on_conflict_do_update(index_elements=["id"], set_=row)
+        )
+        event = {
+            "alarm_id": alarm.id,
+            "feeder": alarm.feeder,
+            "t": transition.t,
+            "change": str(transition.change),
+            "who": transition.who,
+            "comment": transition.comment,
+            "data": data,
+        }
+        number = int(connection.execute(EVENT.insert().values(event).returning(EVENT.c.seq)).scalar_one())
+        connection.execute(OUTBOX.insert().values(seq=number))
+        return number
+
+    def _keep(self, report: FeederReport) -> Mark | None:
+        now = mark(report)
+        return now if worth_keeping(self._marks.get(report.feeder), now, self._history_rules) else None
+
+    def _put_history(self, connection: sa.Connection, report: FeederReport) -> None:
+        row = {
+            "feeder": report.feeder,
+            "t": report.t,
+            "verdict": str(report.verdict),
+            "cause": str(report.cause),
+            "layout": self._layout(connection, report),
+            "data": pack(report.meters),
+        }
+        statement = self._connections.insert(HISTORY).values(row)
+        connection.execute(statement.on_conflict_do_update(index_elements=["feeder", "t"], set_=row))
+        count = self._since_prune.get(report.feeder, 0) + 1
+        if count >= _PRUNE_EVERY:
+            h, keep = HISTORY.c, self._history_rules.keep_s
+            connection.execute(HISTORY.delete().where(h.feeder == report.feeder, h.t < report.t - keep))
+            count = 0
+        self._since_prune[report.feeder] = count
+
+    def _layout(self, connection: sa.Connection, report: FeederReport) -> int:
+        meters = json.dumps([meter.meter for meter in report.meters])
+        known = connection.scalar(sa.select(LAYOUT.c.id).where(LAYOUT.c.meters == meters))
+        if known is None:
+            inserted = connection.execute(LAYOUT.insert().values(meters=meters).returning(LAYOUT.c.id))
+            known = inserted.scalar_one()
+        return int(known)
+
+
+def _put_rejected(connection: sa.Connection, rejected: Iterable[Rejected]) -> None:
+    rows = [
+        {"t": item.t, "key": item.key, "reason": item.reason, "payload": item.payload[:_PAYLOAD_KEPT]}
+        for item in tuple(rejected)[-BAD_READINGS_KEPT:]
+    ]
+    connection.execute(BAD.insert(), rows)
+    newest = sa.select(sa.func.max(BAD.c.seq)).scalar_subquery()
+    connection.execute(BAD.delete().where(BAD.c.seq <= newest - BAD_READINGS_KEPT))
