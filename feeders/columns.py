@@ -155,7 +155,7 @@ CUSTOMER_COLUMNS: tuple[Column, ...] = (
     ),
 )
 
-ESTIMATORS = ("exact-bank",)
+ESTIMATORS = ("exact-bank", "exact-bank-lmi")
 SUSPICIONS = ("voltage", "impedance", "ratio", "rating", "load", "class")
 
 META_COLUMNS: dict[str, tuple[Column, ...]] = {

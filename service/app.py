@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import structlog
 import uvicorn
 
+from feeders.estimators import choose
 from feeders.load import Site, from_tables, load
 from feeders.schema import from_json
 from gridsec.errors import FeederInvalid, GridsecError
@@ -63,7 +64,10 @@ async def serve(
     FeederInvalid, StoreUnavailable, BusUnavailable, AddressUnavailable
         If it cannot start.
     """
-    sites = load_sites(settings.feeders)
+    sites = {
+        name: choose(site, estimator=settings.estimator)
+        for name, site in load_sites(settings.feeders).items()
+    }
     with ExitStack() as stack:
         store = stack.enter_context(Store(settings.database))
         sites = _with_stored(sites, store)

@@ -18,11 +18,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from gridsec.errors import DesignInfeasible, FeederInvalid, GridsecError, NotObservable
+from service import cli_feeders, console
+from service.console import ADDRESS, DATABASE, FAILED, FEEDER, FILE, USAGE, Feeder, complain
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -39,12 +39,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-feeders_app = typer.Typer(no_args_is_help=True, help="List, show and check feeders.")
-app.add_typer(feeders_app, name="feeders")
-_out = Console(highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() else 160)
-_err = Console(stderr=True, highlight=False, soft_wrap=True)
-
-FAILED, USAGE, FEEDER, DATABASE, ADDRESS, FILE = 1, 2, 3, 4, 5, 6
+app.add_typer(cli_feeders.app, name="feeders")
 
 
 def main() -> None:
@@ -55,10 +50,10 @@ def main() -> None:
     try:
         app()
     except GridsecError as error:
-        _complain(str(error))
+        complain(str(error))
         sys.exit(exit_code(error))
     except OSError as error:
-        _complain(f"{error.filename or ''}: {error.strerror or error}".removeprefix(": "))
+        complain(f"{error.filename or ''}: {error.strerror or error}".removeprefix(": "))
         sys.exit(FILE)
 
 
@@ -89,13 +84,8 @@ def exit_code(error: GridsecError) -> int:
     return next((code for kind, code in codes.items() if isinstance(error, kind)), FAILED)
 
 
-def _complain(message: str) -> None:
-    _err.print(f"[bold red]gridsec:[/] {escape(message)}")
-
-
 # ---------------------------------------------------------------------------------------------------- serve
 
-Feeder = Annotated[str, typer.Argument(help="A feeder's folder, or the name of one that comes with gridsec.")]
 Endpoints = Annotated[
     list[str] | None, typer.Option(help="zenoh endpoint to connect to, e.g. tcp/127.0.0.1:7447.")
 ]
@@ -106,6 +96,9 @@ def serve(
     *,
     feeder: Annotated[
         list[str] | None, typer.Option(help="Folder or name of a feeder; may be repeated.")
+    ] = None,
+    estimator: Annotated[
+        str | None, typer.Option(help="exact-bank or exact-bank-lmi. [default: as in the feeder's file]")
     ] = None,
     zenoh_listen: Annotated[
         list[str] | None, typer.Option(help="zenoh endpoint to listen on. [default: tcp/127.0.0.1:7447]")
@@ -149,6 +142,7 @@ def serve(
     chosen = settings(
         {
             "feeders": tuple(feeder) if feeder else None,
+            "estimator": estimator,
             "zenoh_listen": tuple(zenoh_listen) if zenoh_listen else None,
             "zenoh_connect": tuple(zenoh_connect) if zenoh_connect else None,
             "zenoh_mode": zenoh_mode,
@@ -218,19 +212,19 @@ def demo(
 
     plan = Plan(feeder, duration, attacked, size, kind, seed, http)
     try:
-        outcome = run(plan, _out, check=check, keep=keep)
+        outcome = run(plan, console.out, check=check, keep=keep)
     except KeyboardInterrupt:
-        _out.print("Interrupted.")
+        console.out.print("Interrupted.")
         raise typer.Exit(130) from None
-    _out.print(f"Manipulated:          {', '.join(sorted(outcome.lied)) or 'none'}")
-    _out.print(f"Named by the service: {', '.join(sorted(outcome.named)) or 'none'}")
+    console.out.print(f"Manipulated:          {', '.join(sorted(outcome.lied)) or 'none'}")
+    console.out.print(f"Named by the service: {', '.join(sorted(outcome.named)) or 'none'}")
     if check:
         problems = verdict(outcome)
         for problem in problems:
-            _complain(problem)
+            complain(problem)
         if problems:
             raise typer.Exit(FAILED)
-        _out.print("[green]Exactly the manipulated meters were named, and all alarms have cleared.[/]")
+        console.out.print("[green]Exactly the manipulated meters were named, and all alarms have cleared.[/]")
 
 
 # ------------------------------------------------------------------------------------------------- simulate
@@ -295,7 +289,7 @@ def simulate(
         from feeders.recording import record
 
         recording = record(site, scenario, out)
-        _out.print(f"{recording.path}: {recording.count} readings of {site.feeder.name}")
+        console.out.print(f"{recording.path}: {recording.count} readings of {site.feeder.name}")
         return
     _publish(site, scenario, tuple(connect or ("tcp/127.0.0.1:7447",)), prefix, (speed or math.inf, lockstep))
 
@@ -344,11 +338,11 @@ def _publish(
             for _ in play(site, scenario, meters, Pace(*pace)):
                 ticks += 1
     except OutOfStep as error:
-        _complain(f"the service does not keep step: {error}")
+        complain(f"the service does not keep step: {error}")
         raise typer.Exit(FAILED) from None
     except KeyboardInterrupt:
         pass
-    _out.print(f"{ticks} ticks of {len(site.meter_ids)} meters and the busbar published")
+    console.out.print(f"{ticks} ticks of {len(site.meter_ids)} meters and the busbar published")
 
 
 # --------------------------------------------------------------------------------------------------- replay
@@ -375,7 +369,7 @@ def replay(
         raise typer.BadParameter("the file does not say which feeder it belongs to", param_hint="--feeder")
     site = load(name)
     if recording.digest not in {None, site.digest}:
-        _err.print(f"[yellow]{escape(name)} has changed since this was recorded.[/]")
+        console.err.print(f"[yellow]{escape(name)} has changed since this was recorded.[/]")
     tally = Tally()
     began: float | None = None
     for result in run(site, recording.readings(), tally):
@@ -387,79 +381,14 @@ def replay(
                 print(json.dumps(record))
             else:
                 about = escape(f"{alarm.kind} {alarm.meter or alarm.feeder}: {alarm.reason}")
-                _out.print(f"{transition.t - began:10.1f} s  {transition.change:<12} {about}")
+                console.out.print(f"{transition.t - began:10.1f} s  {transition.change:<12} {about}")
     if not as_json:
-        _out.print(f"ticks:    {_counts(tally.ticks)}")
-        _out.print(f"readings: {_counts(tally.readings)}, never arrived {tally.lost}")
+        console.out.print(f"ticks:    {_counts(tally.ticks)}")
+        console.out.print(f"readings: {_counts(tally.readings)}, never arrived {tally.lost}")
 
 
 def _counts(counts: dict[str, int]) -> str:
     return ", ".join(f"{name} {count}" for name, count in sorted(counts.items()) if count) or "none"
-
-
-# -------------------------------------------------------------------------------------------------- feeders
-
-
-@feeders_app.command("list")
-def feeders_list() -> None:
-    """List the feeders that come with gridsec."""
-    from feeders.load import load, names
-
-    table = Table("name", "title", "customers", "meters", "inverters", "M")
-    for name in names():
-        site = load(name)
-        counts = (len(site.feeder.customers), len(site.meter_ids), site.droop.customer.size)
-        cells = (*map(str, counts), str(site.tables.meta.monitor.max_attacked))
-        table.add_row(name, escape(site.tables.meta.title), *cells)
-    _out.print(table)
-
-
-@feeders_app.command("show")
-def feeders_show(feeder: Feeder) -> None:
-    """Show a feeder and its customers."""
-    from feeders.load import load
-
-    site = load(feeder)
-    meta, tree = site.tables.meta, site.feeder
-    _out.print(f"[bold]{escape(meta.name)}[/] {escape(meta.title)}")
-    _out.print(
-        f"{meta.voltage_volt:g} V phase to neutral, {len(tree.buses)} buses, "
-        f"{len(tree.customers)} customers, {len(site.meter_ids)} meters, "
-        f"watched every {meta.monitor.tick_s:g} s for up to {meta.monitor.max_attacked} manipulated meters"
-    )
-    table = Table("customer", "bus", "meter", "load kW", "PV kW", "inverter kVA", "droop")
-    for row in site.tables.customers:
-        numbers = (f"{row.load_kw:g}", f"{row.pv_kw:g}", f"{row.inverter_kva:g}")
-        table.add_row(escape(row.customer), escape(row.bus), row.meter, *numbers, row.droop)
-    _out.print(table)
-
-
-@feeders_app.command("validate")
-def feeders_validate(
-    folder: Annotated[list[Path], typer.Argument(help="Folders of feeders.")],
-) -> None:
-    """Check feeders and name every problem at once."""
-    from feeders.load import from_tables
-    from feeders.schema import examine
-
-    invalid = False
-    for path in folder:
-        found = examine(path)
-        problems = found.problems
-        if found.tables is not None:
-            try:
-                from_tables(found.tables)
-            except FeederInvalid as error:
-                problems = error.problems
-        for note in found.notes:
-            _out.print(f"{escape(str(path))}: note: {escape(note)}")
-        if problems:
-            invalid = True
-            _complain(str(FeederInvalid(f"{path}: {problem}" for problem in problems)))
-        else:
-            _out.print(f"[green]{escape(str(path))}: valid[/]")
-    if invalid:
-        raise typer.Exit(FEEDER)
 
 
 @app.command()
@@ -476,5 +405,5 @@ def convert(
     from feeders.convert import convert as run
 
     for note in run(source, out, root=root, name=name, droop=droop):
-        _out.print(f"note: {escape(note)}")
-    _out.print(f"[green]{escape(str(out))} written[/]")
+        console.out.print(f"note: {escape(note)}")
+    console.out.print(f"[green]{escape(str(out))} written[/]")

@@ -193,7 +193,7 @@ class Runtime:
             finished: MonitorDesign | None = None
             problem = ""
             try:
-                finished = design(watch.site)
+                finished = design(watch.site, _said(watch.name))
             except GridsecError as error:
                 problem = str(error)
             except Exception as error:  # noqa: BLE001 - shown to the operator as the feeder's problem
@@ -345,3 +345,13 @@ def _install(watch: Watch, finished: MonitorDesign | None, problem: str) -> None
         watch.fail(problem)
     else:
         watch.install(finished)
+
+
+def _said(feeder: str) -> Callable[[int, int], None]:
+    """Say how far a design of many parts is, ten times on the way."""
+
+    def progress(done: int, total: int) -> None:
+        if done * 10 // total > (done - 1) * 10 // total:
+            _log.info("designing", feeder=feeder, done=done, total=total)
+
+    return progress

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationError, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
+from feeders.columns import ESTIMATORS
 from gridsec.errors import GridsecError
 from service.align import Clock
 
@@ -45,6 +46,7 @@ class Settings(BaseSettings):
     model_config = SettingsConfigDict(env_prefix=ENV_PREFIX, extra="forbid", frozen=True)
 
     feeders: Listed = ()
+    estimator: str | None = None
     zenoh_listen: Listed = ()
     zenoh_connect: Listed = ()
     zenoh_mode: Literal["router", "peer", "client"] | None = None
@@ -80,6 +82,13 @@ class Settings(BaseSettings):
         wrong = [end for end in value if not _ENDPOINT.match(end)]
         if wrong:
             raise ValueError(f"{', '.join(wrong)}: an endpoint looks like tcp/127.0.0.1:7447")
+        return value
+
+    @field_validator("estimator")
+    @classmethod
+    def _known(cls, value: str | None) -> str | None:
+        if value is not None and value not in ESTIMATORS:
+            raise ValueError(f"{value!r} is no estimator; there are {', '.join(ESTIMATORS)}")
         return value
 
     @field_validator("zenoh_config")

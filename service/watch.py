@@ -6,11 +6,13 @@ owns a `Watch` calls it from one place at a time.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import os
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 
-from feeders.load import Site, plant, to_frame
+from feeders import estimators
+from feeders.load import Site, to_frame
 from gridsec import monitor
 from gridsec.online import Cause
 from service.alarms import AlarmBook, AlarmRules, Transition, acknowledge, advance
@@ -79,21 +81,22 @@ def alarm_rules(site: Site) -> AlarmRules:
     return AlarmRules(settings.on_delay_s, settings.off_delay_s)
 
 
-def design(site: Site) -> monitor.MonitorDesign:
-    """Return the monitor's design for a feeder; takes its time on large ones.
+def design(site: Site, progress: Callable[[int, int], None] | None = None) -> monitor.MonitorDesign:
+    """Return the design of the estimator that a feeder's file names; takes its time on large ones.
 
     Parameters
     ----------
     site
         The feeder.
+    progress
+        Called with (done, total) where the design has many parts.
 
     Raises
     ------
     NotObservable, DesignInfeasible
         If the feeder cannot be watched as its file asks for.
     """
-    settings = site.tables.meta.monitor
-    return monitor.design(plant(site), max_attacked=settings.max_attacked, step_s=settings.tick_s)
+    return estimators.design(site, workers=os.cpu_count() or 1, progress=progress)
 
 
 class Watch:

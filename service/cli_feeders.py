@@ -1,0 +1,116 @@
+"""`gridsec feeders`: what there is to watch, whether it is right, and designs made ahead of time."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from gridsec.errors import FeederInvalid
+from service.console import FEEDER, Feeder, complain, err, out
+
+app = typer.Typer(no_args_is_help=True, help="List, show, check and design feeders.")
+
+
+@app.command("list")
+def feeders_list() -> None:
+    """List the feeders that come with gridsec."""
+    from feeders.load import load, names
+
+    table = Table("name", "title", "customers", "meters", "inverters", "M")
+    for name in names():
+        site = load(name)
+        counts = (len(site.feeder.customers), len(site.meter_ids), site.droop.customer.size)
+        cells = (*map(str, counts), str(site.tables.meta.monitor.max_attacked))
+        table.add_row(name, escape(site.tables.meta.title), *cells)
+    out.print(table)
+
+
+@app.command("show")
+def feeders_show(feeder: Feeder) -> None:
+    """Show a feeder and its customers."""
+    from feeders.load import load
+
+    site = load(feeder)
+    meta, tree = site.tables.meta, site.feeder
+    out.print(f"[bold]{escape(meta.name)}[/] {escape(meta.title)}")
+    out.print(
+        f"{meta.voltage_volt:g} V phase to neutral, {len(tree.buses)} buses, "
+        f"{len(tree.customers)} customers, {len(site.meter_ids)} meters, "
+        f"watched every {meta.monitor.tick_s:g} s for up to {meta.monitor.max_attacked} manipulated meters"
+    )
+    table = Table("customer", "bus", "meter", "load kW", "PV kW", "inverter kVA", "droop")
+    for row in site.tables.customers:
+        numbers = (f"{row.load_kw:g}", f"{row.pv_kw:g}", f"{row.inverter_kva:g}")
+        table.add_row(escape(row.customer), escape(row.bus), row.meter, *numbers, row.droop)
+    out.print(table)
+
+
+@app.command("validate")
+def feeders_validate(
+    folder: Annotated[list[Path], typer.Argument(help="Folders of feeders.")],
+) -> None:
+    """Check feeders and name every problem at once."""
+    from feeders.load import from_tables
+    from feeders.schema import examine
+
+    invalid = False
+    for path in folder:
+        found = examine(path)
+        problems = found.problems
+        if found.tables is not None:
+            try:
+                from_tables(found.tables)
+            except FeederInvalid as error:
+                problems = error.problems
+        for note in found.notes:
+            out.print(f"{escape(str(path))}: note: {escape(note)}")
+        if problems:
+            invalid = True
+            complain(str(FeederInvalid(f"{path}: {problem}" for problem in problems)))
+        else:
+            out.print(f"[green]{escape(str(path))}: valid[/]")
+    if invalid:
+        raise typer.Exit(FEEDER)
+
+
+@app.command("design")
+def feeders_design(
+    feeder: Feeder,
+    *,
+    estimator: Annotated[
+        str | None, typer.Option(help="exact-bank or exact-bank-lmi. [default: as in the feeder's file]")
+    ] = None,
+    max_attacked: Annotated[
+        int | None, typer.Option(help="How many meters may be manipulated. [default: as in the file]")
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(help="Processes for matrix inequalities. [default: all cores]", min=1)
+    ] = None,
+) -> None:
+    """Design a feeder's estimator ahead of time; designs that take long are kept for the next start."""
+    from feeders.estimators import choose, design
+    from feeders.load import load
+
+    site = choose(load(feeder), estimator=estimator, max_attacked=max_attacked)
+    columns = (TextColumn("observers"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    started = time.monotonic()
+    with Progress(*columns, console=err, transient=True) as bar:
+        task = bar.add_task("design", total=None, visible=False)
+        finished = design(
+            site,
+            workers=workers or os.cpu_count() or 1,
+            progress=lambda done, total: bar.update(task, completed=done, total=total, visible=True),
+        )
+    proof, settings = finished.certificate, site.tables.meta.monitor
+    out.print(
+        f"{escape(site.feeder.name)}: {settings.estimator}, M = {settings.max_attacked}, "
+        f"{len(finished.bank.masks)} observers, {time.monotonic() - started:.2f} s"
+    )
+    out.print(f"{proof.kind} certificate, margin {proof.margin:.3g}, decay at least {proof.rate:.3g} 1/s")

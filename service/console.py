@@ -1,0 +1,33 @@
+"""What all commands share: the consoles, exit codes, and arguments."""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated, Final
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+FAILED: Final = 1
+USAGE: Final = 2
+FEEDER: Final = 3
+DATABASE: Final = 4
+ADDRESS: Final = 5
+FILE: Final = 6
+
+Feeder = Annotated[str, typer.Argument(help="A feeder's folder, or the name of one that comes with gridsec.")]
+
+out = Console(highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() else 160)
+err = Console(stderr=True, highlight=False, soft_wrap=True)
+
+
+def complain(message: str) -> None:
+    """Print an error message.
+
+    Parameters
+    ----------
+    message
+        The message, without markup.
+    """
+    err.print(f"[bold red]gridsec:[/] {escape(message)}")

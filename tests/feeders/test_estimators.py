@@ -1,0 +1,89 @@
+"""The estimators by name: what they are designed from, and that they judge alike."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from feeders.estimators import DIRECT, LMI, choose, design, lmi_options
+from feeders.load import load, to_frame
+from feeders.powerflow import PowerFlow
+from feeders.scenario import START, Scenario, random_attacks, simulate, snapshots
+from gridsec import monitor
+from gridsec.errors import FeederInvalid, NotObservable
+from gridsec.lure import close_loop
+from gridsec.online import Decision
+
+SMALL = "cigre-lv"
+
+
+def test_the_file_is_the_default_and_can_be_overruled() -> None:
+    site = load(SMALL)
+    assert choose(site) is site
+    other = choose(site, estimator=LMI, max_attacked=2)
+    assert (other.tables.meta.monitor.estimator, other.tables.meta.monitor.max_attacked) == (LMI, 2)
+    assert other.digest != site.digest
+    assert choose(other, estimator=DIRECT, max_attacked=1).digest == site.digest
+
+
+def test_every_mistake_is_named() -> None:
+    with pytest.raises(FeederInvalid) as caught:
+        choose(load(SMALL), estimator="oracle", max_attacked=-1)
+    assert len(caught.value.problems) == 2
+    assert "'oracle'" in caught.value.problems[0]
+
+
+def test_the_load_columns_are_what_power_flow_does_to_the_voltage() -> None:
+    """Oracle: AC power flow of the lightly loaded feeder with one customer's p, then q, changed."""
+    site = load(SMALL)
+    columns = lmi_options(site, close_loop(site.feeder, site.droop, site.meters)).load
+    count = len(site.feeder.customers)
+    assert columns.shape == (count, 2 * count)
+    flow, base = PowerFlow(site), site.feeder.base_kva
+    loads, volt = site.loads, site.feeder.base_volt
+    dp = loads.p_fraction * loads.load_peak + loads.p_floor
+    for j in range(count):
+        step = 0.01 * base
+        p = np.zeros(count)
+        p[j] = step
+        rest = (flow.solve(np.zeros(count), np.zeros(count), volt)[0] / volt) ** 2
+        moved = (flow.solve(p, np.zeros(count), volt)[0] / volt) ** 2
+        np.testing.assert_allclose(columns[:, j] / dp[j], (rest - moved) / 0.01, rtol=0.02, atol=1e-6)
+
+
+@pytest.mark.parametrize("estimator", [DIRECT, LMI])
+def test_both_name_exactly_the_liar(estimator: str, tmp_path: Path) -> None:
+    site = choose(load(SMALL), estimator=estimator)
+    seen: list[tuple[int, int]] = []
+    finished = design(site, where=tmp_path, progress=lambda done, total: seen.append((done, total)))
+    assert (estimator == LMI) == bool(seen)
+    assert not seen or seen[-1] == (21, 21)
+    (attack,) = attacks = random_attacks(site, 5, "bias", 1, 0.06, t_on=START + 30, t_off=START + 60)
+    state = monitor.init(finished, START)
+    decisions: Counter[Decision] = Counter()
+    for k, snapshot in enumerate(snapshots(simulate(site, Scenario(seed=5, duration_s=60, attacks=attacks)))):
+        state, _, verdict = monitor.step(finished, state, to_frame(site, snapshot))
+        decisions[verdict.decision] += 1
+        named = np.flatnonzero(verdict.suspects)
+        assert named.tolist() == (attack.meters.tolist() if k >= 31 else [])
+    assert decisions[Decision.ATTACKED] == 29
+    assert decisions[Decision.CLEAN] >= 20
+
+
+def test_kept_designs_are_used_again(tmp_path: Path) -> None:
+    site = choose(load(SMALL), estimator=LMI)
+    first = design(site, where=tmp_path)
+
+    def never(done: int, total: int) -> None:
+        raise AssertionError(f"designed again: {done} of {total}")
+
+    second = design(site, where=tmp_path, progress=never)
+    np.testing.assert_array_equal(first.bank.masks, second.bank.masks)
+
+
+def test_too_many_liars_are_refused() -> None:
+    with pytest.raises(NotObservable, match="6 meters"):
+        design(choose(load(SMALL), max_attacked=3))
