@@ -7,6 +7,7 @@ a few words (a label for counters), the problems are sentences (for people).
 from __future__ import annotations
 
 import math
+import reprlib
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
@@ -263,11 +264,16 @@ def printable(text: str) -> str:
     return text if text.isprintable() else repr(text)[1:-1]
 
 
+# CBOR can refer to one value many times, so that three hundred bytes stand for more than memory holds.
+_BRIEF = reprlib.Repr()
+_BRIEF.maxlevel, _BRIEF.maxdict, _BRIEF.maxstring, _BRIEF.maxother = 3, 12, HEAD_BYTES, HEAD_BYTES
+
+
 def head_of(value: object) -> str:
-    """Return the beginning of something as printable text."""
+    """Return the beginning of something as printable text; of what is nested, only as much as is shown."""
     if isinstance(value, bytes):
         return printable(value[:HEAD_BYTES].decode("utf-8", "backslashreplace"))
     try:
-        return printable(repr(value)[:HEAD_BYTES])
+        return printable(_BRIEF.repr(value)[:HEAD_BYTES])
     except (ValueError, RecursionError):  # an integer of thousands of digits, a value inside itself
         return name_of(value)

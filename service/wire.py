@@ -11,9 +11,11 @@ same fields as columns in CBOR (a map of equally long arrays) or Arrow IPC (stre
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 from typing import Any
 
 import cbor2
@@ -284,27 +286,23 @@ def _batch(rows: list[Any], source: Source, known: Known, base: BadReading) -> D
     if not rows:
         return _refuse(base, BadReason.EMPTY, "the batch is empty")
     readings: list[Reading] = []
-    bad: list[BadReading] = []
+    bad: dict[BadReason, list[BadReading]] = {}
+    more: Counter[BadReason] = Counter()
     for index, row in enumerate(rows):
         found = judge(row, known, in_batch=True)
         if isinstance(found, Raw):
             readings.append(to_reading(source.feeder, found.meter, found))
             continue
+        alike = bad.setdefault(found.reason, [])
+        if len(alike) == DETAILED_PER_REASON:
+            more[found.reason] += 1
+            continue
         meter = row.get("meter") if isinstance(row, dict) else None
         ours = meter if isinstance(meter, str) and meter in known.meters else None
         listed = tuple(f"element {index}: {problem}" for problem in found.problems)
-        bad.append(replace(base, reason=found.reason, problems=listed, meter=ours, head=head_of(row)))
-    return Decoded(tuple(readings), tuple(_condense(bad)))
-
-
-def _condense(bad: Iterable[BadReading]) -> Iterator[BadReading]:
-    """Keep the first few of each reason in full and count the others, so that a payload cannot flood."""
-    by_reason: dict[BadReason, list[BadReading]] = {}
-    for one in bad:
-        by_reason.setdefault(one.reason, []).append(one)
-    for group in by_reason.values():
-        yield from group[:DETAILED_PER_REASON]
-        rest = group[DETAILED_PER_REASON:]
-        if rest:
-            tail = f"{len(rest)} more elements of the batch: {rest[0].reason}"
-            yield replace(rest[0], problems=(tail,), count=len(rest))
+        alike.append(replace(base, reason=found.reason, problems=listed, meter=ours, head=head_of(row)))
+    rest = (
+        replace(base, reason=reason, problems=(f"{count} more elements of the batch: {reason}",), count=count)
+        for reason, count in more.items()
+    )
+    return Decoded(tuple(readings), (*chain.from_iterable(bad.values()), *rest))

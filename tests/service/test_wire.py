@@ -262,6 +262,28 @@ def test_malformed_batches(payload: bytes, encoding: str, reason: BadReason) -> 
     assert only_bad(decode(payload, BATCH, encoding))[0] is reason
 
 
+def test_cbor_that_unfolds_to_more_than_memory_holds_is_a_bad_reading() -> None:
+    """Twelve arrays, each of ten references to the one before: 460 bytes that stand for 10^13 numbers."""
+    references = range(13)
+    text = [b"\xd8\x1c\x8a" + b"\x01" * 10]
+    text += [b"\xd8\x1c\x8a" + (b"\xd8\x1d" + bytes([number])) * 10 for number in references[:-1]]
+    payload = b"".join(
+        [
+            b"\xa5\x61x\x8d",
+            *text,
+            b"\x65meter\x81\x61a\x61t\x81",
+            cbor2.dumps(T),
+            b"\x66v_volt\x81",
+            cbor2.dumps(230.0),
+            b"\x64p_kw\x81\xd8\x1d" + bytes([references[-1]]),
+        ]
+    )
+    assert len(payload) < 500
+    decoded = decode(payload, BATCH, "application/cbor")
+    assert only_bad(decoded) == (BadReason.TYPE, ("element 0: p_kw is an array, not a number",))
+    assert len(decoded.bad[0].head) <= 200
+
+
 def test_cbor_numbers_of_other_kinds_are_no_numbers() -> None:
     payload = cbor2.dumps(
         {"meter": ["a", "b"], "t": [T, T], "v_volt": [10**5_000, "x"], "seq": [10**5_000, 1]}
