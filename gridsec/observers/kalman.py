@@ -1,0 +1,296 @@
+"""Partial Kalman filters: each sensor's own filter, with the covariances between all of them.
+
+The filters do not hear of each other, but one disturbance moves all of them and noise may be shared, so
+their errors are correlated. Whoever fuses or compares them needs the joint covariance
+
+    P = E[v v^T],    z_hat = Phi x + v + e,
+
+with all blocks P_ij. It obeys one recursion for all blocks at once: with S, T block diagonal and K block
+diagonal in its turn,
+
+    P(k+1|k)   = S P(k|k) S^T + Phi Q Phi^T
+    P(k+1|k+1) = (I - K T) P(k+1|k) (I - K T)^T + K R K^T,
+
+whose diagonal blocks are the usual covariances because each K_i is optimal for its own sensor.
+
+References
+----------
+lee2018, section 4.3.2; docs/theory-partial-observers.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import LinAlgError, block_diag, solve_discrete_are, solve_discrete_lyapunov
+
+from gridsec.arrays import Bools, Floats, frozen, spectral_radius, symmetry_defect
+from gridsec.errors import DesignInfeasible
+from gridsec.observers.parts import Stack, decompose, stack
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KalmanDesign:
+    """p partial filters as one. mu stacked states, p sensors, m inputs.
+
+    Attributes
+    ----------
+    stack
+        The decomposition.
+    process : (mu, mu)
+        Phi Q Phi^T, covariance of the disturbance as the filters feel it.
+    noise : (p, p)
+        R, covariance of the sensors' noise; need not be diagonal.
+    own : (mu, p)
+        1 where a row belongs to a sensor, else 0.
+    period
+        Sampling time, s.
+    """
+
+    stack: Stack
+    process: Floats
+    noise: Floats
+    own: Floats
+    period: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KalmanState:
+    """Where the filters stand.
+
+    Attributes
+    ----------
+    t
+        Time of the state that `z` estimates, s.
+    z : (…, mu)
+        Stacked estimates; leading axes are independent runs with the same covariance.
+    P : (mu, mu)
+        Joint covariance of their errors while nobody attacks.
+    K : (mu, p)
+        Gain of the last correction; zero for sensors without a reading.
+    """
+
+    t: float
+    z: Floats
+    P: Floats
+    K: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Steady:
+    """Where covariance and gain end up when every reading arrives.
+
+    Attributes
+    ----------
+    P : (mu, mu)
+        P(k|k) for k to infinity.
+    K : (mu, p)
+        Gain, block diagonal.
+    F : (mu, mu)
+        (I - K T) S, Schur stable: motion of the errors.
+    """
+
+    P: Floats
+    K: Floats
+    F: Floats
+
+
+def design(
+    A: Floats,
+    B: Floats,
+    C: Floats,
+    Q: Floats,
+    R: Floats,
+    *,
+    slowest: float,
+    tol: float,
+    period: float = 1.0,
+) -> KalmanDesign:
+    """Prepare one filter for each sensor.
+
+    Parameters
+    ----------
+    A, B, C : (n, n), (n, m), (p, n)
+        Plant, sampled.
+    Q, R : (n, n), (p, p)
+        Covariances of disturbance and noise, symmetric and positive semidefinite.
+    slowest, tol
+        As in `parts.decompose`.
+    period
+        Sampling time, s.
+
+    Raises
+    ------
+    ValueError
+        If Q or R has the wrong shape or is no covariance.
+
+    References
+    ----------
+    lee2018, Assumption 4.3.3, (4.3.8), (4.3.9).
+    """
+    Q, R = np.asarray(Q, dtype=np.float64), np.asarray(R, dtype=np.float64)
+    for name, M, size in (("Q", Q, len(A)), ("R", R, len(C))):
+        if M.shape != (size, size):
+            raise ValueError(f"{name} has shape {M.shape}; ({size}, {size}) is needed")
+        scale = float(np.max(np.abs(M), initial=0.0))
+        if symmetry_defect(M) > 1e-12 or float(np.linalg.eigvalsh(M)[0]) < -1e-12 * scale:
+            raise ValueError(f"{name} is no covariance: not symmetric, or not positive semidefinite")
+    whole = stack(decompose(A, C, slowest=slowest, tol=tol), B)
+    own = block_diag(*(np.ones((part.t.size, 1)) for part in whole.parts))
+    process = whole.phi @ Q @ whole.phi.T
+    return KalmanDesign(whole, frozen(0.5 * (process + process.T)), frozen(R), frozen(own), period)
+
+
+def init(design: KalmanDesign, t: float, mean: Floats, covariance: Floats) -> KalmanState:
+    """Before the first reading: z(0|-1) = Phi x_0, P(0|-1) = Phi P_0 Phi^T.
+
+    Parameters
+    ----------
+    design
+        From `design`.
+    t
+        Time, s.
+    mean : (…, n)
+        Expected state; leading axes are independent runs.
+    covariance : (n, n)
+        P_0, covariance of the state.
+
+    References
+    ----------
+    lee2018, after (4.3.9).
+    """
+    phi = design.stack.phi
+    P = phi @ np.asarray(covariance) @ phi.T
+    return KalmanState(t, mean @ phi.T, 0.5 * (P + P.T), np.zeros(design.own.shape))
+
+
+def predict(design: KalmanDesign, state: KalmanState, u: Floats) -> KalmanState:
+    """From (k|k) to (k+1|k).
+
+    Parameters
+    ----------
+    design, state
+        Filters, and where they stand.
+    u : (…, m)
+        Input during the step.
+
+    References
+    ----------
+    lee2018 (4.3.9b), (4.3.9d), (4.3.15).
+    """
+    S, G = design.stack.S, design.stack.G
+    P = S @ state.P @ S.T + design.process
+    return KalmanState(state.t + design.period, state.z @ S.T + u @ G.T, P, state.K)
+
+
+def correct(design: KalmanDesign, state: KalmanState, y: Floats, seen: Bools | None = None) -> KalmanState:
+    """From (k|k-1) to (k|k): each filter uses its own sensor's reading.
+
+    Parameters
+    ----------
+    design, state
+        Filters, and where they stand.
+    y : (…, p)
+        Readings; anything where not seen.
+    seen : (p,)
+        Which readings there are; all by default.
+
+    References
+    ----------
+    lee2018 (4.3.9a), (4.3.9c), (4.3.9e), (4.3.15), all blocks of P in Joseph's form.
+    """
+    T, R = design.stack.T, design.noise
+    M = (state.P @ T.T) * design.own
+    s = np.einsum("im,mi->i", T, M) + np.diagonal(R)
+    use = s > 0.0 if seen is None else (s > 0.0) & seen
+    K = M * np.where(use, 1.0 / np.where(use, s, 1.0), 0.0)
+    J = np.eye(len(K)) - K @ T
+    P = J @ state.P @ J.T + K @ R @ K.T
+    surprise = np.where(use, y - state.z @ T.T, 0.0)
+    return KalmanState(state.t, state.z + surprise @ K.T, 0.5 * (P + P.T), K)
+
+
+def step(
+    design: KalmanDesign, state: KalmanState, y: Floats, u: Floats, seen: Bools | None = None
+) -> KalmanState:
+    """From (k|k) to (k+1|k+1), with the input u(k) and the readings y(k+1).
+
+    Parameters
+    ----------
+    design, state
+        Filters, and where they stand.
+    y : (…, p)
+        Readings at the end of the step; anything where not seen.
+    u : (…, m)
+        Input during the step.
+    seen : (p,)
+        As in `correct`.
+
+    References
+    ----------
+    lee2018 (4.3.8).
+    """
+    return correct(design, predict(design, state, u), y, seen)
+
+
+def step_steady(
+    design: KalmanDesign, steady: Steady, state: KalmanState, y: Floats, u: Floats
+) -> KalmanState:
+    """`step` with the gain and covariance of `steady`; for filters that have long been running.
+
+    Parameters
+    ----------
+    design, state, y, u
+        As in `step`; every reading is there.
+    steady
+        From `steady`.
+    """
+    z = state.z @ design.stack.S.T + u @ design.stack.G.T
+    z = z + (y - z @ design.stack.T.T) @ steady.K.T
+    return KalmanState(state.t + design.period, z, steady.P, steady.K)
+
+
+def steady(design: KalmanDesign) -> Steady:
+    """Stationary gain and joint covariance.
+
+    The gains by one Riccati equation for each sensor, the joint covariance by one Lyapunov equation.
+
+    Parameters
+    ----------
+    design
+        From `design`.
+
+    Raises
+    ------
+    DesignInfeasible
+        If a filter has no stable stationary gain: a mode on the unit circle that its sensor sees, or that
+        fades too slowly, feels no disturbance.
+
+    References
+    ----------
+    lee2018 (4.3.14), (4.3.15).
+    """
+    whole = design.stack
+    gains = np.zeros(design.own.shape)
+    for i, part in enumerate(whole.parts):
+        if not part.t.size:
+            continue
+        at = whole.rows(i)
+        try:
+            M = solve_discrete_are(
+                part.S.T, part.t[:, None], design.process[at, at], design.noise[[i]][:, [i]]
+            )
+        except (LinAlgError, ValueError) as problem:
+            raise DesignInfeasible(f"stationary filter of sensor {i}", str(problem)) from problem
+        gains[at, i] = M @ part.t / (part.t @ M @ part.t + design.noise[i, i])
+    J = np.eye(len(gains)) - gains @ whole.T
+    F = J @ whole.S
+    radius = spectral_radius(F)
+    if not radius < 1.0:
+        raise DesignInfeasible("stationary filters", f"spectral radius {radius:.6g}", 1.0 - radius)
+    P = np.asarray(
+        solve_discrete_lyapunov(F, J @ design.process @ J.T + gains @ design.noise @ gains.T),
+        dtype=np.float64,
+    )
+    return Steady(frozen(0.5 * (P + P.T)), frozen(gains), frozen(F))

@@ -1,0 +1,389 @@
+"""Partial Luenberger observers: each sensor estimates the part of the state that it can see by itself.
+
+One sensor's reading reaches one observer only, so an attack on q sensors spoils q estimates and leaves
+the others exact. The estimates of all sensors, stacked, are a code word of the state,
+
+    z_hat = Phi x + v + e,    Phi = [Z_1 … Z_p]^T,    e_i = 0 for honest sensors,   |v_i| <= bound_i,
+
+which `gridsec.decode.partial` decodes. Sampled time: x(k+1) = A x(k) + B u(k) + d(k), y(k) = C x(k) + n(k).
+
+References
+----------
+lee2018, sections 4.2.1 and 4.3.1; docs/theory-partial-observers.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.linalg import LinAlgError, solve_discrete_are
+
+from gridsec.arrays import Bools, Floats, Ints, frozen, spectral_radius
+from gridsec.errors import DesignInfeasible
+from gridsec.observers.parts import Part, Stack, decompose, stack
+
+LONGEST = 1 << 18
+"""Largest number of steps that an observer's error may take to halve before its design is refused."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bounds:
+    """What disturbances and noise can be at most (lee2018, Assumption 4.3.2).
+
+    Attributes
+    ----------
+    process
+        d_max: `d(k) = E w(k)` with `|w(k)|_2 <= process`.
+    noise : (p,)
+        n_max of each sensor: `|n_i(k)| <= noise[i]`, in the sensor's unit.
+    E : (n, l)
+        How disturbances enter; the identity in the paper.
+    """
+
+    process: float
+    noise: Floats
+    E: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Envelope:
+    """Bound of one observer's honest error: |v(k)| <= |F^k| |v(0)| + limit.
+
+    Attributes
+    ----------
+    powers : (K + 1,)
+        |F^j|_2 for j = 0 … K, the last at most 1/2. Beyond: |F^(mK + r)| <= powers[K]^m powers[r].
+    limit
+        w_max: the sum over all j >= 0 of |F^j L| n_max + |F^j Z^T E| d_max, its tail bounded by a
+        geometric series. Never above the paper's (eta_L n_max + eta_Z d_max) / (1 - beta).
+
+    References
+    ----------
+    lee2018 (4.3.7).
+    """
+
+    powers: Floats
+    limit: float
+
+    def growth(self, steps: int) -> float:
+        """Bound of |F^steps|_2."""
+        whole, rest = divmod(steps, self.powers.size - 1)
+        return float(self.powers[-1] ** whole * self.powers[rest])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LuenbergerDesign:
+    """p partial observers as one. mu stacked states, p sensors, m inputs.
+
+    Attributes
+    ----------
+    stack
+        The decomposition.
+    L : (mu, p)
+        Injection gains, block diagonal.
+    F : (mu, mu)
+        S - L T, block diagonal and Schur stable.
+    bounds
+        Disturbances and noise that the envelopes hold for.
+    envelopes
+        One for each sensor.
+    step_norm : (p,)
+        |S_i|_2: by how much a step without a reading can enlarge an error.
+    period
+        Sampling time, s.
+    """
+
+    stack: Stack
+    L: Floats
+    F: Floats
+    bounds: Bounds
+    envelopes: tuple[Envelope, ...]
+    step_norm: Floats
+    period: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LuenbergerState:
+    """Where the observers stand.
+
+    Attributes
+    ----------
+    t
+        Time of the state that `z` estimates, s.
+    z : (…, mu)
+        Stacked estimates; leading axes are independent runs.
+    origin : (p,)
+        Bound of |z_i - Z_i^T x| when sensor i was last started; infinite if unknown.
+    age : (p,)
+        Steps since then.
+    """
+
+    t: float
+    z: Floats
+    origin: Floats
+    age: Ints
+
+
+def riccati_gain(part: Part, process: Floats, noise: float, *, rate: float) -> Floats:
+    """L of the stationary Kalman predictor, with a prescribed decay.
+
+    Solves the Riccati equation of (S / rate, t); then (S - L t) / rate is Schur stable.
+
+    Parameters
+    ----------
+    part
+        The sensor's part of the state.
+    process : (n, n)
+        Weight (covariance) of d.
+    noise
+        Weight (variance) of n_i, > 0.
+    rate
+        In (0, 1]: the error decays at least like rate^k.
+
+    Raises
+    ------
+    DesignInfeasible
+        If no gain achieves the rate: a fading mode is slower than `rate`, or the process weight leaves a
+        mode on the circle of radius `rate` without disturbance.
+
+    References
+    ----------
+    B. Anderson, J. Moore, "Optimal filtering", Prentice-Hall, 1979, sections 4.4 and 6.3 (prescribed decay).
+    """
+    if not 0.0 < rate <= 1.0:
+        raise ValueError(f"rate is {rate}; it must lie in (0, 1]")
+    if not part.t.size:
+        return np.zeros(0)
+    S, t = part.S / rate, part.t / np.sqrt(noise)
+    Q = part.basis.T @ process @ part.basis
+    what = f"observer gain for decay like {rate:g}^k"
+    try:
+        P = solve_discrete_are(S.T, t[:, None], Q, np.eye(1))
+    except (LinAlgError, ValueError) as problem:
+        raise DesignInfeasible(
+            what, f"no stabilising solution of the Riccati equation ({problem})"
+        ) from problem
+    gain = rate * S @ P @ t / (t @ P @ t + 1.0) / np.sqrt(noise)
+    radius = spectral_radius(part.S - np.outer(gain, part.t))
+    if not radius < rate:
+        raise DesignInfeasible(what, f"spectral radius {radius:.6g}", rate - radius)
+    return np.asarray(gain)
+
+
+def design(
+    A: Floats,
+    B: Floats,
+    C: Floats,
+    bounds: Bounds,
+    *,
+    slowest: float,
+    tol: float,
+    gains: Literal["riccati"] | Sequence[Floats] = "riccati",
+    rate: float = 1.0,
+    period: float = 1.0,
+) -> LuenbergerDesign:
+    """Design one partial observer for each sensor.
+
+    Parameters
+    ----------
+    A, B, C : (n, n), (n, m), (p, n)
+        Plant, sampled.
+    bounds
+        Of disturbance and noise; also the weights of the Riccati gains.
+    slowest, tol
+        As in `decompose`.
+    gains
+        "riccati": `riccati_gain` with weights `process^2 E E^T` and `noise^2`. Or L_i (mu_i,) for each
+        sensor.
+    rate
+        As in `riccati_gain`.
+    period
+        Sampling time, s.
+
+    Raises
+    ------
+    DesignInfeasible
+        If some F_i = S_i - L_i t_i is not Schur stable, or so slow that errors halve in more than
+        2^18 steps.
+
+    References
+    ----------
+    lee2018 (4.3.1), (4.3.3), (4.3.7).
+    """
+    parts = decompose(A, C, slowest=slowest, tol=tol)
+    E, noise = np.asarray(bounds.E, dtype=np.float64), np.asarray(bounds.noise, dtype=np.float64)
+    if E.ndim != 2 or E.shape[0] != len(A) or noise.shape != (len(parts),):
+        raise ValueError(f"E has shape {E.shape} and noise {noise.shape} for n = {len(A)}, p = {len(parts)}")
+    if bounds.process < 0.0 or np.any(noise < 0.0):
+        raise ValueError("bounds of disturbance and noise cannot be negative")
+    if isinstance(gains, str):
+        weight = bounds.process**2 * E @ E.T
+        if np.any(noise == 0.0):
+            raise ValueError('gains="riccati" needs positive bounds of the noise; give the gains otherwise')
+        chosen = [
+            riccati_gain(part, weight, float(size) ** 2, rate=rate)
+            for part, size in zip(parts, noise, strict=True)
+        ]
+    else:
+        chosen = [np.asarray(gain, dtype=np.float64) for gain in gains]
+    if [gain.shape for gain in chosen] != [part.t.shape for part in parts]:
+        raise ValueError(f"gains must have the lengths {[part.t.size for part in parts]}")
+    whole = stack(parts, B)
+    L = np.zeros((whole.phi.shape[0], len(parts)))
+    for i, gain in enumerate(chosen):
+        L[whole.rows(i), i] = gain
+    envelopes = tuple(
+        envelope(part, gain, bounds.process, float(size), E)
+        for part, gain, size in zip(parts, chosen, noise, strict=True)
+    )
+    step_norm = [float(np.linalg.norm(part.S, 2)) if part.t.size else 0.0 for part in parts]
+    kept = Bounds(float(bounds.process), frozen(noise), frozen(E))
+    return LuenbergerDesign(
+        whole, frozen(L), frozen(whole.S - L @ whole.T), kept, envelopes, frozen(np.array(step_norm)), period
+    )
+
+
+def envelope(part: Part, gain: Floats, process: float, noise: float, E: Floats) -> Envelope:
+    """Bound of the honest error of one partial observer.
+
+    Parameters
+    ----------
+    part, gain
+        The sensor's part and L_i (mu_i,).
+    process, noise, E
+        As in `Bounds`, noise of this sensor.
+
+    Raises
+    ------
+    DesignInfeasible
+        As `design`.
+    """
+    F = part.S - np.outer(gain, part.t)
+    radius = spectral_radius(F)
+    if not radius < 1.0:
+        raise DesignInfeasible("partial observer", f"spectral radius {radius:.6g} of S - L t", 1.0 - radius)
+    if not part.t.size:
+        return Envelope(frozen(np.array([1.0, 0.0])), 0.0)
+    powers = _powers(F)
+    sizes = np.linalg.norm(powers, 2, axis=(1, 2))
+    by_noise = np.linalg.norm(powers[:-1] @ gain, axis=1) * noise
+    by_process = np.linalg.norm(powers[:-1] @ (part.basis.T @ E), 2, axis=(1, 2)) * process
+    limit = float(np.sum(by_noise + by_process) / (1.0 - sizes[-1]))
+    return Envelope(frozen(sizes), limit)
+
+
+def _powers(F: Floats) -> Floats:
+    """F^0 … F^K, K the first power of two with |F^K| <= 1/2; (K + 1, mu, mu)."""
+    powers = np.stack([np.eye(len(F)), F])
+    while np.linalg.norm(powers[-1], 2) > 0.5:
+        if len(powers) > LONGEST:
+            raise DesignInfeasible("partial observer", f"its errors do not halve within {LONGEST} steps")
+        powers = np.concatenate([powers, powers[1:] @ powers[-1]])
+    return powers
+
+
+def geometric(part: Part, gain: Floats, process: float, noise: float, E: Floats, *, beta: float) -> Envelope:
+    """The paper's own bound, with the smallest constants eta_F, eta_L, eta_Z that fit a given beta.
+
+    Parameters
+    ----------
+    part, gain, process, noise, E
+        As in `envelope`.
+    beta
+        Between the spectral radius of F and 1.
+
+    Returns
+    -------
+    Envelope
+        With `growth(k) = eta_F beta^k` and limit = (eta_L n_max + eta_Z d_max) / (1 - beta).
+
+    References
+    ----------
+    lee2018 (4.3.7).
+    """
+    F = part.S - np.outer(gain, part.t)
+    if not spectral_radius(F) < beta < 1.0:
+        raise ValueError(f"beta is {beta}; it must lie between {spectral_radius(F):.6g} and 1")
+    powers = _powers(F / beta)
+    # |F^j M| beta^-j is largest within the first K powers: later ones are shorter than those K before.
+    eta_f = float(np.max(np.linalg.norm(powers, 2, axis=(1, 2))))
+    eta_l = float(np.max(np.linalg.norm(powers @ gain, axis=1)))
+    eta_z = float(np.max(np.linalg.norm(powers @ (part.basis.T @ E), 2, axis=(1, 2))))
+    return Envelope(frozen(np.array([eta_f, beta])), (eta_l * noise + eta_z * process) / (1.0 - beta))
+
+
+def init(design: LuenbergerDesign, t: float, x: Floats, error: float = np.inf) -> LuenbergerState:
+    """Start all observers from a guess of the state.
+
+    Parameters
+    ----------
+    design
+        From `design`.
+    t
+        Time, s.
+    x : (…, n)
+        Guess; leading axes are independent runs.
+    error
+        Bound of |guess - x|_2. Infinite: unknown, then bounds stay infinite for ever.
+    """
+    p = len(design.stack.parts)
+    # |Z_i^T| = 1 unless the part is empty.
+    origin = np.array([error if part.t.size else 0.0 for part in design.stack.parts])
+    return LuenbergerState(t, x @ design.stack.phi.T, origin, np.zeros(p, dtype=np.intp))
+
+
+def step(
+    design: LuenbergerDesign, state: LuenbergerState, y: Floats, u: Floats, seen: Bools | None = None
+) -> LuenbergerState:
+    """From z_hat(k), with the readings y(k) and the input u(k), to z_hat(k+1).
+
+        z_hat_i(k+1) = S_i z_hat_i(k) + Z_i^T B u(k) + L_i (y_i(k) - t_i z_hat_i(k))
+
+    Parameters
+    ----------
+    design, state
+        Observers, and where they stand.
+    y : (…, p)
+        Readings; anything where not seen.
+    u : (…, m)
+        Inputs.
+    seen : (p,)
+        Which readings there are; all by default. An observer without a reading predicts, and the bound
+        of its error starts anew from the enlarged one.
+
+    References
+    ----------
+    lee2018 (4.3.1).
+    """
+    stack = design.stack
+    if seen is None or bool(np.all(seen)):
+        z = state.z @ design.F.T + y @ design.L.T + u @ stack.G.T
+        return LuenbergerState(state.t + design.period, z, state.origin, state.age + 1)
+    surprise = np.where(seen, y - state.z @ stack.T.T, 0.0)
+    z = state.z @ stack.S.T + surprise @ design.L.T + u @ stack.G.T
+    pushed = design.bounds.process * float(np.linalg.norm(design.bounds.E, 2))
+    grown = np.where(design.step_norm > 0.0, design.step_norm * bound(design, state) + pushed, 0.0)
+    origin = np.where(seen, state.origin, grown)
+    return LuenbergerState(state.t + design.period, z, origin, np.where(seen, state.age + 1, 0))
+
+
+def bound(design: LuenbergerDesign, state: LuenbergerState) -> Floats:
+    """Bound of |z_hat_i - Z_i^T x|_2 for every honest sensor, (p,); the largest is v_max(k).
+
+    Parameters
+    ----------
+    design, state
+        Observers, and where they stand.
+
+    References
+    ----------
+    lee2018 (4.3.7).
+    """
+    out = np.empty(state.origin.size)
+    for i, (env, origin, age) in enumerate(zip(design.envelopes, state.origin, state.age, strict=True)):
+        # An unknown start stays unknown, also where the growth has underflowed to zero.
+        out[i] = env.growth(int(age)) * origin + env.limit if np.isfinite(origin) else np.inf
+    return out

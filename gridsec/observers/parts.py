@@ -1,0 +1,181 @@
+"""What each sensor sees of the state by itself: Kalman's decomposition, sensor by sensor.
+
+    z_i = Z_i^T x,    z_i(k+1) = S_i z_i(k) + Z_i^T B u(k) + Z_i^T d(k),    y_i(k) = t_i z_i(k) + n_i(k)
+
+The partial observers of `luenberger` and `kalman` estimate z_i from y_i alone.
+
+References
+----------
+lee2018, section 4.2.1; docs/theory-partial-observers.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import block_diag, schur
+
+from gridsec.arrays import Floats, Ints, frozen, frozen_ints
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """What one sensor sees of an n-dimensional state: an orthonormal basis in three pieces.
+
+    Attributes
+    ----------
+    observable : (n, nu)
+        Z^o, basis of the orthogonal complement of the unobservable subspace N(G_i).
+    fading : (n, mu - nu)
+        Z^d, basis of what the sensor does not see but a model predicts ever better by itself.
+    hidden : (n, n - mu)
+        W, basis of the rest: unseen and not predictable.
+    S : (mu, mu)
+        Motion of z = Z^T x with Z = [Z^o Z^d]; block lower triangular.
+    t : (mu,)
+        The sensor's row on z; zero beyond the first nu.
+
+    References
+    ----------
+    lee2018 (4.2.3)-(4.2.5).
+    """
+
+    observable: Floats
+    fading: Floats
+    hidden: Floats
+    S: Floats
+    t: Floats
+
+    @property
+    def basis(self) -> Floats:
+        """[Z^o Z^d], (n, mu)."""
+        return np.hstack([self.observable, self.fading])
+
+
+def decompose(A: Floats, C: Floats, *, slowest: float, tol: float) -> tuple[Part, ...]:
+    """Kalman decomposition for every single sensor.
+
+    The motion that a sensor does not see has eigenvalues of its own. Modes below `slowest` in modulus go
+    into `fading`, the others into `hidden`. Hence `slowest=0` gives the Kalman observability
+    decomposition (nothing unseen is kept), and `slowest=1` the detectability decomposition.
+
+    Parameters
+    ----------
+    A, C : (n, n), (p, n)
+        The pair, sampled.
+    slowest
+        In [0, 1]. A little below 1 is wise: a mode that fades in 1e6 steps helps nobody, and a repeated
+        eigenvalue on the unit circle comes out of rounding a little inside.
+    tol
+        A row of the observability matrix, made orthogonal to those before it, counts as new if longer than
+        this times |A|. Too large a value only makes parts smaller; too small a one promises what noise
+        then has to deliver.
+
+    Returns
+    -------
+    p times Part
+
+    References
+    ----------
+    lee2018, section 4.2.1.
+    """
+    A, C = np.asarray(A, dtype=np.float64), np.asarray(C, dtype=np.float64)
+    if A.ndim != 2 or A.shape[0] != A.shape[1] or C.ndim != 2 or C.shape[1] != A.shape[0]:
+        raise ValueError(f"A has shape {A.shape} and C {C.shape}; (n, n) and (p, n) are needed")
+    if not 0.0 <= slowest <= 1.0:
+        raise ValueError(f"slowest is {slowest}; it is the modulus of a decaying mode, in [0, 1]")
+    return tuple(_part(A, c, slowest, tol) for c in C)
+
+
+def _part(A: Floats, c: Floats, slowest: float, tol: float) -> Part:
+    seen, unseen = _krylov(A, c, tol)
+    hidden_count, turn = 0, np.zeros((0, 0))
+    if unseen.shape[1]:
+        # N(G) is invariant: the leading Schur vectors of its slow modes are invariant in their turn,
+        # and the others complete them orthogonally.
+        _, turn, hidden_count = schur(
+            unseen.T @ A @ unseen, output="real", sort=lambda re, im: np.hypot(re, im) >= slowest
+        )
+    rest = unseen @ turn
+    hidden, fading = rest[:, :hidden_count], rest[:, hidden_count:]
+    Z = np.hstack([seen, fading])
+    return Part(frozen(seen), frozen(fading), frozen(hidden), frozen(Z.T @ A @ Z), frozen(c @ Z))
+
+
+def _krylov(A: Floats, c: Floats, tol: float) -> tuple[Floats, Floats]:
+    """Orthonormal bases of span{c, A^T c, …} and of its complement, without powers of A."""
+    n = A.shape[0]
+    size = float(np.linalg.norm(A, 2)) or 1.0
+    basis = np.zeros((n, 0))
+    length = float(np.linalg.norm(c))
+    row = c / length if length > 0.0 else c
+    while basis.shape[1] < n and (length := float(np.linalg.norm(row))) > tol:
+        basis = np.column_stack([basis, row / length])
+        row = A.T @ basis[:, -1] / size
+        # Twice, because once leaves errors of rounding that later rows would inherit.
+        for _ in range(2):
+            row = row - basis @ (basis.T @ row)
+    full, _ = np.linalg.qr(basis, mode="complete") if basis.shape[1] else (np.eye(n), None)
+    return basis, full[:, basis.shape[1] :]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stack:
+    """All parts side by side. mu is the sum of the parts' sizes.
+
+    Attributes
+    ----------
+    parts
+        One for each sensor.
+    first : (p + 1,)
+        Sensor i has the rows `first[i]:first[i + 1]` of everything stacked.
+    phi : (mu, n)
+        Phi = [Z_1 … Z_p]^T, without the rows of zeros that the paper appends.
+    S, T : (mu, mu), (p, mu)
+        Motion and outputs of the stacked z; block diagonal.
+    G : (mu, m)
+        Phi B.
+
+    References
+    ----------
+    lee2018 (4.2.9), (4.2.10), (4.2.5).
+    """
+
+    parts: tuple[Part, ...]
+    first: Ints
+    phi: Floats
+    S: Floats
+    T: Floats
+    G: Floats
+
+    def rows(self, sensor: int) -> slice:
+        """The rows of one sensor."""
+        return slice(int(self.first[sensor]), int(self.first[sensor + 1]))
+
+    @property
+    def blocks(self) -> tuple[Floats, ...]:
+        """Z_i^T of each sensor, (mu_i, n)."""
+        return tuple(self.phi[self.rows(i)] for i in range(len(self.parts)))
+
+
+def stack(parts: Sequence[Part], B: Floats) -> Stack:
+    """Put the parts side by side.
+
+    Parameters
+    ----------
+    parts
+        From `decompose`.
+    B : (n, m)
+        How inputs enter the state.
+    """
+    phi = np.vstack([part.basis.T for part in parts])
+    first = np.concatenate([[0], np.cumsum([part.t.size for part in parts])])
+    T = np.zeros((len(parts), phi.shape[0]))
+    for i, part in enumerate(parts):
+        T[i, first[i] : first[i + 1]] = part.t
+    S = block_diag(*(part.S for part in parts))
+    return Stack(
+        tuple(parts), frozen_ints(first), frozen(phi), frozen(S), frozen(T), frozen(phi @ np.asarray(B))
+    )
