@@ -1,6 +1,6 @@
 """The real service as a process of its own, and a meter fleet that talks to it over zenoh.
 
-Nothing of the service is imported here: what these tests use is what an integrator has, zenoh keys, JSON
+Nothing of the service is used from inside: what these tests use is what an integrator has, zenoh keys, JSON
 and HTTP.
 """
 
@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -23,15 +22,10 @@ import httpx
 import zenoh
 
 from feeders.scenario import Reading, Sample
+from tests.service.running import free_port
 
 START_S = 60.0
 ECHO_S = 30.0
-
-
-def free_port() -> int:
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        return int(s.getsockname()[1])
 
 
 @dataclass
