@@ -162,3 +162,35 @@ def statement(what: str, where: str, printed: str, ours: str) -> Claim:
         The two texts, for example "1 -> 2 -> 3".
     """
     return Claim(what, where, printed, ours, printed == ours)
+
+
+def rounded_up(what: str, where: str, printed: float, ours: float, *, unit: float) -> Claim:
+    """Claim about a printed upper bound, met when ours, rounded up, is it.
+
+    Parameters
+    ----------
+    what, where, printed, ours
+        As in `Claim`.
+    unit
+        Worth of one step in the last printed digit.
+
+    Returns
+    -------
+    Claim
+        Met when `printed - unit < ours <= printed`, with a part in 1e9 for rounding.
+    """
+    slack = 1e-9 * unit
+    return Claim(
+        what, where, printed, float(ours), bool(printed - unit < ours + slack <= printed + 2.0 * slack)
+    )
+
+
+def at_most(what: str, where: str, printed: float, ours: float) -> Claim:
+    """Claim that a number is an upper bound, met when ours does not exceed it.
+
+    Parameters
+    ----------
+    what, where, printed, ours
+        As in `Claim`.
+    """
+    return Claim(what, where, printed, float(ours), bool(ours <= printed))

@@ -1,0 +1,282 @@
+"""Gains and constants of the partial high-gain observers: P(theta), decay, noise, settling times.
+
+    z' = A z + e_n alpha(z) + beta(z) u,    zhat' = the same + K (y - zhat_1),    K = P^{-1} C^T
+    0 = -theta P - A^T P - P A + C^T C
+
+In `xi = diag(1, 1/theta, …, 1/theta^{n-1}) (zhat - z)` the error obeys
+`xi' = theta (A - Pt^{-1} C^T C) xi + d + theta Pt^{-1} C^T v` with Pt = P(1), and `V = xi^T Pt xi` falls
+like `V' <= -theta V / 2 + theta v^2` as soon as `margin` is positive. docs/theory-high-gain.md proves it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+from math import comb, sqrt
+
+import numpy as np
+
+from gridsec.arrays import Floats
+
+
+def riccati(n: int, theta: float) -> Floats:
+    """P(theta) in closed form, (n, n): `(-1)^{i+j} C(i+j-2, i-1) / theta^{i+j-1}`.
+
+    Parameters
+    ----------
+    n
+        Dimension of the observable part.
+    theta
+        High-gain parameter, 1/s, positive.
+
+    References
+    ----------
+    kim2018, the equation after (5); lee2018 (5.2.7).
+    """
+    out = np.empty((n, n))
+    for i, j in product(range(1, n + 1), repeat=2):
+        out[i - 1, j - 1] = (-1.0) ** (i + j) * comb(i + j - 2, i - 1) / theta ** (i + j - 1)
+    return out
+
+
+def gain(n: int, theta: float) -> Floats:
+    """K = P(theta)^{-1} C^T in closed form, (n,): `C(n, j) theta^j`.
+
+    All eigenvalues of `A - K C` are -theta.
+
+    Parameters
+    ----------
+    n, theta
+        As in `riccati`.
+    """
+    return np.array([comb(n, j) * theta**j for j in range(1, n + 1)], dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class Decay:
+    """`|zhat(t) - z(t)| <= max(eta e^{-rate t} |zhat(0) - z(0)|, epsilon)`, largest entries.
+
+    Attributes
+    ----------
+    eta
+        Overshoot.
+    epsilon
+        What noise leaves over.
+    rate
+        1/s.
+    origin
+        Which derivation: "kim2018", "lee2018" or "componentwise".
+    """
+
+    eta: float
+    epsilon: float
+    rate: float
+    origin: str
+
+    def bound(self, initial: Floats, age: Floats) -> Floats:
+        """Bound on the error, (…).
+
+        Parameters
+        ----------
+        initial : (…)
+            Bound on the error at the start.
+        age : (…)
+            Time since the start, s.
+        """
+        return np.asarray(np.maximum(self.eta * initial * np.exp(-self.rate * age), self.epsilon))
+
+
+def decay_kim(n: int, theta: float, noise: float) -> Decay:
+    """Constants of kim2018: `eta = sqrt(2 n l2 / l1) theta^{n-1}`, `eps = 4 sqrt(2) Mv theta^{n-1} / l1`.
+
+    Parameters
+    ----------
+    n, theta
+        As in `riccati`.
+    noise
+        M_v, largest absolute value of the measurement noise.
+
+    References
+    ----------
+    kim2018, Lemma 1 and its proof in the appendix.
+    """
+    low, high = _spectrum(n)
+    peak = theta ** (n - 1)
+    rest = 4.0 * sqrt(2.0) * noise / low * peak
+    return Decay(sqrt(2.0 * n * high / low) * peak, rest, theta / 8.0, "kim2018")
+
+
+def decay_lee(n: int, theta: float, noise: float, *, printed: bool = False) -> Decay:
+    """Constants of lee2018: no noise in the analysis, rate theta / 4, a given floor for the noise.
+
+    Parameters
+    ----------
+    n, theta
+        As in `riccati`.
+    noise
+        delta of Remark 5.4.1, the floor of the bound.
+    printed
+        The value that gives the dissertation's 168 misses a factor sqrt(n) that passing from
+        Euclidean to largest-entry norm costs; True reproduces it, without a proof.
+
+    References
+    ----------
+    lee2018, Lemma 5.2.1 and Remark 5.4.1; docs/errata/kim2018.md.
+    """
+    low, high = _spectrum(n)
+    factor = 1.0 if printed else float(n)
+    return Decay(sqrt(factor * high / low) * theta ** (n - 1), noise, theta / 4.0, "lee2018")
+
+
+def decay_componentwise(n: int, theta: float, noise: float) -> Decay:
+    """Our constants: the same Lyapunov function, no norm changed on the way.
+
+    `|e_j| <= theta^{j-1} sqrt(S_jj V)` with S = Pt^{-1}, `V(t) <= V(0) e^{-theta t / 2} + 2 Mv^2`, and
+    V(0) at most the largest value of `xi^T Pt xi` over the corners of the box of initial errors.
+    `sqrt(a + b) <= sqrt(2) max` brings it into the form of `Decay`. The rate is twice kim2018's.
+
+    Parameters
+    ----------
+    n, theta, noise
+        As in `decay_kim`; theta at least 1.
+
+    References
+    ----------
+    docs/theory-high-gain.md, Theorem 1.
+    """
+    base = riccati(n, 1.0)
+    scale = theta ** np.arange(n, dtype=np.float64)
+    corners = np.array(list(product((1.0, -1.0), repeat=n))) / scale
+    start = float(np.max(np.einsum("ki,ij,kj->k", corners, base, corners)))
+    reach = float(np.max(scale * np.sqrt(np.diagonal(np.linalg.inv(base)))))
+    return Decay(reach * sqrt(2.0 * start), 2.0 * reach * noise, theta / 4.0, "componentwise")
+
+
+def _spectrum(n: int) -> tuple[float, float]:
+    values = np.linalg.eigvalsh(riccati(n, 1.0))
+    return float(values[0]), float(values[-1])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Slopes:
+    """Ranges of the partial derivatives of one sensor's alpha and beta u, over everything that occurs.
+
+    Attributes
+    ----------
+    low, high : (n, n)
+        Entry (j, k): range of the derivative of row j with respect to z_k. Rows before the last hold
+        `beta_j u`, the last one `alpha + beta_n u`; zero above the diagonal.
+    proven
+        Whether the ranges are rigorous; otherwise they come from samples.
+    """
+
+    low: Floats
+    high: Floats
+    proven: bool
+
+
+def margin(slopes: Slopes, theta: float) -> float:
+    """How far the observer's Lyapunov inequality is from failing; positive: Lemma 1 holds at this theta.
+
+    Largest mu with `Pt D + D^T Pt <= (theta/2 - mu) Pt` for every D whose entries `D_jk = theta^{k-j} s_jk`
+    have `s_jk` in its range. The inequality is affine in each s_jk, so that the corners decide.
+
+    Parameters
+    ----------
+    slopes
+        Ranges of the derivatives.
+    theta
+        High-gain parameter, 1/s.
+
+    References
+    ----------
+    docs/theory-high-gain.md, Theorem 1 (makes kim2018's "sufficiently large theta" a number).
+    """
+    n = slopes.low.shape[0]
+    base = riccati(n, 1.0)
+    root = np.linalg.cholesky(base)
+    free = np.argwhere(slopes.low < slopes.high)
+    if len(free) > _CORNERS:
+        return _margin_by_norm(slopes, theta)
+    power = theta ** (np.arange(n)[None, :] - np.arange(n)[:, None]).astype(np.float64)
+    worst = -np.inf
+    for pick in product((False, True), repeat=len(free)):
+        chosen = slopes.low.copy()
+        for (j, k), upper in zip(free, pick, strict=True):
+            if upper:
+                chosen[j, k] = slopes.high[j, k]
+        D = chosen * power
+        form = np.linalg.solve(root, np.linalg.solve(root, base @ D + D.T @ base).T)
+        worst = max(worst, float(np.linalg.eigvalsh(0.5 * (form + form.T))[-1]))
+    return 0.5 * theta - worst
+
+
+# More uncertain entries than this, and the corners are replaced by a norm bound.
+_CORNERS = 12
+
+
+def _margin_by_norm(slopes: Slopes, theta: float) -> float:
+    """The same with `2 |Pt^{1/2} D Pt^{-1/2}|` bounded by centre and radius; more careful, never wrong."""
+    n = slopes.low.shape[0]
+    base = riccati(n, 1.0)
+    root = np.linalg.cholesky(base)
+    power = theta ** (np.arange(n)[None, :] - np.arange(n)[:, None]).astype(np.float64)
+    centre, radius = 0.5 * (slopes.low + slopes.high) * power, 0.5 * (slopes.high - slopes.low) * power
+    form = np.linalg.solve(root, np.linalg.solve(root, base @ centre + centre.T @ base).T)
+    spread = np.abs(root.T) @ radius @ np.abs(np.linalg.inv(root.T))
+    extra = 2.0 * float(np.linalg.norm(spread, 2))
+    return 0.5 * theta - float(np.linalg.eigvalsh(0.5 * (form + form.T))[-1]) - extra
+
+
+def smallest_theta(slopes: Slopes, *, most: float = 1e6, tolerance: float = 1e-6) -> float:
+    """Smallest theta >= 1 from which on `margin` was positive at every theta tried; infinite if none.
+
+    A geometric grid from `most` downwards, then bisection on the last interval.
+
+    Parameters
+    ----------
+    slopes
+        Ranges of the derivatives.
+    most
+        Largest theta to consider, 1/s.
+    tolerance
+        Relative.
+
+    References
+    ----------
+    kim2018, theta* of Lemma 1.
+    """
+    if margin(slopes, most) <= 0.0:
+        return np.inf
+    high = most
+    for low in np.geomspace(most, 1.0, 121)[1:]:
+        if margin(slopes, float(low)) <= 0.0:
+            break
+        high = float(low)
+    else:
+        return 1.0
+    bad = float(low)
+    while high - bad > tolerance * high:
+        middle = 0.5 * (bad + high)
+        bad, high = (bad, middle) if margin(slopes, middle) > 0.0 else (middle, high)
+    return high
+
+
+def settling(decay: Decay, z_bound: float) -> tuple[float, float]:
+    """Delta_1 and Delta_2, s: how long an observer needs after an attack, without and after a reset.
+
+    Parameters
+    ----------
+    decay
+        The observer's constants, epsilon > 0.
+    z_bound
+        M_z, largest entry of the observable part.
+
+    References
+    ----------
+    kim2018 (18a), (18b) with equality.
+    """
+    start = 2.0 * z_bound * decay.eta
+    first = (max(start, decay.epsilon) + 2.0 * z_bound) * decay.eta
+    pair = [max(np.log(size / decay.epsilon) / decay.rate, 0.0) for size in (first, start)]
+    return float(pair[0]), float(pair[1])

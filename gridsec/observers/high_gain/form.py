@@ -1,0 +1,427 @@
+"""Uniform observability decomposition: what each sensor sees of the state, and how that part moves.
+
+    z_i = Phi_i(x) = (h_i, L_f h_i, …, L_f^{n_i - 1} h_i)
+    z_i' = A z_i + e alpha_i(z_i) + beta_i(z_i) u,    beta_ij depends on z_i1, …, z_ij only
+    y_i = z_i1 + a_i + v_i
+
+All functions are written over *components*: they take a sequence of n entries and use NumPy's
+operations on them, so that the same function serves numbers, arrays and intervals.
+`linear` makes the decomposition of a linear system, `symbolic.decompose` that of a system in sympy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import chain
+from typing import Any
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats, Ints
+from gridsec.errors import NotObservable
+from gridsec.observers.high_gain.constants import Slopes
+from gridsec.observers.high_gain.intervals import Interval, interval, supremum
+
+Scalar = Callable[[Sequence[Any]], Any]
+Vector = Callable[[Sequence[Any]], Sequence[Any]]
+Matrix = Callable[[Sequence[Any]], Sequence[Sequence[Any]]]
+
+
+def at(function: Vector, points: Floats) -> Floats:
+    """Values of a function over components at points.
+
+    Parameters
+    ----------
+    function
+        From n components to k.
+    points : (…, n)
+        Where.
+
+    Returns
+    -------
+    Floats
+        (…, k).
+    """
+    points = np.asarray(points, dtype=np.float64)
+    values = function(list(np.moveaxis(points, -1, 0)))
+    return np.stack([np.broadcast_to(np.asarray(v, float), points.shape[:-1]) for v in values], axis=-1)
+
+
+def jacobian_at(function: Matrix, points: Floats) -> Floats:
+    """Values of a matrix over components at points, (…, k, n).
+
+    Parameters
+    ----------
+    function
+        From n components to k rows of n entries.
+    points : (…, n)
+        Where.
+    """
+    rows = len(function(list(np.moveaxis(np.asarray(points, float), -1, 0))))
+    flat = at(lambda x: list(chain.from_iterable(function(x))), points)
+    return flat.reshape(*flat.shape[:-1], rows, -1)
+
+
+def sat(z: Floats, bound: Floats | float) -> Floats:
+    """Componentwise saturation `min(max(z, -bound), bound)`; NaN becomes zero.
+
+    Parameters
+    ----------
+    z : (…)
+        Anything, also infinite.
+    bound
+        Saturation level, scalar or broadcastable.
+
+    References
+    ----------
+    kim2018, after (4); lee2018, after (5.2.5).
+    """
+    return np.clip(np.where(np.isnan(z), 0.0, z), -np.asarray(bound), np.asarray(bound))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Polynomial:
+    """A polynomial `sum_k c_k prod_j z_j^{e_kj}`; differentiable, and stackable over sensors.
+
+    Attributes
+    ----------
+    exponents : (k, n)
+        Non-negative integers.
+    coefficients : (k,)
+        Real.
+    """
+
+    exponents: Ints
+    coefficients: Floats
+
+    def __call__(self, z: Sequence[Any]) -> Any:
+        """Value at n components."""
+        total: Any = 0.0
+        for powers, factor in zip(self.exponents.tolist(), self.coefficients.tolist(), strict=True):
+            term: Any = factor
+            for component, power in zip(z, powers, strict=True):
+                if power == 1:
+                    term = term * component
+                elif power > 1:
+                    term = term * component**power
+            total = total + term
+        return total
+
+    def derivative(self, k: int) -> Polynomial:
+        """Partial derivative with respect to the k-th component."""
+        keep = self.exponents[:, k] > 0
+        lowered = self.exponents[keep].copy()
+        factors = self.coefficients[keep] * lowered[:, k]
+        lowered[:, k] -= 1
+        return Polynomial(lowered, factors)
+
+
+def affine(constant: float, slopes: Sequence[float]) -> Polynomial:
+    """`constant + sum_j slopes_j z_j` as a `Polynomial`.
+
+    Parameters
+    ----------
+    constant, slopes
+        Coefficients.
+    """
+    n = len(slopes)
+    exponents = np.concatenate([np.zeros((1, n), dtype=np.intp), np.eye(n, dtype=np.intp)])
+    return Polynomial(exponents, np.array([constant, *slopes], dtype=np.float64))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Partial:
+    """One sensor's uniformly observable part.
+
+    Attributes
+    ----------
+    phi
+        Phi_i, from the n components of x to the n_i of z_i.
+    jacobian
+        Its derivative, n_i rows of n entries.
+    alpha
+        alpha_i over the n_i components of z_i.
+    beta
+        beta_i: n_i rows with one function for each of the m inputs; row j must use z_1 … z_j only.
+    bound
+        M_z,i: `|Phi_i(x)| <= bound` on the whole box of states. alpha and beta are only evaluated
+        at saturated arguments, which makes them globally Lipschitz (kim2018 (4)).
+    """
+
+    phi: Vector
+    jacobian: Matrix
+    alpha: Scalar
+    beta: tuple[tuple[Scalar, ...], ...]
+    bound: float
+
+    @property
+    def size(self) -> int:
+        """n_i."""
+        return len(self.beta)
+
+    @property
+    def inputs(self) -> int:
+        """Number of inputs."""
+        return len(self.beta[0])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class System:
+    """A system seen through its sensors. n states, p sensors, N = n_1 + … + n_p.
+
+    Attributes
+    ----------
+    x_bound : (n,)
+        The states stay in the box `|x_k| <= x_bound_k`.
+    partials
+        The sensors' observable parts.
+    """
+
+    x_bound: Floats
+    partials: tuple[Partial, ...]
+    mask: Bools = field(init=False)
+
+    def __post_init__(self) -> None:
+        if not self.partials:
+            raise NotObservable((), 0, "a system without sensors shows nothing of its state")
+        widths = {partial.inputs for partial in self.partials}
+        if len(widths) != 1:
+            raise ValueError(f"all sensors share the inputs, but they count {sorted(widths)} of them")
+        object.__setattr__(self, "x_bound", np.atleast_1d(np.asarray(self.x_bound, dtype=np.float64)))
+        sizes = np.array([partial.size for partial in self.partials])
+        object.__setattr__(self, "mask", np.arange(sizes.max())[None, :] < sizes[:, None])
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return int(self.x_bound.shape[0])
+
+    @property
+    def z_bound(self) -> Floats:
+        """M_z,i of every sensor, (p,)."""
+        return np.array([partial.bound for partial in self.partials], dtype=np.float64)
+
+    def phi(self, x: Floats, sensors: Sequence[int] | None = None) -> Floats:
+        """Phi_I(x), (…, N_I); by default of all sensors.
+
+        Parameters
+        ----------
+        x : (…, n)
+            States.
+        sensors
+            I, ascending.
+
+        References
+        ----------
+        kim2018 (9); lee2018 (5.3.2), without the zeros that only pad it.
+        """
+        return np.concatenate([at(self.partials[i].phi, x) for i in self._chosen(sensors)], axis=-1)
+
+    def jacobian(self, x: Floats, sensors: Sequence[int] | None = None) -> Floats:
+        """Derivative of Phi_I, (…, N_I, n).
+
+        Parameters
+        ----------
+        x, sensors
+            As in `phi`.
+        """
+        parts = [jacobian_at(self.partials[i].jacobian, x) for i in self._chosen(sensors)]
+        return np.concatenate(parts, axis=-2)
+
+    def rows(self, sensors: Sequence[int] | None = None) -> Matrix:
+        """Derivative of Phi_I over components, for interval bounds.
+
+        Parameters
+        ----------
+        sensors
+            I, ascending.
+        """
+        chosen = [self.partials[i].jacobian for i in self._chosen(sensors)]
+        return lambda x: list(chain.from_iterable(part(x) for part in chosen))
+
+    def pick(self, sensors: Sequence[int]) -> Bools:
+        """Which entries of the stacked z belong to the sensors I, (N,); kim2018 (8).
+
+        Parameters
+        ----------
+        sensors
+            I.
+        """
+        owner = np.nonzero(self.mask)[0]
+        return np.isin(owner, np.asarray(sensors, dtype=np.intp))
+
+    def _chosen(self, sensors: Sequence[int] | None) -> Sequence[int]:
+        return range(len(self.partials)) if sensors is None else sensors
+
+
+def largest(phi: Vector, x_bound: Floats, *, gap: float = 1e-3) -> float:
+    """A proven M_z: bound on `|Phi_i|` over the box of states, by interval bisection.
+
+    Parameters
+    ----------
+    phi
+        Phi_i over components.
+    x_bound : (n,)
+        Half-widths of the box.
+    gap
+        Relative overestimation that is good enough.
+    """
+    count = len(phi(list(np.zeros(len(x_bound)))))
+    return max(supremum(_size(phi, j), -x_bound, x_bound, gap=gap).upper for j in range(count))
+
+
+def _size(phi: Vector, j: int) -> Scalar:
+    return lambda x: np.absolute(phi(x)[j])
+
+
+def slopes(partial: Partial, u_low: Floats, u_high: Floats, *, samples: int = 4000, seed: int = 0) -> Slopes:
+    """Ranges of the derivatives of alpha and beta u for `constants.margin`.
+
+    Proven by intervals where alpha and beta are `Polynomial`; otherwise the ranges seen by central
+    differences at random points, widened by a tenth, and marked as not proven. Zero is always inside,
+    because beyond the saturation the functions are flat.
+
+    Parameters
+    ----------
+    partial
+        The sensor.
+    u_low, u_high : (m,)
+        Range of the inputs.
+    samples, seed
+        Number and seed of the random points, where they are needed.
+    """
+    n = partial.size
+    low, high, proven = np.zeros((n, n)), np.zeros((n, n)), True
+    u = [Interval(a, b) for a, b in zip(np.atleast_1d(u_low), np.atleast_1d(u_high), strict=True)]
+    box = [Interval(np.array(-partial.bound), np.array(partial.bound)) for _ in range(n)]
+    points = np.random.default_rng(seed).uniform(-partial.bound, partial.bound, (samples, n))
+    for j in range(n):
+        terms: list[tuple[Scalar, Interval]] = list(zip(partial.beta[j], u, strict=True))
+        if j == n - 1:
+            terms.append((partial.alpha, interval(1.0)))
+        for k in range(n if j == n - 1 else j + 1):
+            total = interval(0.0)
+            for function, factor in terms:
+                if isinstance(function, Polynomial):
+                    total = total + interval(function.derivative(k)(box)) * factor
+                else:
+                    proven = False
+                    total = total + _seen(function, points, k) * factor
+            low[j, k], high[j, k] = min(float(total.lo), 0.0), max(float(total.hi), 0.0)
+    return Slopes(low, high, proven)
+
+
+def _seen(function: Scalar, points: Floats, k: int) -> Interval:
+    h = 1e-6 * max(float(np.max(np.abs(points))), 1e-6)
+    ahead, behind = points.copy(), points.copy()
+    ahead[:, k] += h
+    behind[:, k] -= h
+    rate = (at(_single(function), ahead) - at(_single(function), behind)) / (2.0 * h)
+    extra = 0.1 * float(np.max(np.abs(rate)))
+    return Interval(np.array(rate.min() - extra), np.array(rate.max() + extra))
+
+
+def defects(system: System, f: Vector, g: Matrix, h: Vector, points: Floats, *, step: float = 1e-5) -> Floats:
+    """How far given Phi, alpha, beta are from being the decomposition of `x' = f + g u, y = h`.
+
+    Central differences of Phi_i along f and the columns of g against `(z_2, …, alpha)` and `beta`, and
+    Phi_i1 against h_i. No derivative of the decomposition is trusted, so that this checks it.
+
+    Parameters
+    ----------
+    system
+        The decomposition.
+    f, g, h
+        The system over components; g has n rows of m entries.
+    points : (k, n)
+        Where to look, inside the box of states.
+    step
+        Length of the differences, relative to the length of the direction.
+
+    Returns
+    -------
+    Floats
+        (p,) largest absolute defect of every sensor; near `step^2` for a right decomposition.
+
+    References
+    ----------
+    kim2018, Assumption 2 and (3).
+    """
+    drift, drive, read = at(f, points), jacobian_at(g, points), at(h, points)
+    out = np.zeros(len(system.partials))
+    for i, partial in enumerate(system.partials):
+        z = at(partial.phi, points)
+        want = np.concatenate([z[:, 1:], at(_single(partial.alpha), z)], axis=1)
+        worst = [np.abs(z[:, 0] - read[:, i]), np.abs(_along(partial.phi, points, drift, step) - want)]
+        for column in range(partial.inputs):
+            rows = at(_column(partial, column), z)
+            worst.append(np.abs(_along(partial.phi, points, drive[..., column], step) - rows))
+        out[i] = max(float(part.max()) for part in worst)
+    return out
+
+
+def _single(function: Scalar) -> Vector:
+    return lambda z: [function(z)]
+
+
+def _column(partial: Partial, column: int) -> Vector:
+    return lambda z: [row[column](z) for row in partial.beta]
+
+
+def _along(phi: Vector, points: Floats, direction: Floats, step: float) -> Floats:
+    return np.asarray(
+        (at(phi, points + step * direction) - at(phi, points - step * direction)) / (2.0 * step)
+    )
+
+
+def linear(A: Floats, B: Floats, C: Floats, x_bound: Floats, *, tolerance: float = 1e-9) -> System:
+    """Decomposition of `x' = A x + B u, y = C x`: for linear systems Assumption 2 always holds.
+
+    Phi_i is the observability matrix of (A, c_i) up to its rank n_i, and alpha_i follows from writing
+    `c_i A^{n_i}` in its rows.
+
+    Parameters
+    ----------
+    A, B, C : (n, n), (n, m), (p, n)
+        The system.
+    x_bound : (n,)
+        Half-widths of the box of states.
+    tolerance
+        Relative size of the part of a row outside the span of the rows before that counts as zero.
+
+    Raises
+    ------
+    NotObservable
+        If a sensor's row is zero.
+    """
+    A, B, C = (np.asarray(matrix, dtype=np.float64) for matrix in (A, B, C))
+    x_bound = np.broadcast_to(np.asarray(x_bound, dtype=np.float64), A.shape[:1])
+    parts = []
+    for i, row in enumerate(C):
+        if not row.any():
+            raise NotObservable((i,), 0, f"sensor {i} measures nothing: its row of C is zero")
+        kept = [row]
+        while True:
+            ahead = kept[-1] @ A
+            stack = np.array(kept)
+            weights = np.linalg.lstsq(stack.T, ahead, rcond=None)[0]
+            if np.max(np.abs(weights @ stack - ahead)) <= tolerance * max(1.0, float(np.max(np.abs(ahead)))):
+                break
+            kept.append(ahead)
+        flat = [0.0] * len(kept)
+        beta = tuple(tuple(affine(float(r @ b), flat) for b in B.T) for r in kept)
+        bound = float(np.max(np.abs(stack) @ x_bound))
+        parts.append(Partial(_times(stack), _constant(stack), affine(0.0, weights.tolist()), beta, bound))
+    return System(np.array(x_bound), tuple(parts))
+
+
+def _times(matrix: Floats) -> Vector:
+    def phi(x: Sequence[Any]) -> Sequence[Any]:
+        return [affine(0.0, row)(x) for row in matrix.tolist()]
+
+    return phi
+
+
+def _constant(matrix: Floats) -> Matrix:
+    return lambda _: matrix.tolist()

@@ -1,0 +1,511 @@
+"""Partial high-gain observers, detection with a time-varying threshold, and the switching search.
+
+Each sensor has an observer of its own, so that an attack stays where it is. A set of p - q sensors is
+trusted as long as its left inverse explains all its estimates; the search goes on only when it does not.
+
+References
+----------
+kim2018, section III; lee2018, sections 5.2 and 5.4; docs/theory-high-gain.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats, frozen
+from gridsec.errors import DesignInfeasible, NotObservable
+from gridsec.observers.high_gain.constants import (
+    Decay,
+    decay_componentwise,
+    decay_kim,
+    decay_lee,
+    margin,
+)
+from gridsec.observers.high_gain.field import Field, Transition, advance, field, gains, transition
+from gridsec.observers.high_gain.form import System, slopes
+from gridsec.observers.high_gain.inverse import Inverse, check, corners_and_interior
+from gridsec.observers.high_gain.lipschitz import kappa_detect, upper_proven
+from gridsec.observers.high_gain.redundancy import groups
+from gridsec.online import Cause, Decision
+
+_DECAYS = {"componentwise": decay_componentwise, "kim2018": decay_kim, "lee2018": decay_lee}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HighGainDesign:
+    """Everything that is computed once. p sensors, s sets of p - q sensors.
+
+    Attributes
+    ----------
+    system
+        The system and its decomposition.
+    inverses
+        Psi of the sets Lambda(1), …, Lambda(s), in the order of the search.
+    whole
+        Psi of all sensors, for the test of Corollary 1; None: no such test.
+    theta : (p,)
+        High-gain parameters, 1/s.
+    decays
+        Constants of every sensor's observer.
+    margins : (p,)
+        Margin of every sensor's Lyapunov inequality; positive: Lemma 1 holds at this theta.
+    proven
+        Whether the margins rest on proven ranges of derivatives only.
+    limit : (p,)
+        Size of an estimate at which it is reset (7).
+    lowest
+        Lower bound on Lip_(Phi_J) over all sets of p - 2q sensors; NaN: unknown, and so is the bound.
+    steep : (p,)
+        Upper bounds on Lip^(Phi_i).
+    search
+        "all": sets are tried at once until one passes. "one": one change of set per step, as a
+        controller with little time does it (the papers' simulations).
+    K : (p, n_max)
+        Gains.
+    field, move
+        Right-hand side, and matrices for the nominal step.
+    substeps
+        Parts that a step is divided into.
+    """
+
+    system: System
+    inverses: tuple[Inverse, ...]
+    whole: Inverse | None
+    theta: Floats
+    decays: tuple[Decay, ...]
+    margins: Floats
+    proven: bool
+    limit: Floats
+    lowest: float
+    steep: Floats
+    search: Literal["all", "one"]
+    K: Floats
+    field: Field
+    move: Transition
+    substeps: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HighGainState:
+    """Where the observers stand.
+
+    Attributes
+    ----------
+    t
+        Time, s.
+    z : (p, n_max)
+        Estimates; zero where a sensor has no such entry or is silent.
+    y : (p,)
+        Readings at t; NaN where silent.
+    u : (m,)
+        Input at t.
+    age : (p,)
+        Time for which each observer has had readings without a gap, s.
+    sigma
+        Place of the set in use, from 0.
+    """
+
+    t: float
+    z: Floats
+    y: Floats
+    u: Floats
+    age: Floats
+    sigma: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outcome:
+    """Answer at one instant.
+
+    Attributes
+    ----------
+    t
+        Time, s.
+    x : (n,)
+        Estimate of the state; NaN where no set is complete.
+    bound
+        Bound on its largest error while at most q sensors are attacked; NaN if the design has no
+        `lowest`, infinite when no set passed.
+    sigma
+        Place of the set it rests on, from 0.
+    visited
+        The sets that were tried, in order; the last is `sigma`.
+    trusted : (p,)
+        The sensors of that set.
+    residual, threshold
+        Of that set; NaN where it was not tested.
+    decision, cause, reason
+        As everywhere in this project: UNDECIDED is an answer of its own.
+    suspects : (p,)
+        Sensors that are named. If `bound` is known: those that cannot be healthy; otherwise, after an
+        alarm, those outside the trusted set.
+    reset : (p,)
+        Observers that were reset in this step.
+    """
+
+    t: float
+    x: Floats
+    bound: float
+    sigma: int
+    visited: tuple[int, ...]
+    trusted: Bools
+    residual: float
+    threshold: float
+    decision: Decision
+    cause: Cause
+    reason: str
+    suspects: Bools
+    reset: Bools
+
+
+def design(
+    system: System,
+    inverses: Sequence[Inverse],
+    *,
+    theta: Floats | float,
+    noise: Floats | float,
+    max_attacked: int,
+    u_low: Floats | float,
+    u_high: Floats | float,
+    step_s: float,
+    whole: Inverse | None = None,
+    decay: Literal["componentwise", "kim2018", "lee2018"] | Sequence[Decay] = "componentwise",
+    lowest: float = np.nan,
+    search: Literal["all", "one"] = "all",
+    reset: bool = True,
+    substeps: int = 1,
+    tolerance: float = 1e-6,
+) -> HighGainDesign:
+    """Design observers, thresholds and search, and check what they rest on.
+
+    Parameters
+    ----------
+    system
+        The system and its decomposition.
+    inverses
+        A left inverse for each set of p - q sensors, in the order of the search.
+    theta
+        High-gain parameters, 1/s, at least 1; scalar or (p,).
+    noise
+        M_v: largest measurement error of honest sensors, interpolation included; scalar or (p,).
+    max_attacked
+        q.
+    u_low, u_high
+        Range of the inputs; scalar or (m,).
+    step_s
+        Nominal time between readings, s.
+    whole
+        Left inverse of all sensors for the test of Corollary 1.
+    decay
+        Which derivation of eta, epsilon and rate; or these constants, one for each sensor.
+    lowest
+        Lower bound on Lip_(Phi_J) for every set J of p - 2q sensors.
+    search
+        See `HighGainDesign`.
+    reset
+        Whether the reset rule (7) applies; lee2018 has none. What is not finite is reset anyway.
+    substeps
+        Parts that a step is divided into, for accuracy.
+    tolerance
+        Largest error of a left inverse at its check points.
+
+    Raises
+    ------
+    NotObservable
+        If p <= 2q, or the sets are not all sets of p - q sensors.
+    DesignInfeasible
+        If theta is too small for Lemma 1, or a left inverse is none.
+    """
+    p, m = len(system.partials), system.partials[0].inputs
+    wanted = set(groups(p, max_attacked)) if p > 2 * max_attacked >= 0 else set()
+    if not wanted:
+        raise NotObservable(range(p), p, f"{p} sensors, {max_attacked} attacked: more than twice are needed")
+    if len(inverses) != len(wanted) or {inverse.sensors for inverse in inverses} != wanted:
+        raise NotObservable(
+            range(p), p, f"a left inverse for each set of {p - max_attacked} sensors is needed"
+        )
+    thetas = np.broadcast_to(np.asarray(theta, dtype=np.float64), (p,))
+    noises = np.broadcast_to(np.asarray(noise, dtype=np.float64), (p,))
+    low, high = (np.broadcast_to(np.asarray(end, dtype=np.float64), (m,)) for end in (u_low, u_high))
+    margins, proven = _margins(system, thetas, low, high)
+    points = corners_and_interior(system, samples=100)
+    for inverse in (*inverses, *(() if whole is None else (whole,))):
+        check(system, inverse, points, tolerance=tolerance)
+    if isinstance(decay, str):
+        rule = _DECAYS[decay]
+        parts = zip(system.partials, thetas, noises, strict=True)
+        decays = tuple(rule(part.size, float(th), float(v)) for part, th, v in parts)
+    else:
+        decays = tuple(decay)
+    eta, rest = (np.array([getattr(d, name) for d in decays]) for name in ("eta", "epsilon"))
+    limit = np.maximum(2.0 * eta * system.z_bound, rest) + system.z_bound if reset else np.full(p, np.inf)
+    steep = [
+        upper_proven(part.jacobian, -system.x_bound, system.x_bound, gap=1e-2) for part in system.partials
+    ]
+    K = gains(system, thetas)
+    return HighGainDesign(
+        system=system,
+        inverses=tuple(inverses),
+        whole=whole,
+        theta=frozen(thetas),
+        decays=decays,
+        margins=frozen(margins),
+        proven=proven,
+        limit=frozen(limit),
+        lowest=lowest,
+        steep=frozen(np.array([bracket.upper for bracket in steep])),
+        search=search,
+        K=frozen(K),
+        field=field(system),
+        move=transition(system, K, step_s / substeps),
+        substeps=substeps,
+    )
+
+
+def _margins(system: System, theta: Floats, low: Floats, high: Floats) -> tuple[Floats, bool]:
+    if np.any(theta < 1.0):
+        raise DesignInfeasible(
+            "partial high-gain observers", "theta must be at least 1", float(theta.min()) - 1.0
+        )
+    ranges = [slopes(partial, low, high) for partial in system.partials]
+    margins = np.array([margin(part, float(th)) for part, th in zip(ranges, theta, strict=True)])
+    if not np.all(margins > 0.0):
+        bad = int(np.argmin(margins))
+        what = f"partial observer of sensor {bad}"
+        raise DesignInfeasible(what, f"theta = {theta[bad]:g} is too small for Lemma 1", float(margins[bad]))
+    return margins, all(part.proven for part in ranges)
+
+
+def init(
+    design: HighGainDesign,
+    t: float,
+    y: Floats | None = None,
+    u: Floats | None = None,
+    z: Floats | None = None,
+) -> HighGainState:
+    """Start all observers.
+
+    Parameters
+    ----------
+    design
+        The design.
+    t
+        Time, s.
+    y : (p,)
+        Readings at t, NaN where there is none; without them every observer starts with its first
+        reading.
+    u : (m,)
+        Input at t; zero by default.
+    z : (p, n_max)
+        Where the estimates of the sensors with a reading start, at most M_z in size; zero by default.
+    """
+    system = design.system
+    p, m = len(system.partials), system.partials[0].inputs
+    start = np.zeros(system.mask.shape) if z is None else np.where(system.mask, z, 0.0)
+    return HighGainState(
+        t=float(t),
+        z=frozen(start),
+        y=frozen(np.full(p, np.nan) if y is None else np.where(np.isfinite(y), y, np.nan)),
+        u=frozen(np.zeros(m) if u is None else np.atleast_1d(u)),
+        age=frozen(np.zeros(p)),
+        sigma=0,
+    )
+
+
+def step(  # noqa: PLR0917  # the border that all observer families share
+    design: HighGainDesign, state: HighGainState, y: Floats, u: Floats, seen: Bools, h: float
+) -> tuple[HighGainState, Outcome]:
+    """Advance all observers to the next readings, and judge.
+
+    Parameters
+    ----------
+    design
+        The design.
+    state
+        Where the observers stand.
+    y : (p,)
+        Readings at `t + h`; ignored where unseen or not finite.
+    u : (m,)
+        Input at `t + h`; finite.
+    seen : (p,)
+        Which readings exist. An unseen sensor leaves the game, and comes back as a new observer.
+    h
+        Length of the step, s.
+
+    Returns
+    -------
+    HighGainState, Outcome
+        At `t + h`. Never raises on data.
+
+    References
+    ----------
+    kim2018 (5), (7), Theorem 2.
+    """
+    live = np.asarray(seen, dtype=np.bool_) & np.isfinite(y)
+    going = live & np.isfinite(state.y)
+    now = np.atleast_1d(np.asarray(u, dtype=np.float64))
+    # An attack may be as large as it likes: whatever overflows is reset below.
+    with np.errstate(all="ignore"):
+        z = _advance(design, state, np.where(going, y, 0.0), now, going=going, h=h)
+        large = ~(np.max(np.abs(z), axis=1) <= design.limit) & going
+    z = np.where((going & ~large)[:, None], z, 0.0)
+    age = np.where(going, state.age + h, 0.0)
+    sigma, outcome = _judge(design, state, z, age, live, large, state.t + h)
+    after = HighGainState(
+        state.t + h, frozen(z), frozen(np.where(live, y, np.nan)), frozen(now), frozen(age), sigma
+    )
+    return after, outcome
+
+
+def _advance(
+    design: HighGainDesign, state: HighGainState, y: Floats, u: Floats, *, going: Bools, h: float
+) -> Floats:
+    move, parts = design.move, design.substeps
+    if abs(h - parts * move.h) > 1e-12 * h:
+        move = transition(design.system, design.K, h / parts)
+    old, z = np.where(going, state.y, 0.0), state.z
+    for k in range(parts):
+        a, b = k / parts, (k + 1) / parts
+        readings = old + a * (y - old), old + b * (y - old)
+        inputs = state.u + a * (u - state.u), state.u + b * (u - state.u)
+        z = advance(design.field, design.K, move, z, y=readings, u=inputs)
+    return z
+
+
+def error_bounds(design: HighGainDesign, age: Floats) -> Floats:
+    """Bound on every honest observer's error, (p,): `max(2 M_z eta e^{-rate age}, epsilon)`.
+
+    Parameters
+    ----------
+    design
+        The design.
+    age : (p,)
+        Time for which each observer has had readings, s.
+
+    References
+    ----------
+    kim2018 (12), (14); lee2018 (5.4.2).
+    """
+    pairs = zip(design.decays, design.system.z_bound, age, strict=True)
+    return np.array([float(d.bound(2.0 * bound, a)) for d, bound, a in pairs])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Trial:
+    x: Floats
+    residual: float
+    delta: float
+    threshold: float
+
+    @property
+    def passed(self) -> bool:
+        return self.residual <= self.threshold
+
+
+def _test(design: HighGainDesign, inverse: Inverse, z: Floats, delta: Floats) -> _Trial:
+    """Inequality (15), (17) or (21)."""
+    system = design.system
+    own = z[system.mask][system.pick(inverse.sensors)]
+    x = inverse(own)
+    residual = float(np.max(np.abs(own - system.phi(x, inverse.sensors))))
+    reach = float(np.max(delta[list(inverse.sensors)]))
+    return _Trial(x, residual, reach, inverse.factor * reach)
+
+
+def _judge(  # noqa: PLR0917  # one place that sees the whole state
+    design: HighGainDesign, state: HighGainState, z: Floats, age: Floats, live: Bools, large: Bools, t: float
+) -> tuple[int, Outcome]:
+    delta = error_bounds(design, age)
+    sigma, visited, trial, alarm = _search(design, state.sigma, z, delta, live, large)
+    trusted = np.zeros(len(live), dtype=np.bool_)
+    trusted[list(design.inverses[sigma].sensors)] = True
+    nothing = np.full(design.system.n, np.nan)
+    passed = trial is not None and trial.passed
+    # Lemma 1: an honest observer never reaches its limit.
+    bound, named = np.inf, large.copy()
+    if trial is not None and passed:
+        bound = kappa_detect(design.inverses[sigma].factor, design.lowest) * trial.delta
+        named |= _unhealthy(design, z, trial.x, delta, bound) & live
+        if design.whole is not None and live.all():
+            alarm |= not _test(design, design.whole, z, delta).passed
+    settled = bool(np.all(delta[live] <= _rest(design)[live]))
+    decision, cause, reason = _verdict(design, live, trial, alarm or bool(named.any()), settled=settled)
+    guessed = live & ~trusted if alarm and passed and not named.any() else named
+    return sigma, Outcome(
+        t=t,
+        x=nothing if trial is None else trial.x,
+        bound=float(bound),
+        sigma=sigma,
+        visited=visited,
+        trusted=trusted,
+        residual=np.nan if trial is None else trial.residual,
+        threshold=np.nan if trial is None else trial.threshold,
+        decision=decision,
+        cause=cause,
+        reason=reason,
+        suspects=guessed,
+        reset=large,
+    )
+
+
+def _rest(design: HighGainDesign) -> Floats:
+    return np.array([decay.epsilon for decay in design.decays])
+
+
+def _search(  # noqa: PLR0917  # what a test needs, and where to begin
+    design: HighGainDesign, sigma: int, z: Floats, delta: Floats, live: Bools, large: Bools
+) -> tuple[int, tuple[int, ...], _Trial | None, bool]:
+    """The update rule (20): on to the next set whenever the present one fails or is incomplete."""
+    visited, alarm, count = [sigma], False, len(design.inverses)
+    changes = count - 1 if design.search == "all" else 1
+    trial = _try(design, sigma, z, delta, live, large)
+    while (trial is None or not trial.passed) and len(visited) <= changes:
+        alarm |= trial is not None
+        sigma = (sigma + 1) % count
+        visited.append(sigma)
+        trial = _try(design, sigma, z, delta, live, large)
+    alarm |= trial is not None and not trial.passed
+    return sigma, tuple(visited), trial, alarm
+
+
+def _try(  # noqa: PLR0917  # what a test needs
+    design: HighGainDesign, sigma: int, z: Floats, delta: Floats, live: Bools, large: Bools
+) -> _Trial | None:
+    inverse = design.inverses[sigma]
+    members = list(inverse.sensors)
+    if not live[members].all():
+        return None
+    trial = _test(design, inverse, z, delta)
+    # A sensor that has just been reset is attacked, whatever its new estimate looks like.
+    return replace(trial, residual=np.inf) if large[members].any() else trial
+
+
+def _unhealthy(design: HighGainDesign, z: Floats, x: Floats, delta: Floats, bound: float) -> Bools:
+    """Sensors that cannot be healthy: `|zhat_i - Phi_i(xhat)| > delta_i + Lip^(Phi_i) bound`."""
+    if not np.isfinite(bound):
+        return np.zeros(len(delta), dtype=np.bool_)
+    off = np.zeros(z.shape)
+    off[design.system.mask] = z[design.system.mask] - design.system.phi(x)
+    return np.asarray(np.max(np.abs(off), axis=1) > delta + design.steep * bound)
+
+
+def _verdict(
+    design: HighGainDesign, live: Bools, trial: _Trial | None, alarm: bool, *, settled: bool
+) -> tuple[Decision, Cause, str]:
+    if trial is None:
+        needed = len(design.inverses[0].sensors)
+        reason = f"{int(live.sum())} sensors are heard and no set of {needed} is complete"
+        return Decision.UNDECIDED, Cause.TOO_FEW_METERS, reason
+    if not trial.passed:
+        reason = "no set that was tried explains its own estimates"
+        cause = Cause.SETTLING if design.search == "one" else Cause.TOO_MANY_SUSPECTS
+        return Decision.UNDECIDED, cause, reason
+    if alarm:
+        return Decision.ATTACKED, Cause.RESIDUALS, "estimates disagree by more than honest sensors can"
+    if not settled:
+        return Decision.UNDECIDED, Cause.SETTLING, "the observers have not settled yet"
+    return Decision.CLEAN, Cause.AGREEMENT, "all sensors agree within their bounds"
