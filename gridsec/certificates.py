@@ -302,8 +302,9 @@ def error_bound(
         bound_i <- min(span_i, k_i(u_i + free_i sum_j |S_ij| bound_j)),     k_i(r) = d_i r
 
     takes bounds to bounds; it starts from the saturation of the curves, at most `2 limit`, and every
-    iterate is valid. The bound holds for all times if it holds at the beginning, and after the
-    transient otherwise. Under attack, put the size of the attack into `y_error`, infinity included.
+    iterate is valid after the transient. Without `certificate` the bound also holds for all times if
+    it holds at the beginning. Under attack, put the size of the attack into `y_error`, infinity
+    included.
 
     Parameters
     ----------
@@ -321,7 +322,8 @@ def error_bound(
         moving slowly against the time constants. It presumes that some certificate holds.
     certificate
         A certificate of the system. If it is a quadratic one with its multiplier, its norm gives a
-        start of the iteration that may be tighter than saturation; others are not used.
+        start of the iteration that may be tighter than saturation; others are not used. That start is
+        an ellipsoid's box: an error in a corner of it can leave it for a while.
 
     Returns
     -------
