@@ -31,6 +31,9 @@ class Claim:
         What is computed here.
     met
         Whether the two agree, to the printed digits where they are numbers.
+    why
+        Where they do not agree and we know the reason: an erratum, or a choice that the paper leaves open.
+        A claim that is not met and has no reason is a failure of ours.
     """
 
     what: str
@@ -38,6 +41,7 @@ class Claim:
     printed: float | str
     ours: float | str
     met: bool
+    why: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,6 +130,11 @@ class Reproduction:
     def unmet(self) -> tuple[Claim, ...]:
         """The claims that did not come out."""
         return tuple(claim for claim in self.claims if not claim.met)
+
+    @property
+    def unexplained(self) -> tuple[Claim, ...]:
+        """The claims that should have come out and did not: not met, for no stated reason."""
+        return tuple(claim for claim in self.unmet if not claim.why)
 
 
 def number(what: str, where: str, printed: float, ours: float, *, unit: float) -> Claim:
