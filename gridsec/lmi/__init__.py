@@ -1,7 +1,7 @@
-"""Design by linear matrix inequalities, the only place that knows a solver.
+"""Design by optimisation over matrices, the only place that knows a solver.
 
-One module is one inequality: `circle_criterion` (chong2020). Whatever a solver says is rebuilt in
-NumPy before it is believed.
+One module is one problem: `circle_criterion` (chong2020), `unknown_input` (yang2021) and more beside
+them. Whatever a solver says is rebuilt in NumPy before it is believed.
 """
 
 from gridsec.gains import (
@@ -15,11 +15,21 @@ from gridsec.gains import (
     state_bound,
 )
 from gridsec.lmi.circle_criterion import BACKOFF, circle, contraction, prove, settle, solve_many
+from gridsec.lmi.unknown_input import (
+    ErrorSystem,
+    UnknownInputGains,
+    UnknownInputTemplate,
+    unknown_input_margin,
+    unknown_input_matrix,
+)
 
 __all__ = [
     "BACKOFF",
     "CircleGains",
     "CircleOptions",
+    "ErrorSystem",
+    "UnknownInputGains",
+    "UnknownInputTemplate",
     "circle",
     "circle_matrix",
     "contraction",
@@ -31,4 +41,6 @@ __all__ = [
     "solve_many",
     "stacked",
     "state_bound",
+    "unknown_input_margin",
+    "unknown_input_matrix",
 ]

@@ -16,12 +16,9 @@ chong2020 (11), (12), corrected; arcak2001. Proofs: docs/theory-observers.md.
 from __future__ import annotations
 
 import multiprocessing
-import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -36,6 +33,7 @@ from gridsec.gains import (
     refuse_blind,
     sensitivity,
 )
+from gridsec.lmi.solver import cvxpy_late, solver_warnings_as_status
 from gridsec.lure import Lure
 
 __all__ = ["BACKOFF", "circle", "contraction", "prove", "settle", "solve_many"]
@@ -145,7 +143,7 @@ def contraction(lure: Lure, *, rate: float) -> Certificate:
     DesignInfeasible
         If there is no such P at this rate, or it does not survive its verification in NumPy.
     """
-    cp = _cvxpy()
+    cp = cvxpy_late()
     what = f"certificate of direct injection for all sets of meters at rate {rate:g}/s"
     # Units as in _Template: every slope bound becomes 1. An inverter of slope bound 0 is given a
     # small one, which is still a bound.
@@ -160,7 +158,7 @@ def contraction(lure: Lure, *, rate: float) -> Certificate:
     constraints = [whole << -slack * np.eye(2 * n), P >> slack * np.eye(n), cp.trace(P) == n]
     problem = cp.Problem(cp.Maximize(slack), constraints)
     try:
-        with _solver_warnings_as_status():
+        with solver_warnings_as_status():
             problem.solve(solver=cp.CLARABEL)
     except cp.error.SolverError as failure:
         raise DesignInfeasible(what, f"the solver failed: {failure}") from failure
@@ -284,21 +282,6 @@ def _solve_chunk(lure: Lure, options: CircleOptions, group: Sequence[Ints]) -> l
         return _Failure(failure.what, failure.status, failure.margin)
 
 
-@contextmanager
-def _solver_warnings_as_status() -> Iterator[None]:
-    """An inaccurate solution is judged by its margin, not by a warning that nobody reads."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Solution may be inaccurate", category=UserWarning)
-        yield
-
-
-def _cvxpy() -> Any:
-    """Import cvxpy late: it takes a second, and only a design needs it. Its annotations are incomplete."""
-    import cvxpy
-
-    return cvxpy
-
-
 class _Template:
     """The scaled inequality for sets of one size, canonicalised once and solved for many sets.
 
@@ -334,7 +317,7 @@ class _Template:
 
     def _pose(self) -> None:
         """State the problem in scaled coordinates, with the set of meters as a parameter."""
-        cp = _cvxpy()
+        cp = cvxpy_late()
         lure, options, live, k = self.lure, self.options, self.live, self.size
         x, z, clock = self.x_unit, self.z_unit, self.clock
         n, m, r = len(lure.A), int(np.count_nonzero(live)), options.load.shape[1]
@@ -380,7 +363,7 @@ class _Template:
         DesignInfeasible
             As in `circle`.
         """
-        cp = _cvxpy()
+        cp = cvxpy_late()
         lure, options, live = self.lure, self.options, self.live
         what = f"circle-criterion observer of the meters {J.tolist()} at rate {options.rate:g}/s"
         self.C.value = lure.C[J] * self.x_unit / self.z_unit
@@ -388,7 +371,7 @@ class _Template:
         self.N.value = (options.noise[J] / self.noise_unit)[None, :]
         self.at.value = feeds(lure)[np.ix_(live, J)].astype(np.float64)
         try:
-            with _solver_warnings_as_status():
+            with solver_warnings_as_status():
                 self.problem.solve(solver=cp.CLARABEL)
         except cp.error.SolverError as failure:
             raise DesignInfeasible(what, f"the solver failed: {failure}") from failure
