@@ -1,0 +1,144 @@
+"""Estimates and chi-square tests from correlated partial estimates, where covariances may be singular.
+
+    z = Phi x + v + e,    v ~ N(0, P),  P >= 0
+
+The joint covariance of partial filters is singular more often than not: at the start all of them are wrong
+by the same initial error, and modes that several sensors cannot see are predicted by all of them with
+exactly the same error. P^-1 then does not exist. In parity space nothing is missing: with N the
+annihilator of Phi, `N z` has covariance `V = N P N^T`, and
+
+    g = (N z)^T V^+ (N z),     x_hat = Phi^+ (I - P N^T V^+ N) z
+
+are the test and the minimum-variance estimate of `gridsec.decode.gaussian` wherever P > 0. A parity with
+variance zero is no random number: it vanishes exactly, or somebody is attacked.
+
+References
+----------
+lee2018, section 4.3.2, with what its errata correct; docs/theory-partial-observers.md, section 5.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gridsec.arrays import Floats, Ints, frozen, frozen_ints
+from gridsec.decode.stacks import Stack, annihilator
+from gridsec.errors import NotObservable
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Parity:
+    """What fusing one set of sensors needs and no covariance changes. k rows are kept of N.
+
+    Attributes
+    ----------
+    kept
+        The sensors.
+    rows : (k,)
+        Their rows.
+    checks : (k - n, k)
+        Orthonormal N with N Phi = 0 on these rows.
+    inverse : (n, k)
+        Phi^+ on these rows.
+    """
+
+    kept: Ints
+    rows: Ints
+    checks: Floats
+    inverse: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fused:
+    """Fusion of one set of sensors under one covariance. N stacked rows.
+
+    Attributes
+    ----------
+    estimator : (n, N)
+        Psi: the estimate is `Psi z`.
+    covariance : (n, n)
+        Of the estimate's error.
+    standardise : (k - n, N)
+        `g = |W z|^2`. Rows of parities that vanish exactly are divided by `sqrt(tol)` of their scale.
+    freedom
+        Degrees of freedom of g: rank of V.
+    """
+
+    estimator: Floats
+    covariance: Floats
+    standardise: Floats
+    freedom: int
+
+
+def parity(stack: Stack, kept: Ints, *, tol: float) -> Parity:
+    """Prepare the fusion of some sensors.
+
+    Parameters
+    ----------
+    stack
+        Phi.
+    kept
+        The sensors.
+    tol
+        Singular values up to this, times the largest, count as zero.
+
+    Raises
+    ------
+    NotObservable
+        If these sensors do not determine x, or do so without redundancy, so that nothing could speak
+        against them.
+    """
+    rows = stack.rows(kept)
+    phi = stack.matrix[rows]
+    checks = annihilator(phi, tol=tol)
+    rank = rows.size - len(checks)
+    if rank < stack.unknowns or rows.size <= stack.unknowns:
+        lack = "determine only" if rank < stack.unknowns else "determine without redundancy"
+        names = np.asarray(kept).tolist()
+        raise NotObservable(names, rank, f"sensors {names} {lack} {rank} of {stack.unknowns} unknowns")
+    inverse: Floats = np.asarray(np.linalg.pinv(phi), dtype=np.float64)
+    return Parity(frozen_ints(kept), frozen_ints(rows), frozen(checks), frozen(inverse))
+
+
+def fuse(prepared: Parity, P: Floats, *, tol: float) -> Fused:
+    """Minimum-variance estimate and standardised residual under a covariance.
+
+    Parameters
+    ----------
+    prepared
+        From `parity`.
+    P : (N, N)
+        Covariance of v; positive semidefinite.
+    tol
+        A parity whose variance is at most this, in units in which every row of z has variance one, counts
+        as exact. Also what an exact parity may be off by, squared, in the same units.
+
+    References
+    ----------
+    lee2018 (2.2.16) to (2.2.20), Algorithm 4.2 with the rank as degrees of freedom; C. R. Rao, "Linear
+    statistical inference and its applications", Wiley, 1973, section 4i (singular covariance).
+    """
+    at = prepared.rows
+    part = P[np.ix_(at, at)]
+    size = np.sqrt(np.maximum(np.diagonal(part), 0.0))
+    size = np.where(size > 0.0, size, float(size.max(initial=0.0)) or 1.0)
+    # N z = (N D)(D^-1 z): the same parities, orthonormal in units in which rows have variance one.
+    turn, _ = np.linalg.qr((prepared.checks * size).T)
+    variances, axes = np.linalg.eigh(turn.T @ (part / np.outer(size, size)) @ turn)
+    # Flooring instead of dropping: violated exact parities must count, only not as degrees of freedom.
+    W = (turn @ (axes / np.sqrt(np.maximum(variances, tol)))).T / size
+    gain = part @ W.T
+    correction = prepared.inverse @ gain
+    n, N = prepared.inverse.shape[0], P.shape[0]
+    estimator, standardise = np.zeros((n, N)), np.zeros((len(W), N))
+    estimator[:, at] = prepared.inverse - correction @ W
+    standardise[:, at] = W
+    covariance = prepared.inverse @ part @ prepared.inverse.T - correction @ correction.T
+    return Fused(
+        frozen(estimator),
+        frozen(0.5 * (covariance + covariance.T)),
+        frozen(standardise),
+        int(np.count_nonzero(variances > tol)),
+    )

@@ -1,0 +1,321 @@
+"""Partial Kalman filters with chi-square test and choice among hypotheses: lee2018, Algorithm 4.2.
+
+The sensors trusted so far are fused and tested at every step. While the test passes, nothing else is
+computed. When it alarms, every set of p - q sensors is tested, and the most likely one is trusted from
+then on.
+
+Corrected: degrees of freedom are the rank of the residual's covariance, that covariance may be singular,
+and the estimate of an alarming step is that of the newly chosen set: docs/errata/lee2018-chapter-4.md.
+
+References
+----------
+lee2018, section 4.3.2; docs/theory-partial-observers.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from gridsec.arrays import Bools, Floats, frozen, frozen_ints
+from gridsec.decode.gaussian import Hypotheses, Rule, choose
+from gridsec.decode.partial.fusion import Fused, Parity, fuse, parity
+from gridsec.decode.stacks import MOST_SUBSETS, Stack, require, subsets
+from gridsec.observers import kalman
+from gridsec.observers.kalman import KalmanDesign, KalmanState, Steady
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GaussianDesign:
+    """Filters and decoder.
+
+    Attributes
+    ----------
+    filters
+        The partial filters.
+    steady
+        Their stationary gain and covariance, if they run with those; None: time-varying ones.
+    sets
+        All sensors first, then every set of p - q.
+    false_alarm
+        Probability of an alarm per step without attack.
+    rule
+        How the set is chosen after an alarm, see `gridsec.decode.gaussian.choose`.
+    readmit
+        Steps in a row that all sensors together must pass their test, after an alarm, before all of them
+        are trusted again; 0: never, as printed.
+    refresh
+        The fusion is computed anew when an entry of the covariance has changed by more than this, times the
+        standard deviations of its row and column; 0: at every step.
+    tol
+        As in `fusion.fuse`.
+    """
+
+    filters: KalmanDesign
+    steady: Steady | None
+    sets: tuple[Parity, ...]
+    false_alarm: float
+    rule: Rule
+    readmit: int
+    refresh: float
+    tol: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tables:
+    """The fusion of all sets under one covariance.
+
+    Attributes
+    ----------
+    P : (mu, mu)
+        That covariance.
+    fused
+        One for each set.
+    thresholds
+        Delta_TH of each.
+    hypotheses
+        The sets of p - q sensors, as `gridsec.decode.gaussian.choose` wants them.
+    """
+
+    P: Floats
+    fused: tuple[Fused, ...]
+    thresholds: tuple[float, ...]
+    hypotheses: Hypotheses
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GaussianState:
+    """Where filters and decoder stand.
+
+    Attributes
+    ----------
+    filters
+        The filters' state.
+    current
+        Index of the trusted set among the design's sets.
+    passed
+        Steps in a row that all sensors together have passed since the last alarm.
+    tables
+        Fusion in use.
+    """
+
+    filters: KalmanState
+    current: int
+    passed: int
+    tables: Tables
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GaussianOutcome:
+    """What one step says.
+
+    Attributes
+    ----------
+    t
+        Time of the state that is estimated, s.
+    x : (n,)
+        Estimate.
+    covariance : (n, n)
+        Of its error, if the trusted sensors are honest.
+    trusted : (p,)
+        The sensors it is made from.
+    alarm
+        f: whether the set trusted before failed its test in this step.
+    g, threshold, freedom
+        Statistic of the set trusted *before* this step, what it was compared to, its degrees of freedom.
+    credible
+        Whether the set trusted now passes its own test. If not, more than q sensors are attacked, or this
+        step was one of the expected false alarms of all sets.
+    """
+
+    t: float
+    x: Floats
+    covariance: Floats
+    trusted: Bools
+    alarm: bool
+    g: float
+    threshold: float
+    freedom: int
+    credible: bool
+
+
+def design(
+    filters: KalmanDesign,
+    max_attacked: int,
+    *,
+    false_alarm: float,
+    tol: float,
+    steady: Steady | None = None,
+    rule: Rule = "density",
+    readmit: int = 0,
+    refresh: float = 0.0,
+    most: int = MOST_SUBSETS,
+) -> GaussianDesign:
+    """Prepare Algorithm 4.2.
+
+    Parameters
+    ----------
+    filters
+        From `kalman.design`.
+    max_attacked
+        q, at least 1.
+    false_alarm
+        delta, in (0, 1).
+    tol
+        As in `fusion.fuse`; its square root decides whether the state is determined.
+    steady
+        From `kalman.steady`, for filters that have long been running.
+    rule, readmit, refresh
+        As in `GaussianDesign`.
+    most
+        Largest number of sets.
+
+    Raises
+    ------
+    NotObservable
+        Unless the pair is 2q-redundant detectable (lee2018, Proposition 4.3.1) and every set of p - q
+        sensors has redundancy of its own.
+    DesignInfeasible
+        If there are more than `most` sets.
+    """
+    if max_attacked < 1 or not 0.0 < false_alarm < 1.0:
+        raise ValueError(f"max_attacked is {max_attacked} (>= 1), false_alarm {false_alarm} (in (0, 1))")
+    stacked = Stack.of(filters.stack.blocks)
+    zero = float(np.sqrt(tol))
+    require(stacked, 2 * max_attacked, zero, f"undoing {max_attacked} errors")
+    p = stacked.count
+    kept = [np.arange(p), *subsets(p, p - max_attacked, most)]
+    prepared = tuple(parity(stacked, k, tol=zero) for k in kept)
+    return GaussianDesign(filters, steady, prepared, false_alarm, rule, readmit, refresh, tol)
+
+
+def init(
+    design: GaussianDesign,
+    t: float,
+    mean: Floats,
+    covariance: Floats,
+    y: Floats,
+    *,
+    seen: Bools | None = None,
+) -> tuple[GaussianState, GaussianOutcome]:
+    """Start from what is known of the state and the first readings, trusting everybody.
+
+    Parameters
+    ----------
+    design
+        From `design`.
+    t
+        Time of those readings, s.
+    mean, covariance : (n,), (n, n)
+        Of the state; the covariance is not used by stationary filters.
+    y, seen : (p,), (p,)
+        As in `kalman.correct`.
+    """
+    first = kalman.init(design.filters, t, mean, covariance)
+    if design.steady is None:
+        first = kalman.correct(design.filters, first, y, seen)
+    else:
+        z = first.z + (y - first.z @ design.filters.stack.T.T) @ design.steady.K.T
+        first = KalmanState(t, z, design.steady.P, design.steady.K)
+    return decode(design, GaussianState(first, 0, 0, _tables(design, first.P)))
+
+
+def step(
+    design: GaussianDesign, state: GaussianState, y: Floats, u: Floats, seen: Bools | None = None
+) -> tuple[GaussianState, GaussianOutcome]:
+    """From the input u(k) and the readings y(k+1) to the estimate of x(k+1).
+
+    Parameters
+    ----------
+    design, state
+        Filters and decoder, and where they stand.
+    y, u, seen : (p,), (m,), (p,)
+        As in `kalman.step`. Stationary filters need every reading.
+
+    Raises
+    ------
+    ValueError
+        If a stationary filter lacks a reading.
+    """
+    if design.steady is not None:
+        if seen is not None and not np.all(seen):
+            raise ValueError("filters with stationary gains need every reading; design without `steady`")
+        filters = kalman.step_steady(design.filters, design.steady, state.filters, y, u)
+    else:
+        filters = kalman.step(design.filters, state.filters, y, u, seen)
+    tables = state.tables
+    if filters.P is not tables.P and _moved(filters.P, tables.P) > design.refresh:
+        tables = _tables(design, filters.P)
+    return decode(design, GaussianState(filters, state.current, state.passed, tables))
+
+
+def decode(design: GaussianDesign, state: GaussianState) -> tuple[GaussianState, GaussianOutcome]:
+    """Test the trusted set, choose another if it fails, and estimate.
+
+    Parameters
+    ----------
+    design, state
+        Filters and decoder, and where they stand.
+
+    References
+    ----------
+    lee2018, Algorithm 4.2.
+    """
+    tables, z, now = state.tables, state.filters.z, state.current
+    tested = tables.fused[now]
+    g = _score(tested, z)
+    alarm = g > tables.thresholds[now]
+    chosen, passed = now, state.passed
+    if alarm:
+        chosen, passed = 1 + int(choose(tables.hypotheses, z, rule=design.rule).hypothesis), 0
+    elif now != 0 and design.readmit > 0:
+        passed = passed + 1 if _score(tables.fused[0], z) <= tables.thresholds[0] else 0
+        if passed >= design.readmit:
+            chosen, passed = 0, 0
+    used = tables.fused[chosen]
+    trusted = np.zeros(len(design.filters.stack.parts), dtype=np.bool_)
+    trusted[design.sets[chosen].kept] = True
+    credible = bool(_score(used, z) <= tables.thresholds[chosen]) if alarm else True
+    outcome = GaussianOutcome(
+        state.filters.t,
+        used.estimator @ z,
+        used.covariance,
+        trusted,
+        bool(alarm),
+        g,
+        tables.thresholds[now],
+        tested.freedom,
+        credible,
+    )
+    return GaussianState(state.filters, chosen, passed, tables), outcome
+
+
+def _score(fused: Fused, z: Floats) -> float:
+    """Statistic of one set."""
+    return float(np.square(fused.standardise @ z).sum())
+
+
+def _moved(P: Floats, old: Floats) -> float:
+    """Largest change of a covariance, in units of its standard deviations."""
+    size = np.sqrt(np.maximum(np.maximum(np.diagonal(P), np.diagonal(old)), 0.0))
+    scale = np.outer(size, size)
+    return float(np.max(np.abs(P - old) / np.where(scale > 0.0, scale, 1.0), initial=0.0))
+
+
+def _tables(design: GaussianDesign, P: Floats) -> Tables:
+    fused = tuple(fuse(prepared, P, tol=design.tol) for prepared in design.sets)
+    # A set all of whose parities are exact has no random statistic: one violation, of size 1, alarms.
+    thresholds = tuple(float(chi2.isf(design.false_alarm, f.freedom)) if f.freedom else 1.0 for f in fused)
+    small = fused[1:]
+    wide = np.zeros((len(small), max(len(f.standardise) for f in small), P.shape[0]))
+    for i, f in enumerate(small):
+        wide[i, : len(f.standardise)] = f.standardise
+    hypotheses = Hypotheses(
+        frozen_ints(np.stack([prepared.kept for prepared in design.sets[1:]])),
+        frozen(np.stack([f.estimator for f in small])),
+        frozen(wide),
+        frozen_ints(np.array([max(f.freedom, 1) for f in small])),
+    )
+    return Tables(P, fused, thresholds, hypotheses)
