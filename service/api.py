@@ -260,7 +260,7 @@ def get_history(
     *,
     since: Since = None,
     until: Until = None,
-    meter: Annotated[str | None, Query(description="Also the numbers of this meter.")] = None,
+    meter: Annotated[str | None, Query(pattern=_NAME, description="Also the numbers of this meter.")] = None,
     limit: Annotated[int, Query(ge=1, le=5000)] = 500,
 ) -> models.History:
     """The newest kept ticks in [since, until), oldest first."""
@@ -298,7 +298,7 @@ def list_alarms(
     kind: Annotated[list[AlarmKind] | None, Query(description="May be repeated.")] = None,
     severity: Annotated[list[Severity] | None, Query(description="May be repeated.")] = None,
     feeder: Annotated[str | None, Query(pattern=_NAME)] = None,
-    meter: Annotated[str | None, Query(max_length=64)] = None,
+    meter: Annotated[str | None, Query(pattern=_NAME)] = None,
     since: Since = None,
     until: Until = None,
     cursor: Annotated[str | None, Query(pattern=r"^[0-9A-Z]{26}$")] = None,
@@ -437,7 +437,7 @@ def readyz(request: Request, backend: BackendHere) -> Any:
     """Whether feeders are designed, the database can be written and zenoh is connected."""
     ready, reasons = backend.ready()
     try:
-        backend.store.check()
+        backend.store.check(wait=False)
     except StoreUnavailable as error:
         ready, reasons = False, [*reasons, *([] if str(error) in reasons else [str(error)])]
     return _probe(request, ready, reasons, "the service cannot watch at the moment")

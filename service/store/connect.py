@@ -16,7 +16,9 @@ from sqlalchemy.dialects import postgresql, sqlite
 from service.store.records import StoreUnavailable
 
 WAIT_S = 5.0
-"""How long to wait for a lock or a connection before saying that the database cannot be used, s."""
+"""How long to wait for a connection or for the writer before us to end, s."""
+BUSY_S = 0.5
+"""How long a commit waits for somebody who locks the database; whoever watches must not wait longer, s."""
 _ADVISORY_LOCK = 0x6772_6964_7365_6300
 
 
@@ -44,6 +46,8 @@ class Connections:
     def __init__(self, url: str) -> None:
         self._lock_file: IO[bytes] | None = None
         self._engines: tuple[sa.Engine, ...] = ()
+        self._path: Path | None = None
+        self._file: tuple[int, int] | None = None
         try:
             parsed = sa.make_url(url)
         except sa.exc.ArgumentError as error:
@@ -77,14 +81,27 @@ class Connections:
         doing
             What cannot be done, should it fail.
         """
-        with self._guard(doing), self._engines[0].begin() as connection:
-            yield connection
+        with self._guard(doing):
+            self._in_place()
+            with self._engines[0].begin() as connection:
+                yield connection
 
     @contextmanager
     def read(self) -> Iterator[sa.Connection]:
         """Open a connection that cannot write."""
-        with self._guard("read"), self._engines[1].connect() as connection:
-            yield connection
+        with self._guard("read"):
+            self._in_place()
+            with self._engines[1].connect() as connection:
+                yield connection
+
+    def _in_place(self) -> None:
+        """See that the file is where it was: one that was removed takes every commit and keeps none."""
+        if self._path is None or self._file is None:
+            return
+        place = _place(self._path)
+        if place != self._file:
+            what = "removed" if place is None else "replaced"
+            raise OSError(f"the file has been {what}; put it back, or restart to begin with what is there")
 
     @contextmanager
     def _guard(self, doing: str) -> Iterator[None]:
@@ -98,7 +115,7 @@ class Connections:
     def _open_sqlite(self, url: sa.URL) -> tuple[sa.Engine, sa.Engine]:
         if not url.database or url.database == ":memory:":
             raise StoreUnavailable(f"{self.name}: name a file; what is in memory does not survive")
-        path = Path(url.database).absolute()
+        path = self._path = Path(url.database).absolute()
         lock = self._lock_file = path.with_name(path.name + ".lock").open("ab")
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -110,7 +127,7 @@ class Connections:
                 made = sqlite3.connect(
                     f"file:{quote(str(path))}?mode={mode}",
                     uri=True,
-                    timeout=WAIT_S,
+                    timeout=BUSY_S,
                     isolation_level=None,
                     check_same_thread=False,
                 )
@@ -118,6 +135,7 @@ class Connections:
                 if mode == "rwc":
                     made.execute("PRAGMA journal_mode = WAL")
                     made.execute("PRAGMA synchronous = FULL")
+                    self._file = self._file or _place(path)
                 return made
 
             return connection
@@ -132,10 +150,19 @@ class Connections:
         return writer, reader
 
 
+def _place(path: Path) -> tuple[int, int] | None:
+    try:
+        found = path.stat()
+    except FileNotFoundError:
+        return None
+    return found.st_dev, found.st_ino
+
+
 def _open_postgresql(url: sa.URL) -> tuple[sa.Engine, sa.Engine]:
     if url.get_driver_name() != "psycopg":
         url = url.set(drivername="postgresql+psycopg")
-    wait = {"connect_timeout": int(WAIT_S)}
+    # A server that has vanished from the network must not hold us for as long as TCP would.
+    wait = {"connect_timeout": int(WAIT_S), "tcp_user_timeout": int(WAIT_S * 1e3)}
     writer = sa.create_engine(
         url,
         pool_size=1,

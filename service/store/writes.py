@@ -170,16 +170,27 @@ class Store(Reader):
         with self._lock, self._write() as connection:
             connection.execute(statement.on_conflict_do_update(index_elements=["name"], set_=row))
 
-    def check(self) -> None:
+    def check(self, *, wait: bool = True) -> None:
         """Write something and see.
+
+        Parameters
+        ----------
+        wait
+            Wait for whoever is writing at the moment. Without that, somebody who is writing is as good as a
+            check of our own, and however many ask, none of them holds up a commit.
 
         Raises
         ------
         StoreUnavailable
             If the database cannot be written.
         """
-        with self._lock, self._write() as connection:
-            connection.execute(VERSION.update().values(version=VERSION.c.version))
+        if not self._lock.acquire(blocking=wait):
+            return
+        try:
+            with self._write() as connection:
+                connection.execute(VERSION.update().values(version=VERSION.c.version))
+        finally:
+            self._lock.release()
 
     def writable(self) -> bool:
         """Whether the database can be written now; `check` says why not."""

@@ -268,6 +268,8 @@ ERRORS: list[tuple[str, str, bytes | None, dict[str, str], int]] = [
     ("PUT", "/api/v1/feeders/x", b" " * (5 << 20), JSON, 413),
     ("POST", ACK, b'{"who": " "}', JSON, 422),
     ("POST", ACK, b'{"who": 1}', JSON, 422),
+    ("POST", ACK, b'{"who": "Ada\\u0000"}', JSON, 422),
+    ("POST", ACK, b'{"who": "Ada", "comment": "a\\u001b[2J"}', JSON, 422),
     ("POST", ACK, b'{"who": "Ada", "state": "cleared"}', JSON, 422),
 ]
 
@@ -342,7 +344,7 @@ def test_not_ready_while_the_store_cannot_be_written(
     small_service: Callable[..., Any],
     serve: Callable[..., Any],
 ) -> None:
-    monkeypatch.setattr(connect, "WAIT_S", 0.2)
+    monkeypatch.setattr(connect, "BUSY_S", 0.2)
     service = small_service(village())
     server = serve(service)
     blocker = sqlite3.connect(service.store.name.removeprefix("sqlite:///"), isolation_level=None)

@@ -64,7 +64,7 @@ def path(tmp_path: Path) -> Path:
 @pytest.fixture
 def locked(path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], sqlite3.Connection]]:
     """Let somebody else hold the database's lock, as a backup gone wrong would."""
-    monkeypatch.setattr(connect, "WAIT_S", 0.1)
+    monkeypatch.setattr(connect, "BUSY_S", 0.1)
     open_ones: list[sqlite3.Connection] = []
 
     def lock() -> sqlite3.Connection:

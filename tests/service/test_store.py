@@ -9,6 +9,7 @@ import sys
 import tempfile
 import textwrap
 import threading
+import time
 import uuid
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -445,6 +446,59 @@ def test_readers_cannot_write(store: Store, family: str) -> None:
     words = "readonly" if family == "sqlite" else "read-only"
     with pytest.raises(StoreUnavailable, match=words), store._read() as connection:
         connection.execute(schema.FEEDER.delete())
+
+
+def test_a_file_that_was_taken_away_is_missed_and_found_again(tmp_path: Path) -> None:
+    """An unlinked file takes every write and keeps none: that must not look like success."""
+    path, elsewhere = tmp_path / "s.db", tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    with Store(f"sqlite:///{path}") as store:
+        store.commit([raised(an_alarm(1))])
+        for name in ("s.db", "s.db-wal", "s.db-shm"):
+            (tmp_path / name).rename(elsewhere / name)
+        with pytest.raises(StoreUnavailable, match="removed"):
+            store.commit([raised(an_alarm(2))])
+        with pytest.raises(StoreUnavailable, match="removed"):
+            store.alarms()
+        assert not store.writable()
+        path.write_bytes(b"")
+        with pytest.raises(StoreUnavailable, match="replaced"):
+            store.check()
+        for name in ("s.db", "s.db-wal", "s.db-shm"):
+            (elsewhere / name).rename(tmp_path / name)
+        store.commit([raised(an_alarm(2))])
+        assert [alarm.id for alarm in store.alarms()[0]] == [an_alarm(2).id, an_alarm(1).id]
+
+
+def test_a_locked_database_is_given_up_soon(tmp_path: Path) -> None:
+    with Store(f"sqlite:///{tmp_path}/s.db") as store:
+        other = sqlite3.connect(tmp_path / "s.db", isolation_level=None)
+        other.execute("BEGIN IMMEDIATE")
+        begin = time.monotonic()
+        with pytest.raises(StoreUnavailable, match="locked"):
+            store.commit([raised(an_alarm())])
+        assert time.monotonic() - begin < 2.0
+        other.close()
+        store.commit([raised(an_alarm())])
+
+
+def test_whoever_asks_for_health_does_not_hold_up_a_commit(tmp_path: Path) -> None:
+    with Store(f"sqlite:///{tmp_path}/s.db") as store:
+        entered, leave = threading.Event(), threading.Event()
+
+        def write() -> None:
+            with store._lock:
+                entered.set()
+                assert leave.wait(10.0)
+
+        busy = threading.Thread(target=write)
+        busy.start()
+        assert entered.wait(10.0)
+        begin = time.monotonic()
+        store.check(wait=False)
+        assert time.monotonic() - begin < 1.0
+        leave.set()
+        busy.join()
 
 
 def test_sqlite_is_as_safe_as_it_says(tmp_path: Path) -> None:
