@@ -1,0 +1,432 @@
+"""Design of discrete-time circle-criterion observers by linear matrix inequalities.
+
+The observer of the trusted meters J is
+
+    x_hat+ = A x_hat + G phi(zeta) + B u + L r,   zeta = H x_hat + F u + K r,   r = (y - C x_hat - D u)_J
+
+Slopes may lie anywhere in [lower, upper]; a loop transform brings them to [0, upper - lower]. As
+everywhere here, the solver's answer is rebuilt in NumPy, in the plant's own units, before it is believed.
+
+References
+----------
+yang2019 (4), Assumption 1. Proofs: docs/theory-discrete.md.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from gridsec.arrays import Floats, Ints, frozen, frozen_ints
+from gridsec.errors import DesignInfeasible
+from gridsec.gains import negativity
+from gridsec.lmi.discrete_bounds import (
+    DirectProof,
+    DiscreteGains,
+    Uncertainty,
+    discrete_margin,
+    nothing_unknown,
+)
+from gridsec.lmi.sampled import DiscreteLure, shift
+
+# Slack of the scaled inequality, as in circle_criterion: far above the solver's tolerance.
+_SLACK = 1e-7
+# Enlargements of mu and mu_delta tried, in order, when the rebuilt inequality is violated.
+_BACKOFF = (0.0, 1e-4, 1e-3, 1e-2, 5e-2)
+# A meter that moves the observer by less than this part of what it could is not listened to.
+_BLIND = 1e-3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DiscreteOptions:
+    """What a design is asked for. n states, p meters.
+
+    Attributes
+    ----------
+    decays
+        Candidates for lambda, each in (0, 1), per step. The one with the smallest bound is kept.
+    noise : (p,)
+        Scale of each meter's error.
+    unknown
+        What else is unknown.
+    weight : (n, n)
+        Q > 0: the bound minimised is the one on `e^T Q e`.
+    """
+
+    decays: tuple[float, ...]
+    noise: Floats
+    unknown: Uncertainty
+    weight: Floats
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "noise", frozen(self.noise))
+        object.__setattr__(self, "weight", frozen(self.weight))
+        if not self.decays or not all(0.0 < decay < 1.0 for decay in self.decays):
+            raise ValueError("decays must lie between 0 and 1, and there must be one")
+        if self.noise.ndim != 1 or not (np.isfinite(self.noise).all() and np.all(self.noise > 0.0)):
+            raise ValueError("noise must be finite and positive, of shape (p,)")
+        if negativity(-self.weight) <= 0.0:
+            raise ValueError("the weight must be positive definite")
+
+
+def discrete_options(
+    system: DiscreteLure,
+    *,
+    decays: Sequence[float] | float,
+    noise: Floats | float,
+    unknown: Uncertainty | None = None,
+    weight: Floats | None = None,
+) -> DiscreteOptions:
+    """Options with short forms filled in for a plant.
+
+    Parameters
+    ----------
+    system
+        Plant.
+    decays
+        One candidate for lambda or several.
+    noise : (p,) or scalar
+        Scale of the meters' errors.
+    unknown
+        Nothing by default. A plant that settles by itself needs it, or the best design is blind.
+    weight : (n, n)
+        Identity by default.
+    """
+    several = (float(decays),) if isinstance(decays, int | float) else tuple(float(d) for d in decays)
+    return DiscreteOptions(
+        decays=several,
+        noise=np.array(np.broadcast_to(np.asarray(noise, dtype=np.float64), (len(system.C),))),
+        unknown=nothing_unknown(system) if unknown is None else unknown,
+        weight=np.eye(len(system.A)) if weight is None else np.asarray(weight, dtype=np.float64),
+    )
+
+
+def discrete_circle(system: DiscreteLure, J: Sequence[int] | Ints, options: DiscreteOptions) -> DiscreteGains:
+    """Design the observer of one set of trusted meters.
+
+    Minimises `(k mu + r mu_delta) / (1 - lambda^2)`, the bound on `e^T Q e` for entries of size one,
+    over (P, P L~, Lambda, Lambda K, mu, mu_delta) with `P >= Q`, for each candidate lambda.
+
+    Parameters
+    ----------
+    system
+        Plant.
+    J : (k,)
+        Trusted meters.
+    options
+        From `discrete_options`.
+
+    Returns
+    -------
+    DiscreteGains
+        With a positive margin.
+
+    Raises
+    ------
+    DesignInfeasible
+        If there is no such observer for any candidate, or if the best one ignores its meters.
+    """
+    return discrete_circles(system, [J], options)[0]
+
+
+def discrete_circles(
+    system: DiscreteLure, subsets: Sequence[Sequence[int] | Ints], options: DiscreteOptions
+) -> tuple[DiscreteGains, ...]:
+    """`discrete_circle` for many sets; sets of one size share one stated problem.
+
+    Parameters
+    ----------
+    system, options
+        As there.
+    subsets
+        Sets of trusted meters.
+    """
+    templates: dict[int, _Template] = {}
+    made = []
+    for J in subsets:
+        rows = np.asarray(J, dtype=np.intp)
+        if not len(rows):
+            raise DesignInfeasible(
+                "discrete circle-criterion observer", "no trusted meter: nothing to design"
+            )
+        if len(rows) not in templates:
+            templates[len(rows)] = _Template(system, options, len(rows), None)
+        found = templates[len(rows)].best(rows)
+        _refuse_blind(system, found)
+        made.append(found)
+    return tuple(made)
+
+
+def discrete_prove(
+    system: DiscreteLure, J: Sequence[int] | Ints, L: Floats, K: Floats, options: DiscreteOptions
+) -> DiscreteGains:
+    """The best proof for given gains: the same inequality in P, Lambda, mu and mu_delta only.
+
+    Parameters
+    ----------
+    system, J, options
+        As in `discrete_circle`.
+    L, K : (n, k), (m, k)
+        Gains. Blind ones are accepted: they were asked for.
+
+    Raises
+    ------
+    DesignInfeasible
+        If there is no proof.
+    """
+    given = (np.asarray(L, dtype=np.float64), np.asarray(K, dtype=np.float64))
+    return _Template(system, options, len(J), given).best(np.asarray(J, dtype=np.intp))
+
+
+def discrete_contraction(system: DiscreteLure, *, decays: Sequence[float] | float) -> DirectProof:
+    """One proof of direct injection for all sets of meters: the inequality without any meter.
+
+    Trusting a meter replaces a slope of the loop by zero, which is one of the slopes that the proof
+    covers anyway. It needs `lower <= 0 <= upper`.
+
+    Parameters
+    ----------
+    system
+        Plant.
+    decays
+        Candidates for lambda. The one with the smallest `sqrt(cond P) / (1 - lambda)` is kept.
+
+    Raises
+    ------
+    DesignInfeasible
+        If there is none.
+
+    References
+    ----------
+    docs/theory-discrete.md, Theorem 2.
+    """
+    what = "proof of direct injection for all sets of meters"
+    if np.any(system.lower > 0.0) or np.any(system.upper < 0.0):
+        raise DesignInfeasible(what, "a slope interval does not contain zero")
+    options = discrete_options(system, decays=decays, noise=1.0)
+    n, m = len(system.A), len(system.lower)
+    silent = _Template(system, options, 0, (np.zeros((n, 0)), np.zeros((m, 0))))
+    found, best = None, np.inf
+    for decay in options.decays:
+        try:
+            tried = silent.solve(np.zeros(0, dtype=np.intp), decay)
+        except DesignInfeasible:
+            continue
+        cost = np.sqrt(np.linalg.cond(tried.P)) / (1.0 - decay)
+        if cost < best:
+            found, best = tried, cost
+    if found is None:
+        raise DesignInfeasible(what, f"the inequality has no solution for lambda in {options.decays}")
+    return DirectProof(found.P, found.Lambda, found.decay, found.margin, found.status)
+
+
+def _refuse_blind(system: DiscreteLure, gains: DiscreteGains) -> None:
+    """Refuse a design that ignores every one of its meters."""
+    live = system.slope > 0.0
+    through = float(np.max(np.abs(gains.K[live]), initial=0.0))
+    drive = np.abs(system.G) @ np.maximum(np.abs(system.lower), np.abs(system.upper))
+    reference = np.where(drive > 0.0, drive, np.abs(np.diagonal(system.A)))
+    pushed = float(np.max(np.abs(gains.L) / np.maximum(reference, _TINY)[:, None], initial=0.0))
+    if max(through, pushed) < _BLIND:
+        raise DesignInfeasible(
+            f"discrete circle-criterion observer of the meters {gains.J.tolist()}",
+            "degenerate: the best gains are L = K = 0. The plant settles by itself, and nothing but the "
+            "meters was said to be uncertain: listening only costs. State what else is unknown "
+            "(`unknown`), or smaller meter noise",
+        )
+
+
+_TINY = 1e-300
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """An inaccurate solution is judged by its margin, not by a warning that nobody reads."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Solution may be inaccurate", category=UserWarning)
+        yield
+
+
+def _cvxpy() -> Any:
+    """Import cvxpy late: it takes a second, and only a design needs it. Its annotations are incomplete."""
+    import cvxpy
+
+    return cvxpy
+
+
+class _Template:
+    """The scaled inequality for sets of one size, stated once and solved for many sets and decays.
+
+    Units: arguments and outputs in `z_unit` (a typical unknown, or the noise), nonlinearity i in
+    `slope_i z_unit`, states in what the nonlinearities can push in one step, noise in its root mean
+    square.
+    """
+
+    def __init__(
+        self, system: DiscreteLure, options: DiscreteOptions, size: int, given: tuple[Floats, Floats] | None
+    ) -> None:
+        self.system, self.options, self.size, self.given = system, options, size, given
+        self.moved, self.lower = shift(system), system.G * system.lower
+        self.live = system.slope > 0.0
+        self._set_units()
+        self._pose()
+
+    def _set_units(self) -> None:
+        argument = self.options.unknown.argument
+        spread = np.sqrt(np.sum(argument**2, axis=1)) if argument.size else np.zeros(1)
+        self.noise_unit = float(np.sqrt(np.mean(self.options.noise**2)))
+        self.z_unit = float(np.sqrt(np.mean(spread**2))) if np.any(spread > 0.0) else self.noise_unit
+        push = (np.abs(self.system.G) @ self.system.slope) * self.z_unit
+        self.x_unit = np.where(push > 0.0, push, np.max(push, initial=0.0) or self.z_unit)
+        scaled = self.x_unit[:, None] * self.options.weight * self.x_unit
+        self.q_unit = float(np.trace(scaled)) / max(1, len(scaled))
+
+    def _pose(self) -> None:
+        cp = _cvxpy()
+        moved, options, live, k = self.moved, self.options, self.live, self.size
+        x, z, unknown = self.x_unit, self.z_unit, self.options.unknown
+        n, m, r = len(x), int(np.count_nonzero(live)), unknown.state.shape[1]
+        A = moved.A * x / x[:, None]
+        G = moved.G[:, live] * (self.system.slope[live] * z) / x[:, None]
+        H = moved.H[live] * x / z
+        E_x = (unknown.state + self.lower @ unknown.argument) / x[:, None]
+        E_z = unknown.argument[live] / z
+        self.C, self.E_y = cp.Parameter((k, n)), cp.Parameter((k, r))
+        self.N, self.decay2 = cp.Parameter((1, k), nonneg=True), cp.Parameter(nonneg=True)
+        P, lam = cp.Variable((n, n), symmetric=True), cp.Variable(m)
+        mu, mu_delta = cp.Variable(), cp.Variable()
+        Lam = cp.diag(lam) if m else np.zeros((0, 0))
+        if self.given is None:
+            Y, Gamma = cp.Variable((n, k)), cp.Variable((m, k))
+        else:
+            L, K = self.given
+            Y, Gamma = P @ ((L + self.lower @ K) * z / x[:, None]), Lam @ K[live]
+        # Rows and columns: e, psi, noise, delta, and P for the Schur complement of e+.
+        ahead = [P @ A - Y @ self.C, P @ G]
+        argument = [Lam @ H - Gamma @ self.C, -2.0 * Lam]
+        sizes = [n, m]
+        diagonal = [-self.decay2 * P, -2.0 * Lam]
+        if k:
+            ahead.append(-cp.multiply(Y, np.ones((n, 1)) @ self.N))
+            argument.append(-cp.multiply(Gamma, np.ones((m, 1)) @ self.N))
+            diagonal.append(-mu * np.eye(k))
+            sizes.append(k)
+        if r:
+            ahead.append(P @ E_x - Y @ self.E_y)
+            argument.append(Lam @ E_z - Gamma @ self.E_y)
+            diagonal.append(-mu_delta * np.eye(r))
+            sizes.append(r)
+        whole = cp.bmat(_blocks(sizes, diagonal, argument, ahead, -P))
+        Q = x[:, None] * options.weight * x / self.q_unit
+        constraints = [whole << -_SLACK * np.eye(n + sum(sizes)), P >> Q]
+        loud = min((self.noise_unit / z) ** 2, 1e4)
+        # Where nothing disturbs, the roundest P bounds best whatever comes.
+        cost = k * loud * mu + r * mu_delta if k or r else cp.lambda_max(P)
+        self.problem = cp.Problem(cp.Minimize(cost), constraints)
+        self.variables = (P, Y, lam, Gamma, mu, mu_delta)
+
+    def best(self, J: Ints) -> DiscreteGains:
+        """The candidate lambda with the smallest bound."""
+        failure, found, best = None, None, np.inf
+        for decay in self.options.decays:
+            try:
+                tried = self.solve(J, decay)
+            except DesignInfeasible as reason:
+                failure = reason
+                continue
+            r = self.options.unknown.state.shape[1]
+            cost = (len(J) * tried.mu + r * tried.mu_delta) / (1.0 - decay**2)
+            if cost < best:
+                found, best = tried, cost
+        if found is None:
+            raise failure if failure is not None else DesignInfeasible("observer", "no candidate decay")
+        return found
+
+    def solve(self, J: Ints, decay: float) -> DiscreteGains:
+        """Design for one set at one decay, verified."""
+        cp = _cvxpy()
+        what = f"discrete circle-criterion observer of the meters {J.tolist()} at decay {decay:g} per step"
+        if len(J):
+            self.C.value = self.system.C[J] * self.x_unit / self.z_unit
+            self.E_y.value = self.options.unknown.output[J] / self.z_unit
+            self.N.value = (self.options.noise[J] / self.noise_unit)[None, :]
+        else:
+            self.C.value = np.zeros((0, len(self.x_unit)))
+        self.decay2.value = decay**2
+        try:
+            with _quiet():
+                self.problem.solve(solver=cp.CLARABEL)
+        except cp.error.SolverError as failure:
+            raise DesignInfeasible(what, f"the solver failed: {failure}") from failure
+        if self.problem.status not in {cp.OPTIMAL, cp.OPTIMAL_INACCURATE}:
+            raise DesignInfeasible(what, f"the inequality has no solution ({self.problem.status})")
+        return _settle(self.system, self._in_plant_units(J, decay), what)
+
+    def _in_plant_units(self, J: Ints, decay: float) -> DiscreteGains:
+        P, lam = (np.asarray(self.variables[i].value, dtype=np.float64) for i in (0, 2))
+        x, z, live, k = self.x_unit, self.z_unit, self.live, self.size
+        if self.given is not None:
+            L, K = self.given
+        else:
+            Y, Gamma = (np.asarray(self.variables[i].value, dtype=np.float64) for i in (1, 3))
+            K = np.zeros((live.size, k))
+            K[live] = Gamma / lam[:, None]
+            L = np.linalg.solve(P, Y) * (x / z)[:, None] - self.lower @ K
+        Lambda = np.zeros(live.size)
+        Lambda[live] = self.q_unit * lam / (self.system.slope[live] * z**2)
+        mu = float(self.variables[4].value) if k else 0.0
+        r = self.options.unknown.state.shape[1]
+        mu_delta = float(self.variables[5].value) if r else 0.0
+        half = 0.5 * (P + P.T)
+        return DiscreteGains(
+            J=frozen_ints(J),
+            L=frozen(L),
+            K=frozen(K),
+            P=frozen(self.q_unit * half / x[:, None] / x),
+            Lambda=frozen(Lambda),
+            decay=decay,
+            mu=self.q_unit * mu * (self.noise_unit / z) ** 2,
+            mu_delta=self.q_unit * mu_delta,
+            noise=frozen(self.options.noise[J]),
+            unknown=self.options.unknown,
+            margin=np.nan,
+            backoff=0.0,
+            status=str(self.problem.status),
+        )
+
+
+def _blocks(
+    sizes: list[int], diagonal: list[Any], argument: list[Any], ahead: list[Any], last: Any
+) -> list[list[Any]]:
+    """The whole symmetric block matrix from its nonzero parts, blocks of no size left out."""
+    count = len(sizes)
+    rows: list[list[Any]] = [[np.zeros((a, b)) for b in sizes] for a in sizes]
+    for i in range(count):
+        rows[i][i] = diagonal[i]
+        if i != 1:
+            rows[1][i], rows[i][1] = argument[i], argument[i].T
+    rows = [[*row, ahead[i].T] for i, row in enumerate(rows)]
+    rows.append([*ahead, last])
+    keep = [i for i in range(count + 1) if i == count or sizes[i] > 0]
+    return [[rows[i][j] for j in keep] for i in keep]
+
+
+def _settle(system: DiscreteLure, found: DiscreteGains, what: str) -> DiscreteGains:
+    """Turn a solver's answer into a proven design, or refuse it.
+
+    If the margin in plant units is not positive, mu and mu_delta are enlarged by the stated steps.
+    """
+    best = -np.inf
+    for step in _BACKOFF:
+        grown = 1.0 + step
+        tried = replace(found, mu=found.mu * grown, mu_delta=found.mu_delta * grown, backoff=step)
+        held = discrete_margin(system, tried.J, tried)
+        if held > 0.0:
+            return replace(tried, margin=held)
+        best = max(best, held)
+    raise DesignInfeasible(what, f"the rebuilt inequality is violated ({found.status})", best)

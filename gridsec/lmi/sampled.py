@@ -1,0 +1,214 @@
+"""Lur'e systems in discrete time, and the feeder's loop sampled at its readings.
+
+    x(k+1) = A x(k) + G phi(H x(k) + F u(k)) + B u(k),      y(k) = C x(k) + D u(k)
+
+It stands in this package because the inequalities are about it; no solver is used here.
+
+References
+----------
+yang2019 (1), (2), with the known vector rho written as B u; docs/theory-discrete.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import expm
+
+from gridsec.arrays import Floats, exponential_integrals, frozen, spectral_radius
+from gridsec.lure import Lure, Nonlinearity
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DiscreteLure:
+    """`x+ = A x + G phi(H x + F u) + B u`, `y = C x + D u`. n states, m nonlinearities, l inputs, p meters.
+
+    Attributes
+    ----------
+    A : (n, n)
+    G : (n, m)
+    H : (m, n)
+    F : (m, l)
+    B : (n, l)
+    C : (p, n)
+    D : (p, l)
+        The matrices. A known vector rho(u, y) as in yang2019 (1) is passed as further entries of u.
+    lower, upper : (m,)
+        Bounds of the slopes of each entry of phi, `lower <= upper`.
+    phi
+        The nonlinearity, (…, m) -> (…, m), entry by entry.
+    h
+        Time from one step to the next, s.
+    """
+
+    A: Floats
+    G: Floats
+    H: Floats
+    F: Floats
+    B: Floats
+    C: Floats
+    D: Floats
+    lower: Floats
+    upper: Floats
+    phi: Nonlinearity
+    h: float = 1.0
+
+    def __post_init__(self) -> None:
+        names = ("A", "G", "H", "F", "B", "C", "D", "lower", "upper")
+        for name in names:
+            object.__setattr__(self, name, frozen(getattr(self, name)))
+        n, m, inputs, p = self.A.shape[0], self.lower.size, self.F.shape[-1], self.C.shape[0]
+        wanted: dict[str, tuple[int, ...]] = {"A": (n, n), "G": (n, m), "H": (m, n), "F": (m, inputs)}
+        wanted |= {"B": (n, inputs), "C": (p, n), "D": (p, inputs), "lower": (m,), "upper": (m,)}
+        wrong = [
+            f"{name} has shape {getattr(self, name).shape}; expected {shape}"
+            for name, shape in wanted.items()
+            if getattr(self, name).shape != shape
+        ]
+        if not all(np.isfinite(getattr(self, name)).all() for name in names):
+            wrong.append("every entry must be finite")
+        if not wrong and np.any(self.lower > self.upper):
+            wrong.append("a lower slope exceeds its upper slope")
+        if not (np.isfinite(self.h) and self.h > 0.0):
+            wrong.append(f"h is {self.h}; the time between steps must be positive")
+        if wrong:
+            raise ValueError("; ".join(wrong))
+
+    @property
+    def slope(self) -> Floats:
+        """Width of each slope interval, (m,): the slope bound after the loop transform."""
+        return np.asarray(self.upper - self.lower)
+
+
+def shift(system: DiscreteLure) -> DiscreteLure:
+    """Loop transform: the same system with slopes in [0, upper - lower].
+
+    `phi(z) = lower z + phi~(z)` moves the lower slope into the linear part:
+    `A~ = A + G diag(lower) H`, `B~ = B + G diag(lower) F`. Trajectories do not change.
+
+    Parameters
+    ----------
+    system
+        Any.
+    """
+    lower = system.lower
+    pushed = system.G * lower
+    return DiscreteLure(
+        A=system.A + pushed @ system.H,
+        G=system.G,
+        H=system.H,
+        F=system.F,
+        B=system.B + pushed @ system.F,
+        C=system.C,
+        D=system.D,
+        lower=np.zeros(lower.shape),
+        upper=system.slope,
+        phi=lambda z: np.asarray(system.phi(z) - lower * z),
+        h=system.h,
+    )
+
+
+def advance(system: DiscreteLure, x: Floats, u: Floats) -> Floats:
+    """The state one step later.
+
+    Parameters
+    ----------
+    system
+        The system.
+    x : (…, n)
+        State.
+    u : (…, l)
+        Input.
+    """
+    z = x @ system.H.T + u @ system.F.T
+    return np.asarray(x @ system.A.T + system.phi(z) @ system.G.T + u @ system.B.T)
+
+
+def measure(system: DiscreteLure, x: Floats, u: Floats) -> Floats:
+    """Noiseless outputs `C x + D u`, (…, p).
+
+    Parameters
+    ----------
+    system, x, u
+        As in `advance`.
+    """
+    return np.asarray(x @ system.C.T + u @ system.D.T)
+
+
+def sample(lure: Lure, h: float) -> DiscreteLure:
+    """A continuous Lur'e system at steps of length h, inputs held, nonlinearity frozen over a step.
+
+    The exponential Euler step `x+ = exp(A h) x + h phi_1(A h) (G phi(H x + F u) + B u)`. It is exact
+    where z stands still over the step. For a droop loop it is exact in general if the argument of
+    inverter i is taken at some value that z_i has *during* the step; `held_error` bounds how far that
+    is from the value at its beginning.
+
+    Parameters
+    ----------
+    lure
+        The continuous system.
+    h
+        Length of a step, s, positive.
+
+    References
+    ----------
+    docs/theory-discrete.md, section 5.
+    """
+    n = len(lure.A)
+    own = np.diagonal(lure.A)
+    if np.count_nonzero(lure.A) == np.count_nonzero(own):
+        decay, one, _ = exponential_integrals(own * h)
+        A, hold = np.diag(decay), np.diag(h * one)
+    else:
+        block = np.zeros((2 * n, 2 * n))
+        block[:n, :n], block[:n, n:] = h * lure.A, h * np.eye(n)
+        full = expm(block)
+        A, hold = full[:n, :n], full[:n, n:]
+    return DiscreteLure(
+        A=A,
+        G=hold @ lure.G,
+        H=lure.H,
+        F=lure.F,
+        B=hold @ lure.B,
+        C=lure.C,
+        D=lure.D,
+        lower=np.zeros(lure.slope.shape),
+        upper=lure.slope,
+        phi=lure.phi,
+        h=h,
+    )
+
+
+def held_error(lure: Lure, h: float, away: Floats) -> Floats:
+    """How far z can move within one step of a droop loop whose input is held.
+
+    Inverter j obeys `tau_j x_j' = -x_j + K_j(z_j)`, so `|x_j(s) - x_j(0)| <= q_j sup |K_j(z_j) - x_j(0)|`
+    with `q_j = 1 - exp(-h / tau_j)`. With `away_j >= |K_j(z_j(0)) - x_j(0)|`, movement m solves
+    `m = q (away + d |H| m)`, as far as the spectral radius of `diag(q d) |H|` is below 1.
+
+    Parameters
+    ----------
+    lure
+        Closed loop of a feeder, A and G diagonal with G = -A.
+    h
+        Length of the step, s.
+    away : (m,)
+        How far each inverter is from its set point at the beginning of the step, pu.
+
+    Returns
+    -------
+    (m,)
+        Bound on `|z_i(s) - z_i(0)|`, 0 <= s <= h, squared pu; infinite where nothing follows.
+
+    References
+    ----------
+    docs/theory-discrete.md, section 5.
+    """
+    q = -np.expm1(np.diagonal(lure.A) * h)
+    reach = np.abs(lure.H)
+    loop = (q * lure.slope)[:, None] * reach
+    if spectral_radius(loop) >= 1.0:
+        return np.full(len(reach), np.inf)
+    moved = np.linalg.solve(np.eye(len(loop)) - loop, q * away)
+    return np.asarray(reach @ moved)

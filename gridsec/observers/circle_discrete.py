@@ -1,0 +1,441 @@
+"""Discrete-time circle-criterion observers: one observer, or a stack of them moved at once.
+
+    x_hat+ = A x_hat + G phi(zeta) + B u + L r,   zeta = H x_hat + F u + K r,   r = y - C x_hat - D u
+
+with zero columns of L and K for meters outside the trusted set J. Every design carries the constants of
+
+    |e(k)| <= c lambda^k |e(0)| + gamma sup |n_J| + gamma_delta sup |delta|          (yang2019 (5)),
+
+proven, not simulated; `monte_carlo` simulates them as the paper does, and says what such numbers are worth.
+
+References
+----------
+yang2019, section II; docs/theory-discrete.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats, frozen
+from gridsec.errors import DesignInfeasible
+from gridsec.lmi.discrete import DiscreteOptions, discrete_circle
+from gridsec.lmi.discrete_bounds import (
+    DirectProof,
+    DiscreteGains,
+    direct_gain_bound,
+    discrete_margin,
+    growth,
+    noise_gain,
+    nothing_unknown,
+    unknown_gain,
+)
+from gridsec.lmi.sampled import DiscreteLure, measure
+from gridsec.lmi.sampled import advance as advance_plant
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DiscreteDesign:
+    """One observer. n states, m nonlinearities, p meters.
+
+    Attributes
+    ----------
+    system
+        Plant.
+    trusted : (p,)
+        J as a mask.
+    L, K : (n, p), (m, p)
+        Gains; the columns of meters outside J are zero.
+    decay
+        lambda, per step.
+    growth
+        c.
+    noise_gain
+        gamma, with respect to the Euclidean norm of the trusted meters' errors.
+    unknown_gain
+        gamma_delta; for direct injection with respect to the error of the arguments z.
+    certificate
+        The proof.
+    """
+
+    system: DiscreteLure
+    trusted: Bools
+    L: Floats
+    K: Floats
+    decay: float
+    growth: float
+    noise_gain: float
+    unknown_gain: float
+    certificate: DiscreteGains | DirectProof
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DiscreteState:
+    """Where an observer stands.
+
+    Attributes
+    ----------
+    t
+        Time, s.
+    x : (n,)
+        Estimated state.
+    """
+
+    t: float
+    x: Floats
+
+
+def direct_gain(system: DiscreteLure, trusted: Bools) -> Floats:
+    """K of direct injection: the nonlinearity whose argument a trusted meter reads is driven by it.
+
+    Parameters
+    ----------
+    system
+        Plant.
+    trusted : (p,)
+        J as a mask.
+
+    Returns
+    -------
+    Floats
+        (m, p); the first such meter where there are several.
+    """
+    own, read = np.hstack([system.H, system.F]), np.hstack([system.C, system.D])
+    match = (own[:, None, :] == read[None, :, :]).all(axis=-1) & trusted
+    K = np.zeros(match.shape)
+    driven = np.flatnonzero(match.any(axis=1))
+    K[driven, np.argmax(match[driven], axis=1)] = 1.0
+    return K
+
+
+def design(
+    system: DiscreteLure,
+    trusted: Bools,
+    *,
+    gains: Literal["lmi"] | DiscreteGains | DirectProof = "lmi",
+    options: DiscreteOptions | None = None,
+) -> DiscreteDesign:
+    """Design one observer, with a proof that holds.
+
+    Parameters
+    ----------
+    system
+        Plant.
+    trusted : (p,)
+        J as a mask.
+    gains
+        "lmi": by `discrete_circle`. `DiscreteGains`: made before, verified again. `DirectProof` from
+        `discrete_contraction`: direct injection, for which that one proof serves every set.
+    options
+        What an LMI design is asked for; required by "lmi".
+
+    Raises
+    ------
+    DesignInfeasible
+        If there is no proof, or the given one does not hold here.
+    ValueError
+        If `trusted` has the wrong length, or contradicts the given design.
+    """
+    trusted = np.array(trusted, dtype=np.bool_)
+    trusted.flags.writeable = False
+    if trusted.shape != (len(system.C),):
+        raise ValueError(f"trusted has shape {trusted.shape}; the plant has {len(system.C)} meters")
+    if isinstance(gains, DirectProof):
+        return _direct(system, trusted, gains)
+    meters = np.flatnonzero(trusted)
+    if isinstance(gains, DiscreteGains):
+        made = gains
+        if sorted(made.J.tolist()) != meters.tolist():
+            raise ValueError(f"the design is for the meters {made.J.tolist()}, not {meters.tolist()}")
+        held = discrete_margin(system, made.J, made)
+        if not held > 0.0:
+            what = f"discrete observer of the meters {meters.tolist()}"
+            raise DesignInfeasible(what, "does not hold here", held)
+    elif options is None:
+        raise ValueError('gains="lmi" needs options: gridsec.lmi.discrete.discrete_options')
+    else:
+        made = discrete_circle(system, meters, options)
+    L, K = np.zeros((len(system.A), trusted.size)), np.zeros((len(system.lower), trusted.size))
+    L[:, made.J], K[:, made.J] = made.L, made.K
+    return DiscreteDesign(
+        system,
+        trusted,
+        frozen(L),
+        frozen(K),
+        made.decay,
+        growth(made),
+        noise_gain(made),
+        unknown_gain(made),
+        made,
+    )
+
+
+def _direct(system: DiscreteLure, trusted: Bools, proof: DirectProof) -> DiscreteDesign:
+    n, m = len(system.A), len(system.lower)
+    silent = DiscreteGains(
+        J=np.zeros(0, dtype=np.intp),
+        L=np.zeros((n, 0)),
+        K=np.zeros((m, 0)),
+        P=proof.P,
+        Lambda=proof.Lambda,
+        decay=proof.decay,
+        mu=0.0,
+        mu_delta=0.0,
+        noise=np.zeros(0),
+        unknown=nothing_unknown(system),
+        margin=proof.margin,
+        backoff=0.0,
+        status=proof.status,
+    )
+    held = discrete_margin(system, [], silent)
+    if not held > 0.0:
+        raise DesignInfeasible("direct injection", "the proof does not hold here", held)
+    K = direct_gain(system, trusted)
+    return DiscreteDesign(
+        system,
+        trusted,
+        frozen(np.zeros((n, trusted.size))),
+        frozen(K),
+        proof.decay,
+        growth(silent),
+        direct_gain_bound(system, proof, K),
+        direct_gain_bound(system, proof, np.eye(m)),
+        proof,
+    )
+
+
+def init(design: DiscreteDesign, t: float, x: Floats | None = None) -> DiscreteState:
+    """Start an observer.
+
+    Parameters
+    ----------
+    design
+        The observer.
+    t
+        Time, s.
+    x : (n,)
+        Where the estimate starts; zero by default.
+    """
+    start = np.zeros(len(design.system.A)) if x is None else np.array(x, dtype=np.float64)
+    return DiscreteState(float(t), start)
+
+
+def step(design: DiscreteDesign, state: DiscreteState, y: Floats, u: Floats, seen: Bools) -> DiscreteState:
+    """One step of one observer.
+
+    Parameters
+    ----------
+    design
+        The observer.
+    state
+        Where it stands.
+    y : (p,)
+        Readings at the beginning of the step; ignored where unseen or not finite.
+    u : (l,)
+        Known input during the step.
+    seen : (p,)
+        Which readings exist. The rest has exactly no influence.
+    """
+    x = _ahead(design.system, design.L, design.K, state.x, y=y, u=u, seen=seen)
+    return DiscreteState(state.t + design.system.h, x)
+
+
+def outputs(design: DiscreteDesign, state: DiscreteState, u: Floats) -> Floats:
+    """What every meter of the plant should read, `C x_hat + D u`, (p,); trusted or not.
+
+    Parameters
+    ----------
+    design, state
+        The observer.
+    u : (l,)
+        Known input.
+    """
+    return measure(design.system, state.x, u)
+
+
+def error_bound(design: DiscreteDesign, k: int, *, start: float, noise: float, unknown: float = 0.0) -> float:
+    """Right side of yang2019 (5) after k steps.
+
+    Parameters
+    ----------
+    design
+        The observer.
+    k
+        Number of steps.
+    start
+        |e(0)|.
+    noise
+        Supremum of the Euclidean norm of the trusted meters' errors (attacks included).
+    unknown
+        Supremum of the Euclidean norm of delta, or of the arguments' errors for direct injection.
+    """
+    first = design.growth * design.decay**k * start
+    return first + design.noise_gain * noise + design.unknown_gain * unknown
+
+
+def settling_steps(design: DiscreteDesign, *, start: float, epsilon: float) -> int:
+    """Smallest k with `c lambda^k |e(0)| <= epsilon`: k* of yang2019.
+
+    Parameters
+    ----------
+    design
+        The observer.
+    start
+        Bound on |e(0)|; 0: it starts in the true state.
+    epsilon
+        What may be left of it.
+    """
+    if design.growth * start <= epsilon:
+        return 0
+    if epsilon <= 0.0:
+        raise ValueError("epsilon must be positive unless the observers start in the true state")
+    return int(np.ceil(np.log(epsilon / (design.growth * start)) / np.log(design.decay)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stack:
+    """Many observers of one plant, on a leading axis. o observers.
+
+    Attributes
+    ----------
+    system
+        Plant.
+    masks : (o, p)
+        Trusted sets.
+    L, K : (o, n, p), (o, m, p)
+        Gains.
+    """
+
+    system: DiscreteLure
+    masks: Bools
+    L: Floats
+    K: Floats
+
+
+def stack(designs: Sequence[DiscreteDesign]) -> Stack:
+    """Observers of one plant as stacked arrays.
+
+    Parameters
+    ----------
+    designs
+        At least one; all of the same plant.
+    """
+    if any(one.system is not designs[0].system for one in designs):
+        raise ValueError("the observers belong to different plants")
+    return Stack(
+        designs[0].system,
+        np.stack([one.trusted for one in designs]),
+        frozen(np.stack([one.L for one in designs])),
+        frozen(np.stack([one.K for one in designs])),
+    )
+
+
+def advance(stack: Stack, x: Floats, y: Floats, u: Floats, seen: Bools) -> Floats:
+    """One step of all observers.
+
+    Parameters
+    ----------
+    stack
+        The observers.
+    x : (…, o, n)
+        Their estimates.
+    y : (…, p)
+        Readings; ignored where unseen or not finite.
+    u : (…, l)
+        Known input.
+    seen : (p,)
+        Which readings exist.
+
+    Returns
+    -------
+    (…, o, n)
+        Estimates one step later.
+    """
+    y, u = np.asarray(y)[..., None, :], np.asarray(u)[..., None, :]
+    return _ahead(stack.system, stack.L, stack.K, x, y=y, u=u, seen=seen)
+
+
+def _ahead(
+    system: DiscreteLure, L: Floats, K: Floats, x: Floats, *, y: Floats, u: Floats, seen: Bools
+) -> Floats:
+    """The observer equation, for one observer or for a stack with a leading axis of gains."""
+    r = np.where(seen & np.isfinite(y), y - measure(system, x, u), 0.0)[..., None]
+    zeta = x @ system.H.T + u @ system.F.T + (K @ r)[..., 0]
+    pushed = x @ system.A.T + system.phi(zeta) @ system.G.T + u @ system.B.T
+    return np.asarray(pushed + (L @ r)[..., 0])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MonteCarlo:
+    """Gains by simulation: the largest seen, which is a lower bound of the true gain.
+
+    Attributes
+    ----------
+    gains : (o,)
+        `max |e_J(k)| / sup_{j < k} |n_J(j)|` over all runs and steps, starting from e(0) = 0.
+    runs
+        Number of independent runs.
+    exceedance
+        With the stated confidence, one more run of the same kind exceeds a given entry of `gains` with
+        at most this probability: `1 - (1 - confidence)^(1 / runs)`. It says nothing about noise of
+        another kind; see docs/theory-discrete.md, section 4.
+    confidence
+        As asked for.
+    """
+
+    gains: Floats
+    runs: int
+    exceedance: float
+    confidence: float
+
+
+def monte_carlo(
+    stack: Stack,
+    *,
+    half_width: Floats | float,
+    start: Floats,
+    u: Floats,
+    seed: int,
+    confidence: float = 0.99,
+) -> MonteCarlo:
+    """ISS gains with respect to noise by simulation, as yang2019's example obtains them.
+
+    Noise is independent and uniform between plus and minus `half_width`; every observer starts in the
+    plant's state.
+
+    Parameters
+    ----------
+    stack
+        The observers.
+    half_width : (p,) or scalar
+        Of each meter's noise.
+    start : (R, n)
+        Initial states, one for each run.
+    u : (T, l)
+        Known input of the T steps.
+    seed
+        Of the random numbers.
+    confidence
+        Of the statement `exceedance`.
+    """
+    system, rng = stack.system, np.random.default_rng(seed)
+    runs, p = len(start), len(system.C)
+    if not (runs and 0.0 < confidence < 1.0):
+        raise ValueError("at least one run, and a confidence between 0 and 1")
+    width = np.broadcast_to(np.asarray(half_width, dtype=np.float64), (p,))
+    everyone, truth = np.ones(p, dtype=np.bool_), np.asarray(start, dtype=np.float64)
+    x = np.repeat(truth[:, None, :], len(stack.masks), axis=1)
+    loudest, worst = np.zeros((runs, len(stack.masks))), np.zeros(len(stack.masks))
+    for now in u:
+        noise = rng.uniform(-width, width, (runs, p))
+        loudest = np.maximum(loudest, np.linalg.norm(noise[:, None] * stack.masks, axis=-1))
+        x = advance(stack, x, measure(system, truth, now) + noise, now, everyone)
+        truth = advance_plant(system, truth, now)
+        size = np.linalg.norm(x - truth[:, None], axis=-1)
+        worst = np.maximum(worst, np.max(size / loudest, axis=0))
+    exceedance = 1.0 - (1.0 - confidence) ** (1.0 / runs)
+    return MonteCarlo(worst, runs, float(exceedance), confidence)

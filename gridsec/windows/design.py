@@ -1,0 +1,205 @@
+"""The bank of discrete-time observers, its thresholds, and its consistency measures.
+
+References
+----------
+yang2019 (8), (10), (17), (19).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gridsec.arrays import Floats, frozen
+from gridsec.lmi.discrete import DiscreteOptions, discrete_circles
+from gridsec.lmi.discrete_bounds import DirectProof
+from gridsec.lmi.sampled import DiscreteLure
+from gridsec.observers import circle_discrete
+from gridsec.observers.circle_discrete import DiscreteDesign, Stack, settling_steps, stack
+from gridsec.subsets import Subsets, subsets
+from gridsec.windows.rules import Rule
+
+MOST_OBSERVERS = 20_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WindowDesign:
+    """The bank with its thresholds. p meters, q liars at most, s = C(p, q) large sets, o observers.
+
+    Attributes
+    ----------
+    observers
+        All o = 1 + C(p, q) + C(p, 2q) observers: of all meters, of the large sets J, of the small sets S.
+    sets
+        J and S, and who is compared to whom.
+    gains : (o,)
+        gamma of each observer.
+    noise
+        m, supremum over time of the Euclidean norm of all meters' noise.
+    epsilon
+        What may be left of the initial error once windows begin.
+    settling
+        k*, first step of the first window.
+    detect_above
+        Threshold of pi.
+    isolate_above : (s,)
+        Thresholds of pi_J.
+    length
+        N, steps in a window.
+    rule
+        How a window isolates: "majority" is Algorithm 2; "survivors" keeps the J that never failed.
+    """
+
+    observers: Stack
+    sets: Subsets
+    gains: Floats
+    noise: float
+    epsilon: float
+    settling: int
+    detect_above: float
+    isolate_above: Floats
+    length: int
+    rule: Rule
+
+
+def bank(
+    system: DiscreteLure,
+    max_attacked: int,
+    *,
+    options: DiscreteOptions | None = None,
+    proof: DirectProof | None = None,
+    most: int = MOST_OBSERVERS,
+) -> tuple[DiscreteDesign, ...]:
+    """Design all observers: of all meters, of every p - q and of every p - 2q of them.
+
+    Parameters
+    ----------
+    system
+        Plant with p meters.
+    max_attacked
+        q, at least 1.
+    options
+        For gains by matrix inequality. Either this
+    proof
+        or this: direct injection.
+    most
+        Largest number of observers that is acceptable.
+
+    Raises
+    ------
+    NotObservable
+        Unless p > 2q.
+    DesignInfeasible
+        If there would be too many, or if an observer cannot be designed.
+    """
+    if max_attacked < 1:
+        raise ValueError("max_attacked must be at least 1: without liars there is nothing to isolate")
+    if (options is None) == (proof is None):
+        raise ValueError("give options for gains by matrix inequality, or a proof for direct injection")
+    sets = subsets(len(system.C), max_attacked, most=most)
+    masks = np.vstack([np.ones((1, sets.meters), dtype=np.bool_), sets.masks()])
+    if proof is not None:
+        return tuple(circle_discrete.design(system, mask, gains=proof) for mask in masks)
+    assert options is not None  # noqa: S101  # exactly one of the two, checked above
+    made = discrete_circles(system, [np.flatnonzero(mask) for mask in masks], options)
+    return tuple(
+        circle_discrete.design(system, mask, gains=one) for mask, one in zip(masks, made, strict=True)
+    )
+
+
+def design(
+    observers: Sequence[DiscreteDesign],
+    max_attacked: int,
+    *,
+    noise: float,
+    length: int,
+    start: float = 0.0,
+    epsilon: float = 0.0,
+    gains: Floats | None = None,
+    unknown: float = 0.0,
+    rule: Rule = "majority",
+) -> WindowDesign:
+    """Thresholds of a bank, `2 (epsilon + gamma m)`.
+
+    Parameters
+    ----------
+    observers
+        From `bank`.
+    max_attacked
+        q, as there.
+    noise
+        m, supremum of the Euclidean norm of all meters' noise.
+    length
+        N.
+    start
+        Bound on every observer's initial error; 0: all start in the true state.
+    epsilon
+        What may be left of it when windows begin.
+    gains : (o,)
+        gamma of each observer; by default the proven ones. Simulated ones make thresholds that are
+        smaller and no bounds any more.
+    unknown
+        Supremum of the norm of what else is unknown; its share `gamma_delta unknown` is part of epsilon
+        in (10) and (19), observer by observer.
+    rule
+        How a window isolates.
+
+    References
+    ----------
+    yang2019 (10), (19).
+    """
+    p = len(observers[0].system.C)
+    sets = subsets(p, max_attacked, most=MOST_OBSERVERS)
+    if len(observers) != 1 + sets.count_large + sets.count_small:
+        raise ValueError(
+            f"{len(observers)} observers do not make a bank for {p} meters, {max_attacked} liars"
+        )
+    if length < 1:
+        raise ValueError("a window has at least one step")
+    gamma = np.array([one.noise_gain for one in observers]) if gains is None else np.asarray(gains)
+    level = epsilon + gamma * noise + np.array([one.unknown_gain for one in observers]) * unknown
+    large, small = level[1 : 1 + sets.count_large], level[1 + sets.count_large :]
+    spread = np.broadcast_to(small, sets.parent.shape).ravel()[sets.pairs].max(axis=1)
+    return WindowDesign(
+        observers=stack(observers),
+        sets=sets,
+        gains=frozen(gamma),
+        noise=float(noise),
+        epsilon=float(epsilon),
+        settling=max(settling_steps(one, start=start, epsilon=epsilon) for one in observers),
+        detect_above=float(2.0 * max(level[0], large.max())),
+        isolate_above=frozen(2.0 * np.maximum(large, spread)),
+        length=int(length),
+        rule=rule,
+    )
+
+
+def consistency(design: WindowDesign, x: Floats) -> tuple[Floats, Floats]:
+    """Both measures, pi and pi_J, of a set of estimates.
+
+    Parameters
+    ----------
+    design
+        The bank.
+    x : (…, o, n)
+        All estimates.
+
+    Returns
+    -------
+    pi, pi_J : (…), (…, s)
+        Euclidean distances.
+
+    References
+    ----------
+    yang2019 (8), (17).
+    """
+    sets, first = design.sets, 1 + design.sets.count_large
+    whole, large, small = x[..., :1, :], x[..., 1:first, :], x[..., first:, :]
+    pi = np.linalg.norm(large - whole, axis=-1).max(axis=-1)
+    gaps = np.stack(
+        [np.linalg.norm(small - large[..., parent, :], axis=-1) for parent in sets.parent], axis=-2
+    )
+    flat = gaps.reshape(*gaps.shape[:-2], -1)
+    return pi, np.asarray(flat[..., sets.pairs].max(axis=-1))

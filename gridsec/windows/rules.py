@@ -1,0 +1,137 @@
+"""What a window of consistency measures says: Algorithms 1 and 2 of yang2019 as pure functions.
+
+References
+----------
+yang2019, Algorithms 1 and 2; docs/theory-discrete.md, section 3.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats
+
+Rule = Literal["majority", "survivors"]
+
+
+def detection(pi: Floats, threshold: float, length: int) -> Bools:
+    """Algorithm 1: whether pi exceeds its threshold anywhere in each window.
+
+    Parameters
+    ----------
+    pi : (…, T)
+        From step k* on; a last window that is not full is left out.
+    threshold
+        (10).
+    length
+        N.
+
+    Returns
+    -------
+    (…, T // N)
+        detection(i) as booleans.
+    """
+    count = pi.shape[-1] // length
+    return np.asarray(
+        (pi[..., : count * length] > threshold).reshape(*pi.shape[:-1], count, length).any(axis=-1)
+    )
+
+
+def believed(passing: Bools, masks: Bools) -> Bools:
+    """W-bar(k): the union of all large sets that pass.
+
+    Parameters
+    ----------
+    passing : (…, s)
+        Whether pi_J is within its threshold.
+    masks : (s, p)
+        The large sets.
+
+    Returns
+    -------
+    (…, p)
+        Meters regarded as honest.
+
+    References
+    ----------
+    yang2019 (21).
+    """
+    return np.asarray((passing[..., :, None] & masks).any(axis=-2))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Isolation:
+    """What windows say. w windows, p meters.
+
+    Attributes
+    ----------
+    suspects : (…, w, p)
+        Meters regarded as attacked; none where `decided` is False.
+    decided : (…, w)
+        Whether the window has an answer at all.
+    share : (…, w)
+        Part of the window's steps that gave this very answer (majority), or part of the large sets that
+        survived (survivors).
+    """
+
+    suspects: Bools
+    decided: Bools
+    share: Floats
+
+
+def isolation(pi_sets: Floats, thresholds: Floats, masks: Bools, length: int, rule: Rule) -> Isolation:
+    """Algorithm 2, or its sound variant, over consecutive windows.
+
+    "majority" takes the set that equals W-bar(k) most often in the window (steps at which nothing passes
+    do not vote; of sets with equally many votes the one seen first wins; no vote: undecided). "survivors"
+    drops a large set as soon as it fails once and believes the union of those that never did; if none is
+    left, the assumptions are wrong and the window is undecided.
+
+    Parameters
+    ----------
+    pi_sets : (…, T, s)
+        pi_J from step k* on; NaN where J cannot be judged, which passes nothing and fails nothing.
+    thresholds : (s,)
+        (19).
+    masks : (s, p)
+        The large sets.
+    length
+        N. A last window that is not full is left out.
+    rule
+        Which of the two.
+
+    References
+    ----------
+    yang2019, Algorithm 2; docs/errata/yang2019.md for why there are two.
+    """
+    count = pi_sets.shape[-2] // length
+    shape = (*pi_sets.shape[:-2], count, length, pi_sets.shape[-1])
+    windowed = np.asarray(pi_sets[..., : count * length, :].reshape(shape))
+    if rule == "survivors":
+        failed = np.asarray((windowed > thresholds).any(axis=-2))
+        judged = np.asarray(np.isfinite(windowed).any(axis=-2))
+        alive = np.asarray(~failed & judged)
+        decided = np.asarray(alive.any(axis=-1) & judged.all(axis=-1))
+        suspects = ~believed(alive, masks) & decided[..., None]
+        return Isolation(suspects, decided, alive.mean(axis=-1))
+    trusted = believed(np.asarray(windowed <= thresholds), masks)
+    return _majority(trusted, np.asarray(np.isfinite(windowed).all(axis=-1) & trusted.any(axis=-1)))
+
+
+def _majority(trusted: Bools, votes: Bools) -> Isolation:
+    """The most frequent set (…, w, N, p) among the steps that vote (…, w, N)."""
+    lead, (length, p) = trusted.shape[:-2], trusted.shape[-2:]
+    suspects = np.zeros((int(np.prod(lead, dtype=np.intp)), p), dtype=np.bool_)
+    share = np.zeros(len(suspects))
+    rows = zip(trusted.reshape(-1, length, p), votes.reshape(-1, length), strict=True)
+    for index, (sets, voting) in enumerate(rows):
+        if not voting.any():
+            continue
+        kinds, first, tally = np.unique(sets[voting], axis=0, return_index=True, return_counts=True)
+        # Most votes; of equals the one that was seen first.
+        winner = min(range(len(kinds)), key=lambda i: (-tally[i], first[i]))
+        suspects[index], share[index] = ~kinds[winner], tally[winner] / length
+    return Isolation(suspects.reshape(*lead, p), (share > 0.0).reshape(lead), share.reshape(lead))

@@ -1,0 +1,89 @@
+"""Simulated runs of plant and bank, and thresholds taken from honest ones.
+
+References
+----------
+yang2019, Example 1; docs/theory-discrete.md, section 4.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gridsec.arrays import Floats, frozen
+from gridsec.lmi.sampled import advance as advance_plant
+from gridsec.lmi.sampled import measure
+from gridsec.observers.circle_discrete import advance
+from gridsec.windows.design import WindowDesign, consistency
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trace:
+    """A simulated run, or several. T steps, R runs in front where there are several.
+
+    Attributes
+    ----------
+    pi : (…, T)
+    pi_sets : (…, T, s)
+        The consistency measures.
+    error : (…, T, o)
+        `|x_hat - x|` of every observer.
+    """
+
+    pi: Floats
+    pi_sets: Floats
+    error: Floats
+
+
+def simulate(
+    design: WindowDesign, x: Floats, u: Floats, disturbance: Floats, apart: Floats | float = 0.0
+) -> Trace:
+    """Plant and bank together: what the measures do under given noise and attacks.
+
+    Parameters
+    ----------
+    design
+        The bank.
+    x : (…, n)
+        Initial states of the plant.
+    u : (T, l)
+        Known input.
+    disturbance : (…, T, p)
+        Noise plus attack of every meter.
+    apart : (…, n) or scalar
+        Initial error of every observer.
+    """
+    system, observers = design.observers.system, design.observers
+    truth = np.asarray(x, dtype=np.float64)
+    everyone = np.ones(len(system.C), dtype=np.bool_)
+    lead, steps = truth.shape[:-1], len(u)
+    many = np.repeat((truth + apart)[..., None, :], len(observers.masks), axis=-2)
+    pi, pi_sets = np.zeros((*lead, steps)), np.zeros((*lead, steps, design.sets.count_large))
+    error = np.zeros((*lead, steps, len(observers.masks)))
+    for k in range(steps):
+        pi[..., k], pi_sets[..., k, :] = consistency(design, many)
+        error[..., k, :] = np.linalg.norm(many - truth[..., None, :], axis=-1)
+        y = measure(system, truth, u[k]) + disturbance[..., k, :]
+        many = advance(observers, many, y, u[k], everyone)
+        truth = advance_plant(system, truth, u[k])
+    return Trace(pi, pi_sets, error)
+
+
+def calibrate(design: WindowDesign, honest: Trace) -> WindowDesign:
+    """Thresholds from honest runs: the largest pi and pi_J seen, instead of the triangle inequality.
+
+    Of R independent runs, one more run of the same kind exceeds a given threshold with at most the
+    probability `1 - (1 - confidence)^(1/R)`, with that confidence. Noise of another kind may exceed them
+    at will: these thresholds are statistics and no bounds.
+
+    Parameters
+    ----------
+    design
+        The bank.
+    honest
+        From `simulate` without attack.
+    """
+    first = design.settling
+    top = honest.pi_sets[..., first:, :].reshape(-1, design.sets.count_large).max(axis=0)
+    return replace(design, detect_above=float(honest.pi[..., first:].max()), isolate_above=frozen(top))
