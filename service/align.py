@@ -31,6 +31,9 @@ BACKLOG_TICKS = 3600
 BRIDGED_TICK_S = 2.0
 """Up to this tick, a lost reading is replaced by the one before."""
 
+GAP_MAX = 1_000_000
+"""A running number that leaps further was not counted on; nothing is known to be lost."""
+
 _ACTIVE_ROUNDS = 4
 
 
@@ -157,6 +160,7 @@ class Tick:
 class _Source:
     held: list[Reading] = field(default_factory=list)
     last_t: float = -math.inf
+    last_heard: float = -math.inf
     heard: int = 0
     seq: int | None = None
 
@@ -183,6 +187,8 @@ class Aligner:
         Readings that never came, by the gaps in their running numbers.
     skipped
         Ticks that were skipped because the backlog was too long.
+    restarts
+        How often the clock was set back by more than `silence_s`, and the ticks with it.
     """
 
     def __init__(self, meters: Iterable[str], rules: AlignRules) -> None:
@@ -191,6 +197,7 @@ class Aligner:
         self.counts: Counter[Outcome] = Counter()
         self.lost = 0
         self.skipped = 0
+        self.restarts = 0
         self._sources: dict[str | None, _Source] = {meter: _Source() for meter in (*self.meters, None)}
         self._waiting: set[str | None] = set()
         self._next: int | None = None
@@ -249,6 +256,8 @@ class Aligner:
         source.held.insert(index, reading)
         in_order = t > source.last_t
         source.last_t = max(source.last_t, t)
+        # A reading from the future does not prove that its meter will still be alive then.
+        source.last_heard = t if now is None or self.rules.clock is Clock.EVENTS else now
         if self._next is not None and self._reported(source, self._next):
             self._waiting.discard(reading.meter)
         if late:
@@ -260,8 +269,8 @@ class Aligner:
         # the oldest samples, which shows here and nowhere else.
         if reading.seq is None:
             return
-        if source.seq is not None and reading.seq > source.seq + 1:
-            self.lost += reading.seq - source.seq - 1
+        if source.seq is not None and 0 < (gap := reading.seq - source.seq - 1) <= GAP_MAX:
+            self.lost += gap
         source.seq = reading.seq
 
     # ---------------------------------------------------------------- time
@@ -284,7 +293,9 @@ class Aligner:
 
     def _hear(self, reading: Reading, source: _Source) -> None:
         """Let a reading have its say about the time."""
-        self._arrivals += 1
+        # However often a clock far ahead of all others speaks, they are not forgotten over it.
+        if self._now is None or reading.t - self._now <= self.rules.max_skew_s:
+            self._arrivals += 1
         meter = reading.meter
         if meter in self._active:
             self._claims.pop(bisect_left(self._claims, self._active.pop(meter)))
@@ -333,8 +344,14 @@ class Aligner:
         if now is None:
             return
         if self._next is None:
-            self._first = math.ceil(now / self.rules.tick_s)
-            self._turn_to(self._first)
+            self._begin(now)
+        elif now < self._time(self._number() - 1) - self.rules.silence_s:
+            # The clock was set back. To wait until it is where it was would be to watch nothing meanwhile.
+            self.restarts += 1
+            for source in self._sources.values():
+                source.held.clear()
+                source.last_t = source.last_heard = -math.inf
+            self._begin(now)
         behind = math.floor(now / self.rules.tick_s) - self._number()
         if behind > BACKLOG_TICKS:
             self.skipped += behind - BACKLOG_TICKS
@@ -360,6 +377,10 @@ class Aligner:
             self._turn_to(self._number() + 1)
             yield tick
 
+    def _begin(self, now: float) -> None:
+        self._first = math.ceil(now / self.rules.tick_s)
+        self._turn_to(self._first)
+
     def _number(self) -> int:
         if self._next is None:
             raise RuntimeError("no tick before the time is known")
@@ -383,7 +404,7 @@ class Aligner:
 
     def _silent_for(self, source: _Source, t: float) -> float:
         """Return for how long a source has been silent at t, s; 0 if it is not silent."""
-        since = source.last_t
+        since = min(source.last_t, source.last_heard)
         if since == -math.inf and self._first is not None:
             since = self._time(self._first)
             return math.inf if t - since > self.rules.silence_s else 0.0

@@ -207,7 +207,8 @@ class Watch:
             else:
                 cause, reason = Cause.SETTLING, "the monitor is still being designed"
             return blind(self.site, tick, self.max_attacked, cause, reason)
-        if self._state is None:
+        if self._state is None or (self.report is not None and tick.t <= self.report.t):
+            # The first tick, or the clock was set back: what was known belongs to another time.
             self._state = monitor.init(self._design, tick.t)
         frame = to_frame(self.site, snapshot(tick))
         self._state, estimate, verdict = monitor.step(self._design, self._state, frame)

@@ -190,6 +190,46 @@ def test_a_long_gap_is_skipped_and_counted() -> None:
     assert all(b.t > a_.t for a_, b in zip(w.ticks, w.ticks[1:], strict=False))
 
 
+@pytest.mark.parametrize("back_s", [30.0, 3600.0, 1e6])
+def test_a_clock_that_is_set_back_does_not_stop_the_ticks(back_s: float) -> None:
+    w = Wall(aligner(), T0 - 0.5)
+    for k in range(20):
+        w.all_at(T0 + k)
+    w.ticks.clear()
+    start = T0 - back_s
+    for k in range(20):
+        w.all_at(start + k)
+    assert w.a.restarts == 1
+    assert [t.t for t in w.ticks] == [start + k for k in range(1, 20)]
+    assert {seen(t) for t in w.ticks} == {"abcd0"}
+    assert all(not t.silent for t in w.ticks)
+
+
+def test_a_small_step_back_is_waited_for() -> None:
+    w = Wall(aligner(), T0 - 0.5)
+    for k in (*range(20), *range(17, 30)):
+        w.all_at(T0 + k)
+    assert w.a.restarts == 0
+    assert [t.t for t in w.ticks] == [T0 + k for k in range(30)]
+
+
+def test_a_reading_from_the_future_does_not_hide_silence() -> None:
+    w = Wall(aligner(), T0 - 0.5)
+    w.all_at(T0)
+    w.at(T0 + 0.5, reading("b", T0 + 50.0))
+    for k in range(1, 20):
+        w.all_at(T0 + k, skip=("b",))
+    assert next(t.t - T0 for t in w.ticks if t.silent) == 11.0
+    assert [meter for meter, _ in w.ticks[-1].silent] == ["b"]
+
+
+def test_a_running_number_that_leaps_is_no_loss() -> None:
+    w = Wall(aligner(), T0 - 0.5)
+    for k, seq in enumerate((5, 2**63 - 1, 6, 7, 10)):
+        w.at(T0 + k, reading("a", T0 + k, seq=seq))
+    assert w.a.lost == 2
+
+
 def test_gaps_in_the_running_numbers() -> None:
     a = aligner()
     w = Wall(a, T0 - 0.5)
@@ -236,6 +276,20 @@ def test_events_one_wild_clock_moves_nothing(off: float, place: int) -> None:
     assert a.counts[Outcome.CLOCK_OFF] == 30
     swept = a.refused()
     assert all(r.meter == wild for r in swept)
+
+
+def test_events_one_wild_clock_that_never_stops_talking_moves_nothing() -> None:
+    a = aligner(Clock.EVENTS)
+    ticks: list[Tick] = []
+    for k in range(30):
+        for meter in ALL:
+            ticks += a.take(reading(meter, T0 + k), 0.0)[1]
+        for j in range(200 if k == 10 else 0):
+            assert a.take(reading("c", T0 + 86_400.0 + j), 0.0)[0] is Outcome.CLOCK_OFF
+    assert a.skipped == 0
+    assert [t.t for t in ticks] == [T0 + k for k in range(30)][-len(ticks) :]
+    assert len(ticks) >= 28
+    assert {seen(t) for t in ticks} == {"abcd0"}
 
 
 def test_events_go_on_when_most_meters_fall_silent() -> None:
