@@ -1,0 +1,246 @@
+"""Draws the data of a figure with matplotlib; nothing is imported from it before something is drawn.
+
+No state of pyplot is used, the caller's settings are neither read nor changed, and nothing is written: the
+caller gets a matplotlib figure, or the bytes of a PNG. Both need the extra `plot`.
+"""
+
+from __future__ import annotations
+
+import io
+import textwrap
+from contextlib import contextmanager
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any, Final, cast
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as Canvas
+
+    from gridsec.papers.claims import Figure, Line, Panel
+
+DPI: Final = 150
+WIDTH: Final = 7.4  # inches, with room for legends beside the axes
+# Okabe and Ito's colours, which people with any colour vision tell apart; without yellow, too pale on white.
+PALETTE: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+FAINT: Final = "#9A9A9A"  # curves without a label, beside others that have one
+INK: Final = "#262626"
+DASHES: Final[dict[str, str]] = {
+    "solid": "-",
+    "dashed": "--",
+    "dotted": ":",
+    "dashdot": "-.",
+    "points": "none",
+    "steps": "-",
+}
+SETTINGS: Final[dict[str, Any]] = {
+    "font.family": "DejaVu Sans",  # comes with matplotlib: the same picture everywhere
+    "font.size": 9.0,
+    "mathtext.fontset": "dejavusans",
+    "axes.titlesize": 9.5,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.labelsize": 9.0,
+    "axes.edgecolor": "#8C8C8C",
+    "axes.labelcolor": INK,
+    "axes.titlecolor": INK,
+    "text.color": INK,
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.formatter.useoffset": False,
+    "axes.formatter.limits": (-3, 4),
+    "axes.formatter.use_mathtext": True,
+    "grid.color": "#E4E4E4",
+    "grid.linewidth": 0.6,
+    "xtick.color": "#8C8C8C",
+    "ytick.color": "#8C8C8C",
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "xtick.labelsize": 8.5,
+    "ytick.labelsize": 8.5,
+    "legend.fontsize": 8.5,
+    "legend.frameon": False,
+    "legend.handlelength": 1.9,
+    "legend.borderaxespad": 0.0,
+    "legend.labelspacing": 0.35,
+    "lines.linewidth": 1.4,
+    "lines.markersize": 3.5,
+    "figure.facecolor": "white",
+    "axes.facecolor": "white",
+    "savefig.facecolor": "white",
+    "figure.dpi": DPI,
+    "agg.path.chunksize": 20000,
+}
+
+
+def available() -> bool:
+    """Whether figures can be drawn: matplotlib is installed."""
+    return find_spec("matplotlib") is not None
+
+
+def draw(figure: Figure) -> Canvas:
+    """Draw a figure: its caption, then its panels one below the other, legends beside the axes.
+
+    A label has the same colour in every panel. Neighbouring panels over the same abscissa share it.
+
+    Parameters
+    ----------
+    figure
+        What to draw.
+
+    Returns
+    -------
+    Canvas
+        A matplotlib figure on an Agg canvas, of 150 dots per inch.
+
+    Raises
+    ------
+    ModuleNotFoundError
+        matplotlib is not installed; see `available`.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure as Canvas
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+    caption = textwrap.fill(figure.caption, 106)
+    heights = [_height(panel, len(figure.panels)) for panel in figure.panels]
+    extra = 0.3 + 0.17 * caption.count("\n")
+    with _settings():
+        layout = ConstrainedLayoutEngine(h_pad=0.06, w_pad=0.08)
+        canvas = Canvas(figsize=(WIDTH, sum(heights) + extra), layout=layout)
+        FigureCanvasAgg(canvas)
+        canvas.suptitle(caption, x=0.012, ha="left", fontsize=9.0, linespacing=1.3)
+        rows = canvas.subplots(len(heights), 1, squeeze=False, gridspec_kw={"height_ratios": heights})
+        for axes, panel, colours in zip(rows[:, 0], figure.panels, _colours(figure.panels), strict=True):
+            _panel(axes, panel, colours)
+        for k in range(len(heights) - 1):
+            if _same_abscissa(figure.panels[k], figure.panels[k + 1]):
+                rows[k, 0].set_xlabel("")
+                rows[k, 0].tick_params(labelbottom=False)
+        canvas.align_ylabels(list(rows[:, 0]))
+    return canvas
+
+
+def png(figure: Figure) -> bytes:
+    """Draw a figure as a PNG; the same data give the same bytes.
+
+    Parameters
+    ----------
+    figure
+        What to draw.
+
+    Raises
+    ------
+    ModuleNotFoundError
+        matplotlib is not installed; see `available`.
+    """
+    canvas = draw(figure)
+    buffer = io.BytesIO()
+    about = {"Title": figure.name, "Description": figure.caption, "Software": None}
+    with _settings():
+        canvas.savefig(buffer, format="png", dpi=DPI, metadata=about)
+    return buffer.getvalue()
+
+
+@contextmanager
+def _settings() -> Iterator[None]:
+    """Our settings on top of matplotlib's own defaults, whatever the user's are; undone afterwards."""
+    from matplotlib import rc_context, rcdefaults, rcParams
+
+    with rc_context():
+        rcdefaults()
+        rcParams.update(cast("Any", SETTINGS))
+        yield
+
+
+def _height(panel: Panel, count: int) -> float:
+    """Inches of a panel: more where it is alone, or where its legend is long."""
+    labelled = sum(bool(line.label) for line in panel.lines)
+    return float(max({1: 3.4, 2: 2.4}.get(count, 1.85), 0.6 + 0.19 * labelled))
+
+
+def _colours(panels: tuple[Panel, ...]) -> list[dict[str, Any]]:
+    """Colour of each label, per panel: panels that share a label share all colours, others begin anew."""
+    families: list[dict[str, None]] = []
+    for panel in panels:
+        labels = {line.label: None for line in panel.lines if line.label}
+        kin = [family for family in families if family.keys() & labels.keys()]
+        families = [family for family in families if family not in kin]
+        families.append({label: None for family in (*kin, labels) for label in family})
+    shades = {frozenset(family): _shades(list(family)) for family in families}
+    return [
+        next((s for names, s in shades.items() if any(n.label in names for n in panel.lines)), {})
+        for panel in panels
+    ]
+
+
+def _shades(labels: list[str]) -> dict[str, Any]:
+    """Colour of each label, by order of appearance; a colour map where the palette is too short."""
+    if len(labels) <= len(PALETTE):
+        return dict(zip(labels, PALETTE, strict=False))
+    from matplotlib import colormaps
+
+    # cividis without its palest end: ordered, and read the same by every eye.
+    return dict(zip(labels, colormaps["cividis"](np.linspace(0.0, 0.85, len(labels))), strict=True))
+
+
+def _panel(axes: Axes, panel: Panel, colours: dict[str, Any]) -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    alone = len(panel.lines) == 1
+    for line, width in zip(panel.lines, _widths(panel), strict=True):
+        axes.plot(
+            line.x,
+            line.y,
+            color=colours.get(line.label, PALETTE[0] if alone else FAINT),
+            linestyle=DASHES[line.style],
+            linewidth=width,
+            marker="o" if line.style == "points" else "",
+            drawstyle="steps-post" if line.style == "steps" else "default",
+            label=line.label or "_",
+            zorder=2.0 if line.label or alone else 1.8,
+        )
+    axes.set_title(panel.title)
+    axes.set_xlabel(panel.x_label)
+    axes.set_ylabel(panel.y_label)
+    axes.margins(x=0.02 if all(line.style == "points" for line in panel.lines) else 0.0, y=0.08)
+    low, high = _span(panel.lines)
+    if 0.0 < low < 0.05 * high:
+        axes.set_xlim(left=0.0)
+    said = alone and panel.y_label.startswith(panel.lines[0].label)
+    if any(line.label for line in panel.lines) and not said:
+        axes.legend(loc="upper left", bbox_to_anchor=(1.015, 1.0))
+    for axis, values in ((axes.xaxis, [n.x for n in panel.lines]), (axes.yaxis, [n.y for n in panel.lines])):
+        if _counts(values):
+            axis.set_major_locator(MaxNLocator(nbins="auto", integer=True, steps=[1, 2, 5, 10]))
+
+
+def _widths(panel: Panel) -> list[float]:
+    """Each curve thinner than the one before it, so that one that runs under another still shows."""
+    count = len(panel.lines)
+    return [1.4] if count == 1 else [float(w) for w in np.linspace(2.5 if count <= 8 else 1.2, 1.1, count)]
+
+
+def _counts(values: list[Any]) -> bool:
+    """Whether an axis counts something: few whole numbers, so that ticks between them have no meaning."""
+    every = np.concatenate([v[np.isfinite(v)] for v in values]) if values else np.empty(0)
+    return bool(every.size and np.all(every == np.round(every)) and np.ptp(every) <= 25.0)
+
+
+def _same_abscissa(upper: Panel, lower: Panel) -> bool:
+    """Whether two panels run over the same abscissa, so that one set of numbers serves both."""
+    if upper.x_label != lower.x_label:
+        return False
+    a, b = _span(upper.lines), _span(lower.lines)
+    return bool(np.allclose(a, b, rtol=0.0, atol=0.01 * max(a[1] - a[0], b[1] - b[0])))
+
+
+def _span(lines: tuple[Line, ...]) -> tuple[float, float]:
+    every = np.concatenate([line.x for line in lines]) if lines else np.empty(0)
+    return (float(np.nanmin(every)), float(np.nanmax(every))) if every.size else (0.0, 0.0)

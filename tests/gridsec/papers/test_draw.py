@@ -1,0 +1,219 @@
+"""Figures: every point is drawn, no text is cut or lies on data, every eye tells the colours apart."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import zlib
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib.colors import to_hex, to_rgb
+from matplotlib.figure import Figure as Canvas
+
+from gridsec.arrays import Floats
+from gridsec.papers.claims import Figure, Line, Panel, Style
+from gridsec.papers.draw import DPI, FAINT, PALETTE, WIDTH, draw, png
+
+T = np.linspace(0.0, 10.0, 101)
+STYLES: tuple[Style, ...] = ("solid", "dashed", "dotted", "dashdot", "points", "steps")
+
+
+def figure(*panels: Panel, caption: str = "What it shows") -> Figure:
+    return Figure("name-1", caption, panels)
+
+
+def panel(*lines: Line, x_label: str = "t in s") -> Panel:
+    return Panel("Voltage", x_label, "v in V", lines)
+
+
+def rich() -> Figure:
+    """Return a figure that asks for everything: all styles, gaps, many curves, long labels and caption."""
+    gap = np.where((T > 3.0) & (T < 4.0), np.nan, np.sin(T))
+    return figure(
+        panel(
+            *(Line(f"curve number {k} of six, {style}", T, gap + k, style) for k, style in enumerate(STYLES))
+        ),
+        panel(Line("", T, np.round(T / 4.0), "steps"), x_label="k"),
+        panel(*(Line(f"m{k:02d}", T, 1e-6 * np.cos(T + k)) for k in range(13))),
+        panel(Line("", T, 1.5 * T), Line("", T, 2.5 * T), Line("mean", T, 2.0 * T)),
+        caption="A caption of more than one line says in one sentence what there is to see in the picture. "
+        * 2,
+    )
+
+
+def test_every_point_is_drawn_in_its_style() -> None:
+    asked = rich()
+    canvas = draw(asked)
+    assert len(canvas.axes) == len(asked.panels)
+    for axes, wanted in zip(canvas.axes, asked.panels, strict=True):
+        assert axes.get_title(loc="left") == wanted.title
+        assert axes.get_ylabel() == wanted.y_label
+        for drawn, line in zip(axes.lines, wanted.lines, strict=True):
+            np.testing.assert_array_equal(np.asarray(drawn.get_xdata()), line.x)
+            np.testing.assert_array_equal(np.asarray(drawn.get_ydata()), line.y)
+            low, high = axes.get_ylim()
+            assert low < np.nanmin(line.y)
+            assert np.nanmax(line.y) < high
+            assert (drawn.get_marker() == "o") == (line.style == "points")
+            assert (drawn.get_linestyle() == "None") == (line.style == "points")
+            assert (drawn.get_drawstyle() == "steps-post") == (line.style == "steps")
+    legends = [axes.get_legend() for axes in canvas.axes]
+    assert [None if each is None else [text.get_text() for text in each.get_texts()] for each in legends] == [
+        [line.label for line in asked.panels[0].lines],
+        None,
+        [line.label for line in asked.panels[2].lines],
+        ["mean"],
+    ]
+
+
+def test_no_text_is_cut_and_none_lies_on_data() -> None:
+    canvas = draw(rich())
+    canvas.canvas.draw()
+    renderer = canvas.canvas.get_renderer()  # type: ignore[attr-defined]  # an Agg canvas has one
+    paper = canvas.bbox
+    texts = [text for text in canvas.findobj(mpl.text.Text) if text.get_visible() and text.get_text()]
+    assert len(texts) > 40
+    for text in texts:
+        box = text.get_window_extent(renderer)
+        assert paper.x0 <= box.x0, text
+        assert box.x1 <= paper.x1, text
+        assert paper.y0 <= box.y0, text
+        assert box.y1 <= paper.y1, text
+    for axes in canvas.axes:
+        assert axes.bbox.width > 0.5 * paper.width
+        legend = axes.get_legend()
+        if legend is not None:
+            assert legend.get_window_extent(renderer).x0 > axes.bbox.x1
+            assert legend.get_window_extent(renderer).height <= axes.get_tightbbox(renderer).height + 1.0
+
+
+def test_neighbours_over_one_abscissa_share_it() -> None:
+    one, other = panel(Line("", T, T)), panel(Line("", T + 5.0, T))
+    labels = [axes.get_xlabel() for axes in draw(figure(one, one, other)).axes]
+    assert labels == ["", "t in s", "t in s"]
+    labels = [axes.get_xlabel() for axes in draw(figure(one, panel(Line("", T, T), x_label="k"))).axes]
+    assert labels == ["t in s", "k"]
+
+
+def test_whole_numbers_have_ticks_at_whole_numbers() -> None:
+    axes = draw(figure(panel(Line("", T, np.where(T < 5.0, 1.0, 2.0), "steps")))).axes[0]
+    assert np.all(axes.get_yticks() == np.round(axes.get_yticks()))
+    axes = draw(figure(panel(Line("", T, np.where(T < 5.0, 1.0, 1.5), "steps")))).axes[0]
+    assert np.any(axes.get_yticks() != np.round(axes.get_yticks()))
+
+
+def colours(canvas: Canvas) -> list[list[str]]:
+    return [[to_hex(line.get_color()).upper() for line in axes.lines] for axes in canvas.axes]
+
+
+def test_a_label_keeps_its_colour() -> None:
+    a, b, c, d = (Line(label, T, T) for label in "abcd")
+    first, second, third, fourth = colours(
+        draw(figure(panel(a, b), panel(b, c), panel(d), panel(d, Line("", T, T))))
+    )
+    assert [*first, second[1]] == list(PALETTE[:3])
+    assert second[0] == first[1]
+    assert third == [PALETTE[0]]
+    assert fourth == [PALETTE[0], FAINT]
+
+
+def test_of_many_curves_each_has_its_own_colour() -> None:
+    many = [Line(str(k), T, T + k) for k in range(13)]
+    (used,) = colours(draw(figure(panel(*many))))
+    assert len(set(used)) == 13
+
+
+# Machado, Oliveira, Fernandes: A physiologically-based model for simulation of color vision deficiency, 2009,
+# at full severity, for linear RGB.
+SIGHT = {
+    "full": np.eye(3),
+    "protanopia": np.array(
+        [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]]
+    ),
+    "deuteranopia": np.array(
+        [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]]
+    ),
+    "tritanopia": np.array(
+        [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]]
+    ),
+}
+
+
+def lab(colour: str, sight: Floats) -> Floats:
+    """Return CIE 1976 L*a*b* of a colour as somebody sees it."""
+    rgb = np.array(to_rgb(colour))
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    seen = np.clip(sight @ linear, 0.0, 1.0)
+    matrix = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+    xyz = matrix @ seen / np.array([0.9505, 1.0, 1.089])
+    f = np.where(xyz > (6 / 29) ** 3, np.cbrt(xyz), xyz / (3 * (6 / 29) ** 2) + 4 / 29)
+    return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
+
+
+@pytest.mark.parametrize("sight", SIGHT.values(), ids=SIGHT)
+def test_every_eye_tells_the_colours_apart(sight: Floats) -> None:
+    seen = [lab(colour, sight) for colour in (*PALETTE, "#FFFFFF")]
+    apart = [np.linalg.norm(a - b) for i, a in enumerate(seen) for b in seen[:i]]
+    assert min(apart) > 12.0  # 2.3 is just noticeable
+
+
+def chunks(data: bytes) -> dict[bytes, list[bytes]]:
+    assert data[:8] == b"\x89PNG\r\n\x1a\n"
+    found: dict[bytes, list[bytes]] = {}
+    at = 8
+    while at < len(data):
+        size = int.from_bytes(data[at : at + 4])
+        kind, body = data[at + 4 : at + 8], data[at + 8 : at + 8 + size]
+        assert zlib.crc32(kind + body) == int.from_bytes(data[at + 8 + size : at + 12 + size])
+        found.setdefault(kind, []).append(body)
+        at += 12 + size
+    return found
+
+
+def test_a_png_is_sharp_named_and_always_the_same() -> None:
+    asked = figure(panel(Line("", T, T)))
+    data = png(asked)
+    assert data == png(asked)
+    parts = chunks(data)
+    assert int.from_bytes(parts[b"IHDR"][0][:4]) == round(WIDTH * DPI)
+    per_metre = int.from_bytes(parts[b"pHYs"][0][:4])
+    assert per_metre * 0.0254 == pytest.approx(150.0, abs=0.5)
+    assert sorted(parts[b"tEXt"]) == [b"Description\0What it shows", b"Title\0name-1"]
+
+
+def test_settings_of_the_caller_are_neither_changed_nor_used() -> None:
+    asked = figure(panel(Line("a", T, T), Line("b", T, -T)))
+    expected = png(asked)
+    with mpl.rc_context({"font.size": 30.0, "axes.facecolor": "black", "lines.linewidth": 9.0}):
+        before = dict(mpl.rcParams)
+        assert png(asked) == expected
+        assert dict(mpl.rcParams) == before
+
+
+def python(code: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def test_nothing_is_imported_before_something_is_drawn() -> None:
+    code = "import sys\nimport gridsec.papers.draw as d\nprint('matplotlib' in sys.modules, d.available())"
+    assert python(code) == "False True"
+    code = (
+        "import sys\nimport numpy as np\nfrom gridsec.papers.draw import png\n"
+        "from gridsec.papers.claims import Figure, Line, Panel\n"
+        "x = np.arange(3.0)\npng(Figure('n', 'c', (Panel('t', 'x', 'y', (Line('', x, x),)),)))\n"
+        "print('matplotlib.pyplot' in sys.modules)"
+    )
+    assert python(code) == "False"
+
+
+def test_without_matplotlib_the_module_says_so() -> None:
+    code = (
+        "import sys\nsys.modules['matplotlib'] = None\nimport gridsec.papers.draw as d\nprint(d.available())"
+    )
+    assert python(code) == "False"
