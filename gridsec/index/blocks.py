@@ -142,6 +142,8 @@ def fewest(
     todo = [(space, np.arange(len(rows)), 0)]
     while todo:
         here, undecided, paid = todo.pop()
+        if paid >= best:
+            continue
         nodes += 1
         if nodes > most:
             what = f"direction that the fewest of {len(rows)} blocks see"
@@ -164,7 +166,7 @@ def fewest(
         if paid + 1 < best:
             todo.append((here, rest, paid + 1))
         smaller = here @ kernel(seen[live][pick], tol)
-        if smaller.shape[1] > 0 and paid < best:
+        if smaller.shape[1] > 0:
             # Pushed last, hence visited first: it lowers the bound soonest.
             todo.append((smaller, rest, paid))
     return _generic(blocks, best_space, tol)

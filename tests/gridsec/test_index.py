@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import cache
 
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
+from scipy.linalg import orth as scipy_orth
 
 from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible
@@ -244,6 +247,7 @@ def test_redundant_subspaces_by_definition() -> None:
     for pair, dynamic, asymptotic in cases()[:40]:
         A, C = pair.a, pair.c
         unstable = unstable_subspace(A, discrete=True, tol=TOL)
+        assert unobservable_subspace(A, C, 5, tol=TOL).shape[1] == 4, "no sensor left"
         for q in (0, 1, 2):
             space = unobservable_subspace(A, C, q, tol=TOL)
             late = undetectable_subspace(A, C, q, discrete=True, tol=TOL)
@@ -258,6 +262,18 @@ def test_redundant_subspaces_by_definition() -> None:
             if late.shape[1]:
                 assert np.allclose(space @ (space.T @ late), late, atol=1e-6)
                 assert np.allclose(unstable @ (unstable.T @ late), late, atol=1e-6)
+            # Propositions 3.1.6 and 3.1.13: the orthogonal complements, from row spaces.
+            G = observability(A, C)
+            parts = [
+                np.asarray(scipy_orth(np.vstack(G[list(kept)]).T, rcond=1e-8))
+                for kept in itertools.combinations(range(5), 5 - q)
+            ]
+            outside = sum(np.eye(4) - part @ part.T for part in parts)
+            values, vectors = np.linalg.eigh(outside)
+            observable = vectors[:, values < 1e-8]
+            assert same_space(observable, complement(space))
+            both = scipy_orth(np.hstack([observable, complement(unstable)]), rcond=1e-8)
+            assert same_space(both, complement(late))
             # Proposition 3.1.7.
             stable = stable_subspace(A, discrete=True, tol=TOL)
             inside = np.allclose(stable @ (stable.T @ space), space, atol=1e-6)
@@ -284,7 +300,7 @@ def manipulated_sets(p: int, q: int) -> Iterator[tuple[int, ...]]:
 
 
 def test_equivalence_with_strong_observability() -> None:
-    """lee2018, Proposition 3.1.3: (i) to (iii), and (iv) with F = -C, which hides the most."""
+    """lee2018, Proposition 3.1.3: (i) to (iii), and (iv) with F = -C, which hides the most, and others."""
     for pair, dynamic, _ in cases()[:40]:
         A, C = pair.a, pair.c
         for q in (1, 2):
@@ -298,6 +314,9 @@ def test_equivalence_with_strong_observability() -> None:
                 fed[list(bad)] += F
                 observable = dynamic_index(A, fed, tol=TOL).count > 0
                 assert observable == system.strongly_observable
+                fed[list(bad)] += np.random.default_rng(q).standard_normal(F.shape)
+                if system.strongly_observable:
+                    assert dynamic_index(A, fed, tol=TOL).count > 0, "no F breaks it"
 
 
 def test_equivalence_with_strong_detectability() -> None:
@@ -440,3 +459,28 @@ def test_linearisation_is_the_derivative_of_the_closed_loop() -> None:
     numeric = np.stack([(motion(x + h * e) - motion(x - h * e)) / (2 * h) for e in np.eye(x.size)], axis=1)
     assert np.allclose(A, numeric, atol=1e-6)
     assert np.array_equal(C, lure.C)
+
+
+@pytest.mark.parametrize("steep", [False, True])
+def test_indices_of_feeders_equal_a_search_over_all_meters(steep: bool) -> None:
+    """Two feeders, in deadband and at the steepest slope; ranks exact, of the very floating-point numbers."""
+    for lure in (tree().lure, line(5).lure):
+        slope = lure.slope if steep else np.zeros(lure.slope.size)
+        found = feeder_index(lure, slope, tol=TOL)
+        p, n = found.C.shape
+        A, C = (np.vectorize(Fraction, otypes=[object])(m) for m in (found.A, found.C))
+        G = np.stack([C @ power(A, k) for k in range(n)], axis=1)
+        for index, rows in ((found.static, G[:, :1]), (found.dynamic, G)):
+            best = next(
+                k
+                for k in range(p + 1)
+                for kept in itertools.combinations(range(p), p - k)
+                if exact_rank([whole(r) for i in kept for r in rows[i]]) < n
+            )
+            assert index.count == best
+
+
+def whole(row: Exact) -> list[int]:
+    """A row of fractions as integers, up to a factor."""
+    factor = math.lcm(*(f.denominator for f in row))
+    return [int(f * factor) for f in row]

@@ -122,7 +122,7 @@ def test_a_second_residual_and_the_erratum_in_its_dimensions() -> None:
     assert n * (p - 1) != (n - 1) * p
     z = np.random.default_rng(2).standard_normal((20, n * p))
     assert np.allclose(z @ Psi.T @ Psi, residual(stack, z)), "r = Psi^T r'"
-    # 10 of the 12 dimensions satisfy everything that is printed, chosen so that they miss an error in one block.
+    # 10 of the 12 dimensions satisfy all that is printed; here they are chosen to miss an error in a block.
     e = np.zeros(n * p)
     e[:n] = [1.0, -2.0, 0.5]
     seen = Psi @ e
