@@ -25,8 +25,8 @@ from gridsec.arrays import Bools, Floats, Ints, frozen, spectral_radius
 from gridsec.errors import DesignInfeasible
 from gridsec.observers.parts import Part, Stack, decompose, stack
 
-LONGEST = 1 << 18
-"""Largest number of steps that an observer's error may take to halve before its design is refused."""
+LONGEST = 1 << 17
+"""Largest number of steps after which an observer's error must have halved for good."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,7 +55,8 @@ class Envelope:
     Attributes
     ----------
     powers : (K + 1,)
-        |F^j|_2 for j = 0 … K, the last at most 1/2. Beyond: |F^(mK + r)| <= powers[K]^m powers[r].
+        |F^j|_2 for j = 0 … K, the last at most half of one over the largest. Beyond:
+        |F^(mK + r)| <= powers[K]^m powers[r].
     limit
         w_max: the sum over all j >= 0 of |F^j L| n_max + |F^j Z^T E| d_max, its tail bounded by a
         geometric series. Never above the paper's (eta_L n_max + eta_Z d_max) / (1 - beta).
@@ -128,9 +129,10 @@ class LuenbergerState:
 
 
 def riccati_gain(part: Part, process: Floats, noise: float, *, rate: float) -> Floats:
-    """L of the stationary Kalman predictor, with a prescribed decay.
+    """L of the stationary Kalman predictor, with a prescribed decay of what the sensor sees.
 
-    Solves the Riccati equation of (S / rate, t); then (S - L t) / rate is Schur stable.
+    With rate 1 the Riccati equation is that of (S, t). Below 1 it is that of the observable block over
+    `rate`, whose error then decays at least like rate^k; fading modes keep their own decay and get no gain.
 
     Parameters
     ----------
@@ -141,13 +143,13 @@ def riccati_gain(part: Part, process: Floats, noise: float, *, rate: float) -> F
     noise
         Weight (variance) of n_i, > 0.
     rate
-        In (0, 1]: the error decays at least like rate^k.
+        In (0, 1].
 
     Raises
     ------
     DesignInfeasible
-        If no gain achieves the rate: a fading mode is slower than `rate`, or the process weight leaves a
-        mode on the circle of radius `rate` without disturbance.
+        If there is no such gain: the process weight leaves a mode on or outside the circle of radius
+        `rate` without disturbance.
 
     References
     ----------
@@ -155,22 +157,24 @@ def riccati_gain(part: Part, process: Floats, noise: float, *, rate: float) -> F
     """
     if not 0.0 < rate <= 1.0:
         raise ValueError(f"rate is {rate}; it must lie in (0, 1]")
-    if not part.t.size:
-        return np.zeros(0)
-    S, t = part.S / rate, part.t / np.sqrt(noise)
-    Q = part.basis.T @ process @ part.basis
+    size = part.t.size if rate == 1.0 else part.observable.shape[1]
+    gain = np.zeros(part.t.size)
+    if not size:
+        return gain
+    basis = part.basis[:, :size]
+    S, t = part.S[:size, :size] / rate, part.t[:size] / np.sqrt(noise)
     what = f"observer gain for decay like {rate:g}^k"
     try:
-        P = solve_discrete_are(S.T, t[:, None], Q, np.eye(1))
+        P = solve_discrete_are(S.T, t[:, None], basis.T @ process @ basis, np.eye(1))
     except (LinAlgError, ValueError) as problem:
         raise DesignInfeasible(
-            what, f"no stabilising solution of the Riccati equation ({problem})"
+            what, f"the Riccati equation has no stabilising solution ({problem})"
         ) from problem
-    gain = rate * S @ P @ t / (t @ P @ t + 1.0) / np.sqrt(noise)
-    radius = spectral_radius(part.S - np.outer(gain, part.t))
+    gain[:size] = rate * S @ P @ t / (t @ P @ t + 1.0) / np.sqrt(noise)
+    radius = spectral_radius(part.S[:size, :size] - np.outer(gain[:size], part.t[:size]))
     if not radius < rate:
         raise DesignInfeasible(what, f"spectral radius {radius:.6g}", rate - radius)
-    return np.asarray(gain)
+    return gain
 
 
 def design(
@@ -206,8 +210,8 @@ def design(
     Raises
     ------
     DesignInfeasible
-        If some F_i = S_i - L_i t_i is not Schur stable, or so slow that errors halve in more than
-        2^18 steps.
+        If some F_i = S_i - L_i t_i is not Schur stable, or so slow that errors may not have halved for
+        good after `LONGEST` steps.
 
     References
     ----------
@@ -267,22 +271,24 @@ def envelope(part: Part, gain: Floats, process: float, noise: float, E: Floats) 
         raise DesignInfeasible("partial observer", f"spectral radius {radius:.6g} of S - L t", 1.0 - radius)
     if not part.t.size:
         return Envelope(frozen(np.array([1.0, 0.0])), 0.0)
-    powers = _powers(F)
-    sizes = np.linalg.norm(powers, 2, axis=(1, 2))
+    powers, sizes = _powers(F)
     by_noise = np.linalg.norm(powers[:-1] @ gain, axis=1) * noise
     by_process = np.linalg.norm(powers[:-1] @ (part.basis.T @ E), 2, axis=(1, 2)) * process
     limit = float(np.sum(by_noise + by_process) / (1.0 - sizes[-1]))
     return Envelope(frozen(sizes), limit)
 
 
-def _powers(F: Floats) -> Floats:
-    """F^0 … F^K, K the first power of two with |F^K| <= 1/2; (K + 1, mu, mu)."""
+def _powers(F: Floats) -> tuple[Floats, Floats]:
+    """F^0 … F^K and their norms; K is the first power of two with |F^K| max_j |F^j| <= 1/2."""
     powers = np.stack([np.eye(len(F)), F])
-    while np.linalg.norm(powers[-1], 2) > 0.5:
+    sizes = np.linalg.norm(powers, 2, axis=(1, 2))
+    while sizes[-1] * sizes.max() > 0.5:
         if len(powers) > LONGEST:
-            raise DesignInfeasible("partial observer", f"its errors do not halve within {LONGEST} steps")
-        powers = np.concatenate([powers, powers[1:] @ powers[-1]])
-    return powers
+            raise DesignInfeasible("partial observer", f"errors may not have halved after {LONGEST} steps")
+        more = powers[1:] @ powers[-1]
+        powers = np.concatenate([powers, more])
+        sizes = np.concatenate([sizes, np.linalg.norm(more, 2, axis=(1, 2))])
+    return powers, sizes
 
 
 def geometric(part: Part, gain: Floats, process: float, noise: float, E: Floats, *, beta: float) -> Envelope:
@@ -307,9 +313,9 @@ def geometric(part: Part, gain: Floats, process: float, noise: float, E: Floats,
     F = part.S - np.outer(gain, part.t)
     if not spectral_radius(F) < beta < 1.0:
         raise ValueError(f"beta is {beta}; it must lie between {spectral_radius(F):.6g} and 1")
-    powers = _powers(F / beta)
     # |F^j M| beta^-j is largest within the first K powers: later ones are shorter than those K before.
-    eta_f = float(np.max(np.linalg.norm(powers, 2, axis=(1, 2))))
+    powers, sizes = _powers(F / beta)
+    eta_f = float(sizes.max())
     eta_l = float(np.max(np.linalg.norm(powers @ gain, axis=1)))
     eta_z = float(np.max(np.linalg.norm(powers @ (part.basis.T @ E), 2, axis=(1, 2))))
     return Envelope(frozen(np.array([eta_f, beta])), (eta_l * noise + eta_z * process) / (1.0 - beta))
