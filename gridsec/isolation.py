@@ -1,0 +1,469 @@
+"""Who lies, inputs and sensors at once: banks of unknown-input observers, selection, reconstruction.
+
+A bank compares every large observer, that distrusts q_1 inputs and q_2 sensors, with all those that
+distrust more, twice as many of each. The one that agrees best with its company is believed; the attacks
+follow from its estimate, and whoever is attacked by more than the estimate's error is named.
+
+    design(plant, ...) -> IsolationDesign
+    init(design, t) -> IsolationState
+    step(design, state, y, u, seen) -> (IsolationState, Isolation)
+
+References
+----------
+yang2021 (5) to (7), (22) to (24), (42) to (47); docs/theory-unknown-input.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Literal
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints
+from gridsec.errors import DesignInfeasible, NotObservable
+from gridsec.lmi.unknown_input import Multiplier
+from gridsec.observers.unknown_input import (
+    Missing,
+    Pair,
+    UnknownInputDesign,
+    UnknownInputPlant,
+    UnknownInputState,
+)
+from gridsec.observers.unknown_input import design as design_family
+from gridsec.observers.unknown_input import init as init_family
+from gridsec.observers.unknown_input import step as step_family
+from gridsec.online import Cause, Decision
+
+Measure = Literal["distance", "bounds"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class IsolationDesign:
+    """A bank with its comparisons. n states, r inputs, p sensors.
+
+    Attributes
+    ----------
+    family
+        All observers that exist.
+    large : (a,)
+        Which of them are large, J of (5) or (22).
+    company : (a, b)
+        For each large observer the small ones within it, padded by repetition.
+    alone : (a,)
+        Large observers whose company does not exist at all: nothing can confirm them.
+    max_inputs, max_sensors
+        q_1 and q_2. A complete bank distrusts all inputs: max_inputs = r.
+    missing
+        Members that the bank should have and has not. Unless empty, the theorems do not apply.
+    measure
+        What "agree" means: "distance" is the Euclidean norm of (5) and (22); "bounds" is the largest
+        difference of an entry relative to the sum of both observers' error bounds, which does not let
+        an observer that is bad at one state drown the others' news.
+    left : (r, n)
+        Left inverse of the inputs' matrix.
+    from_now, from_before, from_drift : (r, n), (r, n), (r,)
+        How bounds of the estimates bound the error of the reconstructed input attack.
+    """
+
+    family: UnknownInputDesign
+    large: Ints
+    company: Ints
+    alone: Bools
+    max_inputs: int
+    max_sensors: int
+    missing: tuple[Missing, ...]
+    measure: Measure
+    left: Floats
+    from_now: Floats
+    from_before: Floats
+    from_drift: Floats
+
+    @property
+    def guaranteed(self) -> bool:
+        """Whether every member exists, as Assumptions 2 and 3 ask."""
+        return not self.missing
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class IsolationState:
+    """What is carried from tick to tick. n states, r inputs, p sensors, l known inputs.
+
+    Attributes
+    ----------
+    family
+        The observers.
+    x, bound : (n,) or None
+        Selected estimate and bound of its error at the last tick.
+    u : (l,) or None
+        Known input of the last tick.
+    inputs, sensors : (r,), (p,)
+        Named so far: Assumption 1 says that attacked sets do not change.
+    """
+
+    family: UnknownInputState
+    x: Floats | None
+    bound: Floats | None
+    u: Floats | None
+    inputs: Bools
+    sensors: Bools
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Isolation:
+    """The answer of one tick. n states, r inputs, p sensors, a large observers.
+
+    Attributes
+    ----------
+    t
+        Time of the tick, s.
+    decision, cause, reason
+        As in `gridsec.online.Verdict`. Without all members of the bank: UNDECIDED, whatever is named.
+    x, bound : (n,)
+        Estimate (7), (24) and a bound of its error, valid under the theorems' assumptions.
+    selected
+        (J_u, J_s) of the observer believed.
+    disagreement : (a,)
+        pi of (5) or (22) for each large observer, infinite where nothing can confirm it.
+    input_attack, input_threshold : (r,)
+        (42), of the *last* tick, and the most that an honest input could show. NaN and infinite at
+        the first tick.
+    sensor_attack, sensor_threshold : (p,)
+        (43), NaN where unseen, and the most that an honest sensor could show.
+    inputs_now, sensors_now : (r,), (p,)
+        (46), (47) with these thresholds, for this tick alone.
+    inputs, sensors : (r,), (p,)
+        Named at this tick or before.
+    """
+
+    t: float
+    decision: Decision
+    cause: Cause
+    reason: str
+    x: Floats
+    bound: Floats
+    selected: Pair
+    disagreement: Floats
+    input_attack: Floats
+    input_threshold: Floats
+    sensor_attack: Floats
+    sensor_threshold: Floats
+    inputs_now: Bools
+    sensors_now: Bools
+    inputs: Bools
+    sensors: Bools
+
+
+def members(inputs: int, sensors: int, max_inputs: int, max_sensors: int) -> tuple[list[Pair], list[Pair]]:
+    """The pairs (J_u, J_s) of both banks.
+
+    Parameters
+    ----------
+    inputs, sensors
+        r and p.
+    max_inputs, max_sensors
+        q_1 and q_2. `max_inputs = inputs` asks for the complete bank, in which both distrust all inputs.
+
+    Returns
+    -------
+    large, small
+        (q_1, p - q_2) and (2 q_1, p - 2 q_2) inputs and sensors.
+
+    Raises
+    ------
+    NotObservable
+        Unless p > 2 q_2 and (except for the complete bank) r > 2 q_1, yang2021 (4), (19), (20).
+    """
+    if sensors <= 2 * max_sensors:
+        why = f"{sensors} sensors of which {max_sensors} may lie: more than {2 * max_sensors} are needed"
+        raise NotObservable(range(sensors), sensors, why + " (yang2021, Assumptions 2 and 3)")
+    complete = max_inputs == inputs
+    if not complete and inputs <= 2 * max_inputs:
+        why = f"{inputs} inputs of which {max_inputs} may lie: more than {2 * max_inputs} are needed"
+        raise NotObservable(range(inputs), inputs, why + ", or the complete bank (yang2021, Assumption 3)")
+    double = inputs if complete else 2 * max_inputs
+
+    def all_pairs(distrusted: int, trusted: int) -> list[Pair]:
+        sets = combinations(range(inputs), distrusted)
+        return [(u, s) for u in sets for s in combinations(range(sensors), trusted)]
+
+    return all_pairs(max_inputs, sensors - max_sensors), all_pairs(double, sensors - 2 * max_sensors)
+
+
+def design(
+    plant: UnknownInputPlant,
+    *,
+    max_inputs: int,
+    max_sensors: int,
+    measure: Measure = "bounds",
+    rates: Sequence[float] = (0.5, 0.8, 0.95, 0.995),
+    multiplier: Multiplier = "diagonal",
+    tolerance: float = 1e-9,
+    rounding: float = 1e-9,
+) -> IsolationDesign:
+    """Design a bank, with its missing members named.
+
+    Parameters
+    ----------
+    plant
+        The plant; r inputs, p sensors.
+    max_inputs, max_sensors
+        How many inputs and sensors may be attacked, q_1 and q_2; `max_inputs = r` is the complete bank.
+    measure
+        See `IsolationDesign`. yang2021: "distance".
+    rates, multiplier, tolerance, rounding
+        See `observers.unknown_input.design`.
+
+    Raises
+    ------
+    NotObservable
+        If there are too few sensors or inputs for the counts.
+    DesignInfeasible
+        If no member exists at all.
+    """
+    r, p = plant.inputs.shape[1], plant.noise.size
+    wide, narrow = members(r, p, max_inputs, max_sensors)
+    # With nothing to tolerate both banks are the same: one observer, compared with itself.
+    asked = wide + [pair for pair in narrow if pair not in set(wide)]
+    family = design_family(
+        plant, asked, rates=rates, multiplier=multiplier, tolerance=tolerance, rounding=rounding
+    )
+    place = {pair: i for i, pair in enumerate(family.pairs)}
+    large = [pair for pair in wide if pair in place]
+    if not large:
+        raise DesignInfeasible(
+            "bank of unknown-input observers", f"no large one exists: {family.missing[0].why}"
+        )
+    inside = [[place[s] for s in narrow if s in place and _within(s, pair)] for pair in large]
+    width = max((len(row) for row in inside), default=0) or 1
+    company = [(row or [place[pair]]) for pair, row in zip(large, inside, strict=True)]
+    padded = [row + [row[-1]] * (width - len(row)) for row in company]
+    lone = np.array([not row for row in inside], dtype=np.bool_)
+    lone.flags.writeable = False
+    system = plant.system
+    left = np.asarray(np.linalg.pinv(plant.inputs), dtype=np.float64)
+    slack = np.abs(left @ (system.G * plant.half)) @ np.abs(system.H)
+    middle = system.A + (system.G * plant.middle) @ system.H
+    return IsolationDesign(
+        family=family,
+        large=frozen_ints(np.array([place[pair] for pair in large], dtype=np.intp)),
+        company=frozen_ints(np.array(padded, dtype=np.intp).reshape(len(large), width)),
+        alone=lone,
+        max_inputs=max_inputs,
+        max_sensors=max_sensors,
+        missing=family.missing,
+        measure=measure,
+        left=frozen(left),
+        from_now=frozen(np.abs(left)),
+        from_before=frozen(np.abs(left @ middle) + slack),
+        from_drift=frozen(np.abs(left @ plant.drift).sum(axis=1)),
+    )
+
+
+def _within(small: Pair, large: Pair) -> bool:
+    return set(small[0]) >= set(large[0]) and set(small[1]) <= set(large[1])
+
+
+def init(
+    design: IsolationDesign, t: float, x: Floats | None = None, radius: Floats | None = None
+) -> IsolationState:
+    """Start a bank.
+
+    Parameters
+    ----------
+    design
+        The bank.
+    t
+        Time of the first readings, s.
+    x, radius : (n,)
+        Where all observers start, and how far the truth may be from it, see
+        `observers.unknown_input.init`.
+    """
+    r, p = len(design.left), len(design.family.plant.noise)
+    nobody = np.zeros(r, dtype=np.bool_), np.zeros(p, dtype=np.bool_)
+    return IsolationState(init_family(design.family, t, x, radius), None, None, None, *nobody)
+
+
+def disagreement(design: IsolationDesign, state: UnknownInputState) -> Floats:
+    """Disagreement pi of every large observer, (5) and (22); infinite where no member is left to confirm it.
+
+    Parameters
+    ----------
+    design
+        The bank.
+    state
+        Where its observers stand.
+
+    Returns
+    -------
+    Floats
+        (a,).
+    """
+    gap = np.abs(state.x[design.large][:, None, :] - state.x[design.company])
+    if design.measure == "distance":
+        pi = np.linalg.norm(gap, axis=2).max(axis=1)
+    else:
+        allowed = state.box[design.large][:, None, :] + state.box[design.company]
+        # Equal estimates agree even where both are known exactly.
+        pi = np.where(gap > 0.0, gap / np.maximum(allowed, np.finfo(np.float64).tiny), 0.0).max(axis=(1, 2))
+    return np.where(design.alone, np.inf, pi)
+
+
+def estimate(design: IsolationDesign, state: UnknownInputState, index: int) -> tuple[Floats, Floats]:
+    """Estimate (7), (24) of one large observer with a bound of its error.
+
+    Some small observer S within it is free of attacks, by Lemmas 1 to 3, so
+    `|e_i| <= max_S (|x_hat_i - x_hat_S,i| + box_S,i)` whoever lies. Nor is it above what the plant's
+    span leaves possible.
+
+    Parameters
+    ----------
+    design
+        The bank.
+    state
+        Where its observers stand.
+    index
+        Place among the large observers.
+
+    Returns
+    -------
+    x, bound : (n,)
+    """
+    x = state.x[design.large[index]]
+    own = design.company[index]
+    bound = np.max(np.abs(x - state.x[own]) + state.box[own], axis=0)
+    return x, np.asarray(np.minimum(bound, np.abs(x) + design.family.plant.span))
+
+
+def input_attack(design: IsolationDesign, x: Floats, before: Floats, u: Floats) -> Floats:
+    """Attack on the inputs at the last tick, (42): `B_a^+ (x_hat - A x_hat- - G phi(z_hat-) - B u-)`.
+
+    Parameters
+    ----------
+    design
+        The bank.
+    x, before : (n,)
+        Estimates at this tick and at the last.
+    u : (l,)
+        Known input of the last tick.
+
+    Returns
+    -------
+    Floats
+        (r,).
+    """
+    s = design.family.plant.system
+    expected = s.A @ before + s.G @ s.phi(s.H @ before + s.F @ u) + s.B @ u
+    return np.asarray(design.left @ (x - expected))
+
+
+def support(attack: Floats, threshold: Floats | float) -> Bools:
+    """Who is attacked, (46) and (47): entries of a reconstructed attack above their threshold.
+
+    The printed `supp` asks for exact zeros, which no estimate has after finitely many steps.
+
+    Parameters
+    ----------
+    attack : (…)
+        From (42) or (43); NaN is nobody.
+    threshold : (…) or scalar
+        What an honest one can show.
+    """
+    return np.asarray(np.abs(np.nan_to_num(attack)) > threshold)
+
+
+def step(
+    design: IsolationDesign, state: IsolationState, y: Floats, u: Floats, seen: Bools
+) -> tuple[IsolationState, Isolation]:
+    """Take in one tick, and say who lies.
+
+    Parameters
+    ----------
+    design, state
+        The bank and what it remembers.
+    y : (p,)
+        Readings; anything where unseen.
+    u : (l,)
+        Known input of this tick; finite.
+    seen : (p,)
+        Which readings exist.
+
+    Returns
+    -------
+    state, answer
+        Never raises on data.
+    """
+    plant, s = design.family.plant, design.family.plant.system
+    family = step_family(design.family, state.family, y, u, seen)
+    pi = disagreement(design, family)
+    best = int(np.argmin(pi))
+    x, bound = estimate(design, family, best)
+    heard = np.asarray(seen, dtype=np.bool_) & np.isfinite(y)
+    sensor_attack = np.where(heard, np.where(heard, y, 0.0) - s.C @ x - s.D @ u, np.nan)
+    sensor_threshold = _times(np.abs(s.C), bound) + plant.noise
+    if state.x is None or state.bound is None or state.u is None:
+        input_attack_, input_threshold = np.full(len(design.left), np.nan), np.full(len(design.left), np.inf)
+    else:
+        input_attack_ = input_attack(design, x, state.x, state.u)
+        input_threshold = (
+            _times(design.from_now, bound) + _times(design.from_before, state.bound) + design.from_drift
+        )
+    inputs_now = support(input_attack_, input_threshold)
+    sensors_now = support(sensor_attack, sensor_threshold)
+    inputs, sensors = state.inputs | inputs_now, state.sensors | sensors_now
+    settled = bool(np.all(bound < plant.span))
+    decision, cause, reason = _decide(design, float(pi[best]), settled, inputs, sensors)
+    answer = Isolation(
+        t=family.t,
+        decision=decision,
+        cause=cause,
+        reason=reason,
+        x=x,
+        bound=bound,
+        selected=design.family.pairs[design.large[best]],
+        disagreement=pi,
+        input_attack=input_attack_,
+        input_threshold=input_threshold,
+        sensor_attack=sensor_attack,
+        sensor_threshold=sensor_threshold,
+        inputs_now=inputs_now,
+        sensors_now=sensors_now,
+        inputs=inputs,
+        sensors=sensors,
+    )
+    kept = np.asarray(u, dtype=np.float64)
+    return IsolationState(family, x, bound, kept, inputs, sensors), answer
+
+
+def _times(matrix: Floats, bound: Floats) -> Floats:
+    """`matrix @ bound` for a non-negative matrix and a bound that may be infinite; 0 times infinity is 0."""
+    endless = ~np.isfinite(bound)
+    reached = np.any((matrix > 0.0) & endless, axis=1)
+    return np.where(reached, np.inf, matrix @ np.where(endless, 0.0, bound))
+
+
+def _decide(
+    design: IsolationDesign, pi: float, settled: bool, inputs: Bools, sensors: Bools
+) -> tuple[Decision, Cause, str]:
+    names = f"inputs {np.flatnonzero(inputs).tolist()}, sensors {np.flatnonzero(sensors).tolist()}"
+    limit = len(inputs) if design.max_inputs == len(inputs) else design.max_inputs
+    if not design.guaranteed:
+        count = len(design.missing)
+        reason = f"{count} members of the bank do not exist, nothing is proven; suspected: {names}"
+        return Decision.UNDECIDED, Cause.DESIGN_INVALID, reason
+    if design.measure == "bounds" and pi > 1.0:
+        reason = "no set of trusted inputs and sensors agrees with itself: more are attacked than assumed"
+        return Decision.UNDECIDED, Cause.TOO_MANY_SUSPECTS, reason
+    if np.count_nonzero(inputs) > limit or np.count_nonzero(sensors) > design.max_sensors:
+        return Decision.UNDECIDED, Cause.TOO_MANY_SUSPECTS, f"more are named than assumed: {names}"
+    if np.any(inputs) or np.any(sensors):
+        return Decision.ATTACKED, Cause.RESIDUALS, f"attacked: {names}"
+    if not settled:
+        return (
+            Decision.UNDECIDED,
+            Cause.SETTLING,
+            "the estimate's error bound is not below what is known anyway",
+        )
+    return Decision.CLEAN, Cause.AGREEMENT, "every input and sensor is within its bounds"
