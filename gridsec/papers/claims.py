@@ -34,6 +34,8 @@ class Claim:
     why
         Where they do not agree and we know the reason: an erratum, or a choice that the paper leaves open.
         A claim that is not met and has no reason is a failure of ours.
+    relation
+        How ours should stand to the printed number: equal to the digits, or at most it.
     """
 
     what: str
@@ -42,6 +44,7 @@ class Claim:
     ours: float | str
     met: bool
     why: str = ""
+    relation: Literal["=", "<="] = "="
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -160,7 +163,7 @@ def number(what: str, where: str, printed: float, ours: float, *, unit: float) -
     return Claim(what, where, printed, float(ours), bool(abs(ours - printed) <= half))
 
 
-def statement(what: str, where: str, printed: str, ours: str) -> Claim:
+def statement(what: str, where: str, printed: str, ours: str, why: str = "") -> Claim:
     """Claim in words, met when both texts are the same.
 
     Parameters
@@ -169,8 +172,10 @@ def statement(what: str, where: str, printed: str, ours: str) -> Claim:
         As in `Claim`.
     printed, ours
         The two texts, for example "1 -> 2 -> 3".
+    why
+        As in `Claim`.
     """
-    return Claim(what, where, printed, ours, printed == ours)
+    return Claim(what, where, printed, ours, printed == ours, why)
 
 
 def rounded_up(what: str, where: str, printed: float, ours: float, *, unit: float) -> Claim:
@@ -189,9 +194,8 @@ def rounded_up(what: str, where: str, printed: float, ours: float, *, unit: floa
         Met when `printed - unit < ours <= printed`, with a part in 1e9 for rounding.
     """
     slack = 1e-9 * unit
-    return Claim(
-        what, where, printed, float(ours), bool(printed - unit < ours + slack <= printed + 2.0 * slack)
-    )
+    met = bool(printed - unit < ours + slack <= printed + 2.0 * slack)
+    return Claim(what, where, printed, float(ours), met, relation="<=")
 
 
 def at_most(what: str, where: str, printed: float, ours: float) -> Claim:
@@ -202,4 +206,4 @@ def at_most(what: str, where: str, printed: float, ours: float) -> Claim:
     what, where, printed, ours
         As in `Claim`.
     """
-    return Claim(what, where, printed, float(ours), bool(ours <= printed))
+    return Claim(what, where, printed, float(ours), bool(ours <= printed), relation="<=")

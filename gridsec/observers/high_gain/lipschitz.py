@@ -136,10 +136,10 @@ def lower_proven(rows: Matrix, lower: Floats, upper: Floats) -> Bracket:
     B = np.linalg.pinv(middle)
     off = np.abs(B @ middle - np.eye(middle.shape[1])) + np.abs(B) @ radius
     left = 1.0 - float(np.max(np.sum(off, axis=1)))
+    if left <= 0.0:
+        return Bracket(0.0, np.inf, "interval")
     # A part in 1e12 for the rounding of this last, well-conditioned step.
-    return Bracket(
-        max(left, 0.0) / float(np.max(np.sum(np.abs(B), axis=1))) * (1.0 - 1e-12), np.inf, "interval"
-    )
+    return Bracket(left / float(np.max(np.sum(np.abs(B), axis=1))) * (1.0 - 1e-12), np.inf, "interval")
 
 
 def extend(points: Floats, values: Floats, constants: Floats) -> Map:

@@ -1,0 +1,520 @@
+"""Constants, decomposition and observers of gridsec.observers.high_gain, against scipy and closed forms."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given as hypothesis_given
+from hypothesis import settings
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+from scipy.linalg import solve_continuous_lyapunov
+
+from gridsec.errors import DesignInfeasible, NotObservable
+from gridsec.observers import high_gain
+from gridsec.observers.high_gain import Partial, Polynomial, System, affine, defects, groups, linear, nearest
+from gridsec.observers.high_gain.constants import (
+    Slopes,
+    decay_componentwise,
+    decay_kim,
+    decay_lee,
+    gain,
+    margin,
+    riccati,
+    settling,
+    smallest_theta,
+)
+from gridsec.observers.high_gain.field import advance, field, gains, transition
+from gridsec.observers.high_gain.form import at, jacobian_at, largest, sat, slopes
+from gridsec.online import Cause, Decision
+
+
+def shift(n: int) -> np.ndarray:
+    return np.eye(n, k=1)
+
+
+def bent() -> System:
+    """Oscillator `x1' = x2, x2' = -x1 - x2 + 0.3 x1^2 + u` with three equal sensors of x1."""
+    force = Polynomial(np.array([[1, 0], [0, 1], [2, 0]]), np.array([-1.0, -1.0, 0.3]))
+    first = Partial(
+        phi=lambda x: [x[0], x[1]],
+        jacobian=lambda _: [[1.0, 0.0], [0.0, 1.0]],
+        alpha=force,
+        beta=((affine(0.0, [0.0, 0.0]),), (affine(1.0, [0.0, 0.0]),)),
+        bound=1.0,
+    )
+    return System(np.array([1.0, 1.0]), (first, first, first))
+
+
+def oscillator(x: Any) -> list[Any]:
+    return [x[1], -x[0] - x[1] + 0.3 * x[0] ** 2]
+
+
+def oscillator_input(x: Any) -> list[list[Any]]:
+    return [[0.0 * x[0]], [1.0 + 0.0 * x[0]]]
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4, 5])
+@pytest.mark.parametrize("theta", [1.0, 7.5, 32.0])
+def test_riccati_and_gain_solve_the_lyapunov_equation(n: int, theta: float) -> None:
+    C = np.eye(1, n)
+    dense = solve_continuous_lyapunov((shift(n) + 0.5 * theta * np.eye(n)).T, C.T @ C)
+    closed = riccati(n, theta)
+    assert np.allclose(closed, dense, rtol=1e-7, atol=0.0)
+    assert np.all(np.linalg.eigvalsh(riccati(n, 1.0)) > 0.0)
+    K = gain(n, theta)
+    assert np.allclose(closed @ K, C[0], rtol=1e-9, atol=1e-9 * np.abs(closed).max() * np.abs(K).max())
+    # The characteristic polynomial of A - K C is (s + theta)^n.
+    wanted = np.poly(np.full(n, -theta))
+    assert np.allclose(np.concatenate([[1.0], K]), wanted, rtol=1e-12)
+
+
+def test_constants_of_order_two_by_hand() -> None:
+    low, high = (3.0 - np.sqrt(5.0)) / 2.0, (3.0 + np.sqrt(5.0)) / 2.0
+    made = decay_kim(2, 32.0, 1e-6)
+    assert made.eta == pytest.approx(32.0 * np.sqrt(4.0 * high / low), rel=1e-12)
+    assert made.epsilon == pytest.approx(32.0 * 4.0 * np.sqrt(2.0) * 1e-6 / low, rel=1e-12)
+    assert made.rate == 4.0
+    # sqrt(high / low) = high because high * low = 1.
+    assert decay_lee(2, 16.0, 0.0, printed=True).eta == pytest.approx(16.0 * high, rel=1e-12)
+    assert decay_lee(2, 16.0, 0.0).eta == pytest.approx(16.0 * high * np.sqrt(2.0), rel=1e-12)
+    ours = decay_componentwise(2, 32.0, 1e-6)
+    start = 1.0 + 2.0 / 32.0 + 2.0 / 32.0**2
+    assert ours.eta == pytest.approx(32.0 * np.sqrt(2.0 * start), rel=1e-12)
+    assert ours.epsilon == pytest.approx(32.0 * 2.0 * 1e-6, rel=1e-12)
+    assert ours.bound(4.0, 0.0) == pytest.approx(4.0 * ours.eta)
+    assert ours.bound(4.0, 100.0) == ours.epsilon
+
+
+@settings(max_examples=15, deadline=None)
+@hypothesis_given(n=st.integers(1, 3), theta=st.floats(4.0, 40.0), seed=st.integers(0, 10_000))
+def test_errors_stay_below_all_proven_bounds(n: int, theta: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    reach = np.tril(rng.uniform(0.0, 1.5, (n, n)))
+    ranges = Slopes(-reach, reach, proven=True)
+    if margin(ranges, theta) <= 0.0:
+        theta = 1.01 * smallest_theta(ranges)
+    noise, start = 1e-2, rng.choice([-1.0, 1.0], n)
+    K, pieces = gain(n, theta), 12
+    D, v = rng.uniform(-1.0, 1.0, (pieces, n, n)) * reach, noise * rng.choice([-1.0, 1.0], pieces)
+    ends = np.linspace(0.0, 24.0 / theta, pieces + 1)
+    limits = [decay_kim(n, theta, noise), decay_componentwise(n, theta, noise)]
+    e = start.copy()
+    for k in range(pieces):
+        M = shift(n) - np.outer(K, np.eye(n)[0]) + D[k]
+        path = solve_ivp(
+            lambda _, e, M=M, k=k: M @ e + K * v[k],
+            (ends[k], ends[k + 1]),
+            e,
+            rtol=1e-9,
+            atol=1e-12,
+            max_step=0.2 / theta,
+        )
+        sizes = np.abs(path.y).max(axis=0)
+        for limit in limits:
+            assert np.all(sizes <= limit.bound(1.0, path.t) * (1.0 + 1e-6))
+        e = path.y[:, -1]
+
+
+def test_margin_is_the_worst_case_over_the_ranges() -> None:
+    rng = np.random.default_rng(0)
+    for n in (1, 2, 3, 5):
+        low = np.tril(rng.uniform(-2.0, 0.0, (n, n)))
+        high = np.tril(rng.uniform(0.0, 1.0, (n, n)))
+        theta = 20.0
+        claimed = margin(Slopes(low, high, proven=True), theta)
+        base, power = riccati(n, 1.0), theta ** (np.arange(n)[None, :] - np.arange(n)[:, None]).astype(float)
+        found = np.inf
+        for _ in range(2000):
+            D = np.where(rng.uniform(size=(n, n)) < 0.5, low, high) * power
+            values = np.linalg.eigvals(np.linalg.solve(base, base @ D + D.T @ base)).real
+            found = min(found, 0.5 * theta - values.max())
+        assert claimed <= found + 1e-8
+        if n < 5:  # corners are all tried there; five states fall back to a norm bound
+            assert claimed == pytest.approx(found, abs=0.2)
+
+
+def test_smallest_theta_separates_good_from_bad() -> None:
+    ranges = Slopes(np.array([[0.0, 0.0], [-2.0, -3.0]]), np.zeros((2, 2)), proven=True)
+    least = smallest_theta(ranges)
+    assert margin(ranges, least) > 0.0
+    assert margin(ranges, 0.99 * least) <= 0.0
+    assert smallest_theta(Slopes(np.zeros((1, 1)), np.zeros((1, 1)), proven=True)) == 1.0
+    # A derivative above the diagonal, which is no uniformly observable system, has no theta at all.
+    bad = Slopes(np.array([[0.0, -3.0], [0.0, 0.0]]), np.array([[0.0, 3.0], [0.0, 0.0]]), proven=True)
+    assert smallest_theta(bad) == np.inf
+
+
+def test_settling_times_meet_18_with_equality() -> None:
+    made, size = decay_kim(3, 12.0, 1e-5), 1.7
+    first, second = settling(made, size)
+    start = 2.0 * size * made.eta
+    assert (max(start, made.epsilon) + 2.0 * size) * made.eta * np.exp(-1.5 * first) == pytest.approx(
+        made.epsilon
+    )
+    assert start * np.exp(-1.5 * second) == pytest.approx(made.epsilon)
+
+
+def test_sat_removes_what_is_not_finite() -> None:
+    assert np.array_equal(sat(np.array([np.nan, np.inf, -np.inf, 0.5]), 2.0), [0.0, 2.0, -2.0, 0.5])
+
+
+def test_polynomials_and_their_derivatives() -> None:
+    p = Polynomial(np.array([[2, 1], [0, 3], [0, 0]]), np.array([2.0, -1.0, 5.0]))
+    z = np.random.default_rng(0).normal(size=(2, 50))
+    assert np.allclose(p(list(z)), 2.0 * z[0] ** 2 * z[1] - z[1] ** 3 + 5.0)
+    assert np.allclose(p.derivative(0)(list(z)), 4.0 * z[0] * z[1])
+    assert np.allclose(p.derivative(1)(list(z)), 2.0 * z[0] ** 2 - 3.0 * z[1] ** 2)
+    assert p.derivative(0).derivative(0).derivative(0)([1.0, 1.0]) == 0.0
+
+
+@settings(max_examples=25, deadline=None)
+@hypothesis_given(seed=st.integers(0, 10_000))
+def test_linear_systems_always_decompose(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    # A block-triangular A gives sensors that see only a part.
+    A, B = rng.integers(-2, 3, (3, 3)).astype(float), rng.normal(size=(3, 2))
+    A[0, 1:] *= seed % 2
+    C = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 1.0]])
+    made = linear(A, B, C, 1.0)
+    for row, part in zip(C, made.partials, strict=True):
+        stack = np.array([row @ np.linalg.matrix_power(A, k) for k in range(3)])
+        assert part.size == np.linalg.matrix_rank(stack)
+    points = rng.uniform(-1.0, 1.0, (40, 3))
+    off = defects(
+        made,
+        lambda x: list(A @ np.array(x)),
+        lambda x: [[value + 0.0 * x[0] for value in row] for row in B.tolist()],
+        lambda x: list(C @ np.array(x)),
+        points,
+    )
+    assert np.all(off < 1e-6)
+    z = np.abs(made.phi(points))
+    assert all(z[:, made.pick([i])].max() <= made.z_bound[i] + 1e-12 for i in range(2))
+
+
+def test_sensors_without_a_row_are_refused() -> None:
+    with pytest.raises(NotObservable, match="sensor 1 measures nothing"):
+        linear(np.eye(2), np.ones((2, 1)), np.array([[1.0, 0.0], [0.0, 0.0]]), 1.0)
+    with pytest.raises(NotObservable, match="without sensors"):
+        System(np.ones(2), ())
+
+
+def test_defects_find_a_wrong_decomposition() -> None:
+    right = bent()
+    points = np.random.default_rng(1).uniform(-1.0, 1.0, (50, 2))
+    read = lambda x: [x[0]] * 3  # noqa: E731
+    assert np.all(defects(right, oscillator, oscillator_input, read, points) < 1e-8)
+    wrong = replace(right.partials[0], alpha=affine(0.0, [-1.0, -1.0]))
+    pair = System(right.x_bound, (right.partials[0], wrong))
+    off = defects(
+        pair,
+        oscillator,
+        oscillator_input,
+        lambda x: [x[0]] * 2,
+        points,
+    )
+    assert off[0] < 1e-8
+    assert off[1] > 0.1
+    turned = replace(right.partials[0], beta=((affine(1.0, [0.0, 0.0]),), (affine(0.0, [0.0, 0.0]),)))
+    assert (
+        defects(System(right.x_bound, (turned,)), oscillator, oscillator_input, lambda x: [x[0]], points)[0]
+        > 0.5
+    )
+
+
+def test_slopes_are_proven_for_polynomials_and_say_so() -> None:
+    first = bent().partials[0]
+    known = slopes(first, np.array([-1.0]), np.array([2.0]))
+    assert known.proven
+    # -1 + 0.6 z1 on |z1| <= 1, with zero for the saturated arguments.
+    assert known.low[1, 0] == pytest.approx(-1.6)
+    assert known.high[1, 0] == 0.0
+    assert known.low[1, 1] == pytest.approx(-1.0)
+    hidden = replace(first, alpha=lambda z: -z[0] - z[1] + 0.3 * z[0] ** 2)
+    seen = slopes(hidden, np.array([-1.0]), np.array([2.0]))
+    assert not seen.proven
+    assert np.all(seen.low <= known.low + 1e-3)
+    assert np.all(seen.low >= 1.2 * known.low - 1e-3)
+
+
+def test_stack_project_and_bound() -> None:
+    model = linear(
+        np.diag([-1.0, -2.0]), np.ones((2, 1)), np.array([[1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]), 1.0
+    )
+    assert [part.size for part in model.partials] == [1, 2, 1]
+    x = np.random.default_rng(2).uniform(-1.0, 1.0, (20, 2))
+    whole = model.phi(x)
+    for chosen in ([0], [0, 2], [1, 2], [0, 1, 2]):
+        assert np.array_equal(whole[:, model.pick(chosen)], model.phi(x, chosen))
+    step = 1e-6
+    for k in range(2):
+        shifted = x + step * np.eye(2)[k]
+        assert np.allclose((model.phi(shifted) - whole) / step, model.jacobian(x)[..., k], atol=1e-8)
+    assert jacobian_at(model.rows([1]), x).shape == (20, 2, 2)
+    assert largest(lambda z: [z[0] ** 2 - z[1], z[0]], np.array([1.0, 0.5])) == pytest.approx(1.5, rel=2e-3)
+
+
+def mixed() -> System:
+    """Two different sizes, nonlinear, two inputs."""
+    one = Partial(
+        phi=lambda x: [x[0], x[1]],
+        jacobian=lambda _: [[1.0, 0.0], [0.0, 1.0]],
+        alpha=Polynomial(np.array([[1, 0], [1, 1]]), np.array([-1.0, -0.5])),
+        beta=(
+            (affine(0.3, [0.2, 0.0]), affine(0.0, [0.0, 0.0])),
+            (affine(0.0, [0.0, 0.4]), affine(1.0, [0.0, 0.0])),
+        ),
+        bound=1.5,
+    )
+    two = Partial(
+        phi=lambda x: [x[1]],
+        jacobian=lambda _: [[0.0, 1.0]],
+        alpha=Polynomial(np.array([[3]]), np.array([-0.2])),
+        beta=((affine(0.1, [1.0]), affine(0.0, [0.5])),),
+        bound=0.8,
+    )
+    return System(np.array([1.0, 1.0]), (one, two))
+
+
+def looped(model: System) -> System:
+    """The same system with its polynomials hidden, so that nothing can be stacked."""
+
+    def hide(function: Any) -> Any:
+        # A partial application is no Polynomial any more.
+        return partial(function)
+
+    parts = [
+        replace(p, alpha=hide(p.alpha), beta=tuple(tuple(hide(e) for e in row) for row in p.beta))
+        for p in model.partials
+    ]
+    return System(model.x_bound, tuple(parts))
+
+
+def test_stacked_and_looped_right_hand_sides_agree() -> None:
+    model = mixed()
+    rng = np.random.default_rng(3)
+    stacked, one_by_one = field(model), field(looped(model))
+    for _ in range(20):
+        z, u = np.where(model.mask, rng.normal(scale=2.0, size=(2, 2)), 0.0), rng.normal(size=2)
+        assert np.allclose(stacked(z, u), one_by_one(z, u), rtol=1e-12, atol=1e-12)
+        assert stacked(z, u)[1, 1] == 0.0
+
+
+def test_transition_solves_linear_forcing_exactly() -> None:
+    model = linear(np.diag([-1.0, -2.0]), np.ones((2, 1)), np.array([[1.0, 1.0], [0.0, 1.0]]), 1.0)
+    K = gains(model, np.array([20.0, 3.0]))
+    for h in (1e-6, 0.02, 0.7):
+        move = transition(model, K, h)
+        g0, g1, z0 = np.array([0.3, -0.2]), np.array([-1.0, 0.5]), np.array([1.0, 2.0])
+        M = shift(2) - np.outer(K[0], [1.0, 0.0])
+        path = solve_ivp(
+            lambda t, z, M=M, h=h, a=g0, b=g1: M @ z + a + (b - a) * t / h,
+            (0.0, h),
+            z0,
+            method="DOP853",
+            rtol=1e-12,
+            atol=1e-13,
+        )
+        ours = move.whole[0] @ z0 + move.held[0] @ g0 + move.slope[0] @ (g1 - g0)
+        assert np.allclose(ours, path.y[:, -1], rtol=1e-9, atol=1e-10)
+
+
+def test_steps_converge_to_the_differential_equation_with_order_two() -> None:
+    model = mixed()
+    K = gains(model, np.array([8.0, 5.0]))
+    right = field(model)
+
+    def signal(t: float) -> tuple[np.ndarray, np.ndarray]:
+        return np.array([0.5 * t, 0.2 - 0.3 * t]), np.array([t, 1.0 - t])
+
+    def rate(t: float, flat: np.ndarray) -> np.ndarray:
+        z, (y, u) = flat.reshape(2, 2), signal(t)
+        ahead = np.column_stack([z[:, 1], np.zeros(2)]) * np.array([[1.0, 0.0], [0.0, 0.0]])
+        return (ahead + right(z, u) + K * (y - z[:, 0])[:, None]).ravel()
+
+    start = np.array([[0.9, -0.7], [0.6, 0.0]])
+    exact = solve_ivp(rate, (0.0, 1.0), start.ravel(), rtol=1e-12, atol=1e-13).y[:, -1].reshape(2, 2)
+    errors = []
+    for count in (20, 40, 80):
+        move, z = transition(model, K, 1.0 / count), start
+        for k in range(count):
+            (y0, u0), (y1, u1) = signal(k / count), signal((k + 1) / count)
+            z = advance(right, K, move, z, y=(y0, y1), u=(u0, u1))
+        errors.append(np.abs(z - exact).max())
+    assert errors[-1] < 1e-4
+    assert errors[0] / errors[1] > 3.4
+    assert errors[1] / errors[2] > 3.4
+
+
+# The whole estimator on a small nonlinear system with three equal sensors.
+
+
+def estimator(**options: Any) -> high_gain.HighGainDesign:
+    model = bent()
+    given: dict[str, Any] = {
+        "theta": 12.0, "noise": 2e-4, "max_attacked": 1, "u_low": -0.4, "u_high": 0.4, "step_s": 0.02,
+        "whole": nearest(model, (0, 1, 2), accept=1e-4), "lowest": 1.0,
+    }  # fmt: skip
+    return high_gain.design(
+        model, [nearest(model, group, accept=1e-4) for group in groups(3, 1)], **{**given, **options}
+    )
+
+
+def truth(seconds: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    t = np.arange(0.0, seconds, 0.02)
+    u = 0.3 * np.sin(t)
+    path = solve_ivp(
+        lambda s, x: np.array(oscillator(x)) + np.array([0.0, 0.3 * np.sin(s)]),
+        (0.0, t[-1]), [0.4, -0.3], t_eval=t, rtol=1e-10, atol=1e-12,
+    )  # fmt: skip
+    return t, path.y.T, u
+
+
+def watch(made: high_gain.HighGainDesign, added: Any, seconds: float = 8.0, seed: int = 0) -> tuple[Any, ...]:
+    t, x, u = truth(seconds)
+    y = x[:, [0, 0, 0]] + np.random.default_rng(seed).uniform(-1e-4, 1e-4, (len(t), 3)) + added(t)
+    state = high_gain.init(made, 0.0, y[0], u[:1])
+    outcomes, states = [], []
+    for k in range(1, len(t)):
+        state, outcome = high_gain.step(made, state, y[k], u[k : k + 1], np.ones(3, dtype=bool), 0.02)
+        outcomes.append(outcome)
+        states.append(state)
+    return t[1:], x[1:], outcomes, states
+
+
+def nothing(t: np.ndarray) -> np.ndarray:
+    return np.zeros((len(t), 3))
+
+
+def on_second(size: float, start: float = 4.0) -> Any:
+    def added(t: np.ndarray) -> np.ndarray:
+        out = np.zeros((len(t), 3))
+        out[t >= start, 1] = size
+        return out
+
+    return added
+
+
+@pytest.mark.parametrize("decay", ["componentwise", "kim2018"])
+def test_honest_sensors_are_never_suspected_and_bounds_hold(decay: Any) -> None:
+    made = estimator(decay=decay)
+    t, x, outcomes, states = watch(made, nothing)
+    assert all(outcome.decision is not Decision.ATTACKED for outcome in outcomes)
+    assert all(outcome.visited == (0,) for outcome in outcomes)
+    assert outcomes[-1].decision is Decision.CLEAN
+    assert outcomes[0].cause is Cause.SETTLING
+    for state, outcome, truth_x in zip(states, outcomes, x, strict=True):
+        limits = high_gain.error_bounds(made, state.age)
+        assert np.all(np.abs(state.z - truth_x).max(axis=1) <= limits)
+        assert np.abs(outcome.x - truth_x).max() <= outcome.bound
+    assert t[-1] == pytest.approx(states[-1].t)
+    assert made.proven
+
+
+@pytest.mark.parametrize("size", [0.02, -0.3, 1e4, 1e300])
+def test_attacks_are_seen_named_and_left_out(size: float) -> None:
+    made = estimator()
+    t, x, outcomes, states = watch(made, on_second(size))
+    after = [outcome for moment, outcome in zip(t, outcomes, strict=True) if moment > 4.5]
+    assert all(outcome.decision is Decision.ATTACKED for outcome in after)
+    assert all(outcome.suspects.tolist() == [False, True, False] for outcome in after)
+    assert after[-1].trusted.tolist() == [True, False, True]
+    error = np.array([np.abs(o.x - truth_x).max() for o, truth_x in zip(outcomes, x, strict=True)])
+    assert np.all(error <= np.array([outcome.bound for outcome in outcomes]))
+    assert np.all(np.abs(np.array([state.z for state in states])) <= made.limit[:, None] + 1e-9)
+    assert any(outcome.reset[1] for outcome in after) == (abs(size) > made.limit[1])
+
+
+def test_search_walks_through_the_sets_at_once_or_one_by_one() -> None:
+    # Sensor 2 is in the first two sets, {1, 2} and {0, 2}.
+    added = lambda t: 0.5 * (t[:, None] >= 4.0) * np.array([0.0, 0.0, 1.0])  # noqa: E731
+    _, _, together, _ = watch(estimator(), added)
+    _, _, singly, _ = watch(estimator(search="one"), added)
+    assert {o.visited for o in together if len(o.visited) > 1} == {(0, 1, 2)}
+    assert [o.visited for o in singly if len(o.visited) > 1][:2] == [(0, 1), (1, 2)]
+    assert together[-1].sigma == singly[-1].sigma == 2
+
+
+def test_two_liars_leave_no_answer_and_say_so() -> None:
+    added = lambda t: (t[:, None] >= 4.0) * np.array([0.5, -0.7, 0.0])  # noqa: E731
+    _, _, outcomes, _ = watch(estimator(), added)
+    assert outcomes[-1].decision is Decision.UNDECIDED
+    assert outcomes[-1].cause is Cause.TOO_MANY_SUSPECTS
+    assert outcomes[-1].bound == np.inf
+
+
+def test_unseen_sensors_have_no_influence_and_come_back() -> None:
+    made = estimator()
+    t, x, u = truth(8.0)
+    runs = []
+    for junk in (np.nan, 1e9, 0.0):
+        state, sigma = high_gain.init(made, 0.0, x[0, [0, 0, 0]], u[:1]), []
+        for k in range(1, len(t)):
+            silent = 3.0 < t[k] < 5.0
+            y = x[k, [0, 0, 0]].copy()
+            y[0] = junk if silent else y[0]
+            state, outcome = high_gain.step(
+                made, state, y, u[k : k + 1], np.array([not silent, True, True]), 0.02
+            )
+            sigma.append((outcome.sigma, outcome.decision, tuple(outcome.x), outcome.bound))
+            assert np.abs(outcome.x - x[k]).max() <= outcome.bound
+            assert outcome.decision is not Decision.ATTACKED
+            if silent:
+                assert not outcome.trusted[0]
+                assert state.age[0] == 0.0
+        assert state.age[0] == pytest.approx(t[-1] - 5.0, abs=0.05)
+        assert state.age[1] == pytest.approx(t[-1])
+        runs.append(sigma)
+    assert runs[0] == runs[1] == runs[2]
+
+
+def test_too_few_sensors_give_no_answer() -> None:
+    made = estimator()
+    state = high_gain.init(made, 0.0)
+    state, outcome = high_gain.step(
+        made, state, np.full(3, np.nan), np.zeros(1), np.ones(3, dtype=bool), 0.02
+    )
+    assert outcome.decision is Decision.UNDECIDED
+    assert outcome.cause is Cause.TOO_FEW_METERS
+    assert np.all(np.isnan(outcome.x))
+    _, outcome = high_gain.step(made, state, np.zeros(3), np.zeros(1), np.array([True, False, False]), 0.02)
+    assert outcome.cause is Cause.TOO_FEW_METERS
+
+
+def test_steps_of_another_length_give_the_same_path() -> None:
+    made = estimator()
+    start = high_gain.init(made, 0.0, np.array([0.2, 0.1, 0.0]), np.zeros(1))
+    y, u, seen = np.array([0.25, 0.1, 0.05]), np.array([0.1]), np.ones(3, dtype=bool)
+    twice = estimator(step_s=0.04, substeps=2)
+    long, _ = high_gain.step(made, start, y, u, seen, 0.04)
+    parts, _ = high_gain.step(twice, start, y, u, seen, 0.04)
+    half, _ = high_gain.step(made, start, start.y + 0.5 * (y - start.y), 0.5 * u, seen, 0.02)
+    full, _ = high_gain.step(made, half, y, u, seen, 0.02)
+    assert np.allclose(full.z, parts.z, rtol=1e-12, atol=1e-12)
+    assert np.allclose(long.z, parts.z, rtol=0.0, atol=2e-3)
+
+
+def test_designs_that_do_not_hold_are_refused() -> None:
+    model = bent()
+    sets = [nearest(model, group) for group in groups(3, 1)]
+    rest: dict[str, Any] = {"noise": 1e-3, "max_attacked": 1, "u_low": -1.0, "u_high": 1.0, "step_s": 0.02}
+    with pytest.raises(DesignInfeasible, match="too small for Lemma 1"):
+        high_gain.design(model, sets, theta=1.5, **rest)
+    with pytest.raises(DesignInfeasible, match="at least 1"):
+        high_gain.design(model, sets, theta=0.5, **rest)
+    with pytest.raises(NotObservable, match="each set of 2 sensors"):
+        high_gain.design(model, sets[:2], theta=12.0, **rest)
+    with pytest.raises(NotObservable, match="more than twice"):
+        high_gain.design(model, sets, theta=12.0, **{**rest, "max_attacked": 2})
+    wrong = replace(sets[0], function=lambda z: 0.9 * sets[0].function(z))
+    with pytest.raises(DesignInfeasible, match="misses the state"):
+        high_gain.design(model, [wrong, *sets[1:]], theta=12.0, **rest)
+
+
+def test_values_over_components_broadcast_constants() -> None:
+    assert at(lambda x: [1.0, x[0]], np.ones((4, 1))).shape == (4, 2)
