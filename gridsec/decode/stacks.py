@@ -108,7 +108,7 @@ def cospark(stack: Stack, *, tol: float, below: float = 0.0) -> Sparsest:
     tol
         What counts as zero then.
     below
-        Stop as soon as fewer blocks than this are found.
+        As in `gridsec.index.fewest`.
 
     References
     ----------

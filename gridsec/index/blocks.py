@@ -123,7 +123,8 @@ def fewest(
     most
         Largest number of nodes.
     below
-        Stop at the first direction that fewer blocks than this see: enough to answer "fewer than?".
+        Only answer whether fewer blocks than this see some direction: the count found is below it if so,
+        and otherwise any upper bound. Takes at most C(n + below, n) nodes. 0: find the minimum.
 
     Returns
     -------
@@ -142,7 +143,8 @@ def fewest(
     todo = [(space, np.arange(len(rows)), 0)]
     while todo:
         here, undecided, paid = todo.pop()
-        if paid >= best:
+        enough = min(best, below) if below > 0 else best
+        if paid >= enough:
             continue
         nodes += 1
         if nodes > most:
@@ -163,7 +165,7 @@ def fewest(
         left, ranks = undecided[live], np.count_nonzero(sizes[live] > tol, axis=1)
         pick = int(np.argmin(ranks))
         rest = np.delete(left, pick)
-        if paid + 1 < best:
+        if paid + 1 < enough:
             todo.append((here, rest, paid + 1))
         smaller = here @ kernel(seen[live][pick], tol)
         if smaller.shape[1] > 0:

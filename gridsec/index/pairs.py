@@ -205,11 +205,11 @@ def asymptotic_index(A: Floats, C: Floats, *, discrete: bool, tol: float, by: By
     return _over(tuple(e.vectors for e in spaces if e.unstable(discrete=discrete, tol=tol)), C, tol)
 
 
-def _over(spaces: Sequence[Matrix], C: Floats, tol: float) -> Index:
+def _over(spaces: Sequence[Matrix], C: Floats, tol: float, *, below: float = 0.0) -> Index:
     rows = _sensors(C)
     best = fewest(rows, np.zeros((C.shape[1], 0)), tol=tol)
     for space in spaces:
-        found = fewest(rows, space, tol=tol)
+        found = fewest(rows, space, tol=tol, below=below)
         if found.count < best.count:
             best = found
     return Index(best.count, frozen_ints(best.blocks), best.direction)
@@ -234,7 +234,7 @@ def redundant_observable(A: Floats, C: Floats, q: int, *, tol: float, by: By = "
     lee2018, Definition 3.1.1, Propositions 3.1.1 (iii) and 3.1.2 (ii).
     """
     if by == "eigenvectors":
-        return dynamic_index(A, C, tol=tol).count > q
+        return _over([e.vectors for e in eigenspaces(A, tol=tol)], C, tol, below=q + 1).count > q
     rows = observable_rows(A, C, tol=tol)
     return all(_lost(rows, kept, A.shape[0], tol).shape[1] == 0 for kept in _survivors(len(rows), q))
 
@@ -256,7 +256,8 @@ def redundant_detectable(
     lee2018, Definition 3.1.3, Propositions 3.1.8 (ii) and 3.1.9 (ii).
     """
     if by == "eigenvectors":
-        return asymptotic_index(A, C, discrete=discrete, tol=tol).count > q
+        spaces = [e.vectors for e in eigenspaces(A, tol=tol) if e.unstable(discrete=discrete, tol=tol)]
+        return _over(spaces, C, tol, below=q + 1).count > q
     rows = observable_rows(A, C, tol=tol)
     space = unstable_subspace(A, discrete=discrete, tol=tol)
     return all(_lost(rows, kept, 0, tol, space).shape[1] == 0 for kept in _survivors(len(rows), q))

@@ -421,6 +421,10 @@ def test_fewest_stops_early_and_gives_up_loudly() -> None:
     with pytest.raises(DesignInfeasible, match="more than 50 nodes"):
         fewest(rows, np.eye(7), tol=TOL, most=50)
     assert fewest(rows, np.zeros((7, 0)), tol=TOL).count == np.inf
+    many = [row_space(r[None, :], TOL) for r in rng.standard_normal((30, 10))]
+    # The minimum, 21, would take millions of nodes; that it is not below 5 takes at most C(15, 10).
+    assert fewest(many, np.eye(10), tol=TOL, below=5, most=3003).count >= 5
+    assert fewest([*many[:3], *[r[:0] for r in many]], np.eye(10), tol=TOL, below=1).count == 0
 
 
 def test_observable_rows_where_powers_of_a_overflow_all_scales() -> None:
