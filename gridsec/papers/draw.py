@@ -210,9 +210,7 @@ def _panel(axes: Axes, panel: Panel, colours: dict[str, Any]) -> None:
     axes.set_xlabel(panel.x_label)
     axes.set_ylabel(panel.y_label)
     axes.margins(x=0.02 if all(line.style == "points" for line in panel.lines) else 0.0, y=0.08)
-    low, high = _span(panel.lines)
-    if 0.0 < low < 0.05 * high:
-        axes.set_xlim(left=0.0)
+    axes.set_xlim(*_ends(*_span(panel.lines), *axes.get_xlim()))
     said = alone and panel.y_label.startswith(panel.lines[0].label)
     if any(line.label for line in panel.lines) and not said:
         axes.legend(loc="upper left", bbox_to_anchor=(1.015, 1.0))
@@ -221,10 +219,25 @@ def _panel(axes: Axes, panel: Panel, colours: dict[str, Any]) -> None:
             axis.set_major_locator(MaxNLocator(nbins="auto", integer=True, steps=[1, 2, 5, 10]))
 
 
+def _ends(low: float, high: float, left: float, right: float) -> tuple[float, float]:
+    """Ends of an abscissa: those of the axes, or the round number that the data all but reach."""
+    span = high - low
+    if span > 0.0:
+        step = 10.0 ** np.floor(np.log10(span)) / 2.0
+        if 0.0 <= (up := step * np.ceil(high / step)) - high < 0.02 * span:
+            right = max(right, float(up))
+        if 0.0 <= low - (down := step * np.floor(low / step)) < 0.02 * span:
+            left = min(left, float(down))
+    return left, right
+
+
 def _widths(panel: Panel) -> list[float]:
     """Each curve thinner than the one before it, so that one that runs under another still shows."""
     count = len(panel.lines)
-    return [1.4] if count == 1 else [float(w) for w in np.linspace(2.5 if count <= 8 else 1.2, 1.1, count)]
+    if count == 1:
+        return [1.4]
+    widths = np.linspace(min(0.7 + 0.4 * count, 2.5) if count <= 8 else 1.2, 1.1, count)
+    return [float(w) if line.label else 0.8 for w, line in zip(widths, panel.lines, strict=True)]
 
 
 def _counts(values: list[Any]) -> bool:

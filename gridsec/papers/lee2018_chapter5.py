@@ -119,7 +119,7 @@ def reproduce() -> Reproduction:
             place,
             "{1, 2, 3}",
             _members(run, before=4.0),
-            "set 1 of Table 5.1 is {2, 3, 4}; the first search needs a set that holds the attacked sensor 2",
+            "Table 5.1 and its text have Lambda_i = [4] - {i}",
         ),
         statement("sensors of set 2", place, "{1, 3, 4}", _members(run, before=np.inf)),
         Claim(
