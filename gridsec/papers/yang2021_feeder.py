@@ -1,0 +1,185 @@
+"""yang2021 on a feeder: an inverter that injects the wrong reactive power and a meter that lies, at once.
+
+The feeder is the overhead line of Kerber's rural network, 13 customers at equal distances; three
+inverters with a droop curve, eight meters. docs/papers/yang2021.md says for which inverters the bank
+exists, and how exact readings have to be.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from gridsec.arrays import Floats
+from gridsec.droop import Droop, fleet
+from gridsec.feeder import Feeder
+from gridsec.isolation import Isolation, IsolationDesign, design, init, step
+from gridsec.lmi.sampled import advance, measure
+from gridsec.lure import Lure, close_loop
+from gridsec.observers.unknown_input import UnknownInputPlant, inverters
+from gridsec.papers.claims import Figure, Line, Panel
+
+CUSTOMERS = 13
+STEP_S = 1.0
+ONSET_S = 40.0
+
+
+def feeder() -> Feeder:
+    """Kerber's rural overhead line: 13 sections of 9.303 mohm + j 1.449 mohm at 400 V, base 100 kVA.
+
+    References
+    ----------
+    G. Kerber, dissertation, TU Muenchen 2011, as distributed with pandapower.
+    """
+    ohm = 400.0**2 / 100e3
+    return Feeder(
+        name="kerber-line",
+        parent=np.arange(CUSTOMERS),
+        r=np.full(CUSTOMERS, 9.303e-3 / ohm),
+        x=np.full(CUSTOMERS, 1.449e-3 / ohm),
+        bus=np.arange(1, CUSTOMERS + 1),
+        customers=tuple(f"c{i:02d}" for i in range(1, CUSTOMERS + 1)),
+        buses=tuple(f"b{i:02d}" for i in range(CUSTOMERS + 1)),
+        base_volt=400.0 / np.sqrt(3.0),
+        base_kva=100.0,
+        charging=np.zeros(CUSTOMERS),
+    )
+
+
+def _droop(at: tuple[int, ...]) -> Droop:
+    return fleet(np.array(at), ["ieee1547-b"] * len(at), np.full(len(at), 10.0), 100.0)
+
+
+def loop(at: tuple[int, ...], meters: tuple[int, ...]) -> Lure:
+    """The closed loop with inverters of 10 kVA and the curve of IEEE 1547, category B.
+
+    Parameters
+    ----------
+    at
+        Customers with an inverter, from 0.
+    meters
+        Customers with a meter, from 0.
+    """
+    return close_loop(feeder(), _droop(at), np.array(meters))
+
+
+def plant(at: tuple[int, ...], meters: tuple[int, ...], reading_error: float) -> UnknownInputPlant:
+    """The sampled loop with every inverter open to attack.
+
+    Parameters
+    ----------
+    at, meters
+        As in `loop`.
+    reading_error
+        Largest error of every meter, squared pu.
+    """
+    return inverters(
+        loop(at, meters),
+        STEP_S,
+        np.arange(len(at)),
+        reading_error=np.full(len(meters), reading_error),
+        u_error=np.zeros(CUSTOMERS),
+        curve_error=np.zeros(len(at)),
+        # Beyond its droop an inverter can be made to inject; not beyond twice as much.
+        span=2.0 * _droop(at).limit,
+    )
+
+
+AT = (3, 6, 9)
+METERS = (0, 2, 4, 6, 8, 10, 11, 12)
+
+
+@lru_cache(maxsize=1)
+def bank(reading_error: float = 1e-6) -> IsolationDesign:
+    """Bank for one wrong inverter among three and one lying meter among eight: all 108 members exist.
+
+    Parameters
+    ----------
+    reading_error
+        As in `plant`.
+    """
+    return design(plant(AT, METERS, reading_error), max_inputs=1, max_sensors=1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Run:
+    """One simulation. T ticks, m inverters, p meters.
+
+    Attributes
+    ----------
+    x, a_u : (T, m)
+        Reactive injections and wrong parts of their set points, pu.
+    a_y : (T, p)
+        Attacks on the meters, squared pu.
+    answers
+        What the bank said.
+    """
+
+    x: Floats
+    a_u: Floats
+    a_y: Floats
+    answers: tuple[Isolation, ...]
+
+
+def simulate(made: IsolationDesign, *, inverter: int, meter: int, ticks: int = 80, seed: int = 1) -> Run:
+    """The loop under attack: from `ONSET_S` on the inverter absorbs instead of injecting, the meter lies.
+
+    Parameters
+    ----------
+    made
+        The bank.
+    inverter, meter
+        Who is attacked, from 0.
+    ticks
+        Length.
+    seed
+        Of the meters' errors, which are uniform inside their bounds.
+    """
+    model = made.family.plant
+    m, p = model.inputs.shape[1], len(model.noise)
+    rng = np.random.default_rng(seed)
+    state, x = init(made, 0.0), np.zeros(m)
+    xs, au, ay, answers = np.empty((ticks, m)), np.zeros((ticks, m)), np.zeros((ticks, p)), []
+    for k in range(ticks):
+        # Evening load: low voltage along the line, slowly moving.
+        u = 0.055 + 0.035 * np.arange(1, CUSTOMERS + 1) / CUSTOMERS * (1.0 + 0.2 * np.sin(k / 9.0))
+        if k * STEP_S >= ONSET_S:
+            au[k, inverter], ay[k, meter] = -0.06, -0.01
+        xs[k] = x
+        y = measure(model.system, x, u) + ay[k] + model.noise * rng.uniform(-1.0, 1.0, p)
+        state, answer = step(made, state, y, u, np.ones(p, dtype=np.bool_))
+        answers.append(answer)
+        x = advance(model.system, x, u) + model.inputs @ au[k]
+    return Run(xs, au, ay, tuple(answers))
+
+
+def figure() -> Figure:
+    """Injections, reconstructed attacks on inverters and on meters."""
+    run = simulate(bank(), inverter=1, meter=5)
+    t = np.arange(0.0, len(run.x) * STEP_S, STEP_S)
+    found = np.array([a.x for a in run.answers])
+    late = np.array([a.input_attack for a in run.answers])
+    lies = np.array([a.sensor_attack for a in run.answers])
+    # Before the bounds have settled, the reconstruction means nothing.
+    known = np.array([[np.all(a.bound < _droop(AT).limit)] for a in run.answers])
+    late, lies = np.where(known, late, np.nan), np.where(known, lies, np.nan)
+    ahead = np.vstack([late[1:], np.full((1, late.shape[1]), np.nan)])
+    panels = (
+        _panel("reactive injection / pu", t, (run.x, found), [f"inverter at c{i + 1:02d}" for i in AT]),
+        _panel("wrong part of the set point / pu", t, (run.a_u, ahead), [f"c{i + 1:02d}" for i in AT]),
+        _panel("lie of the meter / squared pu", t, (run.a_y, lies), [f"c{i + 1:02d}" for i in METERS]),
+    )
+    return Figure(
+        "yang2021-feeder",
+        "One inverter absorbs and one meter lies from 40 s on; both are named, nobody else is",
+        panels,
+    )
+
+
+def _panel(what: str, t: Floats, pair: tuple[Floats, Floats], names: list[str]) -> Panel:
+    lines = []
+    for i, name in enumerate(names):
+        lines += [Line(name, t, pair[0][:, i], "solid"), Line("", t, pair[1][:, i], "dashed")]
+    return Panel(f"{what}: truth, and estimate (dashed)", "t / s", what, tuple(lines))
