@@ -6,8 +6,9 @@ the threshold, and an attack on sensor 2 at 4 s that moves the search from set 1
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from gridsec.papers.uniformly_observable import (
     Z_BOUND,
     Run,
     lip_inverses,
+    phi,
     printed_inverses,
     simulate,
     switching,
@@ -48,6 +50,12 @@ def attack(t: Floats, size: float = ATTACK) -> Floats:
     out = np.zeros((*t.shape, 4))
     out[..., 1] = size * (t >= 4.0)
     return out
+
+
+def phi_printed(x: Sequence[Any]) -> list[Any]:
+    """Phi as printed in section 5.5: `L_f h_2` stands in the place of `h_3` too (erratum)."""
+    rows = phi(x)
+    return [*rows[:4], rows[3], *rows[5:]]
 
 
 def estimator(search: Literal["all", "one"] = "one") -> HighGainDesign:

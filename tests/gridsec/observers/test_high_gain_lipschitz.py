@@ -199,6 +199,40 @@ def test_residual_of_the_nearest_point_is_at_most_root_n_times_the_error(seed: i
     assert np.abs(back - x).max() <= kappa_detect(psi.factor, example.lowest()) * size * (1.0 + 1e-6)
 
 
+@settings(max_examples=120, deadline=None)
+@given(
+    seed=st.integers(0, 100_000),
+    exponent=st.floats(-6.0, 1.0),
+    kind=st.sampled_from(["table", "nearest", "whole"]),
+)
+def test_theorem_1_and_its_corollary(seed: int, exponent: float, kind: str) -> None:
+    rng, model, delta = np.random.default_rng(seed), example.system(), 1e-4
+    which = seed % 4
+    psi = {
+        "table": example.printed_inverses(model)[which],
+        "nearest": nearest(model, groups(4, 1)[which]),
+        "whole": nearest(model, (0, 1, 2, 3)),
+    }[kind]
+    # The corollary tests all sensors; the groups that can be free of attacks are then the triples.
+    lowest, steepest = example.lowest(), example.lip_phi().upper
+    x = rng.uniform(-0.5, 0.5, 3)
+    z = model.phi(x, psi.sensors)
+    r = rng.uniform(-delta, delta, z.shape)
+    owner = np.repeat(range(4), example.SIZES)[model.pick(psi.sensors)]
+    liar = rng.choice(psi.sensors)
+    e = np.where(owner == liar, 10.0**exponent * rng.normal(size=z.shape), 0.0)
+
+    def test(code: np.ndarray) -> tuple[np.ndarray, bool]:
+        back = psi(code)
+        return back, bool(np.abs(code - model.phi(back, psi.sensors)).max() <= psi.factor * delta)
+
+    assert test(z + r)[1]  # part (i): without an attack the test passes
+    back, passed = test(z + r + np.where(owner == liar, e - r, 0.0))
+    if passed:  # part (ii)
+        assert np.abs(back - x).max() <= kappa_detect(psi.factor, lowest) * delta
+        assert np.abs(e).max() <= kappa_error(psi.factor, lowest, steepest) * delta
+
+
 def test_saturated_inverses_are_left_inverses_with_the_stated_constant() -> None:
     model = example.system()
     rng = np.random.default_rng(5)

@@ -91,6 +91,43 @@ def test_erratum_one_row_of_the_printed_phi_is_doubled() -> None:
         assert (np.abs(inverse(printed[:, chosen]) - x).max() > 0.1) == (1 in group)
 
 
+def test_erratum_the_dissertation_doubles_the_same_row_elsewhere() -> None:
+    x = box(300)
+    printed, right = at(lee2018_chapter5.phi_printed, x), at(example.phi, x)
+    off = np.abs(printed - right).max(axis=0)
+    assert off[4] > 1.0
+    assert np.all(np.delete(off, 4) == 0.0)
+    # Here the left inverses that use h_3 miss the state.
+    for group, inverse in zip(groups(4, 1), example.table(), strict=True):
+        chosen = example.system().pick(group)
+        assert (np.abs(inverse(printed[:, chosen]) - x).max() > 0.1) == (2 in group)
+
+
+def test_erratum_differentiable_immersions_need_not_be_lipschitz() -> None:
+    # phi' = 1 plus a spike of height k and width k^-4 at 1/k: phi is injective, differentiable everywhere
+    # with phi' >= 1, and phi'(0) = 1, but its steepest difference quotients grow without bound.
+    k = np.arange(2, 4000, dtype=float)
+    area = 0.5 * k**-3.0  # of a triangle
+
+    def rise(x: float) -> float:
+        """Phi at a point between two spikes."""
+        return x + float(area[1.0 / k < x].sum())
+
+    for m in (10, 100, 1000):
+        x = 1.0 / (m + 0.5)
+        assert abs(rise(x) / x - 1.0) < 1.0 / m
+    assert np.all(np.diff(1.0 + area / k**-4.0) > 0.0)
+    assert (1.0 + area / k**-4.0)[-1] > 1000.0
+
+
+def test_the_scenario_meets_assumption_3() -> None:
+    t = np.arange(0.0, 25.0, 0.01)
+    active = example.attacks(t) != 0.0
+    for now in t:
+        window = (t >= max(now - 8.37, 0.0)) & (t <= now)
+        assert active[window].any(axis=0).sum() <= 1
+
+
 def test_jacobians_of_the_left_inverses_and_their_constants() -> None:
     rng = np.random.default_rng(0)
     for k, (inverse, bracket) in enumerate(zip(example.table(), example.lip_inverses(), strict=True)):
