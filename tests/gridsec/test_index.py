@@ -205,6 +205,23 @@ def test_the_attack_named_with_an_index_is_one() -> None:
             assert set(np.flatnonzero(seen > 1e-6)) == set(found.sensors)
 
 
+def test_attacks_on_the_asymptotic_index_last_and_others_die_away() -> None:
+    """lee2018, Definitions 3.2.3 and 3.2.4, by the difference of the two stories, A^k x_a (errata)."""
+    lasting = fading = 0
+    for pair, dynamic, asymptotic in cases():
+        later = np.linalg.matrix_power(pair.a, 60)
+        if np.isfinite(asymptotic):
+            found = asymptotic_index(pair.a, pair.c, discrete=True, tol=TOL)
+            assert np.linalg.norm(later @ found.direction) > 0.5
+            lasting += 1
+        if dynamic < asymptotic:
+            # Fewer sensors suffice only for differences that vanish: 2^-60 times a polynomial of the step.
+            found = dynamic_index(pair.a, pair.c, tol=TOL)
+            assert np.linalg.norm(later @ found.direction) < 1e-6
+            fading += 1
+    assert min(lasting, fading) > 20
+
+
 def test_one_eigenvector_per_eigenvalue_is_not_enough() -> None:
     """What a search over `numpy.linalg.eig`'s vectors says where an eigenvalue repeats: too much."""
     A = np.eye(3)
