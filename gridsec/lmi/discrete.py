@@ -373,9 +373,10 @@ class _Template:
         if self.given is not None:
             L, K = self.given
         else:
-            Y, Gamma = (np.asarray(self.variables[i].value, dtype=np.float64) for i in (1, 3))
+            Y = np.asarray(self.variables[1].value, dtype=np.float64)
             K = np.zeros((live.size, k))
-            K[live] = Gamma / lam[:, None]
+            if live.any():
+                K[live] = np.asarray(self.variables[3].value, dtype=np.float64) / lam[:, None]
             L = np.linalg.solve(P, Y) * (x / z)[:, None] - self.lower @ K
         Lambda = np.zeros(live.size)
         Lambda[live] = self.q_unit * lam / (self.system.slope[live] * z**2)

@@ -212,3 +212,34 @@ def held_error(lure: Lure, h: float, away: Floats) -> Floats:
         return np.full(len(reach), np.inf)
     moved = np.linalg.solve(np.eye(len(loop)) - loop, q * away)
     return np.asarray(reach @ moved)
+
+
+def drift_error(lure: Lure, h: float, jump: Floats) -> Floats:
+    """The same for a loop that was at rest once, and whose input jumps little from step to step.
+
+    With `|F (u(k+1) - u(k))| <= jump` the inverters follow: their movement m within any step obeys
+    `m <= d ((1 + 2 q) |H| m + jump)`, as far as the spectral radius of `(1 + 2 q) diag(d) |H|` is below 1.
+
+    Parameters
+    ----------
+    lure, h
+        As in `held_error`.
+    jump : (m,)
+        Largest change of each argument's own input from one step to the next, squared pu.
+
+    Returns
+    -------
+    (m,)
+        Bound on `|z_i(s) - z_i(0)|`, 0 <= s <= h, squared pu; infinite where nothing follows.
+
+    References
+    ----------
+    docs/theory-discrete.md, section 5.
+    """
+    q = -np.expm1(np.diagonal(lure.A) * h)
+    reach = np.abs(lure.H)
+    loop = (lure.slope * (1.0 + 2.0 * q))[:, None] * reach
+    if spectral_radius(loop) >= 1.0:
+        return np.full(len(reach), np.inf)
+    moved = np.linalg.solve(np.eye(len(loop)) - loop, lure.slope * jump)
+    return np.asarray(reach @ moved)
