@@ -23,11 +23,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import LinAlgError, block_diag, solve_discrete_are, solve_discrete_lyapunov
+from scipy.linalg import block_diag, solve_discrete_lyapunov
 
 from gridsec.arrays import Bools, Floats, frozen, spectral_radius, symmetry_defect
 from gridsec.errors import DesignInfeasible
-from gridsec.observers.parts import Stack, decompose, stack
+from gridsec.observers.parts import Stack, decompose, riccati, stack
+
+RESIDUAL = 1e-8
+"""Largest relative residual of a Riccati equation whose solution counts."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -264,8 +267,7 @@ def steady(design: KalmanDesign) -> Steady:
     Raises
     ------
     DesignInfeasible
-        If a filter has no stable stationary gain: a mode on the unit circle that its sensor sees, or that
-        fades too slowly, feels no disturbance.
+        If a filter has no stable stationary gain: a mode on the unit circle feels no disturbance.
 
     References
     ----------
@@ -277,12 +279,7 @@ def steady(design: KalmanDesign) -> Steady:
         if not part.t.size:
             continue
         at = whole.rows(i)
-        try:
-            M = solve_discrete_are(
-                part.S.T, part.t[:, None], design.process[at, at], design.noise[[i]][:, [i]]
-            )
-        except (LinAlgError, ValueError) as problem:
-            raise DesignInfeasible(f"stationary filter of sensor {i}", str(problem)) from problem
+        M = riccati(part.S, part.t, design.process[at, at], float(design.noise[i, i]), tol=RESIDUAL)
         gains[at, i] = M @ part.t / (part.t @ M @ part.t + design.noise[i, i])
     J = np.eye(len(gains)) - gains @ whole.T
     F = J @ whole.S

@@ -19,14 +19,16 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.linalg import LinAlgError, solve_discrete_are
 
 from gridsec.arrays import Bools, Floats, Ints, frozen, spectral_radius
 from gridsec.errors import DesignInfeasible
-from gridsec.observers.parts import Part, Stack, decompose, stack
+from gridsec.observers.parts import Part, Stack, decompose, riccati, stack
 
 LONGEST = 1 << 17
 """Largest number of steps after which an observer's error must have halved for good."""
+
+RESIDUAL = 1e-6
+"""Largest relative residual of a Riccati equation; its gain is then verified by itself."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,7 +61,8 @@ class Envelope:
         |F^(mK + r)| <= powers[K]^m powers[r].
     limit
         w_max: the sum over all j >= 0 of |F^j L| n_max + |F^j Z^T E| d_max, its tail bounded by a
-        geometric series. Never above the paper's (eta_L n_max + eta_Z d_max) / (1 - beta).
+        geometric series: at most 1 / (1 - powers[K]) times the sum, and the sum is at most the paper's
+        (eta_L n_max + eta_Z d_max) / (1 - beta).
 
     References
     ----------
@@ -163,17 +166,13 @@ def riccati_gain(part: Part, process: Floats, noise: float, *, rate: float) -> F
         return gain
     basis = part.basis[:, :size]
     S, t = part.S[:size, :size] / rate, part.t[:size] / np.sqrt(noise)
-    what = f"observer gain for decay like {rate:g}^k"
-    try:
-        P = solve_discrete_are(S.T, t[:, None], basis.T @ process @ basis, np.eye(1))
-    except (LinAlgError, ValueError) as problem:
-        raise DesignInfeasible(
-            what, f"the Riccati equation has no stabilising solution ({problem})"
-        ) from problem
+    P = riccati(S, t, basis.T @ process @ basis, 1.0, tol=RESIDUAL)
     gain[:size] = rate * S @ P @ t / (t @ P @ t + 1.0) / np.sqrt(noise)
     radius = spectral_radius(part.S[:size, :size] - np.outer(gain[:size], part.t[:size]))
     if not radius < rate:
-        raise DesignInfeasible(what, f"spectral radius {radius:.6g}", rate - radius)
+        raise DesignInfeasible(
+            f"observer gain for decay like {rate:g}^k", f"spectral radius {radius:.6g}", rate - radius
+        )
     return gain
 
 

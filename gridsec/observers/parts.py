@@ -15,9 +15,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import block_diag, schur
+from scipy.linalg import LinAlgError, block_diag, schur, solve_discrete_are
 
 from gridsec.arrays import Floats, Ints, frozen, frozen_ints
+from gridsec.errors import DesignInfeasible
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -179,3 +180,44 @@ def stack(parts: Sequence[Part], B: Floats) -> Stack:
     return Stack(
         tuple(parts), frozen_ints(first), frozen(phi), frozen(S), frozen(T), frozen(phi @ np.asarray(B))
     )
+
+
+def riccati(S: Floats, t: Floats, Q: Floats, r: float, *, tol: float) -> Floats:
+    """Covariance of the stationary prediction of z from one sensor.
+
+        M = S M S^T + Q - S M t t^T M S^T / (t^T M t + r)
+
+    Parameters
+    ----------
+    S, t : (mu, mu), (mu,)
+        The sensor's part.
+    Q : (mu, mu)
+        Covariance of what moves z.
+    r
+        Variance of the sensor's noise, > 0.
+    tol
+        Largest residual of the equation, relative to its largest term.
+
+    Raises
+    ------
+    DesignInfeasible
+        If no stabilising solution is found that solves the equation.
+    """
+    best, worst, said = S, np.inf, "no stabilising solution"
+    # SciPy's balancing goes wrong by orders of magnitude where t has zeros, as it does for fading modes;
+    # without it badly scaled plants suffer. The residual tells.
+    for balanced in (False, True):
+        try:
+            M = np.asarray(solve_discrete_are(S.T, t[:, None], Q, np.array([[r]]), balanced=balanced))
+        except (LinAlgError, ValueError) as problem:
+            said = str(problem)
+            continue
+        moved, gain = S @ M @ S.T, S @ M @ t
+        left = moved + Q - M - np.outer(gain, gain) / (t @ M @ t + r)
+        size = max(float(np.max(np.abs(moved))), float(np.max(np.abs(Q))), float(np.max(np.abs(M))))
+        off = float(np.max(np.abs(left))) / (size or 1.0)
+        if off < worst:
+            best, worst = M, off
+    if not worst <= tol:
+        raise DesignInfeasible("Riccati equation of one sensor", said, -worst)
+    return np.asarray(0.5 * (best + best.T))
