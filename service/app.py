@@ -173,7 +173,8 @@ def _signals(stop: asyncio.Event) -> Iterator[None]:
 def _listen(address: str) -> Iterator[socket.socket]:
     host, port = split_address(address)
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.socket(family, socket.SOCK_STREAM) as listener:
+    # asyncio switches Nagle's algorithm off (40 ms an answer) only where the protocol is said to be TCP.
+    with socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP) as listener:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             listener.bind((host, port))

@@ -12,20 +12,33 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import httpx
 import zenoh
 
-from feeders.scenario import Reading, Sample
+from feeders.scenario import Reading
 from tests.service.running import free_port
 
 START_S = 60.0
 ECHO_S = 30.0
+
+
+class Tick(Protocol):
+    """What is reported at one tick."""
+
+    @property
+    def t(self) -> float: ...
+
+    @property
+    def readings(self) -> Iterable[Reading]: ...
+
+
+T = TypeVar("T", bound=Tick)
 
 
 @dataclass
@@ -156,12 +169,22 @@ class Fleet:
             congestion_control=zenoh.CongestionControl.BLOCK,
         )
 
-    def play(self, samples: Iterable[Sample]) -> Iterator[tuple[Sample, dict[str, Any]]]:
+    def play(self, samples: Iterable[T]) -> Iterator[tuple[T, dict[str, Any]]]:
         """Publish tick by tick, each once the estimate of the one before has been heard."""
         for sample in samples:
             for reading in sample.readings:
                 self.put(reading)
             yield sample, self._estimate_at(sample.t)
+
+    def pour(self, samples: Sequence[Tick]) -> list[dict[str, Any]]:
+        """Publish many ticks without waiting, and return their states, up to the last one.
+
+        The last tick must be complete: where the readings tell the time, an incomplete one stays open.
+        """
+        for sample in samples:
+            for reading in sample.readings:
+                self.put(reading)
+        return [self._estimate_at(sample.t) for sample in samples]
 
     def _estimate_at(self, t: float) -> dict[str, Any]:
         end = time.monotonic() + ECHO_S

@@ -1,0 +1,393 @@
+"""What meters, operators and strangers do to a service: it says what is wrong and goes on judging."""
+
+from __future__ import annotations
+
+import json
+import math
+import sqlite3
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, TypedDict
+
+import cbor2
+import numpy as np
+import pyarrow as pa
+import pytest
+import zenoh
+from pyarrow import ipc
+
+from feeders.load import Site, from_tables, load
+from feeders.scenario import START, Reading, Scenario, simulate
+from feeders.schema import write
+from gridsec.attack import Attack, Bias
+from tests.acceptance.live import Fleet, Live, serve
+from tests.service.running import free_port
+
+BUSBAR = ""
+FEEDER = "simbench-lv-rural1"
+SILENCE_S = 10.0
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What is reported at one tick; the busbar's meter is the empty string."""
+
+    t: float
+    readings: tuple[Reading, ...]
+
+
+def sampled(site: Site, seconds: float, dt_s: float = 1.0, attacks: tuple[Attack, ...] = ()) -> list[Sample]:
+    scenario = Scenario(seed=7, duration_s=seconds, dt_s=dt_s, attacks=attacks)
+    return [Sample(sample.t, tuple(sample.readings)) for sample in simulate(site, scenario)]
+
+
+def lie(meter: int, t_on: float, t_off: float, size: float) -> Attack:
+    return Bias(meters=np.array([meter]), t_on=t_on, t_off=t_off, size=np.array([size]))
+
+
+def without(sample: Sample, *meters: str) -> Sample:
+    return replace(sample, readings=tuple(r for r in sample.readings if r.meter not in meters))
+
+
+def verdicts(fleet: Fleet, samples: Iterable[Sample]) -> list[tuple[float, str, dict[str, Any]]]:
+    return [(sample.t - START, state["verdict"], state) for sample, state in fleet.play(samples)]
+
+
+def kinds(live: Live) -> list[tuple[str, str | None, str]]:
+    return sorted((a["kind"], a["meter"], a["state"]) for a in live.alarms())
+
+
+def until(condition: Callable[[], Any], patience_s: float = 15.0) -> Any:
+    end = time.monotonic() + patience_s
+    while time.monotonic() < end:
+        if value := condition():
+            return value
+        time.sleep(0.05)
+    raise AssertionError("it did not happen")
+
+
+# --------------------------------------------------------------------------- silence
+
+
+def test_a_meter_that_falls_silent_is_data_loss_and_never_clean(tmp_path: Path) -> None:
+    samples = sampled(load(FEEDER), 60)
+    samples[20:45] = [without(s, "m05") for s in samples[20:45]]
+    samples[10] = without(samples[10], "m07")  # A single reading that gets lost is no event.
+    with serve(FEEDER, tmp_path) as live, Fleet(live) as fleet:
+        for state in fleet.pour(samples):
+            t = state["t"] - START
+            unseen = [m["meter"] for m in state["meters"] if not m["seen"]]
+            assert state["verdict"] == ("undecided" if unseen or t < 1 else "clean"), (t, state["reason"])
+            assert unseen == (["m05"] if 22 <= t < 45 else []), t
+            silent = [s["meter"] for s in state["silent"]]
+            assert silent == (["m05"] if 19 + SILENCE_S < t < 45 else []), t
+        (alarm,) = until(lambda: [a for a in live.alarms() if a["state"] == "cleared"])
+    assert (alarm["kind"], alarm["meter"]) == ("data-loss", "m05")
+    assert 30 <= alarm["t_raised"] - START <= 19 + SILENCE_S + 4
+
+
+def test_a_silent_busbar_is_data_loss_and_never_clean(tmp_path: Path) -> None:
+    samples = sampled(load(FEEDER), 60)
+    samples[20:45] = [without(s, BUSBAR) for s in samples[20:45]]
+    with serve(FEEDER, tmp_path) as live, Fleet(live) as fleet:
+        for state in fleet.pour(samples):
+            t = state["t"] - START
+            if 22 <= t < 45:
+                assert (state["verdict"], state["cause"]) == ("undecided", "no-busbar"), t
+            elif not (t < 1 or 45 <= t < 50):  # It settles at the start, and once the busbar is back.
+                assert state["verdict"] == "clean", (t, state["reason"])
+        (alarm,) = until(lambda: [a for a in live.alarms() if a["state"] == "cleared"])
+    assert (alarm["kind"], alarm["meter"]) == ("data-loss", "substation")
+
+
+class Columns(TypedDict):
+    """Readings of many meters at one time, as columns."""
+
+    meter: list[str]
+    t: list[float]
+    v_volt: list[float]
+    p_kw: list[float | None]
+
+
+def in_batch(fleet: Fleet, sample: Sample, t: float, number: int) -> None:
+    """One concentrator brings all meters: JSON, CBOR, Arrow stream, Arrow file in turn."""
+    rows = [r for r in sample.readings if r.meter]
+    columns = Columns(
+        meter=[r.meter for r in rows],
+        t=[t] * len(rows),
+        v_volt=[r.v_volt for r in rows],
+        p_kw=[r.p_kw for r in rows],
+    )
+    payload, encoding = packed(columns, number % 4)
+    key = f"gridsec/{FEEDER}/concentrator/k1/readings"
+    fleet.session.put(key, payload, encoding=encoding, congestion_control=zenoh.CongestionControl.BLOCK)
+
+
+def packed(columns: Columns, form: int) -> tuple[bytes, str]:
+    if form == 0:
+        rows = [
+            {"meter": m, "t": t, "v_volt": v, "p_kw": p} for m, t, v, p in zip(*columns.values(), strict=True)
+        ]
+        return json.dumps(rows).encode(), "application/json"
+    if form == 1:
+        return cbor2.dumps(columns), "application/cbor"
+    table, sink = pa.table(columns), pa.BufferOutputStream()
+    make, name = ((ipc.new_stream, "stream"), (ipc.new_file, "file"))[form - 2]
+    with make(sink, table.schema) as writer:
+        writer.write_table(table)
+    return sink.getvalue().to_pybytes(), f"application/vnd.apache.arrow.{name}"
+
+
+def reached(t: float, state: dict[str, Any]) -> bool:
+    return bool(state["t"] >= t)
+
+
+@pytest.mark.slow
+def test_a_concentrator_in_every_format_and_its_silence(tmp_path: Path) -> None:
+    """By the wall clock, half a second a tick: nobody needs to talk for time to go on."""
+    folder, tables = tmp_path / FEEDER, load(FEEDER).tables
+    settings = replace(tables.meta.monitor, tick_s=0.5, on_delay_s=0.5, off_delay_s=0.5, silence_s=2.0)
+    tables = replace(tables, meta=replace(tables.meta, monitor=settings))
+    write(tables, folder)
+    samples = sampled(from_tables(tables), 15.0, dt_s=0.5)
+    meters = {r.meter for r in samples[0].readings if r.meter}
+    with serve(str(folder), tmp_path, clock="wall") as live:
+        live.feeder = FEEDER
+        with Fleet(live) as fleet:
+            begin = 0.5 * math.ceil(2.0 * time.time()) + 0.5
+            for number, sample in enumerate(samples):
+                t = begin + 0.5 * number
+                time.sleep(max(0.0, t - time.time()))
+                talking = not 8 <= number < 20
+                if talking:
+                    in_batch(fleet, sample, t, number)
+                fleet.put(replace(next(r for r in sample.readings if not r.meter), t=t))
+                if number in (7, 19, 29):
+                    state = live.await_state(partial(reached, t - 0.5))
+                    assert state["verdict"] == ("clean" if talking else "undecided"), state["reason"]
+                    assert {s["meter"] for s in state["silent"]} == (set() if talking else meters)
+            alarms = live.alarms()
+    assert {(a["kind"], a["meter"], a["state"]) for a in alarms if a["kind"] == "data-loss"} == {
+        ("data-loss", meter, "cleared") for meter in meters
+    }
+    assert not [a for a in alarms if a["kind"] in ("meter-manipulated", "voltage-limit")]
+
+
+# ------------------------------------------------------------------- quarter hours
+
+
+def test_readings_of_a_quarter_of_an_hour(tmp_path: Path) -> None:
+    """A day of them: a liar is named, a lost reading and a silent meter are never clean."""
+    step = 900.0
+    folder, tables = tmp_path / FEEDER, load(FEEDER).tables
+    settings = replace(tables.meta.monitor, tick_s=step, on_delay_s=0.0, off_delay_s=step, silence_s=2 * step)
+    tables = replace(tables, meta=replace(tables.meta, monitor=settings))
+    write(tables, folder)
+    site = from_tables(tables)
+    liar, t_on, t_off = 4, START + 20 * step, START + 40 * step
+    samples = sampled(site, 96 * step, dt_s=step, attacks=(lie(liar, t_on, t_off, 0.04),))
+    samples[10] = without(samples[10], "m02")
+    samples[60:66] = [without(s, "m09") for s in samples[60:66]]
+    with serve(str(folder), tmp_path) as live:
+        live.feeder = FEEDER
+        with Fleet(live) as fleet:
+            states = fleet.pour(samples)
+        for number, state in enumerate(states):
+            unseen = [m["meter"] for m in state["meters"] if not m["seen"]]
+            suspects = [m["meter"] for m in state["meters"] if m["suspect"]]
+            assert unseen == (["m02"] if number == 10 else ["m09"] if 60 <= number < 66 else [])
+            assert state["verdict"] != "clean" or not unseen
+            assert set(suspects) <= {site.meter_ids[liar]}
+            if t_on + 2 * step <= state["t"] < t_off:
+                assert (state["verdict"], suspects) == ("attacked", [site.meter_ids[liar]])
+        assert states[-1]["verdict"] == "clean"
+        found = until(lambda: [a for a in live.alarms() if a["state"] == "cleared"][1:] and kinds(live))
+    assert found == [("data-loss", "m09", "cleared"), ("meter-manipulated", site.meter_ids[liar], "cleared")]
+
+
+# ------------------------------------------------------------------ bad material
+
+GOOD = {"t": START, "v_volt": 230.0}
+BAD: tuple[tuple[str, bytes, str], ...] = (
+    ("meter/m01/reading", b'{"t": 17', "syntax"),
+    ("meter/m01/reading", b"[" * 100_000, "syntax"),
+    ("meter/m01/reading", b'{"t": ' + b"9" * 5000 + b', "v_volt": 230}', "syntax"),
+    ("meter/m01/reading", b"\xff\xfe\x00", "syntax"),
+    ("meter/m01/reading", b"", "empty"),
+    ("meter/m01/reading", b"{}", "empty"),
+    ("concentrator/k1/readings", b"[]", "empty"),
+    ("meter/m01/reading", b"null", "type"),
+    ("meter/m01/reading", b'{"t": "noon", "v_volt": [230], "p_kw": true, "seq": 1.5}', "type"),
+    ("concentrator/k1/readings", json.dumps([GOOD]).encode(), "type"),
+    ("meter/m01/reading", b'{"t": NaN, "v_volt": Infinity}', "value"),
+    ("meter/m01/reading", b'{"t": 1795212000, "v_volt": 1e300}', "value"),
+    ("meter/m01/reading", b'{"t": 1795212000, "v_volt": -5, "p_kw": 1e12}', "value"),
+    ("meter/m01/reading", b'{"t": 1795212000, "v_volt": 230, "seq": ' + b"9" * 40 + b"}", "value"),
+    ("meter/m01/reading", json.dumps(GOOD | {"t": START + 1e6}).encode(), "clock-off"),
+    ("meter/stranger/reading", json.dumps(GOOD).encode(), "unknown-meter"),
+    ("concentrator/k1/readings", json.dumps([GOOD | {"meter": "x"}]).encode(), "unknown-meter"),
+    ("meter/m01/reading", b" " * 1_000_000, "oversize"),
+    ("meter/*/reading", json.dumps(GOOD).encode(), "key"),
+    ("meter/m01/readings", json.dumps(GOOD).encode(), "key"),
+    ("../elsewhere/meter/m01/reading", json.dumps(GOOD).encode(), "key"),
+)
+
+
+def test_every_kind_of_bad_reading_is_named_and_none_stops_the_judging(tmp_path: Path) -> None:
+    samples = sampled(load(FEEDER), 10 + len(BAD))
+    with serve(FEEDER, tmp_path) as live, Fleet(live) as fleet:
+        verdicts(fleet, samples[:10])
+        for sample, (key, payload, reason) in zip(samples[10:], BAD, strict=True):
+            fleet.session.put(f"gridsec/{FEEDER}/{key}", payload, encoding="application/json")
+            fleet.session.put(f"gridsec/nowhere/{key}", payload, encoding="application/json")
+            ((_, state),) = fleet.play([sample])
+            assert state["verdict"] == "clean", (key, payload[:50], state["reason"])
+            newest = live.get("/api/v1/bad-readings", limit=2)["readings"]
+            reasons = {one["reason"].partition(":")[0] for one in newest}
+            assert reason in reasons, (key, payload[:50], newest)
+        assert live.http.get("/readyz").status_code == 200
+        assert live.alarms() == []
+
+
+def test_a_flood_of_bad_keys_costs_no_memory_and_no_labels(tmp_path: Path) -> None:
+    samples = sampled(load(FEEDER), 30)
+    with serve(FEEDER, tmp_path) as live, Fleet(live) as fleet:
+        verdicts(fleet, samples[:10])
+        labels, before = len(live.http.get("/metrics").text.splitlines()), resident_mb(live)
+        for number in range(10_000):
+            key = f"gridsec/{FEEDER}/meter/stranger-{number}/reading"
+            fleet.session.put(key, b"x" * 100, congestion_control=zenoh.CongestionControl.BLOCK)
+        assert {verdict for _, verdict, _ in verdicts(fleet, samples[10:])} == {"clean"}
+        metrics = live.http.get("/metrics").text
+        assert len(metrics.splitlines()) <= labels + 10
+        assert f'gridsec_bad_readings_total{{feeder="{FEEDER}",reason="unknown-meter"}} 10000.0' in metrics
+        assert "stranger" not in metrics
+        assert resident_mb(live) - before < 60
+
+
+def resident_mb(live: Live) -> float:
+    status = Path(f"/proc/{live.process.pid}/status")
+    if not status.exists():
+        pytest.skip("there is no /proc to see a process's memory in")
+    (line,) = (line for line in status.read_text().splitlines() if line.startswith("VmRSS"))
+    return int(line.split()[1]) / 1024
+
+
+# ------------------------------------------------------------ ports, database, files
+
+
+def start(*options: str) -> subprocess.CompletedProcess[str]:
+    command = [str(Path(sys.executable).parent / "gridsec"), "serve", "--feeder", FEEDER, *options]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+
+
+def test_a_second_service_says_what_is_taken_and_leaves_the_first_alone(tmp_path: Path) -> None:
+    samples = sampled(load(FEEDER), 25)
+    with serve(FEEDER, tmp_path) as live, Fleet(live) as fleet:
+        verdicts(fleet, samples[:10])
+        mine = f"sqlite:///{tmp_path / 'second.db'}"
+        http, zenoh_end = f"127.0.0.1:{live.http.base_url.port}", f"tcp/127.0.0.1:{live.zenoh_port}"
+        free_http, free_zenoh = f"127.0.0.1:{free_port()}", f"tcp/127.0.0.1:{free_port()}"
+        theirs = f"sqlite:///{tmp_path / 'alarms.db'}"
+        for told, options in {
+            f"HTTP cannot listen on {http}": (http, free_zenoh, mine),
+            f"zenoh cannot be opened on {zenoh_end}": (free_http, zenoh_end, mine),
+            "another process writes it": (free_http, free_zenoh, theirs),
+            "No such file": (free_http, free_zenoh, "sqlite:////proc/no/such/folder/x.db"),
+        }.items():
+            ended = start("--http", options[0], "--zenoh-listen", options[1], "--database", options[2])
+            assert ended.returncode != 0
+            said = " ".join((ended.stdout + ended.stderr).split())
+            assert told in said, said
+            assert "Traceback" not in said
+        assert {verdict for _, verdict, _ in verdicts(fleet, samples[10:])} == {"clean"}
+
+
+def test_a_locked_and_a_removed_database_do_not_stop_the_judging(tmp_path: Path) -> None:
+    """Ticks go on, readiness says what is wrong, and the alarm of that time is stored once it is back."""
+    site = load(FEEDER)
+    attack = lie(4, START + 15, START + 30, 0.05)
+    samples = sampled(site, 60, attacks=(attack,))
+    path = tmp_path / "alarms.db"
+    with serve(FEEDER, tmp_path) as live, Fleet(live) as fleet:
+        verdicts(fleet, samples[:10])
+        other = sqlite3.connect(path, isolation_level=None)
+        other.execute("BEGIN IMMEDIATE")
+        assert verdicts(fleet, samples[10:25])[-1][1] == "attacked"
+        answer = until(lambda: (a := live.http.get("/readyz")).status_code == 503 and a)
+        assert "locked" in answer.json()["reasons"][0]
+        assert live.http.get("/healthz").status_code == 200
+        assert live.alarms() == []
+        other.close()
+        (alarm,) = until(live.alarms)
+        assert (alarm["meter"], alarm["state"]) == (site.meter_ids[4], "raised")
+        verdicts(fleet, samples[25:40])
+        away = tmp_path / "away"
+        away.mkdir()
+        for name in ("alarms.db", "alarms.db-wal", "alarms.db-shm"):
+            (tmp_path / name).rename(away / name)
+        assert verdicts(fleet, samples[40:50])[-1][1] == "clean"
+        answer = until(lambda: (a := live.http.get("/readyz")).status_code == 503 and a)
+        assert "removed" in answer.json()["reasons"][0]
+        assert live.http.get("/api/v1/alarms").headers["content-type"] == "application/problem+json"
+        for name in ("alarms.db", "alarms.db-wal", "alarms.db-shm"):
+            (away / name).rename(tmp_path / name)
+        assert verdicts(fleet, samples[50:])[-1][1] == "clean"
+        until(lambda: live.http.get("/readyz").status_code == 200)
+        assert [a["state"] for a in live.alarms()] == ["cleared"]
+
+
+def test_a_feeder_with_five_mistakes_by_file_and_by_rest(tmp_path: Path) -> None:
+    samples = sampled(load(FEEDER), 20)
+    with serve(FEEDER, tmp_path) as live, Fleet(live) as fleet:
+        verdicts(fleet, samples[:10])
+        tables = live.get(f"/api/v1/feeders/{FEEDER}")["tables"]
+        tables["feeder"]["base_kva"] = -1
+        tables["lines"][0]["r_ohm"] = -1
+        tables["lines"][1]["from_bus"] = "nowhere"
+        tables["customers"][0]["droop"] = "no-such-curve"
+        tables["customers"][1]["power_factor"] = 3
+        answer = live.http.put(f"/api/v1/feeders/{FEEDER}", json=tables)
+        assert (answer.status_code, answer.headers["content-type"]) == (422, "application/problem+json")
+        problems = answer.json()["problems"]
+        assert len(problems) == 5
+        for word in ("base_kva", "r_ohm", "nowhere", "no-such-curve", "power_factor"):
+            assert any(word in problem for problem in problems), problems
+        assert {verdict for _, verdict, _ in verdicts(fleet, samples[10:])} == {"clean"}
+
+
+def test_a_feeder_put_while_running_is_watched_and_the_other_goes_on(tmp_path: Path) -> None:
+    samples = sampled(load(FEEDER), 30)
+    with serve(FEEDER, tmp_path) as live, Fleet(live) as fleet:
+        verdicts(fleet, samples[:10])
+        tables = live.get(f"/api/v1/feeders/{FEEDER}")["tables"]
+        tables["feeder"]["name"] = "second"
+        assert live.http.put("/api/v1/feeders/second", json=tables).status_code == 200
+        second = Live("second", live.zenoh_port, live.http, live.process, live.log)
+        with Fleet(second) as fleet2:
+            both = zip(fleet.play(samples[10:]), fleet2.play(samples[10:]), strict=True)
+            for (sample, one), (_, two) in both:
+                assert one["verdict"] == "clean"
+                assert (one["feeder"], two["feeder"]) == (FEEDER, "second")
+                assert two["verdict"] == "clean" or sample.t - START < 12
+            replies = fleet.session.get("gridsec/*/estimate", timeout=5.0)
+            told = {str(r.ok.key_expr): json.loads(r.ok.payload.to_bytes()) for r in replies if r.ok}
+        assert {state["feeder"] for state in told.values()} == {FEEDER, "second"}
+        assert told[f"gridsec/{FEEDER}/estimate"] == live.get(f"/api/v1/feeders/{FEEDER}/state")
+
+
+def test_answers_come_without_delay(tmp_path: Path) -> None:
+    """Small answers must not wait for Nagle's algorithm and the other side's delayed acknowledgement."""
+    with serve(FEEDER, tmp_path) as live:
+        times = []
+        for _ in range(21):
+            begin = time.perf_counter()
+            live.get("/api/v1/feeders")
+            times.append(time.perf_counter() - begin)
+    assert statistics.median(times) < 0.03
