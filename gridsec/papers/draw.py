@@ -7,6 +7,7 @@ caller gets a matplotlib figure, or the bytes of a PNG. Both need the extra `plo
 from __future__ import annotations
 
 import io
+import re
 import textwrap
 from contextlib import contextmanager
 from importlib.util import find_spec
@@ -35,6 +36,28 @@ DASHES: Final[dict[str, str]] = {
     "dashdot": "-.",
     "points": "none",
     "steps": "-",
+}
+ROUNDS: Final = ("-", "--", ":")  # the palette's second and third use
+GREEK: Final = {
+    "alpha": "α",
+    "beta": "β",
+    "gamma": "γ",
+    "delta": "δ",
+    "Delta": "Δ",
+    "epsilon": "ε",
+    "eta": "η",
+    "theta": "θ",
+    "kappa": "κ",
+    "lambda": "λ",
+    "Lambda": "Λ",
+    "mu": "μ",
+    "pi": "π",
+    "rho": "ρ",
+    "sigma": "σ",
+    "tau": "τ",
+    "phi": "φ",
+    "Phi": "Φ",
+    "omega": "ω",
 }
 SETTINGS: Final[dict[str, Any]] = {
     "font.family": "DejaVu Sans",  # comes with matplotlib: the same picture everywhere
@@ -108,7 +131,7 @@ def draw(figure: Figure) -> Canvas:
     from matplotlib.figure import Figure as Canvas
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-    caption = textwrap.fill(figure.caption, 106)
+    caption = _typeset(textwrap.fill(figure.caption, 106))
     heights = [_height(panel, len(figure.panels)) for panel in figure.panels]
     extra = 0.3 + 0.17 * caption.count("\n")
     with _settings():
@@ -117,12 +140,11 @@ def draw(figure: Figure) -> Canvas:
         FigureCanvasAgg(canvas)
         canvas.suptitle(caption, x=0.012, ha="left", fontsize=9.0, linespacing=1.3)
         rows = canvas.subplots(len(heights), 1, squeeze=False, gridspec_kw={"height_ratios": heights})
-        for axes, panel, colours in zip(rows[:, 0], figure.panels, _colours(figure.panels), strict=True):
-            _panel(axes, panel, colours)
-        for k in range(len(heights) - 1):
-            if _same_abscissa(figure.panels[k], figure.panels[k + 1]):
-                rows[k, 0].set_xlabel("")
-                rows[k, 0].tick_params(labelbottom=False)
+        looks = _looks(figure.panels)
+        for axes, panel, height in zip(rows[:, 0], figure.panels, heights, strict=True):
+            _panel(axes, panel, looks)
+            axes.set_ylabel(_typeset(textwrap.fill(panel.y_label, int(12.0 * (height - 0.3)))))
+        _share(list(rows[:, 0]), figure.panels)
         canvas.align_ylabels(list(rows[:, 0]))
     return canvas
 
@@ -165,51 +187,66 @@ def _height(panel: Panel, count: int) -> float:
     return float(max({1: 3.4, 2: 2.4}.get(count, 1.85), 0.6 + 0.19 * labelled))
 
 
-def _colours(panels: tuple[Panel, ...]) -> list[dict[str, Any]]:
-    """Colour of each label, per panel: panels that share a label share all colours, others begin anew."""
+def _typeset(text: str) -> str:
+    """Write Greek letters, subscripts and signs of a plain text as they are printed."""
+    if "$" in text:
+        return text
+    text = re.sub(rf"(?<![A-Za-z])({'|'.join(GREEK)})(?![A-Za-z])", lambda name: GREEK[name[1]], text)
+    text = re.sub(r"([α-ωΑ-Ω]) (\d)", r"\1_\2", text)
+    text = re.sub(r"\b([auxyz])(\d+)\b", r"\1_\2", text)
+    text = re.sub(r"\bxhat\b|\bx_hat\b", r"$\\mathregular{\\hat{x}}$", text)
+    text = re.sub(r"(?<![\w$])([A-Za-zα-ωΑ-Ω])_(\w+)", r"$\\mathregular{\1_{\2}}$", text)
+    return text.replace(" - ", " − ").replace("<=", "≤").replace(">=", "≥").replace("->", "→")
+
+
+def _looks(panels: tuple[Panel, ...]) -> dict[str, tuple[Any, str]]:
+    """Colour and dashes of each label: panels that share a label share all, others begin anew."""
     families: list[dict[str, None]] = []
     for panel in panels:
         labels = {line.label: None for line in panel.lines if line.label}
         kin = [family for family in families if family.keys() & labels.keys()]
         families = [family for family in families if family not in kin]
         families.append({label: None for family in (*kin, labels) for label in family})
-    shades = {frozenset(family): _shades(list(family)) for family in families}
-    return [
-        next((s for names, s in shades.items() if any(n.label in names for n in panel.lines)), {})
-        for panel in panels
-    ]
+    return {label: look for family in families for label, look in _shades(list(family)).items()}
 
 
-def _shades(labels: list[str]) -> dict[str, Any]:
-    """Colour of each label, by order of appearance; a colour map where the palette is too short."""
-    if len(labels) <= len(PALETTE):
-        return dict(zip(labels, PALETTE, strict=False))
+def _shades(labels: list[str]) -> dict[str, tuple[Any, str]]:
+    """Colour and dashes of each label of a family, by order of appearance."""
+    count, most = len(labels), len(PALETTE)
+    if count <= most * len(ROUNDS):
+        return {label: (PALETTE[k % most], ROUNDS[k // most]) for k, label in enumerate(labels)}
     from matplotlib import colormaps
 
     # cividis without its palest end: ordered, and read the same by every eye.
-    return dict(zip(labels, colormaps["cividis"](np.linspace(0.0, 0.85, len(labels))), strict=True))
+    return {
+        label: (colour, "-")
+        for label, colour in zip(labels, colormaps["cividis"](np.linspace(0.0, 0.85, count)), strict=True)
+    }
 
 
-def _panel(axes: Axes, panel: Panel, colours: dict[str, Any]) -> None:
+def _panel(axes: Axes, panel: Panel, looks: dict[str, tuple[Any, str]]) -> None:
     from matplotlib.ticker import MaxNLocator
 
     alone = len(panel.lines) == 1
     for line, width in zip(panel.lines, _widths(panel), strict=True):
+        colour, dashes = looks.get(line.label, (PALETTE[0] if alone else FAINT, "-"))
+        points = line.style == "points"
         axes.plot(
             line.x,
             line.y,
-            color=colours.get(line.label, PALETTE[0] if alone else FAINT),
-            linestyle=DASHES[line.style],
+            color=colour,
+            linestyle=dashes if DASHES[line.style] == "-" else DASHES[line.style],
             linewidth=width,
-            marker="o" if line.style == "points" else "",
+            marker="o" if points else "",
+            markersize=3.0 * width if len(panel.lines) > 1 else 3.5,
             drawstyle="steps-post" if line.style == "steps" else "default",
-            label=line.label or "_",
+            label=_typeset(line.label) or "_",
             zorder=2.0 if line.label or alone else 1.8,
+            clip_on=not points,
         )
-    axes.set_title(panel.title)
-    axes.set_xlabel(panel.x_label)
-    axes.set_ylabel(panel.y_label)
-    axes.margins(x=0.02 if all(line.style == "points" for line in panel.lines) else 0.0, y=0.08)
+    axes.set_title(_typeset(panel.title))
+    axes.set_xlabel(_typeset(panel.x_label))
+    axes.margins(x=0.02 if any(line.style == "points" for line in panel.lines) else 0.0, y=0.08)
     axes.set_xlim(*_ends(*_span(panel.lines), *axes.get_xlim()))
     said = alone and panel.y_label.startswith(panel.lines[0].label)
     if any(line.label for line in panel.lines) and not said:
@@ -217,6 +254,23 @@ def _panel(axes: Axes, panel: Panel, colours: dict[str, Any]) -> None:
     for axis, values in ((axes.xaxis, [n.x for n in panel.lines]), (axes.yaxis, [n.y for n in panel.lines])):
         if _counts(values):
             axis.set_major_locator(MaxNLocator(nbins="auto", integer=True, steps=[1, 2, 5, 10]))
+    low, high = axes.get_ylim()
+    if _counts([line.y for line in panel.lines]) and high - low < 1.0:
+        axes.set_ylim(low, low + 1.1)
+
+
+def _share(rows: list[Axes], panels: tuple[Panel, ...]) -> None:
+    """Give neighbours over the same abscissa the same ends, and the numbers to the lowest of them."""
+    first = 0
+    for k in range(1, len(rows) + 1):
+        if k < len(rows) and _same_abscissa(panels[k - 1], panels[k]):
+            rows[k - 1].set_xlabel("")
+            rows[k - 1].tick_params(labelbottom=False)
+            continue
+        ends = [end for axes in rows[first:k] for end in axes.get_xlim()]
+        for axes in rows[first:k]:
+            axes.set_xlim(min(ends), max(ends))
+        first = k
 
 
 def _ends(low: float, high: float, left: float, right: float) -> tuple[float, float]:

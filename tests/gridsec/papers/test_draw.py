@@ -5,18 +5,21 @@ from __future__ import annotations
 import subprocess
 import sys
 import zlib
+from itertools import combinations, pairwise
 
 import matplotlib as mpl
 import numpy as np
 import pytest
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure as Canvas
+from matplotlib.transforms import Bbox
 
 from gridsec.arrays import Floats
 from gridsec.papers.claims import Figure, Line, Panel, Style
 from gridsec.papers.draw import DPI, FAINT, PALETTE, WIDTH, draw, png
 
 T = np.linspace(0.0, 10.0, 101)
+DOTS = Line("", np.arange(11.0), np.ones(11), "points")
 STYLES: tuple[Style, ...] = ("solid", "dashed", "dotted", "dashdot", "points", "steps")
 
 
@@ -38,6 +41,7 @@ def rich() -> Figure:
         panel(Line("", T, np.round(T / 4.0), "steps"), x_label="k"),
         panel(*(Line(f"m{k:02d}", T, 1e-6 * np.cos(T + k)) for k in range(13))),
         panel(Line("", T, 1.5 * T), Line("", T, 2.5 * T), Line("mean", T, 2.0 * T)),
+        Panel("Points", "t in s", "part of all windows in which a manipulated meter was named", (DOTS,)),
         caption="A caption of more than one line says in one sentence what there is to see in the picture. "
         * 2,
     )
@@ -49,7 +53,7 @@ def test_every_point_is_drawn_in_its_style() -> None:
     assert len(canvas.axes) == len(asked.panels)
     for axes, wanted in zip(canvas.axes, asked.panels, strict=True):
         assert axes.get_title(loc="left") == wanted.title
-        assert axes.get_ylabel() == wanted.y_label
+        assert axes.get_ylabel().replace("\n", " ") == wanted.y_label
         for drawn, line in zip(axes.lines, wanted.lines, strict=True):
             np.testing.assert_array_equal(np.asarray(drawn.get_xdata()), line.x)
             np.testing.assert_array_equal(np.asarray(drawn.get_ydata()), line.y)
@@ -65,7 +69,15 @@ def test_every_point_is_drawn_in_its_style() -> None:
         None,
         [line.label for line in asked.panels[2].lines],
         ["mean"],
+        None,
     ]
+
+
+def touch(one: Bbox, other: Bbox) -> bool:
+    """Whether two boxes overlap by more than the empty rim of their letters."""
+    width = min(one.x1, other.x1) - max(one.x0, other.x0)
+    height = min(one.y1, other.y1) - max(one.y0, other.y0)
+    return width > 1.0 and height > 2.0
 
 
 def test_no_text_is_cut_and_none_lies_on_data() -> None:
@@ -73,7 +85,19 @@ def test_no_text_is_cut_and_none_lies_on_data() -> None:
     canvas.canvas.draw()
     renderer = canvas.canvas.get_renderer()  # type: ignore[attr-defined]  # an Agg canvas has one
     paper = canvas.bbox
-    texts = [text for text in canvas.findobj(mpl.text.Text) if text.get_visible() and text.get_text()]
+    beyond = {
+        label
+        for axes in canvas.axes
+        for axis, ends in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim()))
+        for tick in axis.get_major_ticks()
+        if not ends[0] <= tick.get_loc() <= ends[1]
+        for label in (tick.label1, tick.label2)
+    }
+    texts = [
+        text
+        for text in canvas.findobj(mpl.text.Text)
+        if text.get_visible() and text.get_text() and text not in beyond
+    ]
     assert len(texts) > 40
     for text in texts:
         box = text.get_window_extent(renderer)
@@ -81,6 +105,8 @@ def test_no_text_is_cut_and_none_lies_on_data() -> None:
         assert box.x1 <= paper.x1, text
         assert paper.y0 <= box.y0, text
         assert box.y1 <= paper.y1, text
+    boxes = [text.get_window_extent(renderer) for text in texts]
+    assert not [pair for pair in combinations(boxes, 2) if touch(*pair)]
     for axes in canvas.axes:
         assert axes.bbox.width > 0.5 * paper.width
         legend = axes.get_legend()
@@ -95,11 +121,15 @@ def test_neighbours_over_one_abscissa_share_it() -> None:
     assert labels == ["", "t in s", "t in s"]
     labels = [axes.get_xlabel() for axes in draw(figure(one, panel(Line("", T, T), x_label="k"))).axes]
     assert labels == ["t in s", "k"]
+    upper, lower = draw(figure(one, panel(Line("", T, T, "points")))).axes
+    assert upper.get_xlim() == lower.get_xlim()
 
 
 def test_whole_numbers_have_ticks_at_whole_numbers() -> None:
     axes = draw(figure(panel(Line("", T, np.where(T < 5.0, 1.0, 2.0), "steps")))).axes[0]
     assert np.all(axes.get_yticks() == np.round(axes.get_yticks()))
+    axes = draw(figure(panel(Line("", T, np.zeros(T.size), "points")))).axes[0]
+    assert [y for y in axes.get_yticks() if axes.get_ylim()[0] <= y <= axes.get_ylim()[1]] == [0.0, 1.0]
     axes = draw(figure(panel(Line("", T, np.where(T < 5.0, 1.0, 1.5), "steps")))).axes[0]
     assert np.any(axes.get_yticks() != np.round(axes.get_yticks()))
 
@@ -119,10 +149,34 @@ def test_a_label_keeps_its_colour() -> None:
     assert fourth == [PALETTE[0], FAINT]
 
 
-def test_of_many_curves_each_has_its_own_colour() -> None:
-    many = [Line(str(k), T, T + k) for k in range(13)]
-    (used,) = colours(draw(figure(panel(*many))))
-    assert len(set(used)) == 13
+@pytest.mark.parametrize("count", [13, 30])
+def test_of_many_curves_each_looks_different(count: int) -> None:
+    (axes,) = draw(figure(panel(*(Line(str(k), T, T + k) for k in range(count))))).axes
+    assert len({(to_hex(line.get_color()), line.get_linestyle()) for line in axes.lines}) == count
+
+
+def test_a_curve_under_another_still_shows() -> None:
+    same = [Line(label, T, T, style) for label, style in (("a", "solid"), ("b", "steps"), ("c", "dashed"))]
+    points = [Line(label, T, T, "points") for label in "abc"]
+    solid, dots = draw(figure(panel(*same), panel(*points))).axes
+    widths = [line.get_linewidth() for line in solid.lines]
+    sizes = [line.get_markersize() for line in dots.lines]
+    assert all(under > over + 0.3 for under, over in pairwise(widths))
+    assert all(under > over + 1.0 for under, over in pairwise(sizes))
+
+
+def test_letters_are_typeset() -> None:
+    lines = (Line("pi_J, J without 3", T, T), Line("a2", T, T), Line("m02 -> c_in", T, T))
+    axes = draw(Figure("n", "c", (Panel("sigma(t) of theta 1", "t in s", "xhat - x <= 1", lines),))).axes[0]
+    assert axes.get_title(loc="left") == r"σ(t) of $\mathregular{θ_{1}}$"
+    assert axes.get_ylabel() == r"$\mathregular{\hat{x}}$ − x ≤ 1"
+    legend = axes.get_legend()
+    assert legend is not None
+    assert [text.get_text() for text in legend.get_texts()] == [
+        r"$\mathregular{π_{J}}$, J without 3",
+        r"$\mathregular{a_{2}}$",
+        r"m02 → $\mathregular{c_{in}}$",
+    ]
 
 
 # Machado, Oliveira, Fernandes: A physiologically-based model for simulation of color vision deficiency, 2009,
