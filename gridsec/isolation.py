@@ -59,9 +59,10 @@ class IsolationDesign:
     missing
         Members that the bank should have and has not. Unless empty, the theorems do not apply.
     measure
-        What "agree" means: "distance" is the Euclidean norm of (5) and (22); "bounds" is the largest
-        difference of an entry relative to the sum of both observers' error bounds, which does not let
-        an observer that is bad at one state drown the others' news.
+        What "agree" means. "distance": the Euclidean norm of (5) and (22), and (6), (23) select. "bounds":
+        the largest difference of an entry relative to the sum of both observers' error bounds, which
+        does not let an observer that is bad at one state drown the others' news; selected is the
+        observer whose estimate is certified best.
     left : (r, n)
         Left inverse of the inputs' matrix.
     from_now, from_before, from_drift : (r, n), (r, n), (r,)
@@ -126,7 +127,8 @@ class Isolation:
     selected
         (J_u, J_s) of the observer believed.
     disagreement : (a,)
-        pi of (5) or (22) for each large observer, infinite where nothing can confirm it.
+        pi of (5) or (22) for each large observer, infinite where nothing can confirm it. With "bounds",
+        a value above 1 proves that the observer or one of its company is deceived.
     input_attack, input_threshold : (r,)
         (42), of the *last* tick, and the most that an honest input could show. NaN and infinite at
         the first tick.
@@ -308,15 +310,38 @@ def disagreement(design: IsolationDesign, state: UnknownInputState) -> Floats:
         allowed = state.box[design.large][:, None, :] + state.box[design.company]
         # Equal estimates agree even where both are known exactly.
         pi = np.where(gap > 0.0, gap / np.maximum(allowed, np.finfo(np.float64).tiny), 0.0).max(axis=(1, 2))
-    return np.where(design.alone, np.inf, pi)
+    dead = design.alone | ~state.live[design.large] | ~state.live[design.company].all(axis=1)
+    return np.where(dead, np.inf, pi)
 
 
-def estimate(design: IsolationDesign, state: UnknownInputState, index: int) -> tuple[Floats, Floats]:
+def bounds(design: IsolationDesign, state: UnknownInputState) -> Floats:
+    """Bounds of the errors of all large observers, whoever lies.
+
+    Some small observer S within J is free of attacks, by Lemmas 1 to 3, so
+    `|e_J,i| <= max_S (|x_hat_J,i - x_hat_S,i| + box_S,i)`, for every J: those that trust a liar are told by
+    their company. Nor is an error above what the plant's span leaves possible.
+
+    Parameters
+    ----------
+    design
+        The bank.
+    state
+        Where its observers stand.
+
+    Returns
+    -------
+    Floats
+        (a, n).
+    """
+    x = state.x[design.large]
+    gap = np.abs(x[:, None, :] - state.x[design.company]) + state.box[design.company]
+    return np.asarray(np.minimum(gap.max(axis=1), np.abs(x) + design.family.plant.span))
+
+
+def estimate(design: IsolationDesign, state: UnknownInputState, index: int) -> tuple[Floats, Floats, bool]:
     """Estimate (7), (24) of one large observer with a bound of its error.
 
-    Some small observer S within it is free of attacks, by Lemmas 1 to 3, so
-    `|e_i| <= max_S (|x_hat_i - x_hat_S,i| + box_S,i)` whoever lies. Nor is it above what the plant's
-    span leaves possible.
+    The truth is within the bounds of every large observer, so in the intersection of all these intervals.
 
     Parameters
     ----------
@@ -330,11 +355,23 @@ def estimate(design: IsolationDesign, state: UnknownInputState, index: int) -> t
     Returns
     -------
     x, bound : (n,)
+    torn
+        Whether intervals do not intersect: then more is attacked than assumed, and the bound is infinite
+        where they do not.
     """
-    x = state.x[design.large[index]]
-    own = design.company[index]
-    bound = np.max(np.abs(x - state.x[own]) + state.box[own], axis=0)
-    return x, np.asarray(np.minimum(bound, np.abs(x) + design.family.plant.span))
+    x, wide = state.x[design.large], bounds(design, state)
+    low, high = np.max(x - wide, axis=0), np.min(x + wide, axis=0)
+    bound = np.maximum(high - x[index], x[index] - low)
+    return x[index], np.where(low <= high, bound, np.inf), bool(np.any(low > high))
+
+
+def _select(design: IsolationDesign, state: UnknownInputState, pi: Floats) -> int:
+    if design.measure == "distance":
+        return int(np.argmin(pi))
+    wide = bounds(design, state)
+    best = wide.min(axis=0)
+    known = np.isfinite(best)
+    return int(np.argmin((wide[:, known] / best[known]).max(axis=1, initial=0.0)))
 
 
 def input_attack(design: IsolationDesign, x: Floats, before: Floats, u: Floats) -> Floats:
@@ -398,8 +435,8 @@ def step(
     plant, s = design.family.plant, design.family.plant.system
     family = step_family(design.family, state.family, y, u, seen)
     pi = disagreement(design, family)
-    best = int(np.argmin(pi))
-    x, bound = estimate(design, family, best)
+    best = _select(design, family, pi)
+    x, bound, torn = estimate(design, family, best)
     heard = np.asarray(seen, dtype=np.bool_) & np.isfinite(y)
     sensor_attack = np.where(heard, np.where(heard, y, 0.0) - s.C @ x - s.D @ u, np.nan)
     sensor_threshold = _times(np.abs(s.C), bound) + plant.noise
@@ -414,7 +451,7 @@ def step(
     sensors_now = support(sensor_attack, sensor_threshold)
     inputs, sensors = state.inputs | inputs_now, state.sensors | sensors_now
     settled = bool(np.all(bound < plant.span))
-    decision, cause, reason = _decide(design, float(pi[best]), settled, inputs, sensors)
+    decision, cause, reason = _decide(design, torn, settled, inputs, sensors)
     answer = Isolation(
         t=family.t,
         decision=decision,
@@ -445,7 +482,7 @@ def _times(matrix: Floats, bound: Floats) -> Floats:
 
 
 def _decide(
-    design: IsolationDesign, pi: float, settled: bool, inputs: Bools, sensors: Bools
+    design: IsolationDesign, torn: bool, settled: bool, inputs: Bools, sensors: Bools
 ) -> tuple[Decision, Cause, str]:
     names = f"inputs {np.flatnonzero(inputs).tolist()}, sensors {np.flatnonzero(sensors).tolist()}"
     limit = len(inputs) if design.max_inputs == len(inputs) else design.max_inputs
@@ -453,7 +490,7 @@ def _decide(
         count = len(design.missing)
         reason = f"{count} members of the bank do not exist, nothing is proven; suspected: {names}"
         return Decision.UNDECIDED, Cause.DESIGN_INVALID, reason
-    if design.measure == "bounds" and pi > 1.0:
+    if torn:
         reason = "no set of trusted inputs and sensors agrees with itself: more are attacked than assumed"
         return Decision.UNDECIDED, Cause.TOO_MANY_SUSPECTS, reason
     if np.count_nonzero(inputs) > limit or np.count_nonzero(sensors) > design.max_sensors:

@@ -16,7 +16,7 @@ yang2021 (35), (36), with the injection of y+ in (35) corrected: docs/errata/yan
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -91,6 +91,8 @@ class UnknownInputState:
         Bounds of their errors.
     y, u, seen : (p,), (l,), (p,) or None
         The last readings; None before the first ones.
+    live : (c,)
+        Whether an observer had all its readings in the last step.
     """
 
     t: float
@@ -100,6 +102,7 @@ class UnknownInputState:
     y: Floats | None
     u: Floats | None
     seen: Bools | None
+    live: Bools
 
 
 def design(
@@ -243,7 +246,14 @@ def init(
     away = np.abs(start) + design.plant.span if radius is None else np.asarray(radius, dtype=np.float64)
     level = _levels(design, np.tile(away, (count, 1)))
     return UnknownInputState(
-        float(t), np.tile(start, (count, 1)), level, np.tile(away, (count, 1)), None, None, None
+        t=float(t),
+        x=np.tile(start, (count, 1)),
+        level=level,
+        box=np.tile(away, (count, 1)),
+        y=None,
+        u=None,
+        seen=None,
+        live=np.ones(count, dtype=np.bool_),
     )
 
 
@@ -284,7 +294,7 @@ def step(
     drive = np.asarray(u, dtype=np.float64)
     if state.y is None or state.u is None or state.seen is None:
         # The estimates are of this tick already: time starts with the first readings.
-        return UnknownInputState(state.t, state.x, state.level, state.box, now, drive, heard)
+        return replace(state, y=now, u=drive, seen=heard)
     z = state.x @ system.H.T + system.F @ state.u
     free = state.x @ system.A.T + system.phi(z) @ system.G.T + system.B @ state.u
     able = ~np.any(design.sensors & ~(heard & state.seen), axis=1)
@@ -302,7 +312,7 @@ def step(
         lost = np.abs(free[~able]) + plant.span
         box[~able] = lost
         level[~able] = _levels(design, box)[~able]
-    return UnknownInputState(state.t + system.h, x, level, box, now, drive, heard)
+    return UnknownInputState(state.t + system.h, x, level, box, now, drive, heard, able)
 
 
 def _grown(design: UnknownInputDesign, box: Floats) -> Floats:
