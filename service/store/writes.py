@@ -108,16 +108,17 @@ class Store(Reader):
         """
         transitions, rejected = tuple(transitions), tuple(rejected)
         with self._lock:
-            kept = [(now, report) for report in reports if (now := self._keep(report))]
+            marks = dict(self._marks)
+            kept = [report for report in reports if self._worth(marks, report)]
             if not (transitions or kept or rejected):
                 return ()
             with self._write() as connection:
                 numbers = tuple(self._put_transition(connection, item) for item in transitions)
-                for _, report in kept:
+                for report in kept:
                     self._put_history(connection, report)
                 if rejected:
                     _put_rejected(connection, rejected)
-            self._marks.update({report.feeder: now for now, report in kept})
+            self._marks = marks
             self._last_event = max((self._last_event, *numbers))
             return numbers
 
@@ -230,9 +231,13 @@ class Store(Reader):
         connection.execute(OUTBOX.insert().values(seq=number))
         return number
 
-    def _keep(self, report: FeederReport) -> Mark | None:
+    def _worth(self, marks: dict[str, Mark], report: FeederReport) -> bool:
+        """Say whether a report gets a row, and if so, let the following ones be compared with it."""
         now = mark(report)
-        return now if worth_keeping(self._marks.get(report.feeder), now, self._history_rules) else None
+        worth = worth_keeping(marks.get(report.feeder), now, self._history_rules)
+        if worth:
+            marks[report.feeder] = now
+        return worth
 
     def _put_history(self, connection: sa.Connection, report: FeederReport) -> None:
         row = {

@@ -287,6 +287,7 @@ def start(*options: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
 
 
+@pytest.mark.slow
 def test_a_second_service_says_what_is_taken_and_leaves_the_first_alone(tmp_path: Path) -> None:
     samples = sampled(load(FEEDER), 25)
     with serve(FEEDER, tmp_path) as live, Fleet(live) as fleet:

@@ -448,6 +448,18 @@ def test_readers_cannot_write(store: Store, family: str) -> None:
         connection.execute(schema.FEEDER.delete())
 
 
+def test_reports_of_one_commit_are_thinned_out_like_those_of_many(tmp_path: Path) -> None:
+    suspects = [("m1",) if 13 <= k < 15 or k == 33 else () for k in range(40)]
+    reports = [a_report(T0 + k, named) for k, named in enumerate(suspects)]
+    with Store(f"sqlite:///{tmp_path}/one.db") as one, Store(f"sqlite:///{tmp_path}/many.db") as many:
+        one.commit(reports=reports)
+        for report in reports:
+            many.commit(reports=[report])
+        rows = one.history("village")
+        assert rows == many.history("village")
+    assert [row["t"] - T0 for row in rows] == [0, 10, 13, 15, 20, 30, 33, 34]
+
+
 def test_a_file_that_was_taken_away_is_missed_and_found_again(tmp_path: Path) -> None:
     """An unlinked file takes every write and keeps none: that must not look like success."""
     path, elsewhere = tmp_path / "s.db", tmp_path / "elsewhere"
