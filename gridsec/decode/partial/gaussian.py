@@ -39,8 +39,9 @@ class GaussianDesign:
         Their stationary gain and covariance, if they run with those; None: time-varying ones.
     sets
         All sensors first, then every set of p - q.
-    false_alarm
-        Probability of an alarm per step without attack.
+    thresholds : (N + 1,)
+        Delta_TH for every number of degrees of freedom. Without any, the statistic is not random: a
+        violation of size 1 alarms.
     rule
         How the set is chosen after an alarm, see `gridsec.decode.gaussian.choose`.
     readmit
@@ -56,7 +57,7 @@ class GaussianDesign:
     filters: KalmanDesign
     steady: Steady | None
     sets: tuple[Parity, ...]
-    false_alarm: float
+    thresholds: Floats
     rule: Rule
     readmit: int
     refresh: float
@@ -65,24 +66,18 @@ class GaussianDesign:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tables:
-    """The fusion of all sets under one covariance.
+    """The fusions that have been needed so far under one covariance.
 
     Attributes
     ----------
     P : (mu, mu)
         That covariance.
     fused
-        One for each set.
-    thresholds
-        Delta_TH of each.
-    hypotheses
-        The sets of p - q sensors, as `gridsec.decode.gaussian.choose` wants them.
+        One place for each set; None where it has not been needed.
     """
 
     P: Floats
-    fused: tuple[Fused, ...]
-    thresholds: tuple[float, ...]
-    hypotheses: Hypotheses
+    fused: tuple[Fused | None, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -188,7 +183,9 @@ def design(
     p = stacked.count
     kept = [np.arange(p), *subsets(p, p - max_attacked, most)]
     prepared = tuple(parity(stacked, k, tol=zero) for k in kept)
-    return GaussianDesign(filters, steady, prepared, false_alarm, rule, readmit, refresh, tol)
+    freedom = np.arange(1, stacked.matrix.shape[0] + 1)
+    thresholds = frozen(np.concatenate([[1.0], chi2.isf(false_alarm, freedom)]))
+    return GaussianDesign(filters, steady, prepared, thresholds, rule, readmit, refresh, tol)
 
 
 def init(
@@ -219,7 +216,7 @@ def init(
     else:
         z = first.z + (y - first.z @ design.filters.stack.T.T) @ design.steady.K.T
         first = KalmanState(t, z, design.steady.P, design.steady.K)
-    return decode(design, GaussianState(first, 0, 0, _tables(design, first.P)))
+    return decode(design, GaussianState(first, 0, 0, _none(design, first.P)))
 
 
 def step(
@@ -247,7 +244,7 @@ def step(
         filters = kalman.step(design.filters, state.filters, y, u, seen)
     tables = state.tables
     if filters.P is not tables.P and _moved(filters.P, tables.P) > design.refresh:
-        tables = _tables(design, filters.P)
+        tables = _none(design, filters.P)
     return decode(design, GaussianState(filters, state.current, state.passed, tables))
 
 
@@ -263,21 +260,25 @@ def decode(design: GaussianDesign, state: GaussianState) -> tuple[GaussianState,
     ----------
     lee2018, Algorithm 4.2.
     """
-    tables, z, now = state.tables, state.filters.z, state.current
-    tested = tables.fused[now]
-    g = _score(tested, z)
-    alarm = g > tables.thresholds[now]
-    chosen, passed = now, state.passed
+    z, now = state.filters.z, state.current
+    tables, tested = _fused(design, state.tables, now)
+    g, threshold = _score(tested, z), float(design.thresholds[tested.freedom])
+    alarm = g > threshold
+    chosen, passed, used = now, state.passed, tested
     if alarm:
-        chosen, passed = 1 + int(choose(tables.hypotheses, z, rule=design.rule).hypothesis), 0
+        for i in range(1, len(design.sets)):
+            tables, _ = _fused(design, tables, i)
+        chosen = 1 + int(choose(_hypotheses(design, tables), z, rule=design.rule).hypothesis)
+        tables, used = _fused(design, tables, chosen)
+        passed = 0
     elif now != 0 and design.readmit > 0:
-        passed = passed + 1 if _score(tables.fused[0], z) <= tables.thresholds[0] else 0
+        tables, every = _fused(design, tables, 0)
+        passed = passed + 1 if _score(every, z) <= design.thresholds[every.freedom] else 0
         if passed >= design.readmit:
-            chosen, passed = 0, 0
-    used = tables.fused[chosen]
+            chosen, passed, used = 0, 0, every
     trusted = np.zeros(len(design.filters.stack.parts), dtype=np.bool_)
     trusted[design.sets[chosen].kept] = True
-    credible = bool(_score(used, z) <= tables.thresholds[chosen]) if alarm else True
+    credible = not alarm or bool(_score(used, z) <= design.thresholds[used.freedom])
     outcome = GaussianOutcome(
         state.filters.t,
         used.estimator @ z,
@@ -285,7 +286,7 @@ def decode(design: GaussianDesign, state: GaussianState) -> tuple[GaussianState,
         trusted,
         bool(alarm),
         g,
-        tables.thresholds[now],
+        threshold,
         tested.freedom,
         credible,
     )
@@ -304,18 +305,29 @@ def _moved(P: Floats, old: Floats) -> float:
     return float(np.max(np.abs(P - old) / np.where(scale > 0.0, scale, 1.0), initial=0.0))
 
 
-def _tables(design: GaussianDesign, P: Floats) -> Tables:
-    fused = tuple(fuse(prepared, P, tol=design.tol) for prepared in design.sets)
-    # A set all of whose parities are exact has no random statistic: one violation, of size 1, alarms.
-    thresholds = tuple(float(chi2.isf(design.false_alarm, f.freedom)) if f.freedom else 1.0 for f in fused)
-    small = fused[1:]
-    wide = np.zeros((len(small), max(len(f.standardise) for f in small), P.shape[0]))
+def _none(design: GaussianDesign, P: Floats) -> Tables:
+    """Nothing fused yet under a new covariance."""
+    return Tables(P, (None,) * len(design.sets))
+
+
+def _fused(design: GaussianDesign, tables: Tables, index: int) -> tuple[Tables, Fused]:
+    """Fusion of one set, kept in the tables for the next time."""
+    found = tables.fused[index]
+    if found is not None:
+        return tables, found
+    made = fuse(design.sets[index], tables.P, tol=design.tol)
+    return Tables(tables.P, (*tables.fused[:index], made, *tables.fused[index + 1 :])), made
+
+
+def _hypotheses(design: GaussianDesign, tables: Tables) -> Hypotheses:
+    """The sets of p - q sensors, all of them fused, as `gridsec.decode.gaussian.choose` wants them."""
+    small = [f for f in tables.fused[1:] if f is not None]
+    wide = np.zeros((len(small), max(len(f.standardise) for f in small), len(tables.P)))
     for i, f in enumerate(small):
         wide[i, : len(f.standardise)] = f.standardise
-    hypotheses = Hypotheses(
+    return Hypotheses(
         frozen_ints(np.stack([prepared.kept for prepared in design.sets[1:]])),
         frozen(np.stack([f.estimator for f in small])),
         frozen(wide),
         frozen_ints(np.array([max(f.freedom, 1) for f in small])),
     )
-    return Tables(P, fused, thresholds, hypotheses)
