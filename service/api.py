@@ -427,12 +427,14 @@ def list_rejected(
 
 
 @_operations.get("/healthz", response_model=models.Health)
+@_operations.head("/healthz", include_in_schema=False)
 async def healthz(request: Request, backend: BackendHere) -> Any:
     """Whether the process and its tasks are alive."""
     return _probe(request, *backend.healthy(), "the service does not work and should be restarted")
 
 
 @_operations.get("/readyz", response_model=models.Health)
+@_operations.head("/readyz", include_in_schema=False)
 def readyz(request: Request, backend: BackendHere) -> Any:
     """Whether feeders are designed, the database can be written and zenoh is connected."""
     ready, reasons = backend.ready()

@@ -334,6 +334,7 @@ def test_probes(setup: Setup) -> None:
     setup.service.is_ready = (False, ["feeder village has no design"])
     body = is_problem(setup.http.get("/readyz"), 503)
     assert (body["ok"], body["reasons"]) == (False, ["feeder village has no design"])
+    assert [setup.http.head(path).status_code for path in ("/healthz", "/readyz")] == [200, 503]
     setup.service.is_healthy = (False, ["the runtime task has ended"])
     assert is_problem(setup.http.get("/healthz"), 503)["reasons"] == ["the runtime task has ended"]
 
