@@ -262,9 +262,9 @@ def _cvxpy() -> Any:
 class _Template:
     """The scaled inequality for sets of one size, stated once and solved for many sets and decays.
 
-    Units: arguments and outputs in `z_unit` (a typical unknown, or the noise), nonlinearity i in
-    `slope_i z_unit`, states in what the nonlinearities can push in one step, noise in its root mean
-    square.
+    Units: arguments in `z_unit` (a typical unknown), nonlinearity i in `slope_i z_unit`, states in what
+    the nonlinearities can push in one step, outputs in what such states show there, noise in its root
+    mean square. Where nothing but the meters is unknown, the noise sets the scale of all.
     """
 
     def __init__(
@@ -280,16 +280,24 @@ class _Template:
         argument = self.options.unknown.argument
         spread = np.sqrt(np.sum(argument**2, axis=1)) if argument.size else np.zeros(1)
         self.noise_unit = float(np.sqrt(np.mean(self.options.noise**2)))
-        self.z_unit = float(np.sqrt(np.mean(spread**2))) if np.any(spread > 0.0) else self.noise_unit
-        push = (np.abs(self.system.G) @ self.system.slope) * self.z_unit
-        self.x_unit = np.where(push > 0.0, push, np.max(push, initial=0.0) or self.z_unit)
+        push = np.abs(self.system.G) @ self.system.slope
+        push = np.where(push > 0.0, push, np.max(push, initial=0.0) or 1.0)
+        read, fed = (float(np.mean(np.abs(rows) @ push)) for rows in (self.system.C, self.system.H))
+        ratio = read / fed if read > 0.0 and fed > 0.0 else 1.0
+        if np.any(spread > 0.0):
+            self.z_unit = float(np.sqrt(np.mean(spread**2)))
+            self.y_unit = ratio * self.z_unit
+        else:
+            self.y_unit = self.noise_unit
+            self.z_unit = self.y_unit / ratio
+        self.x_unit = push * self.z_unit
         scaled = self.x_unit[:, None] * self.options.weight * self.x_unit
         self.q_unit = float(np.trace(scaled)) / max(1, len(scaled))
 
     def _pose(self) -> None:
         cp = _cvxpy()
         moved, options, live, k = self.moved, self.options, self.live, self.size
-        x, z, unknown = self.x_unit, self.z_unit, self.options.unknown
+        x, z, y, unknown = self.x_unit, self.z_unit, self.y_unit, self.options.unknown
         n, m, r = len(x), int(np.count_nonzero(live)), unknown.state.shape[1]
         A = moved.A * x / x[:, None]
         G = moved.G[:, live] * (self.system.slope[live] * z) / x[:, None]
@@ -305,7 +313,7 @@ class _Template:
             Y, Gamma = cp.Variable((n, k)), cp.Variable((m, k))
         else:
             L, K = self.given
-            Y, Gamma = P @ ((L + self.lower @ K) * z / x[:, None]), Lam @ K[live]
+            Y, Gamma = P @ ((L + self.lower @ K) * y / x[:, None]), Lam @ K[live] * (y / z)
         # Rows and columns: e, psi, noise, delta, and P for the Schur complement of e+.
         ahead = [P @ A - Y @ self.C, P @ G]
         argument = [Lam @ H - Gamma @ self.C, -2.0 * Lam]
@@ -324,7 +332,7 @@ class _Template:
         whole = cp.bmat(_blocks(sizes, diagonal, argument, ahead, -P))
         Q = x[:, None] * options.weight * x / self.q_unit
         constraints = [whole << -_SLACK * np.eye(n + sum(sizes)), P >> Q]
-        loud = min((self.noise_unit / z) ** 2, 1e4)
+        loud = min((self.noise_unit / y) ** 2, 1e4)
         # Where nothing disturbs, the roundest P bounds best whatever comes.
         cost = k * loud * mu + r * mu_delta if k or r else cp.lambda_max(P)
         self.problem = cp.Problem(cp.Minimize(cost), constraints)
@@ -352,8 +360,8 @@ class _Template:
         cp = _cvxpy()
         what = f"discrete circle-criterion observer of the meters {J.tolist()} at decay {decay:g} per step"
         if len(J):
-            self.C.value = self.system.C[J] * self.x_unit / self.z_unit
-            self.E_y.value = self.options.unknown.output[J] / self.z_unit
+            self.C.value = self.system.C[J] * self.x_unit / self.y_unit
+            self.E_y.value = self.options.unknown.output[J] / self.y_unit
             self.N.value = (self.options.noise[J] / self.noise_unit)[None, :]
         else:
             self.C.value = np.zeros((0, len(self.x_unit)))
@@ -369,15 +377,15 @@ class _Template:
 
     def _in_plant_units(self, J: Ints, decay: float) -> DiscreteGains:
         P, lam = (np.asarray(self.variables[i].value, dtype=np.float64) for i in (0, 2))
-        x, z, live, k = self.x_unit, self.z_unit, self.live, self.size
+        x, z, y, live, k = self.x_unit, self.z_unit, self.y_unit, self.live, self.size
         if self.given is not None:
             L, K = self.given
         else:
             Y = np.asarray(self.variables[1].value, dtype=np.float64)
             K = np.zeros((live.size, k))
             if live.any():
-                K[live] = np.asarray(self.variables[3].value, dtype=np.float64) / lam[:, None]
-            L = np.linalg.solve(P, Y) * (x / z)[:, None] - self.lower @ K
+                K[live] = np.asarray(self.variables[3].value, dtype=np.float64) / lam[:, None] * (z / y)
+            L = np.linalg.solve(P, Y) * (x / y)[:, None] - self.lower @ K
         Lambda = np.zeros(live.size)
         Lambda[live] = self.q_unit * lam / (self.system.slope[live] * z**2)
         mu = float(self.variables[4].value) if k else 0.0
@@ -391,7 +399,7 @@ class _Template:
             P=frozen(self.q_unit * half / x[:, None] / x),
             Lambda=frozen(Lambda),
             decay=decay,
-            mu=self.q_unit * mu * (self.noise_unit / z) ** 2,
+            mu=self.q_unit * mu * (self.noise_unit / y) ** 2,
             mu_delta=self.q_unit * mu_delta,
             noise=frozen(self.options.noise[J]),
             unknown=self.options.unknown,
