@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from gridsec.papers.claims import Claim, Reproduction
 
 # Short name of each paper: the module of gridsec.papers that holds its examples.
-PAPERS: Final = ("kim2018", "lee2018")
+PAPERS: Final = ("chong2020", "kim2018", "lee2018", "yang2019", "yang2021")
 
 
 def reproduce(
@@ -72,7 +72,9 @@ def _computed(papers: tuple[str, ...]) -> Iterator[tuple[Reproduction, float]]:
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
     for number, paper in enumerate(papers, start=1):
         started = time.monotonic()
-        with Progress(*columns, console=console.err, transient=True) as bar:
+        with Progress(
+            *columns, console=console.err, transient=True, disable=not console.err.is_terminal
+        ) as bar:
             bar.add_task(f"{paper} ({number} of {len(papers)})", total=None)
             made: Reproduction = import_module(f"gridsec.papers.{paper}").reproduce()
         yield made, time.monotonic() - started

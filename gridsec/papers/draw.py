@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 DPI: Final = 150
 WIDTH: Final = 7.4  # inches, with room for legends beside the axes
-# Okabe and Ito's colours, which people with any colour vision tell apart; without yellow, too pale on white.
-PALETTE: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+# Okabe and Ito's colours, which every eye tells apart; a dark red for their yellow, too pale on white.
+PALETTE: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#882255")
 FAINT: Final = "#9A9A9A"  # curves without a label, beside others that have one
 INK: Final = "#262626"
 DASHES: Final[dict[str, str]] = {
@@ -140,10 +140,10 @@ def draw(figure: Figure) -> Canvas:
         FigureCanvasAgg(canvas)
         canvas.suptitle(caption, x=0.012, ha="left", fontsize=9.0, linespacing=1.3)
         rows = canvas.subplots(len(heights), 1, squeeze=False, gridspec_kw={"height_ratios": heights})
-        looks = _looks(figure.panels)
-        for axes, panel, height in zip(rows[:, 0], figure.panels, heights, strict=True):
+        parts = zip(rows[:, 0], figure.panels, _looks(figure.panels), heights, strict=True)
+        for axes, panel, looks, height in parts:
             _panel(axes, panel, looks)
-            axes.set_ylabel(_typeset(textwrap.fill(panel.y_label, int(12.0 * (height - 0.3)))))
+            axes.set_ylabel(_typeset(textwrap.fill(panel.y_label, int(14.0 * (height - 0.3)))))
         _share(list(rows[:, 0]), figure.panels)
         canvas.align_ylabels(list(rows[:, 0]))
     return canvas
@@ -199,15 +199,25 @@ def _typeset(text: str) -> str:
     return text.replace(" - ", " − ").replace("<=", "≤").replace(">=", "≥").replace("->", "→")
 
 
-def _looks(panels: tuple[Panel, ...]) -> dict[str, tuple[Any, str]]:
-    """Colour and dashes of each label: panels that share a label share all, others begin anew."""
+def _looks(panels: tuple[Panel, ...]) -> list[dict[str, tuple[Any, str]]]:
+    """Colour and dashes of each label, per panel.
+
+    Panels that share a label share all as long as the palette is long enough; others begin anew.
+    """
     families: list[dict[str, None]] = []
     for panel in panels:
         labels = {line.label: None for line in panel.lines if line.label}
         kin = [family for family in families if family.keys() & labels.keys()]
-        families = [family for family in families if family not in kin]
-        families.append({label: None for family in (*kin, labels) for label in family})
-    return {label: look for family in families for label, look in _shades(list(family)).items()}
+        merged = {label: None for family in (*kin, labels) for label in family}
+        if len(merged) <= len(PALETTE):
+            families = [family for family in families if family not in kin]
+        families.append(merged if len(merged) <= len(PALETTE) else labels)
+    looks = []
+    for panel in panels:
+        labels = {line.label: None for line in panel.lines if line.label}
+        family = next((family for family in families if labels.keys() <= family.keys()), labels)
+        looks.append(_shades(list(family)))
+    return looks
 
 
 def _shades(labels: list[str]) -> dict[str, tuple[Any, str]]:
@@ -229,7 +239,9 @@ def _panel(axes: Axes, panel: Panel, looks: dict[str, tuple[Any, str]]) -> None:
 
     alone = len(panel.lines) == 1
     for line, width in zip(panel.lines, _widths(panel), strict=True):
-        colour, dashes = looks.get(line.label, (PALETTE[0] if alone else FAINT, "-"))
+        # Without a label: the only curve, a crowd behind the others, or a broken partner in front of them.
+        crowd = line.style in {"solid", "steps"}
+        colour, dashes = looks.get(line.label, (PALETTE[0] if alone else FAINT if crowd else INK, "-"))
         points = line.style == "points"
         axes.plot(
             line.x,
@@ -238,10 +250,12 @@ def _panel(axes: Axes, panel: Panel, looks: dict[str, tuple[Any, str]]) -> None:
             linestyle=dashes if DASHES[line.style] == "-" else DASHES[line.style],
             linewidth=width,
             marker="o" if points else "",
-            markersize=3.0 * width if len(panel.lines) > 1 else 3.5,
+            markersize=3.5 if alone else 6.0 * width - 3.5,
+            markeredgecolor="white" if points else colour,
+            markeredgewidth=0.5,
             drawstyle="steps-post" if line.style == "steps" else "default",
             label=_typeset(line.label) or "_",
-            zorder=2.0 if line.label or alone else 1.8,
+            zorder=2.0 if line.label or alone else 1.8 if crowd else 2.2,
             clip_on=not points,
         )
     axes.set_title(_typeset(panel.title))
@@ -287,11 +301,11 @@ def _ends(low: float, high: float, left: float, right: float) -> tuple[float, fl
 
 def _widths(panel: Panel) -> list[float]:
     """Each curve thinner than the one before it, so that one that runs under another still shows."""
-    count = len(panel.lines)
-    if count == 1:
+    count = sum(bool(line.label) for line in panel.lines)
+    if len(panel.lines) == 1:
         return [1.4]
-    widths = np.linspace(min(0.7 + 0.4 * count, 2.5) if count <= 8 else 1.2, 1.1, count)
-    return [float(w) if line.label else 0.8 for w, line in zip(widths, panel.lines, strict=True)]
+    widths = iter(np.linspace(min(0.7 + 0.4 * count, 2.5) if count <= 8 else 1.2, 1.1, count))
+    return [float(next(widths)) if line.label else 0.9 for line in panel.lines]
 
 
 def _counts(values: list[Any]) -> bool:

@@ -16,7 +16,7 @@ from matplotlib.transforms import Bbox
 
 from gridsec.arrays import Floats
 from gridsec.papers.claims import Figure, Line, Panel, Style
-from gridsec.papers.draw import DPI, FAINT, PALETTE, WIDTH, draw, png
+from gridsec.papers.draw import DPI, FAINT, INK, PALETTE, WIDTH, draw, png
 
 T = np.linspace(0.0, 10.0, 101)
 DOTS = Line("", np.arange(11.0), np.ones(11), "points")
@@ -149,6 +149,13 @@ def test_a_label_keeps_its_colour() -> None:
     assert fourth == [PALETTE[0], FAINT]
 
 
+def test_large_families_have_colours_of_their_own_in_each_panel() -> None:
+    first, second = ([Line(str(k), T, T) for k in range(*ends)] for ends in ((0, 5), (4, 10)))
+    upper, lower = colours(draw(figure(panel(*first), panel(*second))))
+    assert upper == list(PALETTE[:5])
+    assert lower == list(PALETTE[:6])
+
+
 @pytest.mark.parametrize("count", [13, 30])
 def test_of_many_curves_each_looks_different(count: int) -> None:
     (axes,) = draw(figure(panel(*(Line(str(k), T, T + k) for k in range(count))))).axes
@@ -162,7 +169,14 @@ def test_a_curve_under_another_still_shows() -> None:
     widths = [line.get_linewidth() for line in solid.lines]
     sizes = [line.get_markersize() for line in dots.lines]
     assert all(under > over + 0.3 for under, over in pairwise(widths))
-    assert all(under > over + 1.0 for under, over in pairwise(sizes))
+    assert all(under > over + 2.0 for under, over in pairwise(sizes))
+
+
+def test_partners_without_a_label_lie_in_front() -> None:
+    lines = (Line("true", T, T), Line("", T, T, "dashed"), Line("", T, -T))
+    truth, partner, crowd = draw(figure(panel(*lines))).axes[0].lines
+    assert partner.get_zorder() > truth.get_zorder() > crowd.get_zorder()
+    assert [partner.get_color(), crowd.get_color()] == [INK, FAINT]
 
 
 def test_letters_are_typeset() -> None:
