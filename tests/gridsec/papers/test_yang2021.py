@@ -7,6 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
+from gridsec.isolation import design
 from gridsec.lmi.sampled import advance
 from gridsec.observers.unknown_input import obstruction
 from gridsec.papers import yang2021, yang2021_feeder
@@ -139,3 +140,12 @@ def test_the_line_is_that_of_the_files() -> None:
     np.testing.assert_allclose(theirs.x, ours.x, rtol=1e-5)
     with pytest.raises(ValueError, match="only 1 and 2"):
         yang2021.plant(3)
+
+
+def test_what_does_hold_as_printed() -> None:
+    """Example 1: q = 0. Example 2: one attacked input and no attacked sensor."""
+    assert design(yang2021.plant(1), max_inputs=2, max_sensors=0).guaranteed
+    assert design(yang2021.plant(2), max_inputs=1, max_sensors=0).guaranteed
+    assert [one.pair for one in design(yang2021.plant(2), max_inputs=0, max_sensors=1).missing] == [
+        ((), (1, 2))
+    ]
