@@ -337,8 +337,8 @@ def _figure(run: Run, state: Floats, voltage: Floats) -> Figure:
     panels = (
         Panel(
             "Voltages of the two lying meters",
-            "t, s",
-            "v, pu",
+            "t in s",
+            "v in pu",
             tuple(
                 line
                 for i in (1, 4)
@@ -356,8 +356,8 @@ def _figure(run: Run, state: Floats, voltage: Floats) -> Figure:
         ),
         Panel(
             "Error of the selected state, decimal logarithm",
-            "t, s",
-            "log10 |x - x_hat|, pu",
+            "t in s",
+            "log10 |x - x_hat| in pu",
             (
                 Line("selected", run.t, np.log10(run.error + tiny)),
                 Line("envelope (8)", run.t, np.log10(state + tiny), "dashed"),
@@ -365,8 +365,8 @@ def _figure(run: Run, state: Floats, voltage: Floats) -> Figure:
         ),
         Panel(
             "Error of the squared voltages, decimal logarithm",
-            "t, s",
-            "log10 |v² - v̂²|, pu",
+            "t in s",
+            "log10 |v² - v̂²| in pu",
             (
                 Line("selected", run.t, np.log10(np.abs(run.v2 - run.v2_estimate).max(axis=1) + tiny)),
                 Line("envelope (20)", run.t, np.log10(voltage + tiny), "dashed"),
@@ -374,7 +374,7 @@ def _figure(run: Run, state: Floats, voltage: Floats) -> Figure:
         ),
         Panel(
             "Selected set",
-            "t, s",
+            "t in s",
             "number of the set",
             (Line("sigma(t)", run.t, run.chosen.astype(np.float64), "steps"),),
         ),

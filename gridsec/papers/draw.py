@@ -238,7 +238,7 @@ def _panel(axes: Axes, panel: Panel, looks: dict[str, tuple[Any, str]]) -> None:
     from matplotlib.ticker import MaxNLocator
 
     alone = len(panel.lines) == 1
-    for line, width in zip(panel.lines, _widths(panel), strict=True):
+    for k, (line, width) in enumerate(zip(panel.lines, _widths(panel), strict=True)):
         # Without a label: the only curve, a crowd behind the others, or a broken partner in front of them.
         crowd = line.style in {"solid", "steps"}
         colour, dashes = looks.get(line.label, (PALETTE[0] if alone else FAINT if crowd else INK, "-"))
@@ -250,7 +250,7 @@ def _panel(axes: Axes, panel: Panel, looks: dict[str, tuple[Any, str]]) -> None:
             linestyle=dashes if DASHES[line.style] == "-" else DASHES[line.style],
             linewidth=width,
             marker="o" if points else "",
-            markersize=3.5 if alone else 6.0 * width - 3.5,
+            markersize=4.0 + 3.0 * min(len(panel.lines) - 1 - k, 3),
             markeredgecolor="white" if points else colour,
             markeredgewidth=0.5,
             drawstyle="steps-post" if line.style == "steps" else "default",
@@ -258,7 +258,7 @@ def _panel(axes: Axes, panel: Panel, looks: dict[str, tuple[Any, str]]) -> None:
             zorder=2.0 if line.label or alone else 1.8 if crowd else 2.2,
             clip_on=not points,
         )
-    axes.set_title(_typeset(panel.title))
+    axes.set_title(_typeset(panel.title) if panel.title != panel.y_label else "")
     axes.set_xlabel(_typeset(panel.x_label))
     axes.margins(x=0.02 if any(line.style == "points" for line in panel.lines) else 0.0, y=0.08)
     axes.set_xlim(*_ends(*_span(panel.lines), *axes.get_xlim()))

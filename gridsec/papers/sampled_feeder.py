@@ -166,9 +166,9 @@ def figure() -> Figure:
     lines = [Line(label, t, column) for label, column in zip(labels, score.T, strict=True)]
     lines.append(Line("threshold", t, np.full(t.size, study.design.detect_above), "dashed"))
     panels = (
-        Panel("Largest value in each window", "t, s", "pu of reactive power", tuple(lines)),
+        Panel("Largest value in each window", "t in s", "pu of reactive power", tuple(lines)),
         Panel(
-            "Named", "t, s", "meter (0: none)", (Line("", t[window.astype(np.intp) - 1], meter, "points"),)
+            "Named", "t in s", "meter (0: none)", (Line("", t[window.astype(np.intp) - 1], meter, "points"),)
         ),
     )
     caption = "Sampled line feeder, five meters with noise, one lying from 150 s on; proven thresholds."

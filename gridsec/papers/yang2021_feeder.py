@@ -167,9 +167,9 @@ def figure() -> Figure:
     late, lies = np.where(known, late, np.nan), np.where(known, lies, np.nan)
     ahead = np.vstack([late[1:], np.full((1, late.shape[1]), np.nan)])
     panels = (
-        _panel("reactive injection / pu", t, (run.x, found), [f"inverter at c{i + 1:02d}" for i in AT]),
-        _panel("wrong part of the set point / pu", t, (run.a_u, ahead), [f"c{i + 1:02d}" for i in AT]),
-        _panel("lie of the meter / squared pu", t, (run.a_y, lies), [f"c{i + 1:02d}" for i in METERS]),
+        _panel("Reactive injection", "pu", t, (run.x, found), [f"inverter at c{i + 1:02d}" for i in AT]),
+        _panel("Wrong part of the set point", "pu", t, (run.a_u, ahead), [f"c{i + 1:02d}" for i in AT]),
+        _panel("Lie of the meter", "squared pu", t, (run.a_y, lies), [f"c{i + 1:02d}" for i in METERS]),
     )
     return Figure(
         "yang2021-feeder",
@@ -178,8 +178,8 @@ def figure() -> Figure:
     )
 
 
-def _panel(what: str, t: Floats, pair: tuple[Floats, Floats], names: list[str]) -> Panel:
+def _panel(what: str, unit: str, t: Floats, pair: tuple[Floats, Floats], names: list[str]) -> Panel:
     lines = []
     for i, name in enumerate(names):
         lines += [Line(name, t, pair[0][:, i], "solid"), Line("", t, pair[1][:, i], "dashed")]
-    return Panel(f"{what}: truth, and estimate (dashed)", "t / s", what, tuple(lines))
+    return Panel(f"{what}: truth, and estimate (dashed)", "t in s", unit, tuple(lines))

@@ -127,6 +127,7 @@ def test_no_paper_fails(
     code, told, error = run(monkeypatch, capsys, paper, "--out", str(tmp_path))
     assert (code, error) == (0, "")
     assert "not met" not in told
+    assert [page for page in re.findall(r"docs/[\w/-]+\.md", told) if not (ROOT / page).exists()] == []
     names = {path.stem for path in tmp_path.iterdir()}
     assert names
     described = (ROOT / "docs" / "papers" / "README.md").read_text()

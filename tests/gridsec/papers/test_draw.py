@@ -134,6 +134,11 @@ def test_whole_numbers_have_ticks_at_whole_numbers() -> None:
     assert np.any(axes.get_yticks() != np.round(axes.get_yticks()))
 
 
+def test_a_title_that_repeats_the_ordinate_is_left_out() -> None:
+    titles = [axes.get_title(loc="left") for axes in draw(figure(Panel("x1", "k", "x1", (DOTS,)))).axes]
+    assert titles == [""]
+
+
 def colours(canvas: Canvas) -> list[list[str]]:
     return [[to_hex(line.get_color()).upper() for line in axes.lines] for axes in canvas.axes]
 
