@@ -23,7 +23,7 @@ from gridsec.feeder import lindistflow, loss_correction
 from gridsec.isolation import Isolation, IsolationDesign, disagreement, init, members, step, support
 from gridsec.lmi.sampled import advance
 from gridsec.lure import close_loop, known_input
-from gridsec.observers.unknown_input import inverters
+from gridsec.observers.unknown_input import inverters, obstruction
 from gridsec.online import Cause, Decision
 from gridsec.papers import yang2021, yang2021_feeder
 
@@ -345,6 +345,29 @@ def test_both_are_named_under_ac_power_flow() -> None:
     assert list(np.flatnonzero(answers[-1].inputs)) == [1]
     assert list(np.flatnonzero(answers[-1].sensors)) == [2]
     assert answers[-1].input_attack[1] == pytest.approx(-1.2 * droop.limit[1], rel=0.05)
+
+
+def test_what_is_missing_on_cigre_as_shipped() -> None:
+    """One inverter at the busbar is seen by no meter; two pairs look alike without their own meters."""
+    site = load("cigre-lv")
+    lure = close_loop(site.feeder, site.droop, site.meters)
+    plant = inverters(
+        lure,
+        1.0,
+        np.arange(6),
+        reading_error=np.full(6, 1e-6),
+        u_error=np.zeros(6),
+        curve_error=np.zeros(6),
+        span=2 * site.droop.limit,
+    )
+    small = members(6, 6, 1, 1)[1]
+    missing = [pair for pair in small if obstruction(plant, pair, tolerance=1e-9) is not None]
+    assert (len(small), len(missing)) == (225, 77)
+    assert np.all(lure.C[:, 0] == 0.0)
+    assert [pair for pair in missing if 0 not in pair[0]] == [
+        ((1, 2), (0, 3, 4, 5)),
+        ((4, 5), (0, 1, 2, 3)),
+    ]
 
 
 def test_meters_of_an_accuracy_class_are_not_exact_enough() -> None:
