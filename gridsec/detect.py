@@ -65,6 +65,8 @@ class MeterAccuracy:
             number = float(getattr(self, name))
             if not (np.isfinite(number) and number >= 0):
                 raise ValueError(f"{name} must be finite and not negative, got {number}")
+        if not self.busbar_class < 1:
+            raise ValueError(f"busbar_class must be below 1, got {self.busbar_class}")
 
 
 def reading_error(accuracy: MeterAccuracy, v2: Floats, sigmas: float) -> Floats:
@@ -94,6 +96,10 @@ def reading_error(accuracy: MeterAccuracy, v2: Floats, sigmas: float) -> Floats:
 def busbar_error(accuracy: MeterAccuracy, v0_squared: float, sigmas: float) -> float:
     """Largest honest error of the squared busbar voltage.
 
+    The class is a part of the truth, and only the reading r is known: `r = v (1 + c) + n` gives
+    `|r - v| = |c r + n| / (1 + c) <= e = (class |r| + resolution / 2 + sigmas jitter) / (1 - class)`,
+    and `|r^2 - v^2| <= e (2 r + e)`.
+
     Parameters
     ----------
     accuracy
@@ -105,6 +111,7 @@ def busbar_error(accuracy: MeterAccuracy, v0_squared: float, sigmas: float) -> f
     """
     v = float(np.sqrt(max(v0_squared, 0.0)))
     e = accuracy.busbar_class * v + 0.5 * accuracy.busbar_resolution + sigmas * accuracy.busbar_jitter
+    e /= 1.0 - accuracy.busbar_class
     return e * (2.0 * v + e)
 
 
@@ -306,9 +313,9 @@ def gap(model: ErrorModel, now: Uncertainty, bound: ErrorBound, *, own: bool = F
     base = now.base[model.droop.customer] if own else now.base
     metered = (model.meter_of >= 0) & now.live[model.meter_of] if now.live.size else model.meter_of >= 0
     out = base + inverters @ np.where(metered, 0.0, bound.free)
-    driven, free = np.zeros((2, now.live.size))
-    np.add.at(driven, model.meter_of[metered], bound.driven[metered])
-    np.add.at(free, model.meter_of[metered], bound.free[metered])
+    p, at = now.live.size, model.meter_of[metered]
+    driven = np.bincount(at, weights=bound.driven[metered], minlength=p)
+    free = np.bincount(at, weights=bound.free[metered], minlength=p)
     # While the net is metered and trusted, the inverter's own state does not matter to the voltage.
     driven = np.where(now.told, 0.0, driven)
     swing = np.maximum(np.where(now.told, free + now.extra, free) - driven, 0.0)
@@ -345,12 +352,16 @@ class Motion:
         How far the selected estimate's z may be from that of a liar-free observer, pu.
     h
         Length of the step, s.
+    lag : (m,)
+        How far the injections of inverters moved that the observers' step takes for slower than they
+        are (`lure.transition`), pu; 0 for the others.
     """
 
     before: Floats
     after: Floats
     offset: Floats
     h: float
+    lag: Floats | float = 0.0
 
 
 def settled(model: ErrorModel, now: Uncertainty, motion: Motion, start: ErrorBound) -> ErrorBound:
@@ -380,9 +391,9 @@ def settled(model: ErrorModel, now: Uncertainty, motion: Motion, start: ErrorBou
 def _image(model: ErrorModel, now: Uncertainty, motion: Motion, bound: ErrorBound) -> ErrorBound:
     """What errors of the size `bound` drive the curves' values to differ by."""
     droop = model.droop
-    # Readings and loads are held over the step; how far they moved in it is part of their error. In a
-    # step far above the time constant only the last time constant counts.
-    hold = np.abs(motion.after - motion.before) / np.maximum(1.0, motion.h / droop.tau)
+    # Readings and loads are held over the step; how far they moved in it is part of their error. It may
+    # all have been just before the reading, so a long step is not let off any of it.
+    hold = np.abs(motion.after - motion.before)
     around = gap(model, now, bound, own=True) + hold
     injected: Floats | float = 0.0
     if model.majorant is None:
@@ -397,11 +408,11 @@ def _image(model: ErrorModel, now: Uncertainty, motion: Motion, bound: ErrorBoun
     low = np.minimum(motion.before, motion.after) - motion.offset - around
     high = np.maximum(motion.before, motion.after) + motion.offset + around
 
-    def reach(radius: Floats) -> Floats:
-        steep = np.minimum(droop.slope * radius, droop(high + radius) - droop(low - radius))
-        return np.asarray(np.minimum(steep + model.mismatch, model.span) + injected)
-
-    return ErrorBound(reach(own), reach(through))
+    radius = np.stack([own, through])
+    over, under = droop(np.stack([high + radius, low - radius]))
+    steep = np.minimum(droop.slope * radius, over - under)
+    driven, free = np.minimum(steep + model.mismatch + motion.lag, model.span) + injected
+    return ErrorBound(driven, free)
 
 
 # Rounds of the iteration and the relative gain below which another round is not worth it. Both trade
@@ -436,14 +447,23 @@ def advance(
         Bound at the end, and this step's G.
     """
     keep = np.exp(-motion.h / model.droop.tau)
-    guess = ErrorBound(
-        np.maximum(bound.driven, _ROOM * last.driven), np.maximum(bound.free, _ROOM * last.free)
-    )
-    image = _image(model, now, motion, guess)
-    if not (np.all(image.free <= guess.free) and np.all(image.driven <= guess.driven)):
-        guess = ceiling(model, now, motion, bound)
-    top = _above(model, now, motion, guess, bound)
+    top = ErrorBound(np.maximum(bound.driven, _ROOM * last.driven), np.maximum(bound.free, _ROOM * last.free))
     image = _image(model, now, motion, top)
+    if not (np.all(image.free <= top.free) and np.all(image.driven <= top.driven)):
+        top = ceiling(model, now, motion, bound)
+        image = _image(model, now, motion, top)
+    # Lower it while it stays above the bound and above its own image.
+    for _ in range(_ROUNDS):
+        lower = ErrorBound(
+            np.minimum(top.driven, np.maximum(image.driven, bound.driven)),
+            np.minimum(top.free, np.maximum(image.free, bound.free)),
+        )
+        done = np.all(lower.free >= (1.0 - _TIGHTENING) * top.free)
+        top = lower
+        # The image of the level before serves as well: it is not below that of the lower one.
+        if done:
+            break
+        image = _image(model, now, motion, top)
     after = ErrorBound(
         keep * bound.driven + (1.0 - keep) * image.driven, keep * bound.free + (1.0 - keep) * image.free
     )
@@ -470,28 +490,10 @@ def ceiling(model: ErrorModel, now: Uncertainty, motion: Motion, floor: ErrorBou
         return ErrorBound(np.maximum(top.driven, floor.driven), np.maximum(top.free, floor.free))
     count = model.span.size
     loop = np.eye(count) - model.droop.slope[:, None] * big.H - big.L @ model.inverters[model.meters]
-    hold = np.abs(motion.after - motion.before) / np.maximum(1.0, motion.h / model.droop.tau)
-    fixed = model.droop.slope * (big.F @ now.base + big.K @ now.reading + hold) + model.mismatch
+    hold = np.abs(motion.after - motion.before)
+    fixed = model.droop.slope * (big.F @ now.base + big.K @ now.reading + hold) + model.mismatch + motion.lag
     fixed = fixed + big.L @ (now.base[model.meters] + now.reading + np.max(hold, initial=0.0))
     level, weights = np.linalg.solve(loop, np.stack([fixed, np.ones(count)], axis=1)).T
     lift = np.max((np.maximum(floor.free, floor.driven) - level) / weights, initial=0.0)
     high = level + lift * weights
     return ErrorBound(high, high.copy())
-
-
-def _above(
-    model: ErrorModel, now: Uncertainty, motion: Motion, start: ErrorBound, floor: ErrorBound
-) -> ErrorBound:
-    """Lower `start` while it stays above `floor` and above its image."""
-    level = start
-    for _ in range(_ROUNDS):
-        image = _image(model, now, motion, level)
-        lower = ErrorBound(
-            np.minimum(level.driven, np.maximum(image.driven, floor.driven)),
-            np.minimum(level.free, np.maximum(image.free, floor.free)),
-        )
-        done = np.all(lower.free >= (1.0 - _TIGHTENING) * level.free)
-        level = lower
-        if done:
-            break
-    return level

@@ -57,7 +57,7 @@ def clean(design: MonitorDesign, state: MonitorState, frame: Frame) -> Inputs:
     correction, rest = _losses(plant, frame.p, q_all, v0, p_error=frame.p_error, q_error=q_error)
     base = design.errors.R2 @ frame.p_error + design.errors.X2 @ q_error + rest
     rise = 2.0 * (model.R @ frame.p + model.X @ q_all) + correction[plant.feeder.bus]
-    reading = detect.reading_error(plant.accuracy, v0 + rise[at] + _ROOM, options.sigmas)
+    reading = detect.reading_error(plant.accuracy, v0 + rise[at] + base[at] + _ROOM, options.sigmas)
     extra = np.where(told, np.maximum(frame.q_error[at] - frame.q_net_error[at], 0.0), 0.0)
     now = Uncertainty(np.minimum(base, NO_VOLTAGE), reading, live, told, extra)
     if busbar:
@@ -70,7 +70,7 @@ def clean(design: MonitorDesign, state: MonitorState, frame: Frame) -> Inputs:
     return Inputs(live, y, z, w, net, frame.q, v0, busbar, correction, now)
 
 
-# Room for the squared voltage at a meter to be above its prediction, where only its accuracy depends on it.
+# Room for what inverters did since the last estimate, where only a meter's accuracy depends on it.
 _ROOM = 0.05
 # Errors of squared voltages end here: no voltage is above 2 pu.
 NO_VOLTAGE = 4.0
@@ -107,7 +107,8 @@ def _losses(
     ends = np.array([0.0, -1.0, 1.0])[:, None]
     with np.errstate(all="ignore"):
         three = loss_correction(feeder, p + ends * p_error, q + ends * q_error, v0, steps=max(steps, 1))
-        rest = model_error_bound(feeder, p, q, v0)
+        # What is left grows with the cube of the load, so the centre says nothing about the ends.
+        rest = model_error_bound(feeder, p + ends * p_error, q + ends * q_error, v0).max(axis=0)
     three = np.nan_to_num(three, nan=0.0, posinf=0.0, neginf=0.0)
     moved = np.abs(three[1:] - three[0]).max(axis=0)[feeder.bus]
     rest = np.nan_to_num(rest, nan=NO_VOLTAGE, posinf=NO_VOLTAGE)

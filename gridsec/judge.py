@@ -12,12 +12,14 @@ from gridsec.online import Cause, Decision
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tally:
-    """How long each meter has been where it is. p meters.
+    """What each meter's latest readings were like. p meters.
 
     Attributes
     ----------
-    above, below : (p,)
-        Readings in a row above the threshold, and not above it.
+    above : (p,)
+        Readings above the threshold since the meter fell under suspicion; 0: it is under none.
+    below : (p,)
+        Readings in a row not above the threshold.
     named : (p,)
         Meters named as manipulated.
     """
@@ -30,7 +32,10 @@ class Tally:
 def count(tally: Tally, over: Bools, live: Bools, *, confirm: int, release: int) -> Tally:
     """Take the residuals of one frame into account.
 
-    A silent meter stays what it was: who was named and then falls silent has not been cleared.
+    A reading above the threshold puts a meter under suspicion; only `release` readings in a row below it
+    end that. The meter is named with the `confirm`-th reading above, whether or not there were others in
+    between: who lies on every second reading only is not better off. A silent meter stays what it
+    was: who was named and then falls silent has not been cleared.
 
     Parameters
     ----------
@@ -41,10 +46,11 @@ def count(tally: Tally, over: Bools, live: Bools, *, confirm: int, release: int)
     live : (p,)
         Who has a residual at all.
     confirm, release
-        Frames in a row after which a meter is named, and is not named any more.
+        Readings above the threshold after which a meter is named, and readings in a row below it after
+        which it is neither named nor suspected any more.
     """
-    above = np.where(live, np.where(over, tally.above + 1, 0), tally.above)
     below = np.where(live, np.where(over, 0, tally.below + 1), tally.below)
+    above = np.where(below >= release, 0, tally.above + (live & over))
     named = (tally.named & (below < release)) | (above >= confirm)
     return Tally(above, below, named)
 
@@ -59,8 +65,8 @@ class Situation:
         How to call the meters in sentences.
     max_attacked
         M.
-    live, over, named : (p,)
-        Who reports, whose residual is above the threshold now, who is named.
+    live, suspected, named : (p,)
+        Who reports, who was above the threshold lately, who is named.
     wide : (p,)
         Whose threshold is too wide for an answer.
     valid, settled, busbar
@@ -70,7 +76,7 @@ class Situation:
     names: tuple[str, ...]
     max_attacked: int
     live: Bools
-    over: Bools
+    suspected: Bools
     named: Bools
     wide: Bools
     valid: bool
@@ -93,7 +99,7 @@ def decide(now: Situation) -> tuple[Decision, Cause, str]:
     live, named = int(np.count_nonzero(now.live)), int(np.count_nonzero(now.named))
     need = 2 * now.max_attacked + 1
     silent = ~now.live
-    pending = now.over & now.live & ~now.named
+    pending = now.suspected & ~now.named
     suspects = _list(now, now.named)
     answers = (
         (
@@ -139,7 +145,7 @@ def decide(now: Situation) -> tuple[Decision, Cause, str]:
             bool(pending.any()),
             undecided,
             Cause.AMBIGUOUS,
-            f"{_list(now, pending)}: further off than allowed, but not for long enough to be named.",
+            f"{_list(now, pending)}: further off than allowed lately, but not often enough to be named.",
         ),
         (
             bool(now.wide.any()),

@@ -10,8 +10,8 @@ run it. A step never raises on data: outcomes are values.
 3. The residuals of *all* meters against the selected estimate are compared with the largest value an
    honest meter can reach (`gridsec.detect`). Lies inside a droop curve's deadband do not move any
    estimate, so that agreement alone would not find them.
-4. A meter that stays above its threshold for `confirm` frames is named, one that stays below it for
-   `release` frames is not any more, and the selection is repeated without the accused.
+4. A meter is named with its `confirm`-th reading above the threshold and stays so until `release` readings
+   in a row were below it; the selection is repeated without the accused.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from gridsec.feeder import LinDistFlow, lindistflow, loss_correction
 from gridsec.frames import NO_VOLTAGE, Inputs, clean, injections
 from gridsec.judge import Situation, Tally, count, decide, residual_excess
 from gridsec.lmi import contraction
-from gridsec.lure import Lure, close_loop
+from gridsec.lure import Lure, close_loop, rest
 from gridsec.online import Cause, Decision, Estimate, Frame, Verdict
 from gridsec.plant import MonitorDesign, MonitorState, Options, Plant
 from gridsec.stacked import StackedState
@@ -57,8 +57,8 @@ def design(
     max_attacked
         M, how many meters may be manipulated at the same time.
     step_s
-        Expected interval between frames, s. Other intervals work, too; above 30 s a meter is named
-        after one frame instead of two, unless `options` say otherwise.
+        Expected interval between frames, s. Other intervals work, too; above 30 s four honest readings
+        in a row clear a meter instead of ten, unless `options` say otherwise.
     gains
         `direct`: the inverter of a trusted meter is driven by that meter's reading. Or stacked gains
         of circle-criterion observers in the order of `bank.subsets(p, M).masks()`; an entrywise
@@ -92,7 +92,7 @@ def design(
     if not (np.isfinite(step_s) and step_s > 0):
         raise ValueError(f"step_s is {step_s}; it must be a positive number of seconds")
     if options is None:
-        options = Options() if step_s <= 30.0 else Options(confirm=1, release=1)
+        options = Options() if step_s <= 30.0 else Options(release=4)
     lure = close_loop(plant.feeder, plant.droop, meters)
     model = lindistflow(plant.feeder)
     bank = banks.design(lure, max_attacked, gains=gains, reactive=_reactive(model, meters, gains))
@@ -280,7 +280,7 @@ def _conclude(  # noqa: PLR0917  # the chain's three values, then what this step
             names=tuple(plant.feeder.customers[c] for c in plant.meters),
             max_attacked=design.bank.sets.max_attacked,
             live=live,
-            over=over,
+            suspected=tally.above > 0,
             named=tally.named,
             wide=live & (view.threshold > options.widest),
             valid=state.valid,
@@ -387,7 +387,8 @@ def _view(  # noqa: PLR0917  # as _conclude
     moved = np.abs(correction - inputs.correction)[plant.feeder.bus]
     now = replace(inputs.now, base=inputs.now.base + moved)
     before = z if state.bank is None else state.z
-    motion = Motion(before=before, after=z, offset=offset[own], h=h)
+    lag = _slowed(design, h) * (np.abs(x - state.x) + spread)
+    motion = Motion(before=before, after=z, offset=offset[own], h=h, lag=lag)
     if index >= 0:
         bound, level = detect.advance(errors, now, motion, state.bound, state.level)
         error = detect.gap(errors, now, bound) + offset
@@ -400,10 +401,17 @@ def _view(  # noqa: PLR0917  # as _conclude
     if index >= 0 and not settled:
         none = np.zeros(x.shape)
         top = detect.ceiling(errors, now, motion, ErrorBound(none, none))
-        rest = detect.settled(errors, now, motion, top)
-        transient = detect.gap(errors, now, bound)[at] - detect.gap(errors, now, rest)[at]
+        level_at_rest = detect.settled(errors, now, motion, top)
+        transient = detect.gap(errors, now, bound)[at] - detect.gap(errors, now, level_at_rest)[at]
         settled = bool(np.all(transient <= design.options.settled * threshold))
     return _View(index, x, z, spread, bound, level, settled, v2, v2_bus, error, score, threshold)
+
+
+def _slowed(design: MonitorDesign, h: float) -> Bools:
+    """Inverters that the step takes for slower than they are: `lure.transition`, `rest`; (m,)."""
+    fast = design.plant.droop.tau * rest(h, design.bank.policy) < 1.0
+    # Where all are that fast, the step ends in the equilibrium.
+    return fast & ~fast.all()
 
 
 def _saturated(design: MonitorDesign, inputs: Inputs, frame: Frame, x: Floats) -> Floats:

@@ -50,9 +50,10 @@ class Options:
         Standard deviations of jitter that an honest reading may be off. One reading in 16 000 is
         further off at 4, and then only matters for a meter at the very limit of its class.
     confirm
-        Frames in a row above the threshold before a meter is named.
+        Readings above the threshold before a meter is named.
     release
-        Frames in a row below it before it is not named any more.
+        Readings in a row below it before a meter is neither named nor suspected any more. A lie on at
+        least every `release`-th reading is named; docs/theory-detection.md, section 5.
     settled
         The verdict is SETTLING until what is left of the unknown initial state is less than this part
         of every threshold.
@@ -67,7 +68,7 @@ class Options:
 
     sigmas: float = 4.0
     confirm: int = 2
-    release: int = 2
+    release: int = 10
     settled: float = 0.1
     tie: float = 1e-6
     widest: float = 0.1

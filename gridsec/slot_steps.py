@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints
-from gridsec.lure import StepPolicy, transition
+from gridsec.lure import StepPolicy, transition, unit
 from gridsec.slots import Block, Drive, Layout, SlotState
 from gridsec.subsets import Subsets
 
@@ -183,10 +183,11 @@ class _Loops:
         """Damped semismooth Newton, as in `gridsec.lure.settle`; then, if need be, plain integration."""
         x = x.copy()
         left = np.arange(x.shape[0])
+        tol = policy.tol * unit(self.lay.droop)
         for _ in range(policy.max_iter):
             loops, now = self.take(left), x[left]
             residual = loops.residual(now)
-            rough = np.abs(residual).max(axis=1) > policy.tol
+            rough = np.abs(residual).max(axis=1) > tol
             left = left[rough]
             if not left.size:
                 return x

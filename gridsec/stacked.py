@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gridsec.arrays import Bools, Floats
-from gridsec.lure import Lure, StepPolicy, Transition, transition
+from gridsec.lure import Lure, StepPolicy, Transition, transition, unit
 
 _QUOTIENT = 1e-7
 _HALVINGS = 30
@@ -194,6 +194,7 @@ def _newton(
     # In units of the state: divide by the open loop, as `lure.equilibrium` does.
     scale = np.abs(np.diagonal(lure.A))
     scale = np.where(scale > 0, scale, 1.0)
+    tol = policy.tol * unit(lure.phi)
 
     def residual(now: Floats) -> Floats:
         phi = lure.phi(_times(H, now) + zeta)
@@ -201,7 +202,7 @@ def _newton(
 
     for _ in range(policy.max_iter):
         rest = residual(x)
-        rough = np.abs(rest).max(axis=1, initial=0.0) > policy.tol
+        rough = np.abs(rest).max(axis=1, initial=0.0) > tol
         if not rough.any():
             break
         z = _times(H, x) + zeta

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
 import pytest
 
 from feeders.inverters import ClosedLoop, Loads, Point
-from feeders.load import Site, Snapshot, load, names, plant, to_frame
+from feeders.load import Site, Snapshot, from_tables, load, names, plant, to_frame
 from feeders.powerflow import PowerFlow
 from gridsec import monitor
 from gridsec.online import Cause, Decision, Verdict
@@ -191,3 +191,42 @@ def test_lies_against_the_own_bias_are_named_while_droop_is_active(name: str) ->
                     verdict = watch.look(lies)
                     assert verdict.decision is not Decision.CLEAN
                 assert all(verdict.suspects[j] for j in lies), verdict.reason
+
+
+def test_wide_load_intervals_on_a_long_feeder(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One meter, no inverter: loads at their intervals' far end, where losses are largest."""
+    tables = load("case33bw").tables
+    rows = tuple(
+        replace(c, meter=c.meter if i == 0 else "", inverter_kva=0.0, droop="")
+        for i, c in enumerate(tables.customers)
+    )
+    tables = replace(
+        tables,
+        meta=replace(tables.meta, monitor=replace(tables.meta.monitor, max_attacked=0)),
+        customers=rows,
+    )
+    made = from_tables(tables)
+    monkeypatch.setattr(f"{__name__}.site", lambda _: made)
+    monkeypatch.setattr(
+        f"{__name__}.designed", lambda _, h: monitor.design(plant(made), max_attacked=0, step_s=h)
+    )
+    watch = Watch(World("case33bw", LOW, v0=0.95, load=1.0, sun=0.0), 900.0)
+    for _ in range(2):
+        watch.world.run(900.0)
+        watch.look()
+
+
+@pytest.mark.parametrize("jump", ["load", "sun"])
+@pytest.mark.parametrize("ends", [HIGH, LOW])
+@pytest.mark.parametrize("v0", [0.955, 0.99, 1.03, 1.045])
+@pytest.mark.parametrize("name", ["cigre-lv", "kerber-landnetz", "case33bw"])
+def test_a_jump_just_before_a_quarter_hourly_reading(name: str, v0: float, ends: Ends, jump: str) -> None:
+    watch = Watch(World(name, ends, v0=v0, load=0.4, sun=0.5), 900.0)
+    world = watch.world
+    for _ in range(4):
+        world.run(900.0)
+        watch.look()
+    world.run(899.5)
+    world.demand(float(jump == "load"), float(jump == "sun"))
+    world.run(0.5)
+    watch.look()

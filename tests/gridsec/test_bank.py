@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
 from math import comb
 
@@ -231,6 +232,25 @@ class TestAgainstLoop:
         np.testing.assert_allclose(states(slow, a), states(fast, b), rtol=0.0, atol=1e-6)
         a, b = banks.step(slow, a, y, u, seen, 1.0), banks.step(fast, b, y, u, seen, 1.0)
         np.testing.assert_allclose(states(slow, a), states(fast, b), rtol=0.0, atol=1e-6)
+
+    @pytest.mark.parametrize("base_kva", [1e2, 1e7, 1e12])
+    @pytest.mark.parametrize("general", [False, True])
+    def test_equilibria_do_not_depend_on_the_base_power(self, base_kva: float, general: bool) -> None:
+        rng = np.random.default_rng(17)
+        feeder, droop = tree(6, rng, impedance=0.05), mixed_fleet(np.arange(6), rng)
+        scale = 100.0 / base_kva
+        y, u = readings(close_loop(feeder, droop, np.arange(6)), rng)
+        found = []
+        for factor in (1.0, scale):
+            branch = {"r": feeder.r / factor, "x": feeder.x / factor}
+            own = Droop(droop.customer, droop.v, droop.q * factor, droop.tau, droop.vbar)
+            lure = close_loop(replace(feeder, **branch), own, np.arange(6))
+            gains = banks.direct_gains(lure, banks.subsets(6, 2, most=100).masks()) if general else "direct"
+            bank = banks.design(lure, 2, gains=gains)
+            state = banks.init(bank, y, u, np.ones(6, dtype=bool))
+            state = banks.step(bank, state, y + 0.02, u, np.ones(6, dtype=bool), 900.0)
+            found.append(np.array([banks.estimate(bank, state, i) for i in range(len(bank.masks))]) / factor)
+        np.testing.assert_allclose(found[1], found[0], rtol=0.0, atol=1e-8 * np.max(droop.limit))
 
     def test_differential_equation(self) -> None:
         """With fine substeps every observer follows its differential equation."""

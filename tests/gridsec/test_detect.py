@@ -51,8 +51,24 @@ class TestReadingError:
         spec = accuracy()
         worst = (1.0 * 1.005 + 2e-4 + 3.0 * 5e-4) ** 2 - 1.0
         assert detect.reading_error(spec, np.ones(2), 3.0)[0] == pytest.approx(worst, rel=1e-12)
-        busbar = (1.001 + 2e-4 + 3e-4) ** 2 - 1.0
-        assert detect.busbar_error(spec, 1.0, 3.0) == pytest.approx(busbar, rel=1e-12)
+        # The reading is 1, the truth below it by what the class is of the truth itself.
+        truth = (1.0 - 2e-4 - 3e-4) / 1.001
+        below = 1.0 - truth**2
+        assert below <= detect.busbar_error(spec, 1.0, 3.0) <= 1.004 * below
+
+    @settings(max_examples=200)
+    @given(
+        v=st.floats(0.5, 1.5),
+        bias=st.floats(-1.0, 1.0),
+        jitter=st.floats(-3.0, 3.0),
+        klass=st.sampled_from([0.0, 0.001, 0.05, 0.3]),
+    )
+    def test_busbar_from_the_reading_alone(self, v: float, bias: float, jitter: float, klass: float) -> None:
+        """The class is a part of the truth; what is known is the reading."""
+        spec = accuracy(busbar_class=klass)
+        reading = v * (1.0 + bias * klass) + jitter * spec.busbar_jitter
+        bound = detect.busbar_error(spec, reading**2, 3.0)
+        assert abs(reading**2 - v**2) <= bound * (1.0 + 1e-12)
 
     @pytest.mark.parametrize(
         "changes",
@@ -63,6 +79,7 @@ class TestReadingError:
             {"jitter": np.zeros((2, 1))},
             {"busbar_class": -0.1},
             {"busbar_jitter": float("inf")},
+            {"busbar_class": 1.0},
         ],
     )
     def test_wrong_descriptions(self, changes: dict[str, object]) -> None:
@@ -201,6 +218,36 @@ class TestErrorBound:
             tight = max(tight, float((error / np.maximum(each, 1e-12)).max()))
             before = after
         assert tight > 0.0
+
+    @pytest.mark.parametrize("ago", [0.2, 2.0, 20.0, 800.0])
+    def test_a_jump_at_any_time_within_a_long_step(self, ago: float) -> None:
+        """The readings at the end are taken for the whole step; the inverters lived through the jump."""
+        rng = np.random.default_rng(8)
+        plant = make_plant(rng, customers=5, drop=0.1, presets=("ieee1547-b", "vde4105"))
+        droop, h = plant.droop, 900.0
+        lin = lindistflow(plant.feeder)
+        model = replace(detect.error_model(droop, lin, plant.meters, 1), mismatch=np.zeros(5))
+        S, zero, none = 2.0 * lin.X, np.zeros(5), np.zeros(5, dtype=bool)
+        exact = Uncertainty(zero, zero, ~none, none, zero)
+
+        def rest(w: np.ndarray, x: np.ndarray) -> np.ndarray:
+            for _ in range(3000):
+                x = x + 0.2 * (droop(w - S @ x) - x)
+            return x
+
+        calm, jumped = np.full(5, 0.05), np.full(5, 0.11)
+        true = rest(calm, zero)
+        before = calm - S @ true
+        seen = rest(jumped, true)
+        rate = lambda _, x: (droop(jumped - S @ x) - x) / droop.tau  # noqa: E731
+        true = solve_ivp(rate, (0.0, ago), true, rtol=1e-9, atol=1e-12, max_step=1.0).y[:, -1]
+        motion = Motion(before=before, after=jumped - S @ true, offset=zero, h=h)
+        start = ErrorBound(zero, zero)
+        bound, _ = detect.advance(model, exact, motion, start, detect.widest(model))
+        # An observer that listens to everybody rests where the last readings put it.
+        heard = droop(jumped - S @ true)
+        assert (np.abs(true - heard) <= bound.driven + 1e-9).all()
+        assert (np.abs(true - seen) <= bound.free + 1e-9).all()
 
     def test_decays_from_saturation_to_its_settled_level(self) -> None:
         rng = np.random.default_rng(3)

@@ -19,19 +19,37 @@ FRESH = Tally(np.zeros(1, dtype=np.intp), np.zeros(1, dtype=np.intp), np.zeros(1
     confirm=st.integers(1, 4),
     release=st.integers(1, 4),
 )
-def test_named_by_runs(history: list[str], confirm: int, release: int) -> None:
-    """Against the plain reading: silence is no reading, and only runs of readings change anything."""
+def test_named_by_readings_under_suspicion(history: list[str], confirm: int, release: int) -> None:
+    """Against the plain reading of all that was heard; silence is no reading.
+
+    A suspicion is what follows the last run of `release` readings below; it names with `confirm` above.
+    """
     tally, named, heard = FRESH, False, []
     for what in history:
         live, over = np.array([what != "silent"]), np.array([what == "over"])
         tally = count(tally, over, live, confirm=confirm, release=release)
         if what != "silent":
             heard.append(what)
-            if heard[-confirm:] == ["over"] * confirm:
-                named = True
-            if heard[-release:] == ["under"] * release:
-                named = False
+            runs = [
+                i for i in range(release, len(heard) + 1) if heard[i - release : i] == ["under"] * release
+            ]
+            suspicion = heard[runs[-1] if runs else 0 :].count("over")
+            named = suspicion >= confirm
+            assert (tally.above[0] > 0) == (suspicion > 0)
         assert tally.named[0] == named
+
+
+@given(gap=st.integers(0, 8), start=st.integers(0, 5))
+def test_flicker_is_named_with_its_second_flash(gap: int, start: int) -> None:
+    """A lie on every second, third, ... reading, down to one in `release`, and never free in between."""
+    tally = FRESH
+    flashes = 0
+    for k in range(start + 10 * (gap + 1)):
+        over = np.array([k >= start and (k - start) % (gap + 1) == 0])
+        flashes += bool(over[0])
+        tally = count(tally, over, np.array([True]), confirm=2, release=9)
+        assert tally.named[0] == (flashes >= 2)
+        assert (tally.above[0] > 0) == (flashes >= 1)
 
 
 def calm() -> Situation:
@@ -40,7 +58,7 @@ def calm() -> Situation:
         names=tuple("abcde"),
         max_attacked=1,
         live=~no,
-        over=no,
+        suspected=no,
         named=no,
         wide=no,
         valid=True,
@@ -61,7 +79,7 @@ def test_order_of_answers() -> None:
     """Each flaw hides all that come after it, and none of them leaves CLEAN."""
     flaws: list[tuple[Cause, dict[str, object]]] = [
         (Cause.AMBIGUOUS, {"wide": only(3)}),
-        (Cause.AMBIGUOUS, {"over": only(2)}),
+        (Cause.AMBIGUOUS, {"suspected": only(2)}),
         (Cause.SETTLING, {"settled": False}),
         (Cause.SILENT_METERS, {"live": ~only(4)}),
         (Cause.RESIDUALS, {"named": only(1)}),

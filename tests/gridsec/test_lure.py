@@ -167,6 +167,54 @@ def test_long_steps_take_the_equilibrium_and_the_change_is_seamless() -> None:
     )
 
 
+@pytest.mark.parametrize("h", [0.5, 20.0, 900.0])
+@settings(max_examples=12)
+@given(seed=seeds, gain=st.sampled_from([0.3, 0.9, 2.0]))
+def test_states_far_faster_than_the_step_are_at_rest(h: float, seed: int, gain: float) -> None:
+    """Milliseconds beside days cost no more substeps, and what the slow ones see of it is small."""
+    _, droop, lure = random_loop(seed, gain=gain)
+    rng = np.random.default_rng([seed, 6])
+    tau = rng.permutation(np.resize([1e-3, 0.05, 3.0, 1e6], droop.tau.size))
+    droop = Droop(droop.customer, droop.v, droop.q, tau, droop.vbar)
+    lure = replace(lure, A=-np.diag(1.0 / tau), G=np.diag(1.0 / tau), phi=droop)
+    u = rng.uniform(-0.2, 0.2, lure.F.shape[1])
+    x = rng.uniform(-1.0, 1.0, tau.size) * droop.limit
+    assert transition(lure, h).substeps <= 140 * (1 + 2 * gain)
+    after, size = advance(lure, x, u, h), float(np.max(droop.limit))
+    exact = solve_ivp(lambda _, s: right_side(lure, s, u), (0.0, h), x, "LSODA", rtol=1e-8, atol=1e-11 * size)
+    assert np.max(np.abs(after - exact.y[:, -1])) < 0.07 * gain * size
+    still = (tau < 0.07 * h) & (tau < 1.0)
+    assert np.max(np.abs(after - droop(lure.H @ after + lure.F @ u))[still], initial=0.0) < 0.01 * size
+
+
+@pytest.mark.parametrize("base_kva", [1e-1, 1e2, 1e7, 1e12])
+def test_the_base_power_is_anybodys_choice(base_kva: float) -> None:
+    """Injections in kvar do not depend on it, however small they are in pu."""
+    _, droop, lure = random_loop(2, gain=2.0)
+    scale = 100.0 / base_kva
+    small = Droop(droop.customer, droop.v, droop.q * scale, droop.tau, droop.vbar)
+    same = replace(lure, H=lure.H / scale, C=lure.C / scale, slope=small.slope, phi=small)
+    u = np.full(lure.F.shape[1], 0.1)
+    for h in (1.0, 900.0):
+        wanted = advance(lure, -droop.limit, u, h)
+        found = advance(same, -small.limit, u, h) / scale
+        assert np.max(np.abs(found - wanted)) < 1e-8 * np.max(droop.limit)
+
+
+@pytest.mark.parametrize("lead", [(), (3,), (2, 3)])
+def test_no_inverters_in_batches(lead: tuple[int, ...]) -> None:
+    feeder = random_feeder(4)
+    nobody = fleet(np.array([], dtype=np.intp), [], np.array([]), 100.0)
+    lure = close_loop(feeder, nobody, np.array([0]))
+    u = np.zeros((*lead, len(feeder.customers)))
+    assert equilibrium(lure, u, tol=1e-10, max_iter=5).shape == (*lead, 0)
+    empty = np.zeros((*lead, 0))
+    found = settle(lure.phi, np.eye(0), lure.H, drive=empty, bias=empty, x0=empty, tol=1e-10, max_iter=5)
+    assert found.shape == (*lead, 0)
+    for h in (0.0, 1.0, 900.0):
+        assert advance(lure, empty, u, h).shape == (*lead, 0)
+
+
 @pytest.mark.parametrize("h", [-1.0, np.nan, np.inf])
 def test_impossible_steps_are_refused(h: float) -> None:
     _, _, lure = random_loop(2, gain=1.0)
