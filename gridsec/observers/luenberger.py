@@ -305,6 +305,11 @@ def geometric(part: Part, gain: Floats, process: float, noise: float, E: Floats,
     Envelope
         With `growth(k) = eta_F beta^k` and limit = (eta_L n_max + eta_Z d_max) / (1 - beta).
 
+    Raises
+    ------
+    DesignInfeasible
+        If beta is so close to the spectral radius that the constants cannot be found in `LONGEST` steps.
+
     References
     ----------
     lee2018 (4.3.7).

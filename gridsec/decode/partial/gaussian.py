@@ -43,7 +43,8 @@ class GaussianDesign:
         Delta_TH for every number of degrees of freedom. Without any, the statistic is not random: a
         violation of size 1 alarms.
     rule
-        How the set is chosen after an alarm, see `gridsec.decode.gaussian.choose`.
+        How the set is chosen after an alarm, see `gridsec.decode.gaussian.choose`. "density" is the paper's,
+        which prefers sets with few rows where sensors see different amounts; "tail" does not.
     readmit
         Steps in a row that all sensors together must pass their test, after an alarm, before all of them
         are trusted again; 0: never, as printed.
@@ -143,7 +144,7 @@ def design(
     false_alarm: float,
     tol: float,
     steady: Steady | None = None,
-    rule: Rule = "density",
+    rule: Rule = "tail",
     readmit: int = 0,
     refresh: float = 0.0,
     most: int = MOST_SUBSETS,
