@@ -278,8 +278,8 @@ def deadbeat_bank() -> tuple[DiscreteDesign, ...]:
     )
     options = discrete_options(plant, decays=0.01, noise=1.0)
     made = []
-    for J in (J for size in (5, 3, 1) for J in combinations(range(5), size)):
-        mask = np.isin(np.arange(5), J)
+    for mask in windows.bank_masks(5, 2):
+        J = np.flatnonzero(mask)
         L = np.full((1, len(J)), 0.5 / len(J))
         proof = discrete_prove(plant, J, L, np.zeros((1, len(J))), options)
         made.append(circle_discrete.design(plant, mask, gains=proof))

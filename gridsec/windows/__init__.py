@@ -13,7 +13,7 @@ References
 yang2019, Algorithms 1 and 2; docs/theory-discrete.md, section 3.
 """
 
-from gridsec.windows.design import WindowDesign, bank, consistency, design
+from gridsec.windows.design import WindowDesign, bank, bank_masks, consistency, design
 from gridsec.windows.rules import Isolation, Rule, believed, detection, isolation
 from gridsec.windows.run import WindowState, WindowVerdict, init, step
 from gridsec.windows.trial import Trace, calibrate, simulate
@@ -26,6 +26,7 @@ __all__ = [
     "WindowState",
     "WindowVerdict",
     "bank",
+    "bank_masks",
     "believed",
     "calibrate",
     "consistency",

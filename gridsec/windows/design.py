@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gridsec.arrays import Floats, frozen
+from gridsec.arrays import Bools, Floats, frozen
 from gridsec.lmi.discrete import DiscreteOptions, discrete_circles
 from gridsec.lmi.discrete_bounds import DirectProof
 from gridsec.lmi.sampled import DiscreteLure
@@ -64,6 +64,27 @@ class WindowDesign:
     rule: Rule
 
 
+def bank_masks(meters: int, max_attacked: int, *, most: int = MOST_OBSERVERS) -> Bools:
+    """Sets of meters of all observers of a bank, in their order: all meters, then J, then S.
+
+    Parameters
+    ----------
+    meters
+        p.
+    max_attacked
+        q.
+    most
+        Largest number of observers that is acceptable.
+
+    Returns
+    -------
+    (o, p)
+        Masks.
+    """
+    sets = subsets(meters, max_attacked, most=most)
+    return np.vstack([np.ones((1, meters), dtype=np.bool_), sets.masks()])
+
+
 def bank(
     system: DiscreteLure,
     max_attacked: int,
@@ -98,8 +119,7 @@ def bank(
         raise ValueError("max_attacked must be at least 1: without liars there is nothing to isolate")
     if (options is None) == (proof is None):
         raise ValueError("give options for gains by matrix inequality, or a proof for direct injection")
-    sets = subsets(len(system.C), max_attacked, most=most)
-    masks = np.vstack([np.ones((1, sets.meters), dtype=np.bool_), sets.masks()])
+    masks = bank_masks(len(system.C), max_attacked, most=most)
     if proof is not None:
         return tuple(circle_discrete.design(system, mask, gains=proof) for mask in masks)
     assert options is not None  # noqa: S101  # exactly one of the two, checked above
@@ -152,10 +172,9 @@ def design(
     """
     p = len(observers[0].system.C)
     sets = subsets(p, max_attacked, most=MOST_OBSERVERS)
-    if len(observers) != 1 + sets.count_large + sets.count_small:
-        raise ValueError(
-            f"{len(observers)} observers do not make a bank for {p} meters, {max_attacked} liars"
-        )
+    wanted = bank_masks(p, max_attacked)
+    if not np.array_equal(np.stack([one.trusted for one in observers]), wanted):
+        raise ValueError(f"no bank for {p} meters and {max_attacked} liars, in the order of `bank_masks`")
     if length < 1:
         raise ValueError("a window has at least one step")
     gamma = np.array([one.noise_gain for one in observers]) if gains is None else np.asarray(gains)

@@ -122,16 +122,20 @@ def isolation(pi_sets: Floats, thresholds: Floats, masks: Bools, length: int, ru
 
 
 def _majority(trusted: Bools, votes: Bools) -> Isolation:
-    """The most frequent set (…, w, N, p) among the steps that vote (…, w, N)."""
+    """The most frequent set (…, w, N, p) among the steps that vote (…, w, N); of equals the first seen."""
     lead, (length, p) = trusted.shape[:-2], trusted.shape[-2:]
-    suspects = np.zeros((int(np.prod(lead, dtype=np.intp)), p), dtype=np.bool_)
-    share = np.zeros(len(suspects))
-    rows = zip(trusted.reshape(-1, length, p), votes.reshape(-1, length), strict=True)
-    for index, (sets, voting) in enumerate(rows):
-        if not voting.any():
-            continue
-        kinds, first, tally = np.unique(sets[voting], axis=0, return_index=True, return_counts=True)
-        # Most votes; of equals the one that was seen first.
-        winner = min(range(len(kinds)), key=lambda i: (-tally[i], first[i]))
-        suspects[index], share[index] = ~kinds[winner], tally[winner] / length
+    rows = trusted.reshape(-1, p)
+    if not rows.size:
+        return Isolation(np.zeros((*lead, p), np.bool_), np.zeros(lead, np.bool_), np.zeros(lead))
+    _, first, kind = np.unique(np.packbits(rows, axis=1), axis=0, return_index=True, return_inverse=True)
+    count = len(rows) // length
+    window, voting = np.repeat(np.arange(count), length), votes.reshape(-1)
+    code = window * len(first) + kind.reshape(-1)
+    tally = np.bincount(code[voting], minlength=count * len(first)).reshape(count, -1)
+    seen = np.full(count * len(first), length)
+    np.minimum.at(seen, code[voting], np.tile(np.arange(length), count)[voting])
+    # Most votes first; `seen` is at most N and decides between equals only.
+    winner = np.argmax(tally * (length + 1) - seen.reshape(tally.shape), axis=1)
+    share = tally[np.arange(count), winner] / length
+    suspects = ~rows[first[winner]] & (share > 0.0)[:, None]
     return Isolation(suspects.reshape(*lead, p), (share > 0.0).reshape(lead), share.reshape(lead))
