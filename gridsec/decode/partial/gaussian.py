@@ -210,11 +210,17 @@ def init(
         Of the state; the covariance is not used by stationary filters.
     y, seen : (p,), (p,)
         As in `kalman.correct`.
+
+    Raises
+    ------
+    ValueError
+        If a stationary filter lacks a reading.
     """
     first = kalman.init(design.filters, t, mean, covariance)
     if design.steady is None:
         first = kalman.correct(design.filters, first, y, seen)
     else:
+        _require_all(seen)
         z = first.z + (y - first.z @ design.filters.stack.T.T) @ design.steady.K.T
         first = KalmanState(t, z, design.steady.P, design.steady.K)
     return decode(design, GaussianState(first, 0, 0, _none(design, first.P)))
@@ -238,8 +244,7 @@ def step(
         If a stationary filter lacks a reading.
     """
     if design.steady is not None:
-        if seen is not None and not np.all(seen):
-            raise ValueError("filters with stationary gains need every reading; design without `steady`")
+        _require_all(seen)
         filters = kalman.step_steady(design.filters, design.steady, state.filters, y, u)
     else:
         filters = kalman.step(design.filters, state.filters, y, u, seen)
@@ -292,6 +297,11 @@ def decode(design: GaussianDesign, state: GaussianState) -> tuple[GaussianState,
         credible,
     )
     return GaussianState(state.filters, chosen, passed, tables), outcome
+
+
+def _require_all(seen: Bools | None) -> None:
+    if seen is not None and not np.all(seen):
+        raise ValueError("filters with stationary gains need every reading; design without `steady`")
 
 
 def _score(fused: Fused, z: Floats) -> float:

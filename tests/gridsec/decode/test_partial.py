@@ -333,6 +333,8 @@ def test_tables_are_refreshed_as_asked_and_steady_filters_keep_them() -> None:
     assert np.allclose(sharp.covariance, settled.covariance, rtol=1e-2)
     with pytest.raises(ValueError, match="every reading"):
         gaussian.step(fixed, at_rest, C @ np.zeros(3), np.zeros(1), np.arange(6) > 0)
+    with pytest.raises(ValueError, match="every reading"):
+        gaussian.init(fixed, 0.0, np.zeros(3), np.eye(3), y[0], seen=np.arange(6) > 0)
 
 
 def test_silent_sensor_does_not_alarm_and_its_reading_does_not_matter() -> None:
