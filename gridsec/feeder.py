@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
+from math import prod
 
 import numpy as np
 
@@ -255,7 +256,31 @@ def loss_correction(
     """
     if steps < 1:
         raise ValueError(f"steps is {steps}; it must be at least 1")
+    return _correction(feeder, _linear_flows(feeder, p, q, v0_squared), steps)
+
+
+def corrected(
+    feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1
+) -> tuple[Floats, Floats]:
+    """`loss_correction` and `model_error_bound` of the same operating points, in less time than apart.
+
+    Parameters
+    ----------
+    feeder, p, q, v0_squared, steps
+        As in `loss_correction`.
+
+    Returns
+    -------
+    (…, b + 1), (…, N)
+        Additive correction of `v^2`, and a bound on what it leaves after its first step, pu.
+    """
+    if steps < 1:
+        raise ValueError(f"steps is {steps}; it must be at least 1")
     flows = _linear_flows(feeder, p, q, v0_squared)
+    return _correction(feeder, flows, steps), _remainder(feeder, flows)
+
+
+def _correction(feeder: Feeder, flows: _Flows, steps: int) -> Floats:
     v2, P, Q = flows.v2, flows.P, flows.charged
     for _ in range(steps):
         current = (P**2 + Q**2) / v2[..., 1:]
@@ -283,7 +308,10 @@ def model_error_bound(feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats |
     (…, N)
         Bound on the remaining error of `v^2`, pu.
     """
-    flows = _linear_flows(feeder, p, q, v0_squared)
+    return _remainder(feeder, _linear_flows(feeder, p, q, v0_squared))
+
+
+def _remainder(feeder: Feeder, flows: _Flows) -> Floats:
     with np.errstate(all="ignore"):
         current = (flows.P**2 + flows.charged**2) / flows.v2[..., 1:]
         charge = flows.half * flows.v2
@@ -316,9 +344,8 @@ class _Flows:
 
 def _linear_flows(feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats | float) -> _Flows:
     """The linear power flow, from the injections of the customers."""
-    P, Q = (
-        _below(feeder, -_at_buses(feeder, np.asarray(each, dtype=np.float64)))[..., 1:] for each in (p, q)
-    )
+    both = np.stack(np.broadcast_arrays(p, q)).astype(np.float64, copy=False)
+    P, Q = _below(feeder, -_at_buses(feeder, both))[..., 1:]
     base = np.asarray(v0_squared, dtype=np.float64)[..., None]
     v2 = base + _from_busbar(feeder, -2.0 * (feeder.r * P + feeder.x * Q))
     half = np.zeros(len(feeder.buses))
@@ -329,17 +356,18 @@ def _linear_flows(feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats | flo
 
 def _losses(feeder: Feeder, current: Floats, charge: Floats, *, sign: float) -> tuple[Floats, Floats, Floats]:
     """What squared currents (…, b) and charging powers (…, b + 1) add to P, Q and to the drop of v^2."""
-    loss_p = _strictly_below(feeder, feeder.r * current)
-    loss_q = _strictly_below(feeder, feeder.x * current) + sign * _below(feeder, charge)[..., 1:]
+    loss_p, loss_q = _strictly_below(feeder, np.stack([feeder.r * current, feeder.x * current]))
+    loss_q = loss_q + sign * _below(feeder, charge)[..., 1:]
     drop = 2.0 * (feeder.r * loss_p + feeder.x * loss_q) + (feeder.r**2 + feeder.x**2) * current
     return loss_p, loss_q, drop
 
 
 def _at_buses(feeder: Feeder, values: Floats) -> Floats:
     """Sum of the customers' `values` (…, N) at every bus, (…, b + 1)."""
-    out = np.zeros((*values.shape[:-1], len(feeder.buses)))
-    np.add.at(np.moveaxis(out, -1, 0), feeder.bus, np.moveaxis(values, -1, 0))
-    return out
+    shape = (*values.shape[:-1], len(feeder.buses))
+    first = np.arange(0, prod(shape), shape[-1])[:, None]
+    total = np.bincount((first + feeder.bus).ravel(), weights=values.ravel(), minlength=prod(shape))
+    return np.asarray(total.reshape(shape))
 
 
 def _below(feeder: Feeder, values: Floats) -> Floats:

@@ -9,7 +9,7 @@ import numpy as np
 from gridsec import detect
 from gridsec.arrays import Bools, Floats
 from gridsec.detect import Uncertainty
-from gridsec.feeder import loss_correction, model_error_bound
+from gridsec.feeder import corrected
 from gridsec.lure import known_input
 from gridsec.online import Frame
 from gridsec.plant import MonitorDesign, MonitorState, Plant
@@ -106,9 +106,9 @@ def _losses(
     # The correction is nearly quadratic in the loads: its ends are where all of them err the same way.
     ends = np.array([0.0, -1.0, 1.0])[:, None]
     with np.errstate(all="ignore"):
-        three = loss_correction(feeder, p + ends * p_error, q + ends * q_error, v0, steps=max(steps, 1))
-        # What is left grows with the cube of the load, so the centre says nothing about the ends.
-        rest = model_error_bound(feeder, p + ends * p_error, q + ends * q_error, v0).max(axis=0)
+        three, left = corrected(feeder, p + ends * p_error, q + ends * q_error, v0, steps=max(steps, 1))
+    # What is left grows with the cube of the load, so the centre says nothing about the ends.
+    rest = left.max(axis=0)
     three = np.nan_to_num(three, nan=0.0, posinf=0.0, neginf=0.0)
     moved = np.abs(three[1:] - three[0]).max(axis=0)[feeder.bus]
     rest = np.nan_to_num(rest, nan=NO_VOLTAGE, posinf=NO_VOLTAGE)

@@ -161,36 +161,49 @@ def test_no_jump_between_two_readings_is_an_attack(name: str) -> None:
 
 # A lie, in percent, that is named whatever the honest errors: more where the loads are known less well.
 NAMED_PERCENT = {
-    "case33bw": 6.0,
-    "cigre-lv": 3.5,
-    "kerber-dorfnetz": 3.5,
+    "case33bw": 5.5,
+    "cigre-lv": 3.25,
+    "kerber-dorfnetz": 3.25,
     "kerber-landnetz": 3.0,
     "kerber-vorstadtnetz": 3.0,
-    "simbench-lv-rural1": 3.0,
+    "simbench-lv-rural1": 2.5,
     "simbench-lv-rural3": 3.0,
 }
 
 
-@pytest.mark.parametrize("name", names())
-def test_lies_against_the_own_bias_are_named_while_droop_is_active(name: str) -> None:
-    """M neighbours lie together in the direction that hides best."""
-    size = NAMED_PERCENT[name] / 100.0
+def hidden(name: str, percent: float) -> int:
+    """In how many alignments a lie by M neighbours is not named, or taken for CLEAN before it is.
+
+    They lie together in the direction that hides best: against their own bias.
+    """
     reactance = designed(name, 1.0).model.X[np.ix_(site(name).meters, site(name).meters)]
     attacked = site(name).tables.meta.monitor.max_attacked
+    depth = np.argsort(np.diag(reactance), kind="stable")
+    missed = 0
     for ends in (HIGH, LOW):
-        for v0 in (0.95, 1.05):
-            for leader in (int(np.argmax(np.diag(reactance))), 0):
+        for v0 in (0.95, 1.0, 1.05):
+            for leader in {int(depth[-1]), int(depth[depth.size // 2]), int(depth[0]), 0}:
                 watch = Watch(World(name, ends, v0=v0, load=0.5, sun=0.3), 1.0)
                 for _ in range(10):
                     watch.world.run(1.0)
                     watch.look()
                 together = np.argsort(-reactance[leader], kind="stable")[:attacked]
-                lies = {int(j): -size * ends.meters for j in together}
+                lies = {int(j): -percent / 100.0 * ends.meters for j in together}
+                answers = []
                 for _ in range(4):
                     watch.world.run(1.0)
-                    verdict = watch.look(lies)
-                    assert verdict.decision is not Decision.CLEAN
-                assert all(verdict.suspects[j] for j in lies), verdict.reason
+                    answers.append(watch.look(lies))
+                missed += any(verdict.decision is Decision.CLEAN for verdict in answers) or not all(
+                    answers[-1].suspects[j] for j in lies
+                )
+    return missed
+
+
+@pytest.mark.parametrize("name", names())
+def test_smallest_lie_that_is_named_in_every_alignment(name: str) -> None:
+    """Droop curves at work and at rest, at head, middle and end. Half a percent less can hide."""
+    assert hidden(name, NAMED_PERCENT[name]) == 0
+    assert hidden(name, NAMED_PERCENT[name] - 0.5) > 0
 
 
 def test_wide_load_intervals_on_a_long_feeder(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,7 +12,14 @@ import pytest
 from hypothesis import given
 
 from gridsec.errors import FeederInvalid
-from gridsec.feeder import Feeder, lindistflow, loss_correction, model_error_bound, squared_voltages
+from gridsec.feeder import (
+    Feeder,
+    corrected,
+    lindistflow,
+    loss_correction,
+    model_error_bound,
+    squared_voltages,
+)
 from tests.gridsec.radial import random_feeder, sweep
 
 seeds = st.integers(0, 100_000)
@@ -123,13 +130,21 @@ def test_error_bound_holds_and_is_no_constant(seed: int) -> None:
     feeder, p, q = operating_point(seed)
     model = lindistflow(feeder)
     exact = sweep(feeder, p, q, 1.0)[feeder.bus]
-    corrected = squared_voltages(model, p, q, 1.0) + loss_correction(feeder, p, q, 1.0)[feeder.bus]
+    found = squared_voltages(model, p, q, 1.0) + loss_correction(feeder, p, q, 1.0)[feeder.bus]
     bound = model_error_bound(feeder, p, q, 1.0)
-    assert np.all(np.abs(corrected - exact) <= bound + 1e-13)
+    assert np.all(np.abs(found - exact) <= bound + 1e-13)
     # Third order in the size of the flows: at a tenth of the load, far below a tenth of the bound.
     small = model_error_bound(feeder, 0.1 * p, 0.1 * q, 1.0)
     if not feeder.charging.any():
         assert np.all(small <= 2e-3 * bound + 1e-15)
+
+
+@given(seeds, st.integers(1, 3))
+def test_correction_and_its_bound_together(seed: int, steps: int) -> None:
+    feeder, p, q = operating_point(seed)
+    both = corrected(feeder, p, q, 1.02, steps=steps)
+    assert np.array_equal(both[0], loss_correction(feeder, p, q, 1.02, steps=steps))
+    assert np.array_equal(both[1], model_error_bound(feeder, p, q, 1.02))
 
 
 def test_bound_is_infinite_beyond_voltage_collapse() -> None:
