@@ -14,11 +14,14 @@ from feeders.records import Parsed, Report, rows, some
 from feeders.topology import Edge, Tree, tree
 from gridsec.droop import PRESETS
 
+RESERVED_METER = "substation"
+"""What the busbar meter is called on the wire and in alarms."""
+
 
 def feeder(parsed: Parsed) -> tuple[list[str], list[str]]:
     """Return every problem between cells, and notes on what is right but worth knowing."""
     report = Report()
-    for check in (_duplicates, _limits, _power_factors, _presets, _profiles, _positions):
+    for check in (_duplicates, _reserved, _limits, _power_factors, _presets, _profiles, _positions):
         check(parsed, report)
     edges, found = _graph(parsed, report)
     units.check(parsed, edges, found, report)
@@ -51,6 +54,15 @@ def _duplicates(parsed: Parsed, report: Report) -> None:
     ]
     if bare:
         report.notes.append(f"{len(bare)} customer(s) without a meter: {some(bare)}")
+
+
+def _reserved(parsed: Parsed, report: Report) -> None:
+    for where, cells in rows(parsed.customers, "meter"):
+        if cells["meter"] == RESERVED_METER:
+            report.problems.append(
+                f"{where}, column meter: {RESERVED_METER!r} is what the busbar meter is called; "
+                "expected another id"
+            )
 
 
 def _limits(parsed: Parsed, report: Report) -> None:

@@ -18,13 +18,14 @@ NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 WORDS_NO_NUMBER = {"nan", "inf", "+inf", "-inf", "infinity", "-infinity", "null", "none", "na", "n/a", "-"}
 NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 LONGEST_ID = 128
+LONGEST_TEXT = 200
 SHOWN = 60
 
 
 class Kind(Enum):
     """The type of a cell."""
 
-    TEXT = "text"
+    TEXT = "text of at most 200 characters"
     ID = "an id: printable text of at most 128 characters"
     NAME = "a name of 1 to 64 of the characters A-Z a-z 0-9 _ -"
     NUMBER = "a number"
@@ -314,19 +315,18 @@ def _outside(column: Column, value: Any) -> str | None:
     return None
 
 
-def _text(cell: object) -> tuple[Any, str | None]:
+def _text(cell: object, longest: int = LONGEST_TEXT) -> tuple[Any, str | None]:
     if not isinstance(cell, str):
         return BAD, f"{shown(cell)} is not text"
     if not cell.isprintable():
         return BAD, f"{shown(cell)} holds characters that cannot be printed"
+    if len(cell) > longest:
+        return BAD, f"{shown(cell)} is longer than {longest} characters"
     return cell, None
 
 
 def _id(cell: object) -> tuple[Any, str | None]:
-    value, what = _text(cell)
-    if what is None and len(value) > LONGEST_ID:
-        return BAD, f"{shown(cell)} is longer than {LONGEST_ID} characters"
-    return value, what
+    return _text(cell, LONGEST_ID)
 
 
 def _name(cell: object) -> tuple[Any, str | None]:

@@ -222,6 +222,26 @@ def test_path_that_is_no_folder(path: str) -> None:
     assert "expected a folder with feeder.toml" in problem
 
 
+def test_the_busbar_meter_s_name_is_taken() -> None:
+    obj = to_json(read(CASES / "good" / "three-customers"))
+    obj["customers"][1]["meter"] = "substation"
+    (problem,) = examine(obj).problems
+    assert problem.startswith("customers, row 2 ")
+    assert "column meter: 'substation' is what the busbar meter is called" in problem
+    obj["customers"][1]["meter"] = "substation-2"
+    assert examine(obj).problems == ()
+
+
+def test_titles_have_an_end() -> None:
+    obj = to_json(read(CASES / "good" / "three-customers"))
+    obj["feeder"]["title"] = "x" * 200
+    assert examine(obj).problems == ()
+    obj["feeder"]["title"] = "x" * 201
+    (problem,) = examine(obj).problems
+    assert "title" in problem
+    assert "longer than 200 characters" in problem
+
+
 def test_accepted_doubts_become_notes(tmp_path: Path) -> None:
     tables = read(CASES / "good" / "three-customers")
     doubtful = replace(tables, meta=replace(tables.meta, voltage_volt=400.0))
@@ -253,7 +273,7 @@ GARBAGE: dict[Kind, tuple[Any, ...]] = {
     ),
     Kind.WHOLE: ("1.5", 2.5, "x", False, math.nan),
     Kind.TRUTH: ("yes", 2, 1.0, "TRUEE", []),
-    Kind.TEXT: (1, 2.5, True, [], "\x00"),
+    Kind.TEXT: (1, 2.5, True, [], "\x00", "x" * 201),
     Kind.ID: (7, "a\nb", "\ud800", "\u200b", "x" * 129, ["1"]),
     Kind.NAME: ("a b", "ä", "x" * 65, 5, "a/b", "*", "a\n"),
     Kind.PAIR: (1, [1], [1, "x"], "1,2", [1, math.nan]),
