@@ -19,7 +19,8 @@ from feeders.schema import from_json
 from gridsec.errors import FeederInvalid, GridsecError
 from service.align import Clock
 from service.api import create_api
-from service.ingest import Bus, BusConfig
+from service.bus import BusConfig
+from service.ingest import Bus
 from service.rounds import RuntimeConfig
 from service.runtime import Runtime
 from service.settings import Settings, split_address

@@ -68,7 +68,7 @@ def exit_code(error: GridsecError) -> int:
     """
     from feeders.recording import RecordingInvalid
     from service.app import AddressUnavailable
-    from service.ingest import BusUnavailable
+    from service.bus import BusUnavailable
     from service.settings import SettingsInvalid
     from service.store import StoreUnavailable
 
@@ -328,7 +328,8 @@ def _with_attacks(site: Site, scenario: Scenario, texts: list[str]) -> Scenario:
 def _publish(
     site: Site, scenario: Scenario, connect: tuple[str, ...], prefix: str, pace: tuple[float, int | None]
 ) -> None:
-    from service.ingest import BusConfig, Meters
+    from service.bus import BusConfig
+    from service.ingest import Meters
     from service.simulate import OutOfStep, Pace, play
 
     ticks = 0

@@ -30,7 +30,8 @@ from rich.table import Table
 from feeders.load import Site, load
 from feeders.scenario import Sample, Scenario, random_attacks
 from gridsec.errors import GridsecError
-from service.ingest import BusConfig, Meters
+from service.bus import BusConfig
+from service.ingest import Meters
 from service.simulate import Pace, play
 
 START_WITHIN_S = 30.0

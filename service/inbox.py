@@ -6,7 +6,7 @@ import threading
 from collections import deque
 from collections.abc import Callable
 
-from service.ingest import Sample
+from service.bus import Sample
 
 _OVERHEAD = 256
 

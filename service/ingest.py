@@ -15,12 +15,11 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import zenoh
 
-from gridsec.errors import GridsecError
+from service.bus import BusConfig, BusCounts, BusUnavailable, Sample
 
 RING = 8192
 """Samples that zenoh keeps for us."""
@@ -35,47 +34,6 @@ _MAX_SESSIONS = 100_000
 _ACCEPT_PENDING = 1_000
 _OPEN_TIMEOUT_MS = 5_000
 JSON = "application/json"
-
-
-class BusUnavailable(GridsecError):
-    """zenoh cannot be used as configured; the message says which endpoint and why."""
-
-
-@dataclass(frozen=True, slots=True)
-class BusConfig:
-    """How to take part in zenoh.
-
-    Attributes
-    ----------
-    mode
-        `router` for the service (it routes between clients and needs no separate router process), `client`
-        for meters and tools, `peer` if an existing network asks for it. None: what the file says, or
-        `router` without a file.
-    listen, connect
-        Endpoints such as `tcp/127.0.0.1:7447`.
-    file
-        A user's own json5 configuration (TLS, users, access control, ...). What it says is kept; mode and
-        endpoints given here are put on top.
-    """
-
-    mode: str | None = None
-    listen: tuple[str, ...] = ()
-    connect: tuple[str, ...] = ()
-    file: Path | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Sample:
-    """One put, copied out of zenoh: key, bytes, encoding, wall time of its arrival (Unix s).
-
-    Of a payload above the limit only the beginning is kept; `size` is its whole length.
-    """
-
-    key: str
-    payload: bytes
-    encoding: str
-    arrival: float
-    size: int
 
 
 def _config(config: BusConfig) -> zenoh.Config:
@@ -141,16 +99,6 @@ def session(config: BusConfig) -> Iterator[zenoh.Session]:
         raise BusUnavailable(f"zenoh cannot be opened on {ends}: {_first_line(error)}") from error
     with opened:
         yield opened
-
-
-@dataclass(slots=True)
-class BusCounts:
-    """What went through and what did not: deletions on reading keys, puts and deletes of ours, queries."""
-
-    deleted: int = 0
-    published: int = 0
-    publish_failed: int = 0
-    queries: int = 0
 
 
 @dataclass(slots=True)
@@ -328,6 +276,17 @@ class Bus:
         """
         with self._answers_lock:
             self._answers[f"{self._prefix}/{key}"] = payload
+
+    def withdraw(self, key: str) -> None:
+        """Let queries for a key find nothing any more.
+
+        Parameters
+        ----------
+        key
+            Key without the prefix.
+        """
+        with self._answers_lock:
+            self._answers.pop(f"{self._prefix}/{key}", None)
 
     def _publish(self, live: zenoh.Session) -> None:
         publishers: dict[str, zenoh.Publisher] = {}

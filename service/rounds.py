@@ -23,7 +23,7 @@ from feeders.load import Site
 from service.alarms import Alarm, AlarmRules, Transition, restore
 from service.alarms import to_json as alarm_json
 from service.align import Clock, Outcome
-from service.ingest import BusCounts, Sample
+from service.bus import BusCounts, Sample
 from service.metrics import Metrics
 from service.reading import BadReading, BadReason, Reading, head_of
 from service.report import FeederReport

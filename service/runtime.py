@@ -24,8 +24,8 @@ from gridsec.errors import FeederInvalid, GridsecError
 from gridsec.monitor import MonitorDesign
 from service import describe
 from service.align import Clock
+from service.bus import Sample
 from service.inbox import Inbox
-from service.ingest import Sample
 from service.report import FeederReport
 from service.rounds import Publisher, Rounds, RuntimeConfig
 from service.store import Store, StoreUnavailable

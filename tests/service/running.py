@@ -16,7 +16,8 @@ from typing import Any
 import httpx
 
 from service.app import Running, serve
-from service.ingest import BusConfig, BusCounts, Meters
+from service.bus import BusConfig, BusCounts
+from service.ingest import Meters
 from service.settings import settings
 
 FEEDER = "simbench-lv-rural1"

@@ -20,9 +20,10 @@ import pytest
 from feeders.load import load
 from feeders.recording import read_recording
 from feeders.scenario import Scenario, random_attacks
+from service.bus import BusConfig
 from service.cli import main
 from service.demo import Outcome, verdict
-from service.ingest import BusConfig, Meters
+from service.ingest import Meters
 from service.simulate import Pace, play
 from tests.service.running import FEEDER, free_port, until
 

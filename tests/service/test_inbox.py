@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import threading
 
+from service.bus import Sample
 from service.inbox import Inbox
-from service.ingest import Sample
 
 
 def sample(number: int, size: int = 10) -> Sample:

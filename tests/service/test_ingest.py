@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from service.ingest import BATCH, RING, Bus, BusConfig, BusUnavailable, Meters, Sample
+from service.bus import BusConfig, BusUnavailable, Sample
+from service.ingest import BATCH, RING, Bus, Meters
 from tests.service.running import free_port, until
 
 

@@ -13,7 +13,7 @@ from feeders.meters import Channel
 from feeders.recording import read_recording, record
 from feeders.scenario import Reading, Scenario, by_arrival, random_attacks, simulate
 from service.align import Clock
-from service.ingest import Sample
+from service.bus import Sample
 from service.replay import Tally, replay
 from service.report import to_json
 from service.rounds import Rounds, RuntimeConfig

@@ -14,7 +14,7 @@ from feeders.scenario import Scenario, by_arrival, random_attacks, simulate
 from gridsec import monitor
 from service.alarms import AlarmState, AlarmUnknown, AlreadyAcknowledged
 from service.align import Clock
-from service.ingest import Sample
+from service.bus import Sample
 from service.rounds import BAD_PER_ROUND, Rounds, RuntimeConfig
 from service.runtime import Runtime
 from service.simulate import key_of, payload_of
