@@ -18,19 +18,20 @@ TABLES = sorted(page for page in (DOCS / "papers").glob("*.md") if page.name != 
 def tables(page: Path) -> list[list[list[str]]]:
     """Return the tables of a page as rows of cells; a bar inside of code, or after a backslash, is text."""
     found = []
-    for is_table, lines in groupby(page.read_text().splitlines(), lambda line: line.startswith("|")):
-        if is_table:
+    for is_table, group in groupby(page.read_text().splitlines(), lambda line: line.startswith("|")):
+        lines = list(group)
+        if is_table and len(lines) > 1 and set(lines[1]) <= set("|-: "):
             bare = [re.sub(r"`[^`]*`", lambda code: code[0].replace("|", "\0"), line) for line in lines]
-            cells = [re.split(r"(?<!\\)\|", line.strip().strip("|")) for line in bare]
+            cells = [re.split(r"(?<!\\)\|", line.strip()[1:-1]) for line in bare]
             found.append([[cell.replace("\0", "|").strip() for cell in row] for row in cells])
     return found
 
 
 @cache
 def functions() -> dict[str, set[str]]:
-    """Return the test functions of every file of tests."""
+    """Return the test functions and classes of every file of tests."""
     return {
-        str(path.relative_to(ROOT)): set(re.findall(r"^def (test_\w+)", path.read_text(), flags=re.MULTILINE))
+        str(path.relative_to(ROOT)): set(re.findall(r"(?:def |class )([tT]est_?\w+)", path.read_text()))
         for path in (ROOT / "tests").rglob("test_*.py")
     }
 
@@ -46,18 +47,24 @@ def words() -> dict[str, set[str]]:
 
 
 def is_test(name: str) -> bool:
-    """Whether a test is there: a path with or without a function, or some words of a function's name."""
+    """Whether a test is there: a folder, or a file or its class or function; some words of a name will do."""
     if name.startswith("tests/") and name.endswith("/"):
         return (ROOT / name).is_dir()
-    path, _, function = name.rpartition("::")
-    if name.endswith(".py") or name in {Path(file).stem for file in functions()}:
-        path, function = name, ""
-    stem = path.removeprefix("tests/").removeprefix("…/").removesuffix(".py")
-    known = [names for file, names in functions().items() if file.removesuffix(".py").endswith(stem)]
-    pieces = [piece.strip("_") for piece in function.split("[")[0].split("…")]
-    return any(
-        all(piece in one for piece in pieces) for names in known for one in ({*names} if function else {""})
+    first, *rest = [part.split("[")[0] for part in name.split("::")]
+    stem = first.removeprefix("tests/").removeprefix("…/").removesuffix(".py")
+    files = {file: names for file, names in functions().items() if file.removesuffix(".py").endswith(stem)}
+    is_file = (
+        not first or first.endswith(".py") or Path(stem).name in {Path(file).stem for file in functions()}
     )
+    wanted = rest if is_file else [first, *rest]
+    known = files.values() if is_file else functions().values()
+    return any(all(any(holds(one, part) for one in names) for part in wanted) for names in known)
+
+
+def holds(name: str, part: str) -> bool:
+    if part.startswith("test_") and "…" not in part:
+        return name == part
+    return all(piece.strip("_") in name for piece in part.split("…"))
 
 
 def is_code(name: str) -> bool:
@@ -118,6 +125,8 @@ def test_names_are_told_from_inventions() -> None:
         "tests/test_docs_papers.py::test_no_cell_is_empty",
         "test_docs_papers::test_no_cell_is_empty",
         "::test_no_cell_is_empty",
+        "test_bank.py::TestGuarantees::test_theorem_2",
+        "TestGuarantees::theorem_2",
         "test_no_cell_is_empty",
         "names_are_told_…",
         "names_…_inventions",
@@ -127,7 +136,7 @@ def test_names_are_told_from_inventions() -> None:
         "tests/none/",
         "tests/test_none.py",
         "test_docs_papers::test_none",
-        "test_nothing_at_all",
+        "test_no_cell",
         "names_…_intentions",
     )
     assert [name for name in bad if is_test(name)] == []
