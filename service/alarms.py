@@ -40,6 +40,7 @@ __all__ = [
     "acknowledge",
     "acknowledged",
     "advance",
+    "close",
     "conditions",
     "from_json",
     "restore",
@@ -423,6 +424,18 @@ def acknowledge(
             entries = {**book.entries, key: replace(entry, alarm=transition.alarm)}
             return replace(book, entries=entries), (transition,)
     raise AlarmUnknown(alarm_id)
+
+
+def close(book: AlarmBook, t: float, why: str) -> tuple[Transition, ...]:
+    """Return the transitions that clear every alarm of a feeder that is watched no more.
+
+    Parameters
+    ----------
+    book, t, why
+        Its alarms, when (Unix s), and why, for the event.
+    """
+    cleared = (replace(alarm, state=AlarmState.CLEARED, t_cleared=t) for alarm in book.active)
+    return tuple(Transition(alarm, Change.CLEARED, t, None, why) for alarm in cleared)
 
 
 def restore(feeder: str, alarms: Iterable[Alarm]) -> AlarmBook:

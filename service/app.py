@@ -71,6 +71,7 @@ async def serve(
     }
     with ExitStack() as stack:
         store = stack.enter_context(Store(settings.database))
+        given = tuple(sites)
         sites = _with_stored(sites, store)
         config = RuntimeConfig(
             prefix=settings.prefix,
@@ -79,8 +80,9 @@ async def serve(
             grace_s=settings.grace_s,
             max_payload=settings.max_payload,
             max_samples=settings.queue,
+            max_feeders=settings.max_feeders,
         )
-        runtime = Runtime(config, store, sites.values())
+        runtime = Runtime(config, store, sites.values(), given=given)
         listener = stack.enter_context(_listen(settings.http))
         bus = stack.enter_context(
             Bus(

@@ -129,6 +129,9 @@ def serve(
     ] = None,
     max_payload: Annotated[int | None, typer.Option(help="Largest payload, bytes. [default: 262144]")] = None,
     queue: Annotated[int | None, typer.Option(help="Payloads that may wait. [default: 20000]")] = None,
+    max_feeders: Annotated[
+        int | None, typer.Option(help="Feeders that may be put over REST. [default: 100]")
+    ] = None,
     log_level: Annotated[
         str | None, typer.Option(help="debug, info, warning or error. [default: info]")
     ] = None,
@@ -156,6 +159,7 @@ def serve(
             "grace_s": grace,
             "max_payload": max_payload,
             "queue": queue,
+            "max_feeders": max_feeders,
             "log_level": log_level,
             "log_format": log_format,
         }

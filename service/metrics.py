@@ -82,7 +82,7 @@ class Metrics:
         )
         self.forgotten = Counter(
             "gridsec_records_forgotten",
-            "History rows and bad readings given up because the database stayed away.",
+            "What was given up because the database stayed away: reports, bad readings, transitions.",
             ["what"],
             registry=registry,
         )
@@ -101,6 +101,18 @@ class Metrics:
         for what, total in now.items():
             self.bus.labels(what.replace("_", "-")).inc(total - self._bus_before[what])
         self._bus_before = now
+
+    def forget(self, feeder: str) -> None:
+        """Show the present state of a feeder no more; what has been counted stays.
+
+        Parameters
+        ----------
+        feeder
+            Its name.
+        """
+        for gauge in (self.seen, self.suspects, self.alarms):
+            if (feeder,) in {tuple(sample.labels.values()) for m in gauge.collect() for sample in m.samples}:
+                gauge.remove(feeder)
 
     def exposition(self) -> bytes:
         """Return everything in Prometheus's text format."""

@@ -38,6 +38,7 @@ class BadReason(StrEnum):
     TYPE = "type"
     VALUE = "value"
     CLOCK_OFF = "clock-off"
+    INTERNAL = "internal"
 
 
 class Reading(msgspec.Struct, frozen=True, gc=False):

@@ -3,59 +3,40 @@
 Everything here is synchronous and called from one thread at a time; `runtime` sees to that. Readers on other
 threads (REST, metrics) only ever take references to immutable reports.
 
-If the database refuses a commit, watching goes on: transitions are kept and tried again, and alarms are
-published when they are stored, not before.
+Nobody who watches waits for the database: see `keeper`.
 """
 
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Protocol, TypeVar
+from typing import Any
 
 import msgspec
 import structlog
 
 from feeders.load import Site
-from service.alarms import Alarm, AlarmRules, Transition, restore
+from service.alarms import AlarmRules, close, restore
 from service.alarms import to_json as alarm_json
 from service.align import Clock, Outcome
-from service.bus import BusCounts, Sample
+from service.bus import Sample
+from service.errors import FeederUnknown
+from service.keeper import Apart, Keeper, alarm_key, at_once
 from service.metrics import Metrics
-from service.reading import BadReading, BadReason, Reading, head_of
+from service.reading import HEAD_BYTES, BadReading, BadReason, Reading, head_of, printable
 from service.report import FeederReport
 from service.report import to_json as report_json
 from service.store import Rejected, Store, StoreUnavailable
 from service.watch import TickResult, Watch, align_rules, known_of
-from service.wire import Wire
+from service.wire import Decoded, Wire
 
 BAD_PER_ROUND = 50
 """So many bad readings of one round are stored; the others are only counted."""
-RETRY_S = 1.0
-RECORDS_KEPT = 3600
-"""So many history rows and bad readings wait for a database that is away; then the oldest go, counted."""
+NOT_WATCHED = "the feeder is not watched any more"
 
-T = TypeVar("T")
 _log = structlog.get_logger("gridsec.runtime")
-
-
-class Publisher(Protocol):
-    """Where estimates and alarms go; `ingest.Bus` is one."""
-
-    failure: str | None
-    counts: BusCounts
-
-    def telemetry(self, key: str, payload: bytes) -> None:
-        """Publish the newest value of a key."""
-
-    def event(self, key: str, payload: bytes, *, last: bool, done: Callable[[], None] | None = None) -> bool:
-        """Publish something that must not be lost; False if there is no room."""
-
-    def answer(self, key: str, payload: bytes) -> None:
-        """Let queries find a value."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +55,8 @@ class RuntimeConfig:
         Largest payload that is read, bytes.
     max_samples
         Length of the queue before the runtime.
+    max_feeders
+        So many feeders may be put while it runs, besides those that were given at the start.
     """
 
     prefix: str = "gridsec"
@@ -82,6 +65,7 @@ class RuntimeConfig:
     grace_s: float | None = None
     max_payload: int = 256 * 1024
     max_samples: int = 20_000
+    max_feeders: int = 100
 
 
 class Rounds:
@@ -99,6 +83,9 @@ class Rounds:
         The wall clock, Unix s.
     stored
         Called after alarms have been stored.
+    apart
+        How writing is done apart from judging: called with what to do, in any thread, and with what to do
+        with the outcome, between two rounds.
     """
 
     def __init__(
@@ -109,22 +96,15 @@ class Rounds:
         *,
         wall: Callable[[], float],
         stored: Callable[[], None],
+        apart: Apart = at_once,
     ) -> None:
         self.config = config
         self.store = store
         self.metrics = Metrics()
-        self.publisher: Publisher | None = None
         self.watches: dict[str, Watch] = {}
-        self.store_problem: str | None = None
-        self._wall = wall
-        self._stored = stored
+        self._wall, self._stored = wall, stored
+        self.keeper = Keeper(store, self.metrics, stored, apart)
         self._wire = Wire({}, config.prefix, config.max_payload)
-        self._transitions: list[Transition] = []
-        self._reports: deque[FeederReport] = deque(maxlen=RECORDS_KEPT)
-        self._rejected: deque[Rejected] = deque(maxlen=RECORDS_KEPT)
-        self._published: deque[int] = deque()
-        self._unpublished: deque[tuple[int, Alarm]] = deque()
-        self._retry_at = 0.0
         for site in sites:
             self.add(site)
 
@@ -141,23 +121,44 @@ class Rounds:
         rules = align_rules(site, config.clock, max_skew_s=config.max_skew_s, grace_s=config.grace_s)
         watch = Watch(site, rules, restore(name, stored))
         self.watches = {**self.watches, name: watch}
-        known = {name: known_of(watch.site) for name, watch in self.watches.items()}
-        self._wire = Wire(known, config.prefix, config.max_payload)
+        self._learn()
         return watch
 
+    def remove(self, name: str) -> None:
+        """Watch a feeder no more: its alarms are cleared, its tables forgotten, its history kept.
+
+        Parameters
+        ----------
+        name
+            Its name.
+
+        Raises
+        ------
+        FeederUnknown, StoreUnavailable
+            If there is none, or that cannot be stored; it is watched as before then.
+        """
+        watch = self.watches.get(name)
+        if watch is None:
+            raise FeederUnknown(name)
+        t = self._wall() if watch.book.t is None else watch.book.t
+        self.keeper.store_now(close(watch.book, t, NOT_WATCHED), without=name)
+        self.watches = {other: kept for other, kept in self.watches.items() if other != name}
+        self._learn()
+        self.metrics.forget(name)
+        if self.keeper.publisher is not None:
+            self.keeper.publisher.withdraw(f"{name}/estimate")
+
+    def _learn(self) -> None:
+        known = {name: known_of(watch.site) for name, watch in self.watches.items()}
+        self._wire = Wire(known, self.config.prefix, self.config.max_payload)
+
     def begin(self) -> None:
-        """Publish what an earlier process stored and did not publish; answer queries for what stands."""
-        try:
-            waiting = self.store.outbox_pending()
-        except StoreUnavailable as error:
-            self._refused(error)
-            return
-        if self.publisher is not None:
+        """Answer queries for what stands; publish what an earlier process stored and did not publish."""
+        if self.keeper.publisher is not None:
             for watch in self.watches.values():
                 for alarm in watch.book.active:
-                    self.publisher.answer(_alarm_key(alarm), msgspec.json.encode(alarm_json(alarm)))
-        self._unpublished.extend((event.seq, event.alarm) for event in waiting)
-        self._publish_alarms()
+                    self.keeper.publisher.answer(alarm_key(alarm), msgspec.json.encode(alarm_json(alarm)))
+        self.keeper.commit()
 
     # ---------------------------------------------------------------- one round
 
@@ -178,7 +179,7 @@ class Rounds:
         results: list[TickResult] = []
         bad: list[Rejected] = []
         for sample in samples:
-            decoded = self._wire.decode(sample.key, sample.payload, sample.encoding, size=sample.size)
+            decoded = self._decode(sample)
             bad.extend(self._note(problem, sample) for problem in decoded.bad)
             for reading in decoded.readings:
                 results.extend(self._take(reading, sample, bad))
@@ -187,17 +188,25 @@ class Rounds:
             skipped = watch.aligner.skipped
             results.extend(self._guarded(watch, partial(watch.due, now)))
             self.metrics.skipped.labels(watch.name).inc(watch.aligner.skipped - skipped)
-        for rejected in bad[:BAD_PER_ROUND]:
-            self._keep(self._rejected, rejected, "bad-reading")
+        self.keeper.waiting.add(rejected=bad[:BAD_PER_ROUND])
         for result in results:
-            self._keep(self._reports, result.report, "report")
-            self._transitions.extend(result.transitions)
+            self.keeper.waiting.add(transitions=result.transitions, reports=(result.report,))
             self._count_tick(result.report, now)
-        self.commit()
+        self.keeper.commit()
         self._publish_estimates(results)
         if samples or results:
             self.metrics.cycle.observe(time.perf_counter() - started)
         return bool(results)
+
+    def _decode(self, sample: Sample) -> Decoded:
+        """Decode a payload; a defect of the decoder costs this payload and nothing else."""
+        try:
+            return self._wire.decode(sample.key, sample.payload, sample.encoding, size=sample.size)
+        except Exception as error:  # noqa: BLE001 - whatever it is, one payload must not end the service
+            problem = printable(f"{type(error).__name__}: {error}"[:HEAD_BYTES])
+            _log.error("a payload could not be decoded", key=sample.key[:HEAD_BYTES], problem=problem)
+            head, key = head_of(sample.payload[:HEAD_BYTES]), printable(sample.key[:HEAD_BYTES])
+            return Decoded(bad=(BadReading(BadReason.INTERNAL, (problem,), key, head=head),))
 
     def _take(self, reading: Reading, sample: Sample, bad: list[Rejected]) -> list[TickResult]:
         watch = self.watches[reading.feeder]
@@ -237,11 +246,6 @@ class Rounds:
         reason = f"{BadReason.CLOCK_OFF}: t = {reading.t:.3f} is too far from now"
         return Rejected(arrival, key, reason, head_of(reading).encode())
 
-    def _keep(self, queue: deque[T], item: T, what: str) -> None:
-        if len(queue) == queue.maxlen:
-            self.metrics.forgotten.labels(what).inc()
-        queue.append(item)
-
     def _count_tick(self, report: FeederReport, now: float) -> None:
         metrics, name = self.metrics, report.feeder
         metrics.ticks.labels(name, report.verdict).inc()
@@ -251,98 +255,15 @@ class Rounds:
         if self.config.clock is Clock.WALL:
             metrics.delay.labels(name).observe(max(0.0, now - report.t))
 
-    # ---------------------------------------------------------------- storing
-
-    def commit(self, *, at_once: bool = False) -> None:
-        """Store what has been gathered; on failure keep it, say so, and try again later.
-
-        Parameters
-        ----------
-        at_once
-            Do not wait after a failure.
-        """
-        if time.monotonic() < self._retry_at and not at_once:
-            return
-        try:
-            if self.store_problem is not None:
-                self.store.check()
-            self.store_all()
-            done = tuple(self._published)
-            if done:
-                self.store.outbox_done(done)
-                for _ in done:
-                    self._published.popleft()
-        except StoreUnavailable as error:
-            self._refused(error)
-        else:
-            if self.store_problem is not None:
-                _log.info("the database is back")
-            self.store_problem, self._retry_at = None, 0.0
-        self.metrics.unstored.set(len(self._transitions))
-        self._publish_alarms()
-
-    def store_all(self, more: tuple[Transition, ...] = ()) -> None:
-        """Commit everything gathered and `more`, all or nothing.
-
-        Parameters
-        ----------
-        more
-            Transitions that are only wanted if they can be stored now.
-
-        Raises
-        ------
-        StoreUnavailable
-            If nothing was stored.
-        """
-        transitions = (*self._transitions, *more)
-        numbers = self.store.commit(transitions, reports=tuple(self._reports), rejected=tuple(self._rejected))
-        self._transitions.clear()
-        self._reports.clear()
-        self._rejected.clear()
-        for number, transition in zip(numbers, transitions, strict=True):
-            alarm = transition.alarm
-            self._unpublished.append((number, alarm))
-            self.metrics.transitions.labels(alarm.feeder, alarm.kind, transition.change).inc()
-            _log.info(
-                "alarm",
-                change=str(transition.change),
-                kind=str(alarm.kind),
-                feeder=alarm.feeder,
-                meter=alarm.meter,
-                id=alarm.id,
-                t=transition.t,
-            )
-        if numbers:
-            self._stored()
-
-    def _refused(self, error: StoreUnavailable) -> None:
-        if self.store_problem is None:
-            _log.error("the database cannot be used; alarms are kept and tried again", problem=str(error))
-        self.store_problem = str(error)
-        self._retry_at = time.monotonic() + RETRY_S
-        self.metrics.store_failures.inc()
-
     # ---------------------------------------------------------------- publishing
 
     def _publish_estimates(self, results: list[TickResult]) -> None:
-        if self.publisher is None:
+        if self.keeper.publisher is None:
             return
         for result in results:
             key = f"{result.report.feeder}/estimate"
-            self.publisher.telemetry(key, msgspec.json.encode(report_json(result.report)))
-        self.metrics.count_bus(self.publisher.counts)
-
-    def _publish_alarms(self) -> None:
-        while self._unpublished:
-            number, alarm = self._unpublished[0]
-            done = partial(self._published.append, number)
-            if self.publisher is None:
-                done()
-            else:
-                payload = msgspec.json.encode(alarm_json(alarm))
-                if not self.publisher.event(_alarm_key(alarm), payload, last=not alarm.active, done=done):
-                    return
-            self._unpublished.popleft()
+            self.keeper.publisher.telemetry(key, msgspec.json.encode(report_json(result.report)))
+        self.metrics.count_bus(self.keeper.publisher.counts)
 
     # ---------------------------------------------------------------- operators
 
@@ -366,18 +287,15 @@ class Rounds:
             before = watch.book
             transitions = watch.acknowledge(alarm_id, who, comment, t)
             try:
-                self.store_all(transitions)
+                self.keeper.store_now(transitions)
             except StoreUnavailable:
                 watch.book = before
                 raise
-            self._publish_alarms()
             return alarm_json(transitions[-1].alarm)
+        if self.keeper.problem is not None:
+            raise StoreUnavailable(self.keeper.problem)
         alarm = self.store.acknowledge(alarm_id, who, comment, t).alarm
-        self._unpublished.append((self.store.last_event, alarm))
-        self._publish_alarms()
+        self.keeper.publish(self.store.last_event, alarm)
+        self.keeper.commit()
         self._stored()
         return alarm_json(alarm)
-
-
-def _alarm_key(alarm: Alarm) -> str:
-    return f"{alarm.feeder}/alarm/{alarm.id}"

@@ -25,9 +25,11 @@ from gridsec.monitor import MonitorDesign
 from service import describe
 from service.align import Clock
 from service.bus import Sample
+from service.errors import FeederFixed, TooManyFeeders
 from service.inbox import Inbox
+from service.keeper import Done, Publisher, at_once
 from service.report import FeederReport
-from service.rounds import Publisher, Rounds, RuntimeConfig
+from service.rounds import Rounds, RuntimeConfig
 from service.store import Store, StoreUnavailable
 from service.watch import Phase, Watch, design
 
@@ -50,6 +52,8 @@ class Runtime:
         The database.
     sites
         The feeders to watch.
+    given
+        Names of those that cannot be deleted over REST; None: all of them.
     wall
         The wall clock, Unix s.
     """
@@ -60,16 +64,29 @@ class Runtime:
         store: Store,
         sites: Iterable[Site],
         *,
+        given: Iterable[str] | None = None,
         wall: Callable[[], float] = time.time,
     ) -> None:
         self._wall = wall
-        self._rounds = Rounds(config, store, sites, wall=wall, stored=self._wake_streams)
+        # Where the readings tell the time, nothing is late by waiting for the database.
+        waits = config.clock is Clock.EVENTS
+        self._rounds = Rounds(
+            config,
+            store,
+            sites,
+            wall=wall,
+            stored=self._wake_streams,
+            apart=at_once if waits else self._write_apart,
+        )
+        self._given = frozenset(self._rounds.watches) if given is None else frozenset(given)
         self._inbox = Inbox(
             self._wake_from_thread, max_samples=config.max_samples, lossless=config.clock is Clock.EVENTS
         )
         self._commands: deque[tuple[Callable[[], Any], asyncio.Future[Any]]] = deque()
         self._subscribers: set[asyncio.Queue[str]] = set()
+        self._outcomes: deque[Callable[[], None]] = deque()
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="gridsec-round")
+        self._writer = ThreadPoolExecutor(1, thread_name_prefix="gridsec-store")
         self._loop: asyncio.AbstractEventLoop | None = None
         self._wake = asyncio.Event()
         self._stopping = False
@@ -86,7 +103,7 @@ class Runtime:
         publisher
             Usually the zenoh bus.
         """
-        self._rounds.publisher = publisher
+        self._rounds.keeper.publisher = publisher
 
     def deliver(self, batch: list[Sample]) -> int:
         """Take samples from a receiving thread; returns how many were dropped for them.
@@ -117,7 +134,7 @@ class Runtime:
                 if news:
                     self._notify("state")
                 await self._pause()
-            await self._in_worker(partial(self._rounds.commit, at_once=True))
+            await self._last_commit()
         except BaseException as error:
             self._died = f"{type(error).__name__}: {error}"
             raise
@@ -126,6 +143,7 @@ class Runtime:
             for _, answer in self._commands:
                 answer.cancel()
             self._worker.shutdown(wait=False)
+            self._writer.shutdown(wait=False)
 
     def stop(self) -> None:
         """End `run` and every subscription soon; called from the event loop."""
@@ -136,7 +154,8 @@ class Runtime:
 
     async def _pause(self) -> None:
         """Wait for samples, commands or the next tick."""
-        if self._stopping or len(self._inbox) or self._commands:
+        commands = self._commands and not self._rounds.keeper.storing
+        if self._stopping or len(self._inbox) or self._outcomes or commands:
             await asyncio.sleep(0)
             return
         now = self._wall()
@@ -150,8 +169,41 @@ class Runtime:
     async def _in_worker(self, run: Callable[..., T], *arguments: Any) -> T:
         return await asyncio.get_running_loop().run_in_executor(self._worker, run, *arguments)
 
+    def _write_apart(self, write: Callable[[], Done], then: Callable[[Done], None]) -> None:
+        """Write in a thread of its own; what came of it is taken in between two rounds."""
+
+        def run() -> None:
+            outcome = partial(then, write())
+            self._in_loop(partial(self._take_in, outcome))
+
+        self._writer.submit(run)
+
+    def _take_in(self, outcome: Callable[[], None]) -> None:
+        self._outcomes.append(outcome)
+        self._wake.set()
+
+    async def _last_commit(self) -> None:
+        """Store what is left, after what is on its way."""
+        await self._landed()
+        await self._in_worker(partial(self._rounds.keeper.commit, at_once=True))
+        await self._landed()
+
+    async def _landed(self) -> None:
+        """Wait for a write that is on its way, and take in what came of it."""
+        await self._take_outcomes()
+        while self._rounds.keeper.storing:
+            await self._wake.wait()
+            self._wake.clear()
+            await self._take_outcomes()
+
+    async def _take_outcomes(self) -> None:
+        while self._outcomes:
+            await self._in_worker(self._outcomes.popleft())
+
     async def _execute_commands(self) -> None:
-        while self._commands:
+        await self._take_outcomes()
+        # Commands may need the database for themselves; a write that is on its way comes first.
+        while self._commands and not self._rounds.keeper.storing:
             command, answer = self._commands.popleft()
             try:
                 result = await self._in_worker(command)
@@ -234,6 +286,16 @@ class Runtime:
         watch = self._rounds.watches.get(name)
         return None if watch is None else describe.detail(watch.site)
 
+    def known(self, name: str) -> bool:
+        """Whether a feeder is watched.
+
+        Parameters
+        ----------
+        name
+            Its name.
+        """
+        return name in self._rounds.watches
+
     def report(self, name: str) -> FeederReport | None:
         """Return a feeder's latest report, or None.
 
@@ -264,10 +326,10 @@ class Runtime:
         problems = self.healthy()[1]
         if self._last_round is None:
             problems.append("the runtime is starting")
-        if rounds.store_problem is not None:
-            problems.append(f"database: {rounds.store_problem}")
-        if rounds.publisher is not None and rounds.publisher.failure is not None:
-            problems.append(f"zenoh: {rounds.publisher.failure}")
+        problems.extend(rounds.keeper.problems())
+        publisher = rounds.keeper.publisher
+        if publisher is not None and publisher.failure is not None:
+            problems.append(f"zenoh: {publisher.failure}")
         for watch in rounds.watches.values():
             if watch.phase is Phase.DESIGNING:
                 problems.append(f"feeder {watch.name}: the monitor is still being designed")
@@ -285,9 +347,10 @@ class Runtime:
 
         Raises
         ------
-        FeederInvalid, NotObservable, DesignInfeasible, StoreUnavailable
+        FeederInvalid, NotObservable, DesignInfeasible, TooManyFeeders, StoreUnavailable
             If it cannot be taken over; the feeder stays as it was.
         """
+        self._make_room(name)
 
         def prepare() -> tuple[Site, MonitorDesign]:
             parsed = from_json(tables)
@@ -299,11 +362,36 @@ class Runtime:
         site, finished = await asyncio.to_thread(prepare)
 
         def install() -> None:
-            self._rounds.store_all()
+            self._make_room(name)
+            self._rounds.keeper.store_now()
             self._rounds.store.put_feeder(name, tables)
             self._rounds.add(site).install(finished)
 
         await self._command(install)
+
+    def _make_room(self, name: str) -> None:
+        """See whether one more feeder may be put."""
+        watched, most = self._rounds.watches, self._rounds.config.max_feeders
+        if name not in watched and len(watched.keys() - self._given) >= most:
+            raise TooManyFeeders(most)
+
+    async def delete_feeder(self, name: str) -> None:
+        """Watch a feeder no more that was put over REST; its alarms are cleared, its history is kept.
+
+        Parameters
+        ----------
+        name
+            Its name.
+
+        Raises
+        ------
+        FeederUnknown, FeederFixed, StoreUnavailable
+            If it cannot be deleted; it is watched as before then.
+        """
+        if name in self._given:
+            raise FeederFixed(name)
+        await self._command(partial(self._rounds.remove, name))
+        self._notify("state")
 
     async def acknowledge(self, alarm_id: str, who: str, comment: str) -> dict[str, Any]:
         """Answer an alarm; it is on the disk when this returns.

@@ -59,6 +59,7 @@ class Settings(BaseSettings):
     grace_s: float | None = Field(default=None, ge=0.0, allow_inf_nan=False)
     max_payload: int = Field(default=256 * 1024, ge=1024, le=16 << 20)
     queue: int = Field(default=20_000, ge=100)
+    max_feeders: int = Field(default=100, ge=0)
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     log_format: Literal["console", "json"] = "console"
 

@@ -146,15 +146,18 @@ class Reader:
         with self._read() as connection:
             return [_event(row) for row in connection.execute(query).mappings()]
 
-    def outbox_pending(self, limit: int = 1000) -> list[Event]:
+    def outbox_pending(self, limit: int = 1000, *, after: int = 0) -> list[Event]:
         """Return the events that have not been published yet, oldest first.
 
         Parameters
         ----------
         limit
             At most so many.
+        after
+            Only those with a higher number.
         """
-        query = sa.select(EVENT).join(OUTBOX, OUTBOX.c.seq == EVENT.c.seq).order_by(EVENT.c.seq)
+        query = sa.select(EVENT).join(OUTBOX, OUTBOX.c.seq == EVENT.c.seq).where(OUTBOX.c.seq > after)
+        query = query.order_by(EVENT.c.seq)
         with self._read() as connection:
             return [_event(row) for row in connection.execute(query.limit(limit)).mappings()]
 

@@ -84,6 +84,7 @@ class Store(Reader):
         *,
         reports: Iterable[FeederReport] = (),
         rejected: Iterable[Rejected] = (),
+        without: str | None = None,
     ) -> tuple[int, ...]:
         """Store what a tick brought, in one transaction; it is on the disk when this returns.
 
@@ -95,6 +96,8 @@ class Store(Reader):
             Reports of the feeders; those worth keeping go into the history.
         rejected
             Readings that could not be used; the newest `BAD_READINGS_KEPT` are kept.
+        without
+            Forget the tables of this feeder.
 
         Returns
         -------
@@ -110,7 +113,7 @@ class Store(Reader):
         with self._lock:
             marks = dict(self._marks)
             kept = [report for report in reports if self._worth(marks, report)]
-            if not (transitions or kept or rejected):
+            if not (transitions or kept or rejected or without):
                 return ()
             with self._write() as connection:
                 numbers = tuple(self._put_transition(connection, item) for item in transitions)
@@ -118,6 +121,8 @@ class Store(Reader):
                     self._put_history(connection, report)
                 if rejected:
                     _put_rejected(connection, rejected)
+                if without is not None:
+                    connection.execute(FEEDER.delete().where(FEEDER.c.name == without))
             self._marks = marks
             self._last_event = max((self._last_event, *numbers))
             return numbers

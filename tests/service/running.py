@@ -57,6 +57,7 @@ class Outlet:
         self.estimates: list[dict[str, Any]] = []
         self.events: list[tuple[dict[str, Any], bool]] = []
         self.answers: list[str] = []
+        self.withdrawn: list[str] = []
         self.confirms = confirms
 
     def telemetry(self, key: str, payload: bytes) -> None:
@@ -73,6 +74,9 @@ class Outlet:
 
     def answer(self, key: str, payload: bytes) -> None:
         self.answers.append(f"{key} {json.loads(payload)['id']}")
+
+    def withdraw(self, key: str) -> None:
+        self.withdrawn.append(key)
 
 
 class InProcess:

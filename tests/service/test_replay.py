@@ -51,7 +51,7 @@ def test_the_live_rounds_and_a_replay_agree_to_the_last_bit(
             RuntimeConfig(clock=Clock.EVENTS), store, [site], wall=lambda: START, stored=lambda: None
         )
         live.watches[FEEDER].install(design(site))
-        live.publisher = outlet
+        live.keeper.publisher = outlet
         for k in range(0, len(samples), 37):
             live.round(samples[k : k + 37])
         alarms = store.alarms()[0]

@@ -3,23 +3,29 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import sqlite3
+import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from feeders.load import Site, load
 from feeders.scenario import Scenario, by_arrival, random_attacks, simulate
 from gridsec import monitor
-from service.alarms import AlarmState, AlarmUnknown, AlreadyAcknowledged
+from service.alarms import AlarmState, AlarmUnknown, AlreadyAcknowledged, Change, Transition
 from service.align import Clock
 from service.bus import Sample
-from service.rounds import BAD_PER_ROUND, Rounds, RuntimeConfig
+from service.errors import FeederUnknown
+from service.rounds import BAD_PER_ROUND, NOT_WATCHED, Rounds, RuntimeConfig
 from service.runtime import Runtime
 from service.simulate import key_of, payload_of
 from service.store import Store, StoreUnavailable, connect
 from service.watch import Phase, design
+from service.wire import Decoded, Wire
 from tests.service.running import Outlet
 
 FEEDER = "simbench-lv-rural1"
@@ -46,7 +52,7 @@ def rounds(
     store: Store, site: Site, outlet: Outlet | None = None, stored: Callable[[], None] = lambda: None
 ) -> Rounds:
     made = Rounds(RuntimeConfig(clock=Clock.EVENTS), store, [site], wall=lambda: START, stored=stored)
-    made.publisher = outlet
+    made.keeper.publisher = outlet
     made.watches[FEEDER].install(design(site))
     made.begin()
     return made
@@ -120,19 +126,19 @@ def test_a_database_that_goes_away_and_comes_back_loses_nothing(
     locked: Callable[[], sqlite3.Connection],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("service.rounds.RETRY_S", 0.0)
+    monkeypatch.setattr("service.keeper.RETRY_S", 0.0)
     outlet = Outlet()
     with Store(f"sqlite:///{path}") as store:
         live = rounds(store, site, outlet)
         before, rest = until(attacked, 8.0)
         live.round(before)
-        assert live.store_problem is None
+        assert live.keeper.problem is None
         other = locked()
         during, after = until(rest, 30.0)
         for k in range(0, len(during), 100):
             live.round(during[k : k + 100])
-        assert live.store_problem is not None
-        assert "locked" in live.store_problem
+        assert live.keeper.problem is not None
+        assert "locked" in live.keeper.problem
         assert outlet.events == []
         assert live.watches[FEEDER].book.alarms
         assert outlet.estimates[-1]["t"] >= START + 28
@@ -141,7 +147,7 @@ def test_a_database_that_goes_away_and_comes_back_loses_nothing(
         assert all(a.state is not AlarmState.ACKNOWLEDGED for a in live.watches[FEEDER].book.alarms)
         other.close()
         live.round(after)
-        assert live.store_problem is None
+        assert live.keeper.problem is None
         assert [a["state"] for a, _ in outlet.events] == ["raised"] * 2 + ["cleared"] * 2
         assert len(store.alarms()[0]) == 2
         stored = [e.t for e in store.events_after(0)]
@@ -151,6 +157,184 @@ def test_a_database_that_goes_away_and_comes_back_loses_nothing(
         assert "gridsec_transitions_unstored 0.0" in metrics
 
 
+def test_nobody_who_watches_waits_for_a_locked_database(
+    site: Site,
+    attacked: list[Sample],
+    path: Path,
+    locked: Callable[[], sqlite3.Connection],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """With the wall clock, rounds go on while a write waits; commands wait for it, and nothing is lost."""
+    monkeypatch.setattr(connect, "BUSY_S", 3.0)
+    t0 = time.time()
+    shift = t0 - START - 20.0
+    late = [_shifted(sample, shift) for sample in attacked if START + 4 <= sample.arrival < START + 20]
+
+    async def scene(store: Store) -> None:
+        runtime = Runtime(RuntimeConfig(grace_s=0.0), store, [site])
+        outlet = Outlet()
+        runtime.attach(outlet)
+        task = asyncio.create_task(runtime.run())
+        while not runtime.ready()[0]:  # noqa: ASYNC110 - readiness is what is tested
+            await asyncio.sleep(0.01)
+        other = locked()
+        begin = time.monotonic()
+        for k in range(0, len(late), 28):
+            runtime.deliver(late[k : k + 28])
+            await asyncio.sleep(0.02)
+        while len(outlet.estimates) < 8:  # noqa: ASYNC110
+            await asyncio.sleep(0.01)
+        assert time.monotonic() - begin < 2.0
+        assert outlet.events == []
+        assert store.alarms()[0] == []
+        other.close()
+        while len(store.alarms()[0]) < 2:  # noqa: ASYNC110
+            await asyncio.sleep(0.01)
+        name = store.alarms()[0][0].id
+        assert (await runtime.acknowledge(name, "Ada", ""))["acknowledged_by"] == "Ada"
+        runtime.stop()
+        await asyncio.wait_for(task, 5.0)
+        assert [alarm["state"] for alarm, _ in outlet.events[:2]] == ["raised", "raised"]
+        assert store.alarm(name).acknowledged_by == "Ada"  # type: ignore[union-attr]
+
+    with Store(f"sqlite:///{path}") as store:
+        asyncio.run(asyncio.wait_for(scene(store), 20.0))
+
+
+def _shifted(sample: Sample, shift: float) -> Sample:
+    reading = json.loads(sample.payload)
+    reading["t"] += shift
+    return replace(sample, payload=json.dumps(reading).encode(), arrival=sample.arrival + shift)
+
+
+def test_a_write_that_fails_in_an_unforeseen_way_is_shown_and_tried_again(
+    site: Site, attacked: list[Sample], path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object, **__: object) -> None:
+        raise ZeroDivisionError("a defect")
+
+    monkeypatch.setattr("service.keeper.RETRY_S", 0.0)
+    with Store(f"sqlite:///{path}") as store:
+        live = rounds(store, site)
+        with monkeypatch.context() as patch:
+            patch.setattr(store, "commit", broken)
+            live.round(until(attacked, 15.0)[0])
+            assert "a defect" in live.keeper.problems()[0]
+            assert "2 changes of alarms wait" in live.keeper.problems()[1]
+        live.round([])
+        assert live.keeper.problems() == []
+        assert len(store.alarms()[0]) == 2
+
+
+def test_a_defect_of_the_decoder_costs_one_payload(
+    site: Site, attacked: list[Sample], path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decode = Wire.decode
+
+    def broken(self: Wire, key: str, payload: bytes, *more: Any, **named: Any) -> Decoded:
+        if b"boom" in payload:
+            raise ZeroDivisionError("a def\x00ect")
+        return decode(self, key, payload, *more, **named)
+
+    monkeypatch.setattr(Wire, "decode", broken)
+    bad = Sample(f"gridsec/{FEEDER}/meter/m01/reading", b'{"boom": 1}\x00', "", START, 1)
+    outlet = Outlet()
+    with Store(f"sqlite:///{path}") as store:
+        live = rounds(store, site, outlet)
+        before, after = until(attacked, 5.0)
+        live.round([*before, bad, *after])
+        assert outlet.estimates[-1]["t"] >= START + 38
+        (kept,) = store.rejected()
+        assert (kept.key, kept.reason) == (bad.key, "internal: ZeroDivisionError: a def\\x00ect")
+        assert b"boom" in kept.payload
+        assert 'gridsec_bad_readings_total{feeder="",reason="internal"} 1.0' in (
+            live.metrics.exposition().decode()
+        )
+
+
+def test_an_outbox_of_any_length_is_published_in_order_also_after_a_failed_read(
+    site: Site, attacked: list[Sample], path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.keeper.OUTBOX_PAGE", 7)
+    monkeypatch.setattr("service.keeper.RETRY_S", 0.0)
+    with Store(f"sqlite:///{path}") as store:
+        rounds(store, site, Outlet(confirms=False)).round(until(attacked, 15.0)[0])
+        first, second = store.active(FEEDER)
+        for k in range(50):
+            store.commit([Transition(first, Change.RAISED, float(k)), Transition(second, Change.RAISED, 0.0)])
+        expected = [event.alarm.id for event in store.outbox_pending()]
+        assert len(expected) == 102
+    outlet = Outlet()
+    with Store(f"sqlite:///{path}") as store:
+        with monkeypatch.context() as patch:
+            patch.setattr(store, "outbox_pending", _refuse)
+            live = rounds(store, site, outlet)
+            live.round([])
+            assert outlet.events == []
+            assert "reading" in live.keeper.problems()[0]
+        # What is stored meanwhile is published after what has been waiting.
+        live.round(until(attacked, 15.0)[1])
+        for _ in range(20):
+            live.round([])
+        assert [alarm["id"] for alarm, _ in outlet.events][:102] == expected
+        assert [alarm["state"] for alarm, _ in outlet.events][102:] == ["cleared", "cleared"]
+        assert store.outbox_pending() == []
+
+
+def _refuse(*_: object, **__: object) -> None:
+    raise StoreUnavailable("no reading today")
+
+
+def test_events_that_zenoh_does_not_take_wait_in_the_outbox(
+    site: Site, attacked: list[Sample], path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.keeper.UNPUBLISHED_KEPT", 1)
+    outlet = Outlet()
+    with Store(f"sqlite:///{path}") as store:
+        live = rounds(store, site, outlet)
+        with monkeypatch.context() as patch:
+            patch.setattr(outlet, "event", lambda *_, **__: False)
+            live.round(until(attacked, 15.0)[0])
+            live.round(until(attacked, 15.0)[1])
+        for _ in range(3):
+            live.round([])
+        assert [alarm["state"] for alarm, _ in outlet.events] == ["raised"] * 2 + ["cleared"] * 2
+        assert store.outbox_pending() == []
+
+
+def test_a_deleted_feeder_leaves_cleared_alarms_and_its_history(
+    site: Site,
+    attacked: list[Sample],
+    path: Path,
+    locked: Callable[[], sqlite3.Connection],
+) -> None:
+    outlet = Outlet()
+    with Store(f"sqlite:///{path}") as store:
+        live = rounds(store, site, outlet)
+        store.put_feeder(FEEDER, {})
+        live.round(until(attacked, 15.0)[0])
+        other = locked()
+        with pytest.raises(StoreUnavailable):
+            live.remove(FEEDER)
+        assert FEEDER in live.watches
+        assert len(live.watches[FEEDER].book.active) == 2
+        other.close()
+        live.keeper.commit(at_once=True)
+        live.remove(FEEDER)
+        assert (live.watches, store.feeders(), store.active(FEEDER)) == ({}, {}, [])
+        alarms = store.alarms()[0]
+        assert {alarm.state for alarm in alarms} == {AlarmState.CLEARED}
+        assert store.events(alarms[0].id)[-1].comment == NOT_WATCHED
+        assert [(a["state"], last) for a, last in outlet.events[2:]] == [("cleared", True)] * 2
+        assert outlet.withdrawn == [f"{FEEDER}/estimate"]
+        assert store.history(FEEDER)
+        assert "gridsec_alarms_active{" not in live.metrics.exposition().decode()
+        live.round(until(attacked, 15.0)[1][:1])
+        assert store.rejected()[0].reason.startswith("unknown-feeder")
+        with pytest.raises(FeederUnknown):
+            live.remove(FEEDER)
+
+
 def test_an_idle_service_notices_that_the_database_is_back(
     site: Site,
     attacked: list[Sample],
@@ -158,16 +342,16 @@ def test_an_idle_service_notices_that_the_database_is_back(
     locked: Callable[[], sqlite3.Connection],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("service.rounds.RETRY_S", 0.0)
+    monkeypatch.setattr("service.keeper.RETRY_S", 0.0)
     with Store(f"sqlite:///{path}") as store:
         live = rounds(store, site)
         other = locked()
         live.round(until(attacked, 5.0)[0])
         live.round([])
-        assert live.store_problem is not None
+        assert live.keeper.problem is not None
         other.close()
         live.round([])
-        assert live.store_problem is None
+        assert live.keeper.problem is None
 
 
 def test_acknowledgements(site: Site, attacked: list[Sample], path: Path) -> None:
@@ -185,7 +369,7 @@ def test_acknowledgements(site: Site, attacked: list[Sample], path: Path) -> Non
     with Store(f"sqlite:///{path}") as store:
         # The feeder is not watched any more: the store alone knows its alarm.
         live = Rounds(RuntimeConfig(), store, [], wall=lambda: START + 100, stored=lambda: None)
-        live.publisher = outlet
+        live.keeper.publisher = outlet
         live.begin()
         known = store.alarm(second)
         assert known is not None
