@@ -65,8 +65,6 @@ class MeterAccuracy:
             number = float(getattr(self, name))
             if not (np.isfinite(number) and number >= 0):
                 raise ValueError(f"{name} must be finite and not negative, got {number}")
-        if not self.busbar_class < 1:
-            raise ValueError(f"busbar_class must be below 1, got {self.busbar_class}")
 
 
 def reading_error(accuracy: MeterAccuracy, v2: Floats, sigmas: float) -> Floats:
@@ -109,6 +107,8 @@ def busbar_error(accuracy: MeterAccuracy, v0_squared: float, sigmas: float) -> f
     sigmas
         As in `reading_error`.
     """
+    if accuracy.busbar_class >= 1.0:
+        return float("inf")  # such a reading says nothing
     v = float(np.sqrt(max(v0_squared, 0.0)))
     e = accuracy.busbar_class * v + 0.5 * accuracy.busbar_resolution + sigmas * accuracy.busbar_jitter
     e /= 1.0 - accuracy.busbar_class

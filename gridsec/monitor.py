@@ -58,7 +58,7 @@ def design(
         M, how many meters may be manipulated at the same time.
     step_s
         Expected interval between frames, s. Other intervals work, too; above 30 s four honest readings
-        in a row clear a meter instead of ten, unless `options` say otherwise.
+        in a row clear a meter instead of six, unless `options` say otherwise.
     gains
         `direct`: the inverter of a trusted meter is driven by that meter's reading. Or stacked gains
         of circle-criterion observers in the order of `bank.subsets(p, M).masks()`; an entrywise

@@ -68,7 +68,7 @@ class Options:
 
     sigmas: float = 4.0
     confirm: int = 2
-    release: int = 10
+    release: int = 6
     settled: float = 0.1
     tie: float = 1e-6
     widest: float = 0.1

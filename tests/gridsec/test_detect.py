@@ -70,6 +70,9 @@ class TestReadingError:
         bound = detect.busbar_error(spec, reading**2, 3.0)
         assert abs(reading**2 - v**2) <= bound * (1.0 + 1e-12)
 
+    def test_a_class_of_a_hundred_percent_says_nothing(self) -> None:
+        assert detect.busbar_error(accuracy(busbar_class=1.0), 1.0, 3.0) == np.inf
+
     @pytest.mark.parametrize(
         "changes",
         [
@@ -79,7 +82,6 @@ class TestReadingError:
             {"jitter": np.zeros((2, 1))},
             {"busbar_class": -0.1},
             {"busbar_jitter": float("inf")},
-            {"busbar_class": 1.0},
         ],
     )
     def test_wrong_descriptions(self, changes: dict[str, object]) -> None:
