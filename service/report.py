@@ -8,6 +8,8 @@ strings and floats, so it can be kept, compared, sent and read from any thread.
 from __future__ import annotations
 
 import math
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +22,7 @@ from service.align import Tick
 
 BUSBAR = "substation"
 """The name under which the busbar meter is reported among the silent ones (as in its zenoh key)."""
+_SHOWN = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,7 +173,7 @@ def build(site: Site, tick: Tick, max_attacked: int, estimate: Estimate, verdict
         site,
         tick,
         max_attacked,
-        verdict=(verdict.decision, verdict.cause, verdict.reason),
+        verdict=(verdict.decision, verdict.cause, _reason(site, tick, max_attacked, verdict)),
         meters=tuple(meters),
         buses=tuple((bus, finite(v)) for bus, v in buses),
     )
@@ -210,6 +213,41 @@ def blind(site: Site, tick: Tick, max_attacked: int, cause: Cause, reason: str) 
         meters=meters,
         buses=tuple((bus, None) for bus in site.feeder.buses),
     )
+
+
+def _reason(site: Site, tick: Tick, max_attacked: int, verdict: Verdict) -> str:
+    """Say why, with the meters' ids, as in alarms: the monitor knows customers only."""
+    suspects = np.flatnonzero(verdict.suspects).tolist()
+    unseen = [k for k, reading in enumerate(tick.readings) if reading is None]
+    named = _meters(site, suspects)
+    if verdict.cause is Cause.RESIDUALS:
+        return f"Manipulated: {named}; further off than meter accuracy and load uncertainty allow."
+    if verdict.cause is Cause.TOO_MANY_SUSPECTS:
+        return (
+            f"{len(suspects)} meters disagree with the feeder ({named}), and at most {max_attacked} can be "
+            "told apart. A wrong busbar reading, switch or line in the model looks the same."
+        )
+    if verdict.cause is Cause.SILENT_METERS and unseen:
+        return f"No reading from {_meters(site, unseen)}."
+    if verdict.cause in {Cause.AMBIGUOUS, Cause.SILENT_METERS}:
+        return _in_ids(site, verdict.reason)
+    return verdict.reason
+
+
+def _meters(site: Site, which: Sequence[int]) -> str:
+    """The ids of some meters, the first few of many."""
+    rest = f" and {len(which) - _SHOWN} more" if len(which) > _SHOWN else ""
+    return ", ".join(site.meter_ids[k] for k in which[:_SHOWN]) + rest
+
+
+def _in_ids(site: Site, text: str) -> str:
+    """Call customers in a sentence by their meters' ids; longer names first, one may begin another."""
+    meter_of = {
+        site.feeder.customers[int(customer)]: meter
+        for customer, meter in zip(site.meters, site.meter_ids, strict=True)
+    }
+    names = "|".join(re.escape(name) for name in sorted(meter_of, key=len, reverse=True))
+    return re.sub(rf"(?<!\w)(?:{names})(?!\w)", lambda found: meter_of[found[0]], text)
 
 
 def _attack_volts(site: Site, tick: Tick, verdict: Verdict) -> Floats:

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from feeders.load import Site, load, to_frame
+from feeders.scenario import Scenario, random_attacks, simulate
+from gridsec import monitor
 from gridsec.online import Cause, Decision, Estimate, Verdict
 from service.align import Tick
 from service.reading import Reading
 from service.report import BUSBAR, blind, build, snapshot, to_json
+from service.watch import design
 
 T = 1_795_212_000.0
 
@@ -69,6 +73,49 @@ def test_volts_and_names(site: Site) -> None:
     assert report.silent == ((site.meter_ids[0], math.inf), (BUSBAR, 12.5))
     assert report.bus_v_volt[0] == (site.feeder.buses[0], pytest.approx(base))
     assert report.v_min_volt == pytest.approx(0.9 * base)
+
+
+def test_reasons_name_meters_as_alarms_do(site: Site) -> None:
+    customers = [site.feeder.customers[k] for k in site.meters]
+    estimate, verdict = judged(site, 6.0, 3)
+
+    def reason(
+        cause: Cause, text: str = "", suspects: tuple[int, ...] = (), unseen: tuple[int, ...] = ()
+    ) -> str:
+        named = np.isin(np.arange(13), suspects)
+        decision = Decision.ATTACKED if cause is Cause.RESIDUALS else Decision.UNDECIDED
+        said = replace(verdict, cause=cause, reason=text, suspects=named, decision=decision)
+        return build(site, tick(site, {}, unseen), 2, estimate, said).reason
+
+    assert reason(Cause.RESIDUALS, suspects=(3, 12)).startswith("Manipulated: m04, m13; further off")
+    many = reason(Cause.TOO_MANY_SUSPECTS, suspects=tuple(range(7)))
+    assert many.startswith(
+        "7 meters disagree with the feeder (m01, m02, m03, m04, m05 and 2 more), and at most 2"
+    )
+    assert reason(Cause.SILENT_METERS, unseen=(4,)) == "No reading from m05."
+    for k, customer in enumerate(customers):  # One customer's name begins another's.
+        text = f"The loads are not known well enough to judge {customer}, {customers[0]}."
+        assert reason(Cause.AMBIGUOUS, text).endswith(f" judge {site.meter_ids[k]}, m01.")
+    assert reason(Cause.NO_BUSBAR, "as it is") == "as it is"
+
+
+def test_the_monitor_s_own_sentences_name_no_customer(site: Site) -> None:
+    """Whatever the monitor says over a real attack with a gap in it, the operator reads meters' ids."""
+    attacks = random_attacks(site, 5, "bias", 3, 0.03, t_on=T + 5, t_off=T + 30)
+    names = re.compile("|".join(re.escape(name) for name in site.feeder.customers))
+    finished, said = design(site), set()
+    state = monitor.init(finished, T)
+    for sample in simulate(site, Scenario(seed=4, start=T, duration_s=40.0, attacks=attacks)):
+        heard = {r.meter: r for r in sample.readings if not (r.meter == "m01" and 32 <= sample.t - T < 36)}
+        readings = tuple(heard.get(meter) for meter in site.meter_ids)
+        now = Tick(sample.t, readings, heard[""], ())  # type: ignore[arg-type]
+        state, estimate, verdict = monitor.step(finished, state, to_frame(site, snapshot(now)))
+        report = build(site, now, 2, estimate, verdict)
+        said.add(report.cause)
+        assert not names.search(report.reason), report.reason
+        if report.cause is Cause.TOO_MANY_SUSPECTS:
+            assert all(site.meter_ids[k] in report.reason for k in np.flatnonzero(verdict.suspects))
+    assert {Cause.AGREEMENT, Cause.TOO_MANY_SUSPECTS, Cause.SILENT_METERS} <= said
 
 
 def test_json_is_plain_and_has_no_nan(site: Site) -> None:
