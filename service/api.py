@@ -12,7 +12,7 @@ import asyncio
 import hashlib
 import json
 import secrets
-from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncGenerator, AsyncIterator
 from functools import partial
 from pathlib import Path as FilePath
 from typing import Annotated, Any, Protocol, cast
@@ -23,13 +23,13 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from fastapi.staticfiles import StaticFiles
-from starlette.exceptions import HTTPException as AnyHTTPException
 
-from gridsec.errors import DesignInfeasible, FeederInvalid, GridsecError, NotObservable
+from gridsec.errors import FeederInvalid
 from service import models
-from service.alarms import AlarmKind, AlarmState, AlarmUnknown, AlreadyAcknowledged, Severity
+from service.alarms import AlarmKind, AlarmState, AlarmUnknown, Severity
 from service.alarms import to_json as alarm_json
-from service.problem import Guard, problem
+from service.errors import FeederUnknown
+from service.problem import Guard, handlers, problem
 from service.report import FeederReport
 from service.report import to_json as report_json
 from service.store import Event, Store, StoreUnavailable
@@ -55,6 +55,9 @@ class Backend(Protocol):
     def feeder(self, name: str) -> dict[str, Any] | None:
         """Return the fields of `models.FeederDetail`, or None if there is no such feeder."""
 
+    def known(self, name: str) -> bool:
+        """Whether there is such a feeder; costs nothing."""
+
     def report(self, name: str) -> FeederReport | None:
         """Return the latest report of a feeder, or None before its first tick."""
 
@@ -68,7 +71,10 @@ class Backend(Protocol):
         """Say whether the process should live on, and if not, why."""
 
     async def put_feeder(self, name: str, tables: dict[str, Any]) -> None:
-        """Take over a feeder's tables; raises FeederInvalid, NotObservable or DesignInfeasible."""
+        """Take over a feeder's tables; raises what says that it is wrong, or TooManyFeeders."""
+
+    async def delete_feeder(self, name: str) -> None:
+        """Watch a feeder no more; raises FeederUnknown or FeederFixed."""
 
     async def acknowledge(self, alarm_id: str, who: str, comment: str) -> dict[str, Any]:
         """Answer an alarm and return it; raises AlarmUnknown or AlreadyAcknowledged."""
@@ -103,11 +109,9 @@ def create_api(backend: Backend) -> FastAPI:
     app.state.streams = 0
     app.state.run = secrets.token_hex(4)
     app.add_middleware(Guard, max_body=MAX_BODY)
-    for error, status in _STATUS.items():
-        app.add_exception_handler(error, _gridsec_handler(status))
-    app.add_exception_handler(AnyHTTPException, _http_handler)
+    for error, handler in handlers().items():
+        app.add_exception_handler(error, handler)
     app.add_exception_handler(RequestValidationError, _validation_handler)
-    app.add_exception_handler(Exception, _unexpected_handler)
     app.include_router(_feeders)
     app.include_router(_alarms)
     app.include_router(_operations)
@@ -150,8 +154,8 @@ Until = Annotated[float | None, Query(allow_inf_nan=False, description="Before t
 
 
 def _known_feeder(backend: BackendHere, feeder: FeederName) -> str:
-    if backend.feeder(feeder) is None:
-        raise HTTPException(404, f"there is no feeder {feeder!r}")
+    if not backend.known(feeder):
+        raise FeederUnknown(feeder)
     return feeder
 
 
@@ -207,6 +211,13 @@ def _summary(backend: Backend, fields: dict[str, Any]) -> models.FeederSummary:
     return models.FeederSummary.model_validate({**fields, **now})
 
 
+def _detail(backend: Backend, feeder: str) -> dict[str, Any]:
+    fields = backend.feeder(feeder)
+    if fields is None:
+        raise FeederUnknown(feeder)
+    return fields
+
+
 @_feeders.get("")
 def list_feeders(backend: BackendHere) -> models.Feeders:
     """All feeders, with the latest verdict of each."""
@@ -218,7 +229,7 @@ def get_feeder(
     backend: BackendHere, feeder: KnownFeeder, response: Response, if_none_match: IfNoneMatch = None
 ) -> Any:
     """A feeder: its tree, and the columns of its files."""
-    fields = backend.feeder(feeder)
+    fields = _detail(backend, feeder)
     text = json.dumps(fields, sort_keys=True, default=str)
     tag = f'"{hashlib.sha256(text.encode()).hexdigest()[:32]}"'
     return _unchanged(response, tag, if_none_match) or fields
@@ -232,7 +243,13 @@ async def put_feeder(backend: BackendHere, feeder: FeederName, tables: dict[str,
     except ValueError as error:
         raise FeederInvalid(["the JSON contains NaN or an infinity; leave the field out instead"]) from error
     await backend.put_feeder(feeder, tables)
-    return backend.feeder(feeder)
+    return _detail(backend, feeder)
+
+
+@_feeders.delete("/{feeder}", status_code=204)
+async def delete_feeder(backend: BackendHere, feeder: KnownFeeder) -> None:
+    """Watch a feeder no more that was put: its alarms are cleared, its history is kept."""
+    await backend.delete_feeder(feeder)
 
 
 @_feeders.get("/{feeder}/state")
@@ -277,6 +294,8 @@ async def stream_states(backend: BackendHere, feeder: KnownFeeder) -> AsyncItera
     yield ServerSentEvent(comment="connected", retry=2000)
     last: FeederReport | None = None
     async for _ in _wakes(backend):
+        if not backend.known(feeder):
+            return
         report = backend.report(feeder)
         if report is not None and report is not last:
             last = report
@@ -459,33 +478,6 @@ def metrics(backend: BackendHere) -> Response:
 
 # --------------------------------------------------------------------- errors
 
-_STATUS: dict[type[GridsecError], int] = {
-    FeederInvalid: 422,
-    NotObservable: 422,
-    DesignInfeasible: 422,
-    AlarmUnknown: 404,
-    AlreadyAcknowledged: 409,
-    StoreUnavailable: 503,
-    GridsecError: 500,
-}
-
-Handler = Callable[[Request, Exception], Awaitable[Response]]
-
-
-def _gridsec_handler(status: int) -> Handler:
-    async def handler(request: Request, error: Exception) -> Response:
-        more = {"problems": list(error.problems)} if isinstance(error, FeederInvalid) else {}
-        headers = {"Retry-After": "5"} if status == 503 else None
-        return problem(request, status, str(error), headers=headers, **more)
-
-    return handler
-
-
-async def _http_handler(request: Request, error: Exception) -> Response:
-    error = cast(AnyHTTPException, error)
-    detail = "there is nothing here" if error.detail == "Not Found" else error.detail
-    return problem(request, error.status_code, detail, headers=dict(error.headers or {}))
-
 
 async def _validation_handler(request: Request, error: Exception) -> Response:
     found = cast(RequestValidationError, error).errors()
@@ -493,9 +485,3 @@ async def _validation_handler(request: Request, error: Exception) -> Response:
     broken = any(item["type"] == "json_invalid" for item in found)
     detail = "; ".join(f"{item['where']}: {item['what']}" for item in errors)
     return problem(request, 400 if broken else 422, detail, errors=errors)
-
-
-async def _unexpected_handler(request: Request, _error: Exception) -> Response:
-    # The server hangs up after an error that it did not expect; the client must not be surprised by that.
-    text = "something went wrong here; the log of the service says what"
-    return problem(request, 500, text, headers={"Connection": "close"})

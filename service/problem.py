@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Awaitable, Callable
 from http import HTTPStatus
-from typing import Any
+from typing import Any, cast
 
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from gridsec.errors import DesignInfeasible, FeederInvalid, GridsecError, NotObservable
+from service.alarms import AlarmUnknown, AlreadyAcknowledged
+from service.errors import FeederFixed, FeederUnknown, TooManyFeeders
+from service.store import StoreUnavailable
 
 _CSP = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
@@ -95,3 +101,46 @@ class Guard:
             await problem(request, 413, text, headers={"Connection": "close"})(scope, receive, guarded)
         else:
             await self.app(scope, limited, guarded)
+
+
+Handler = Callable[[Request, Exception], Awaitable[Response]]
+
+_STATUS: dict[type[GridsecError], int] = {
+    FeederInvalid: 422,
+    NotObservable: 422,
+    DesignInfeasible: 422,
+    AlarmUnknown: 404,
+    FeederUnknown: 404,
+    AlreadyAcknowledged: 409,
+    FeederFixed: 409,
+    TooManyFeeders: 409,
+    StoreUnavailable: 503,
+    GridsecError: 500,
+}
+
+
+def handlers() -> dict[type[Exception], Handler]:
+    """Return what makes problems of errors, by their type."""
+    ours: dict[type[Exception], Handler] = {error: _gridsec_handler(code) for error, code in _STATUS.items()}
+    return {**ours, HTTPException: _http_handler, Exception: _unexpected_handler}
+
+
+def _gridsec_handler(status: int) -> Handler:
+    async def handler(request: Request, error: Exception) -> Response:
+        more = {"problems": list(error.problems)} if isinstance(error, FeederInvalid) else {}
+        headers = {"Retry-After": "5"} if status == 503 else None
+        return problem(request, status, str(error), headers=headers, **more)
+
+    return handler
+
+
+async def _http_handler(request: Request, error: Exception) -> Response:
+    error = cast(HTTPException, error)
+    detail = "there is nothing here" if error.detail == "Not Found" else error.detail
+    return problem(request, error.status_code, detail, headers=dict(error.headers or {}))
+
+
+async def _unexpected_handler(request: Request, _error: Exception) -> Response:
+    # The server hangs up after an error that it did not expect; the client must not be surprised by that.
+    text = "something went wrong here; the log of the service says what"
+    return problem(request, 500, text, headers={"Connection": "close"})

@@ -17,6 +17,7 @@ from gridsec.errors import FeederInvalid
 from gridsec.online import Cause, Decision
 from service.alarms import AlarmBook, AlarmRules, AlarmUnknown, acknowledge, advance, conditions, to_json
 from service.api import create_api
+from service.errors import FeederFixed, TooManyFeeders
 from service.report import FeederReport, MeterReport
 from service.store import Store
 
@@ -152,6 +153,9 @@ class SmallService:
     def feeder(self, name: str) -> dict[str, Any] | None:
         return self.villages[name].detail() if name in self.villages else None
 
+    def known(self, name: str) -> bool:
+        return name in self.villages
+
     def report(self, name: str) -> FeederReport | None:
         return self.reports.get(name)
 
@@ -167,8 +171,17 @@ class SmallService:
     async def put_feeder(self, name: str, tables: dict[str, Any]) -> None:
         if "customers" not in tables:
             raise FeederInvalid(["customers.csv: missing", "lines.csv: missing"])
+        if len(self.villages) >= 3 and name not in self.villages:
+            raise TooManyFeeders(3)
         self.villages[name] = Village(name, int(tables["customers"]))
         self.books[name] = AlarmBook(name)
+
+    async def delete_feeder(self, name: str) -> None:
+        if name == "village":
+            raise FeederFixed(name)
+        del self.villages[name], self.books[name]
+        self.reports.pop(name, None)
+        self.wake({"type": "state", "data": None})
 
     async def acknowledge(self, alarm_id: str, who: str, comment: str) -> dict[str, Any]:
         for name, book in self.books.items():

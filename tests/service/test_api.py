@@ -145,6 +145,34 @@ def test_a_feeder_can_be_put(setup: Setup) -> None:
     assert [f["name"] for f in setup.get("/feeders").json()["feeders"]] == ["village", "town", "hamlet"]
 
 
+def test_a_feeder_can_be_deleted_unless_it_was_given(setup: Setup) -> None:
+    town = setup.service.villages["town"]
+    setup.service.tick(town.report(T0))
+    stream = Stream(setup, "/feeders/town/stream")
+    assert [stream.next().get("event") for _ in range(2)] == [None, "state"]
+    answer = setup.http.delete("/api/v1/feeders/town")
+    assert (answer.status_code, answer.content) == (204, b"")
+    assert stream.next() == {"end": "true"}
+    stream.close()
+    is_problem(setup.http.delete("/api/v1/feeders/town"), 404)
+    is_problem(setup.get("/feeders/town"), 404)
+    assert "cannot be deleted" in is_problem(setup.http.delete("/api/v1/feeders/village"), 409)["detail"]
+    assert [f["name"] for f in setup.get("/feeders").json()["feeders"]] == ["village"]
+
+
+def test_there_is_an_end_to_feeders(setup: Setup) -> None:
+    for name, status in (("one", 200), ("one", 200), ("two", 409), ("town", 200)):
+        assert setup.http.put(f"/api/v1/feeders/{name}", json={"customers": 3}).status_code == status
+    is_problem(setup.http.put("/api/v1/feeders/two", json={"customers": 3}), 409)
+
+
+def test_asking_for_a_feeder_s_state_does_not_build_its_tables(setup: Setup) -> None:
+    setup.attack()
+    setup.service.feeder = lambda _: pytest.fail("the tables were built")
+    for path in ("state", "meters/H3", "history"):
+        assert setup.get(f"/feeders/village/{path}").status_code == 200
+
+
 def test_every_problem_of_a_feeder_is_told_at_once(setup: Setup) -> None:
     body = is_problem(setup.http.put("/api/v1/feeders/hamlet", json={}), 422)
     assert body["problems"] == ["customers.csv: missing", "lines.csv: missing"]
@@ -369,7 +397,7 @@ def test_metrics_and_bad_readings(setup: Setup) -> None:
 def test_the_description_tells_of_problems(setup: Setup) -> None:
     schema = setup.get("/openapi.json").json()
     operations = [op for path in schema["paths"].values() for op in path.values()]
-    assert len(operations) == 16
+    assert len(operations) == 17
     for operation in operations:
         assert list(operation["responses"]["default"]["content"]) == ["application/problem+json"]
         assert "422" not in operation["responses"]
