@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from gridsec.droop import PRESETS, fleet
 from gridsec.errors import DesignInfeasible
 from gridsec.gains import (
     CircleGains,
@@ -22,8 +23,9 @@ from gridsec.gains import (
     stacked,
     state_bound,
 )
-from gridsec.lure import Lure
+from gridsec.lure import Lure, close_loop
 from tests.gridsec.plants import Street, line, shared, tree
+from tests.gridsec.radial import random_feeder
 
 
 def arbitrary(lure: Lure, J: list[int], seed: int = 0) -> CircleGains:
@@ -212,3 +214,41 @@ def test_short_forms_of_options() -> None:
     np.testing.assert_array_equal(options.weight, lure.H.T @ lure.H)
     with pytest.raises(ValueError, match="read-only"):
         options.noise[0] = 1.0
+
+
+@given(seed=st.integers(0, 2**32 - 1), trusted=st.integers(0, 4))
+def test_theorem_2_with_several_inverters_at_one_meter(seed: int, trusted: int) -> None:
+    """The point that docs/theory-observers.md gives satisfies the inequality, whoever shares a connection."""
+    rng = np.random.default_rng(seed)
+    feeder = random_feeder(seed % 1000, customers=4)
+    own, J = np.sort(rng.integers(0, 4, 7)), np.sort(rng.permutation(4)[:trusted])
+    droop = fleet(own, list(rng.choice(PRESETS, 7)), rng.uniform(3.0, 10.0, 7), 100.0, tau=np.full(7, 2.5))
+    lure = close_loop(feeder, droop, np.arange(4))
+    tau, beta, S = 2.5, 0.7, -lure.H
+    K = (own[:, None] == J).astype(np.float64)
+    drives = K.any(axis=1)
+    steepest, k = float(lure.slope.max()), float(K.sum(axis=0).max(initial=0.0))
+    P = S + beta / steepest * np.eye(7)
+    high = 2.0 * steepest * np.linalg.norm(P, 2) / (tau * beta)
+    noise, load = rng.uniform(0.001, 0.02, J.size), rng.uniform(0.0, 0.01, (4, 3))
+    gains = CircleGains(
+        J=J,
+        L=np.zeros((7, J.size)),
+        K=K,
+        P=P,
+        Lambda=np.where(drives, high, 1.0 / tau),
+        nu=beta * beta / steepest / (2.0 * tau),
+        mu=max(k, 1.0) * high * steepest * float(np.max(noise, initial=1e-3)) ** 2,
+        mu_delta=max(steepest * np.linalg.norm(lure.F @ load, 2) ** 2 / tau, 1e-12),
+        alpha=(1.0 - beta) / tau,
+        noise=noise,
+        load=load,
+        weight=np.eye(7),
+        margin=np.nan,
+        sensitivity=np.zeros(J.size),
+        backoff=0.0,
+        status="docs/theory-observers.md, section 4",
+    )
+    matrix = circle_matrix(lure, J, gains)
+    scale = 1.0 / np.sqrt(np.abs(np.diagonal(matrix)))
+    assert np.linalg.eigvalsh(scale[:, None] * matrix * scale)[-1] <= 1e-9
