@@ -25,6 +25,8 @@ from service.store import Event, Store, StoreUnavailable
 from service.waiting import Batch, Waiting
 
 RETRY_S = 1.0
+SLOW_S = 15.0
+"""A write that takes longer is told to the operator."""
 OUTBOX_PAGE = 1000
 """So many events are read from the outbox at once."""
 UNPUBLISHED_KEPT = 10_000
@@ -124,7 +126,7 @@ class Keeper:
         self._metrics = metrics
         self._stored = stored
         self._apart = apart
-        self._retry_at = 0.0
+        self._retry_at = self._began = 0.0
         self._published: deque[int] = deque()
         self._unpublished: deque[tuple[int, Alarm]] = deque()
         # The outbox holds events after this number that are not in `_unpublished`; None: it holds none.
@@ -149,7 +151,8 @@ class Keeper:
             page_after=self._outbox_after if more else None,
         )
         if job.batch or job.published or job.probe or more:
-            self.storing = True
+            self.storing, self._began = True, time.monotonic()
+            self._metrics.unstored.set(len(self.waiting))
             self._apart(partial(_write, self._store, job), partial(self._written, job))
 
     def store_now(self, more: tuple[Transition, ...] = (), *, without: str | None = None) -> None:
@@ -226,9 +229,12 @@ class Keeper:
 
     def problems(self) -> list[str]:
         """Return what is wrong with the database and what that costs, for the operator."""
-        if self.problem is None:
+        under_way = time.monotonic() - self._began if self.storing else 0.0
+        if self.problem is None and under_way < SLOW_S:
             return []
-        problems = [f"database: {self.problem}"]
+        problems = [] if self.problem is None else [f"database: {self.problem}"]
+        if under_way >= SLOW_S:
+            problems.append(f"database: a write has been under way for {under_way:.0f} s")
         if waiting := len(self.waiting):
             problems.append(f"{waiting} changes of alarms wait for the database")
         if gone := self.waiting.given_up:

@@ -62,11 +62,12 @@ class Waiting:
         # Alarms of which the database knows nothing; those of a batch on its way may be known any moment.
         self._unheard: set[str] = set()
         self._on_the_way: set[str] = set()
+        self._taken = 0
         self._thin_at = TRANSITIONS_KEPT
 
     def __len__(self) -> int:
-        """Return how many transitions wait."""
-        return len(self._transitions)
+        """Return how many transitions wait, those on their way included."""
+        return len(self._transitions) + self._taken
 
     def add(
         self,
@@ -97,11 +98,13 @@ class Waiting:
         self._reports.clear()
         self._rejected.clear()
         self._unheard, self._on_the_way = set(), self._unheard
+        self._taken = len(batch.transitions)
         return batch
 
     def stored(self) -> None:
         """Note that what `take` returned is on the disk."""
         self._on_the_way = set()
+        self._taken = 0
         self.given_up, self._thin_at = 0, TRANSITIONS_KEPT
 
     def give_back(self, batch: Batch) -> None:
@@ -114,6 +117,7 @@ class Waiting:
         """
         self._unheard |= self._on_the_way
         self._on_the_way = set()
+        self._taken = 0
         self._transitions[:0] = batch.transitions
         self._reports.extendleft(reversed(batch.reports))
         self._rejected.extendleft(reversed(batch.rejected))

@@ -185,6 +185,9 @@ def test_nobody_who_watches_waits_for_a_locked_database(
         while len(outlet.estimates) < 8:  # noqa: ASYNC110
             await asyncio.sleep(0.01)
         assert time.monotonic() - begin < 2.0
+        monkeypatch.setattr("service.keeper.SLOW_S", 0.01)
+        assert "under way" in runtime.ready()[1][0]
+        assert runtime.healthy()[0]
         assert outlet.events == []
         assert store.alarms()[0] == []
         other.close()

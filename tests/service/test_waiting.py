@@ -49,6 +49,7 @@ def test_a_flapping_alarm_keeps_its_newest_state() -> None:
     assert len(book) <= 20
     batch = book.take()
     assert batch.transitions[-1].alarm == raised("a", 100).alarm
+    assert len(book) == len(batch.transitions)
     assert lost["transition"] == book.given_up == 199 - len(batch.transitions)
     book.stored()
     assert (book.given_up, len(book)) == (0, 0)
