@@ -215,6 +215,7 @@ def demo(
     """Show it: a service, virtual meters on zenoh of which some begin to lie, and a web page."""
     from service.demo import Plan, run, verdict
 
+    _see_kind(kind, check=check)
     plan = Plan(feeder, duration, attacked, size, kind, seed, http)
     try:
         outcome = run(plan, console.out, check=check, keep=keep)
@@ -230,6 +231,22 @@ def demo(
         if problems:
             raise typer.Exit(FAILED)
         console.out.print("[green]Exactly the manipulated meters were named, and all alarms have cleared.[/]")
+
+
+def _see_kind(kind: str, *, check: bool) -> None:
+    """Refuse kinds that there are not, and with `--check` those that need not show within the demo."""
+    from feeders.campaign import Kind
+
+    if kind not in set(Kind):
+        raise typer.BadParameter(
+            f"{kind!r} is not known; expected one of {', '.join(Kind)}", param_hint="--kind"
+        )
+    if check and kind in {Kind.STUCK, Kind.REPLAY}:
+        raise typer.BadParameter(
+            f"{kind} shows only once the voltage has moved away from what is repeated, which may take longer "
+            "than the demo: such meters lie by nothing yet and are rightly not named. Leave out --check",
+            param_hint="--kind",
+        )
 
 
 # ------------------------------------------------------------------------------------------------- simulate

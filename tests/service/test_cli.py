@@ -327,5 +327,15 @@ def test_demo_fails_for_every_kind_of_mistake() -> None:
     assert verdict(Outcome()) == ("no meter was manipulated",)
 
 
+def test_demo_does_not_check_what_need_not_show(gridsec: Run) -> None:
+    for kind in ("stuck", "replay"):
+        done = gridsec("demo", "--kind", kind, "--check", "--duration", "30")
+        assert done.returncode == 2
+        assert "--check" in done.stderr
+    done = gridsec("demo", "--kind", "nonsense")
+    assert done.returncode == 2
+    assert "coordinated-power" in done.stderr
+
+
 def test_demo_of_a_feeder_that_is_none(gridsec: Run) -> None:
     assert "atlantis" in refused(3, gridsec("demo", "--feeder", "atlantis", "--duration", "30"))
