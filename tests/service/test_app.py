@@ -58,6 +58,7 @@ def test_from_readings_to_the_right_alarm_and_back(site: Site, tmp_path: Path) -
         samples = list(play(site, scenario, live.meters, STEP))
         lying = {site.meter_ids[k] for k in np.flatnonzero(samples[25].manipulated)}
         alarms = until(lambda: _all_cleared(live))
+        until(lambda: live.state()["t"] >= samples[-1].t - 2.0, "the end")
         assert {a["meter"] for a in alarms} == lying
         assert {a["kind"] for a in alarms} == {"meter-manipulated"}
         for alarm in alarms:
@@ -74,7 +75,10 @@ def test_from_readings_to_the_right_alarm_and_back(site: Site, tmp_path: Path) -
         assert live.meters.query(f"{FEEDER}/alarm/*", 2.0) == {}
         until(lambda: len([1 for kind, _ in events if kind == "alarm"]) >= 4, "events of both alarms")
         assert [e["change"] for kind, e in events if kind == "alarm"] == ["raised"] * 2 + ["cleared"] * 2
-        assert live.metric("gridsec_readings_total", outcome="accepted") == 14 * 80
+        until(
+            lambda: live.metric("gridsec_readings_total", outcome="accepted") >= 14 * 80, "the last readings"
+        )
+        assert live.metric("gridsec_readings_total") == 14 * 80
         assert live.metric("gridsec_readings_lost_total") == 0
     listener.join(5.0)
     assert not listener.is_alive()
@@ -254,8 +258,29 @@ def test_feeders_over_rest(tmp_path: Path) -> None:
         run(live, other, Scenario(seed=1, start=START, duration_s=8.0))
         assert live.state(other.feeder.name)["verdict"] == "clean"
         detail = live.get(f"/api/v1/feeders/{other.feeder.name}")
+        given = live.http.delete(f"/api/v1/feeders/{FEEDER}")
+        assert given.status_code == 409
+        assert live.http.delete(f"/api/v1/feeders/{other.feeder.name}").status_code == 204
+        assert live.meters.query(f"{other.feeder.name}/estimate", 2.0) == {}
+        assert live.http.get(f"/api/v1/feeders/{other.feeder.name}/state").status_code == 404
         assert from_tables(load("kerber-landnetz").tables).digest == other.digest
         assert len(detail["layout"]["parent"]) == len(detail["layout"]["buses"]) == len(other.feeder.buses)
+
+
+def test_feeders_over_rest_have_an_end_and_stay_deleted(tmp_path: Path) -> None:
+    tables = [to_json(load("kerber-landnetz").tables) for _ in range(3)]
+    for k, one in enumerate(tables):
+        one["feeder"]["name"] = f"village-{k}"
+    with service(tmp_path, clock="events", max_feeders=2) as live:
+        answers = [live.http.put(f"/api/v1/feeders/village-{k}", json=one) for k, one in enumerate(tables)]
+        assert [answer.status_code for answer in answers] == [200, 200, 409]
+        assert "2 feeders" in answers[2].json()["detail"]
+        assert live.http.put("/api/v1/feeders/village-0", json=tables[0]).status_code == 200
+        assert live.http.delete("/api/v1/feeders/village-1").status_code == 204
+        assert live.http.put("/api/v1/feeders/village-2", json=tables[2]).status_code == 200
+    with service(tmp_path, clock="events") as live:
+        names = {f["name"] for f in live.get("/api/v1/feeders")["feeders"]}
+        assert names == {FEEDER, "village-0", "village-2"}
 
 
 @pytest.fixture
