@@ -176,15 +176,19 @@ class Fleet:
                 self.put(reading)
             yield sample, self._estimate_at(sample.t)
 
-    def pour(self, samples: Sequence[Tick]) -> list[dict[str, Any]]:
-        """Publish many ticks without waiting, and return their states, up to the last one.
+    def pour(self, samples: Sequence[Tick], ahead: int = 8) -> list[dict[str, Any]]:
+        """Publish many ticks, some ahead of what has been heard, and return their states, up to the last one.
 
-        The last tick must be complete: where the readings tell the time, an incomplete one stays open.
+        Not all at once: estimates are dropped when there are more than the network takes. The last tick
+        must be complete: where the readings tell the time, an incomplete one stays open.
         """
-        for sample in samples:
+        states = []
+        for number, sample in enumerate(samples):
             for reading in sample.readings:
                 self.put(reading)
-        return [self._estimate_at(sample.t) for sample in samples]
+            if number >= ahead:
+                states.append(self._estimate_at(samples[number - ahead].t))
+        return states + [self._estimate_at(sample.t) for sample in samples[len(states) :]]
 
     def _estimate_at(self, t: float) -> dict[str, Any]:
         end = time.monotonic() + ECHO_S
