@@ -1,4 +1,4 @@
-"""Constants, decomposition and observers of gridsec.observers.high_gain, against scipy and closed forms."""
+"""Constants, decomposition and steps of gridsec.observers.high_gain, against scipy and closed forms."""
 
 from __future__ import annotations
 
@@ -14,9 +14,8 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.linalg import solve_continuous_lyapunov
 
-from gridsec.errors import DesignInfeasible, NotObservable
-from gridsec.observers import high_gain
-from gridsec.observers.high_gain import Partial, Polynomial, System, affine, defects, groups, linear, nearest
+from gridsec.errors import NotObservable
+from gridsec.observers.high_gain import Partial, Polynomial, System, affine, defects, linear
 from gridsec.observers.high_gain.constants import (
     Slopes,
     decay_componentwise,
@@ -30,32 +29,11 @@ from gridsec.observers.high_gain.constants import (
 )
 from gridsec.observers.high_gain.field import advance, field, gains, transition
 from gridsec.observers.high_gain.form import at, jacobian_at, largest, sat, slopes
-from gridsec.online import Cause, Decision
+from tests.gridsec.observers.bent import bent, oscillator, oscillator_input
 
 
 def shift(n: int) -> np.ndarray:
     return np.eye(n, k=1)
-
-
-def bent() -> System:
-    """Oscillator `x1' = x2, x2' = -x1 - x2 + 0.3 x1^2 + u` with three equal sensors of x1."""
-    force = Polynomial(np.array([[1, 0], [0, 1], [2, 0]]), np.array([-1.0, -1.0, 0.3]))
-    first = Partial(
-        phi=lambda x: [x[0], x[1]],
-        jacobian=lambda _: [[1.0, 0.0], [0.0, 1.0]],
-        alpha=force,
-        beta=((affine(0.0, [0.0, 0.0]),), (affine(1.0, [0.0, 0.0]),)),
-        bound=1.0,
-    )
-    return System(np.array([1.0, 1.0]), (first, first, first))
-
-
-def oscillator(x: Any) -> list[Any]:
-    return [x[1], -x[0] - x[1] + 0.3 * x[0] ** 2]
-
-
-def oscillator_input(x: Any) -> list[list[Any]]:
-    return [[0.0 * x[0]], [1.0 + 0.0 * x[0]]]
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4, 5])
@@ -349,171 +327,6 @@ def test_steps_converge_to_the_differential_equation_with_order_two() -> None:
     assert errors[-1] < 1e-4
     assert errors[0] / errors[1] > 3.4
     assert errors[1] / errors[2] > 3.4
-
-
-# The whole estimator on a small nonlinear system with three equal sensors.
-
-
-def estimator(**options: Any) -> high_gain.HighGainDesign:
-    model = bent()
-    given: dict[str, Any] = {
-        "theta": 12.0, "noise": 2e-4, "max_attacked": 1, "u_low": -0.4, "u_high": 0.4, "step_s": 0.02,
-        "whole": nearest(model, (0, 1, 2), accept=1e-4), "lowest": 1.0,
-    }  # fmt: skip
-    return high_gain.design(
-        model, [nearest(model, group, accept=1e-4) for group in groups(3, 1)], **{**given, **options}
-    )
-
-
-def truth(seconds: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    t = np.arange(0.0, seconds, 0.02)
-    u = 0.3 * np.sin(t)
-    path = solve_ivp(
-        lambda s, x: np.array(oscillator(x)) + np.array([0.0, 0.3 * np.sin(s)]),
-        (0.0, t[-1]), [0.4, -0.3], t_eval=t, rtol=1e-10, atol=1e-12,
-    )  # fmt: skip
-    return t, path.y.T, u
-
-
-def watch(made: high_gain.HighGainDesign, added: Any, seconds: float = 8.0, seed: int = 0) -> tuple[Any, ...]:
-    t, x, u = truth(seconds)
-    y = x[:, [0, 0, 0]] + np.random.default_rng(seed).uniform(-1e-4, 1e-4, (len(t), 3)) + added(t)
-    state = high_gain.init(made, 0.0, y[0], u[:1])
-    outcomes, states = [], []
-    for k in range(1, len(t)):
-        state, outcome = high_gain.step(made, state, y[k], u[k : k + 1], np.ones(3, dtype=bool), 0.02)
-        outcomes.append(outcome)
-        states.append(state)
-    return t[1:], x[1:], outcomes, states
-
-
-def nothing(t: np.ndarray) -> np.ndarray:
-    return np.zeros((len(t), 3))
-
-
-def on_second(size: float, start: float = 4.0) -> Any:
-    def added(t: np.ndarray) -> np.ndarray:
-        out = np.zeros((len(t), 3))
-        out[t >= start, 1] = size
-        return out
-
-    return added
-
-
-@pytest.mark.parametrize("decay", ["componentwise", "kim2018"])
-def test_honest_sensors_are_never_suspected_and_bounds_hold(decay: Any) -> None:
-    made = estimator(decay=decay)
-    t, x, outcomes, states = watch(made, nothing)
-    assert all(outcome.decision is not Decision.ATTACKED for outcome in outcomes)
-    assert all(outcome.visited == (0,) for outcome in outcomes)
-    assert outcomes[-1].decision is Decision.CLEAN
-    assert outcomes[0].cause is Cause.SETTLING
-    for state, outcome, truth_x in zip(states, outcomes, x, strict=True):
-        limits = high_gain.error_bounds(made, state.age)
-        assert np.all(np.abs(state.z - truth_x).max(axis=1) <= limits)
-        assert np.abs(outcome.x - truth_x).max() <= outcome.bound
-    assert t[-1] == pytest.approx(states[-1].t)
-    assert made.proven
-
-
-@pytest.mark.parametrize("size", [0.02, -0.3, 1e4, 1e300])
-def test_attacks_are_seen_named_and_left_out(size: float) -> None:
-    made = estimator()
-    t, x, outcomes, states = watch(made, on_second(size))
-    after = [outcome for moment, outcome in zip(t, outcomes, strict=True) if moment > 4.5]
-    assert all(outcome.decision is Decision.ATTACKED for outcome in after)
-    assert all(outcome.suspects.tolist() == [False, True, False] for outcome in after)
-    assert after[-1].trusted.tolist() == [True, False, True]
-    error = np.array([np.abs(o.x - truth_x).max() for o, truth_x in zip(outcomes, x, strict=True)])
-    assert np.all(error <= np.array([outcome.bound for outcome in outcomes]))
-    assert np.all(np.abs(np.array([state.z for state in states])) <= made.limit[:, None] + 1e-9)
-    assert any(outcome.reset[1] for outcome in after) == (abs(size) > made.limit[1])
-
-
-def test_search_walks_through_the_sets_at_once_or_one_by_one() -> None:
-    # Sensor 2 is in the first two sets, {1, 2} and {0, 2}.
-    added = lambda t: 0.5 * (t[:, None] >= 4.0) * np.array([0.0, 0.0, 1.0])  # noqa: E731
-    _, _, together, _ = watch(estimator(), added)
-    _, _, singly, _ = watch(estimator(search="one"), added)
-    assert {o.visited for o in together if len(o.visited) > 1} == {(0, 1, 2)}
-    assert [o.visited for o in singly if len(o.visited) > 1][:2] == [(0, 1), (1, 2)]
-    assert together[-1].sigma == singly[-1].sigma == 2
-
-
-def test_two_liars_leave_no_answer_and_say_so() -> None:
-    added = lambda t: (t[:, None] >= 4.0) * np.array([0.5, -0.7, 0.0])  # noqa: E731
-    _, _, outcomes, _ = watch(estimator(), added)
-    assert outcomes[-1].decision is Decision.UNDECIDED
-    assert outcomes[-1].cause is Cause.TOO_MANY_SUSPECTS
-    assert outcomes[-1].bound == np.inf
-
-
-def test_unseen_sensors_have_no_influence_and_come_back() -> None:
-    made = estimator()
-    t, x, u = truth(8.0)
-    runs = []
-    for junk in (np.nan, 1e9, 0.0):
-        state, sigma = high_gain.init(made, 0.0, x[0, [0, 0, 0]], u[:1]), []
-        for k in range(1, len(t)):
-            silent = 3.0 < t[k] < 5.0
-            y = x[k, [0, 0, 0]].copy()
-            y[0] = junk if silent else y[0]
-            state, outcome = high_gain.step(
-                made, state, y, u[k : k + 1], np.array([not silent, True, True]), 0.02
-            )
-            sigma.append((outcome.sigma, outcome.decision, tuple(outcome.x), outcome.bound))
-            assert np.abs(outcome.x - x[k]).max() <= outcome.bound
-            assert outcome.decision is not Decision.ATTACKED
-            if silent:
-                assert not outcome.trusted[0]
-                assert state.age[0] == 0.0
-        assert state.age[0] == pytest.approx(t[-1] - 5.0, abs=0.05)
-        assert state.age[1] == pytest.approx(t[-1])
-        runs.append(sigma)
-    assert runs[0] == runs[1] == runs[2]
-
-
-def test_too_few_sensors_give_no_answer() -> None:
-    made = estimator()
-    state = high_gain.init(made, 0.0)
-    state, outcome = high_gain.step(
-        made, state, np.full(3, np.nan), np.zeros(1), np.ones(3, dtype=bool), 0.02
-    )
-    assert outcome.decision is Decision.UNDECIDED
-    assert outcome.cause is Cause.TOO_FEW_METERS
-    assert np.all(np.isnan(outcome.x))
-    _, outcome = high_gain.step(made, state, np.zeros(3), np.zeros(1), np.array([True, False, False]), 0.02)
-    assert outcome.cause is Cause.TOO_FEW_METERS
-
-
-def test_steps_of_another_length_give_the_same_path() -> None:
-    made = estimator()
-    start = high_gain.init(made, 0.0, np.array([0.2, 0.1, 0.0]), np.zeros(1))
-    y, u, seen = np.array([0.25, 0.1, 0.05]), np.array([0.1]), np.ones(3, dtype=bool)
-    twice = estimator(step_s=0.04, substeps=2)
-    long, _ = high_gain.step(made, start, y, u, seen, 0.04)
-    parts, _ = high_gain.step(twice, start, y, u, seen, 0.04)
-    half, _ = high_gain.step(made, start, start.y + 0.5 * (y - start.y), 0.5 * u, seen, 0.02)
-    full, _ = high_gain.step(made, half, y, u, seen, 0.02)
-    assert np.allclose(full.z, parts.z, rtol=1e-12, atol=1e-12)
-    assert np.allclose(long.z, parts.z, rtol=0.0, atol=2e-3)
-
-
-def test_designs_that_do_not_hold_are_refused() -> None:
-    model = bent()
-    sets = [nearest(model, group) for group in groups(3, 1)]
-    rest: dict[str, Any] = {"noise": 1e-3, "max_attacked": 1, "u_low": -1.0, "u_high": 1.0, "step_s": 0.02}
-    with pytest.raises(DesignInfeasible, match="too small for Lemma 1"):
-        high_gain.design(model, sets, theta=1.5, **rest)
-    with pytest.raises(DesignInfeasible, match="at least 1"):
-        high_gain.design(model, sets, theta=0.5, **rest)
-    with pytest.raises(NotObservable, match="each set of 2 sensors"):
-        high_gain.design(model, sets[:2], theta=12.0, **rest)
-    with pytest.raises(NotObservable, match="more than twice"):
-        high_gain.design(model, sets, theta=12.0, **{**rest, "max_attacked": 2})
-    wrong = replace(sets[0], function=lambda z: 0.9 * sets[0].function(z))
-    with pytest.raises(DesignInfeasible, match="misses the state"):
-        high_gain.design(model, [wrong, *sets[1:]], theta=12.0, **rest)
 
 
 def test_values_over_components_broadcast_constants() -> None:
