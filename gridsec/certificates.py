@@ -220,10 +220,8 @@ def certify(lure: Lure) -> Certificate:
         except DesignInfeasible as error:
             failed.append(error)
     if not found:
-        margins = [error.margin for error in failed if error.margin is not None]
-        raise DesignInfeasible(
-            "closed-form certificate", "; ".join(str(error) for error in failed), max(margins, default=None)
-        )
+        best = max((error.margin for error in failed if error.margin is not None), default=None)
+        raise DesignInfeasible("closed-form certificate", "; ".join(map(str, failed)), best)
     return max(found, key=lambda certificate: certificate.rate)
 
 
@@ -259,11 +257,8 @@ def verify(certificate: Certificate, lure: Lure, trusted: Bools | None = None) -
         return 1.0
     if certificate.kind == "small-gain" and P.shape == (count,):
         return _small_gain_margin(P, certificate.rate, form)
-    if (
-        certificate.kind in {"reactance", "lmi"}
-        and P.shape == (count, count)
-        and multiplier.shape == (count,)
-    ):
+    shaped = P.shape == (count, count) and multiplier.shape == (count,)
+    if certificate.kind in {"reactance", "lmi"} and shaped:
         return _quadratic_margin(P, multiplier, certificate.rate, form)
     raise DesignInfeasible(f"{certificate.kind} certificate", "its numbers do not fit the system")
 
@@ -408,13 +403,8 @@ class _Form:
 def _droop_form(lure: Lure, what: str) -> _Form:
     """Time constants, S and slopes of a system `T x' = -x + phi(w - S x)`."""
     own = np.diagonal(lure.A)
-    square = lure.A.shape == lure.G.shape
-    fits = (
-        square
-        and bool(np.all(own < 0))
-        and np.array_equal(lure.A, np.diag(own))
-        and np.array_equal(lure.G, -lure.A)
-    )
+    # Arrays of different shapes are not equal.
+    fits = np.array_equal(lure.G, -lure.A) and np.array_equal(lure.A, np.diag(own)) and np.all(own < 0)
     if not fits or np.any(lure.B):
         raise DesignInfeasible(what, "the system is not T x' = -x + phi(H x + F u)")
     return _Form(-1.0 / own, -lure.H, lure.slope)

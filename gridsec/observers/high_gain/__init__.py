@@ -5,12 +5,12 @@ from gridsec.observers.high_gain.inverse import Inverse, given, nearest
 from gridsec.observers.high_gain.observer import (
     HighGainDesign,
     HighGainState,
-    Outcome,
     design,
     error_bounds,
     init,
     step,
 )
+from gridsec.observers.high_gain.outcome import Outcome
 from gridsec.observers.high_gain.redundancy import groups, redundancy
 
 __all__ = [

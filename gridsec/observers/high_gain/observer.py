@@ -29,8 +29,8 @@ from gridsec.observers.high_gain.field import Field, Transition, advance, field,
 from gridsec.observers.high_gain.form import System, slopes
 from gridsec.observers.high_gain.inverse import Inverse, check, corners_and_interior
 from gridsec.observers.high_gain.lipschitz import kappa_detect, upper_proven
+from gridsec.observers.high_gain.outcome import Outcome, verdict
 from gridsec.observers.high_gain.redundancy import groups
-from gridsec.online import Cause, Decision
 
 _DECAYS = {"componentwise": decay_componentwise, "kim2018": decay_kim, "lee2018": decay_lee}
 
@@ -115,51 +115,6 @@ class HighGainState:
     u: Floats
     age: Floats
     sigma: int
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Outcome:
-    """Answer at one instant.
-
-    Attributes
-    ----------
-    t
-        Time, s.
-    x : (n,)
-        Estimate of the state; NaN where no set is complete.
-    bound
-        Bound on its largest error while at most q sensors are attacked; NaN if the design has no
-        `lowest`, infinite when no set passed.
-    sigma
-        Place of the set it rests on, from 0.
-    visited
-        The sets that were tried, in order; the last is `sigma`.
-    trusted : (p,)
-        The sensors of that set.
-    residual, threshold
-        Of that set; NaN where it was not tested.
-    decision, cause, reason
-        As everywhere in this project: UNDECIDED is an answer of its own.
-    suspects : (p,)
-        Sensors that are named. If `bound` is known: those that cannot be healthy; otherwise, after an
-        alarm, those outside the trusted set.
-    reset : (p,)
-        Observers that were reset in this step.
-    """
-
-    t: float
-    x: Floats
-    bound: float
-    sigma: int
-    visited: tuple[int, ...]
-    trusted: Bools
-    residual: float
-    threshold: float
-    decision: Decision
-    cause: Cause
-    reason: str
-    suspects: Bools
-    reset: Bools
 
 
 def design(
@@ -433,7 +388,14 @@ def _judge(  # noqa: PLR0917  # one place that sees the whole state
         if design.whole is not None and live.all():
             alarm |= not _test(design, design.whole, z, delta).passed
     settled = bool(np.all(delta[live] <= _rest(design)[live]))
-    decision, cause, reason = _verdict(design, live, trial, alarm or bool(named.any()), settled=settled)
+    decision, cause, reason = verdict(
+        heard=int(live.sum()),
+        needed=len(design.inverses[0].sensors),
+        passed=None if trial is None else trial.passed,
+        alarm=alarm or bool(named.any()),
+        settled=settled,
+        search=design.search,
+    )
     guessed = live & ~trusted if alarm and passed and not named.any() else named
     return sigma, Outcome(
         t=t,
@@ -491,21 +453,3 @@ def _unhealthy(design: HighGainDesign, z: Floats, x: Floats, delta: Floats, boun
     off = np.zeros(z.shape)
     off[design.system.mask] = z[design.system.mask] - design.system.phi(x)
     return np.asarray(np.max(np.abs(off), axis=1) > delta + design.steep * bound)
-
-
-def _verdict(
-    design: HighGainDesign, live: Bools, trial: _Trial | None, alarm: bool, *, settled: bool
-) -> tuple[Decision, Cause, str]:
-    if trial is None:
-        needed = len(design.inverses[0].sensors)
-        reason = f"{int(live.sum())} sensors are heard and no set of {needed} is complete"
-        return Decision.UNDECIDED, Cause.TOO_FEW_METERS, reason
-    if not trial.passed:
-        reason = "no set that was tried explains its own estimates"
-        cause = Cause.SETTLING if design.search == "one" else Cause.TOO_MANY_SUSPECTS
-        return Decision.UNDECIDED, cause, reason
-    if alarm:
-        return Decision.ATTACKED, Cause.RESIDUALS, "estimates disagree by more than honest sensors can"
-    if not settled:
-        return Decision.UNDECIDED, Cause.SETTLING, "the observers have not settled yet"
-    return Decision.CLEAN, Cause.AGREEMENT, "all sensors agree within their bounds"
