@@ -14,7 +14,7 @@ from gridsec.lmi.discrete_bounds import input_error
 from gridsec.lmi.sampled import DiscreteLure, advance, measure, sample
 from gridsec.observers import circle_discrete as observers
 from gridsec.papers import yang2019
-from tests.contracts.member import Batch, Family, Member, Run, signs_or_anything
+from tests.contracts.member import Batch, Family, Member, Run, signs_or_anything, started_away
 from tests.gridsec.plants import Street, line, shared, tree
 
 STREETS = {"line": line(5), "tree": tree(), "shared": shared()}
@@ -84,7 +84,8 @@ def _honest(of: Kind, rng: np.random.Generator, extreme: bool) -> Run:
     run = _course(of, rng, 60, of.x_size)
     r = run.r + signs_or_anything(rng, np.tile(of.noise, (len(run.r), 1)), extreme)
     u = run.u - signs_or_anything(rng, np.tile(of.u_error, (len(run.r), 1)), extreme)
-    return Run(run.first, run.guess, r, u, run.x, run.h, run.ahead)
+    guess = run.first + started_away(rng, of.x_size, run.first.size)
+    return Run(run.first, guess, r, u, run.x, run.h, run.ahead)
 
 
 def member(where: str, trusted: tuple[int, ...]) -> Member:

@@ -112,3 +112,8 @@ def signs_or_anything(rng: np.random.Generator, size: Floats, extreme: bool) -> 
     """Errors up to `size`: all as large as they may be, or anything between."""
     draw = rng.choice([-1.0, 1.0], size.shape) if extreme else rng.uniform(-1.0, 1.0, size.shape)
     return np.asarray(size * draw)
+
+
+def started_away(rng: np.random.Generator, size: float, n: int) -> Floats:
+    """Error of a first guess; in half of the cases none, so that nothing but later errors fills a bound."""
+    return np.asarray(size * rng.integers(2) * rng.uniform(-1.0, 1.0, n))

@@ -9,7 +9,7 @@ import numpy as np
 from gridsec.arrays import Floats
 from gridsec.observers import kalman, luenberger
 from gridsec.observers.luenberger import Bounds
-from tests.contracts.member import Batch, Family, Member, Run, signs_or_anything
+from tests.contracts.member import Batch, Family, Member, Run, signs_or_anything, started_away
 from tests.gridsec.observers.modal import modal
 
 # Plants of five states and sensors, with a mode that grows and modes that single sensors do not see.
@@ -77,7 +77,7 @@ def luenberger_member(seed: int) -> Member:
         d *= 1.0 if extreme else rng.uniform(0.0, 1.0, (COUNT, 1))
         n = signs_or_anything(rng, np.tile(NOISE, (COUNT + 1, 1)), extreme)
         run = _course(A, B, C, rng, d=d, n=n)
-        return _with_guess(run, run.first + rng.uniform(-1.0, 1.0, 5))
+        return _with_guess(run, run.first + started_away(rng, 1.0, 5))
 
     return Member(
         listens=np.eye(p, dtype=bool),

@@ -13,7 +13,7 @@ from gridsec.lmi.sampled import advance, measure
 from gridsec.observers import unknown_input as observers
 from gridsec.observers.unknown_input import Pair, UnknownInputPlant
 from gridsec.papers import yang2021, yang2021_feeder
-from tests.contracts.member import Batch, Family, Member, Run, signs_or_anything
+from tests.contracts.member import Batch, Family, Member, Run, signs_or_anything, started_away
 
 COUNT = 25
 # More sensors than unbelieved inputs: otherwise an observer reproduces its readings whatever they are.
@@ -61,7 +61,8 @@ def _free(where: str, rng: np.random.Generator) -> Run:
 
 def _honest(where: str, rng: np.random.Generator, extreme: bool) -> Run:
     run = _course(where, rng, errors=True, extreme=extreme)
-    return replace(run, guess=run.first + SIZES[where][0] * rng.uniform(-1.0, 1.0, run.first.size))
+    away = started_away(rng, SIZES[where][0], run.first.size)
+    return replace(run, guess=run.first + away)
 
 
 def member(where: str) -> Member:
