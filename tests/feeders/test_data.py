@@ -14,7 +14,7 @@ from feeders import profiles
 from feeders.convert import RECIPES
 from feeders.load import Site, Snapshot, load, names, to_frame
 from feeders.schema import examine, read
-from gridsec.certificates import certify, verify
+from gridsec.certificates import certify, reactance, small_gain, verify
 from gridsec.feeder import lindistflow, loss_correction, model_error_bound, squared_voltages
 from gridsec.lure import close_loop
 
@@ -73,16 +73,16 @@ def test_source_generators_keep_their_rating() -> None:
 
 
 @every_feeder
-def test_certificates_hold(name: str) -> None:
+def test_both_closed_form_certificates_hold(name: str) -> None:
     site = load(name)
     lure = close_loop(site.feeder, site.droop, site.meters)
     gain = float(np.max(np.abs(np.linalg.eigvals(lure.slope[:, None] * lure.H))))
     assert 0.005 < gain < 1.0
     assert site.droop.tau.max() <= 2.0 * site.droop.tau.min()
-    certificate = certify(lure)
-    assert certificate.margin > 0.0
-    assert verify(certificate, lure) > 0.0
-    assert certificate.rate > 0.1 / site.droop.tau.max()
+    for certificate in (certify(lure), reactance(lure), small_gain(lure)):
+        assert certificate.margin > 0.0
+        assert verify(certificate, lure) > 0.0
+        assert certificate.rate > 0.1 / site.droop.tau.max()
 
 
 # --- the model against AC power flow ------------------------------------------------------------
