@@ -180,7 +180,7 @@ class _Loops:
         return np.asarray(x - self.curve(self.outputs(x)))
 
     def solve(self, x: Floats, policy: StepPolicy) -> Floats:
-        """Damped semismooth Newton, as in `gridsec.lure.settle`; then, if need be, plain integration."""
+        """Damped semismooth Newton, as in `gridsec.newton.settle`; then, if need be, plain integration."""
         x = x.copy()
         left = np.arange(x.shape[0])
         tol = policy.tol * unit(self.lay.droop)

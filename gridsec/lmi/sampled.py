@@ -17,7 +17,8 @@ import numpy as np
 from scipy.linalg import expm
 
 from gridsec.arrays import Floats, exponential_integrals, frozen, spectral_radius
-from gridsec.lure import Lure, Nonlinearity
+from gridsec.lure import Lure
+from gridsec.newton import Nonlinearity
 
 
 @dataclass(frozen=True, slots=True, eq=False)

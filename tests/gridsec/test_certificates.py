@@ -26,7 +26,8 @@ from gridsec.certificates import (
 from gridsec.droop import Droop, fleet
 from gridsec.errors import DesignInfeasible
 from gridsec.feeder import Feeder, lindistflow
-from gridsec.lure import Lure, close_loop, settle
+from gridsec.lure import Lure, close_loop
+from gridsec.newton import settle
 from tests.gridsec.radial import random_feeder, random_loop
 
 seeds = st.integers(0, 100_000)

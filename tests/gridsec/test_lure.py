@@ -16,7 +16,8 @@ from gridsec.arrays import spectral_radius
 from gridsec.droop import PRESETS, Droop, fleet
 from gridsec.errors import DesignInfeasible, FeederInvalid
 from gridsec.feeder import lindistflow, loss_correction, squared_voltages
-from gridsec.lure import POLICY, Lure, advance, close_loop, equilibrium, known_input, settle, step, transition
+from gridsec.lure import POLICY, Lure, advance, close_loop, equilibrium, known_input, step, transition
+from gridsec.newton import settle
 from tests.gridsec.radial import random_feeder, random_loop
 
 seeds = st.integers(0, 100_000)
