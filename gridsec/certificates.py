@@ -24,7 +24,7 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, frozen
 from gridsec.droop import Droop
 from gridsec.errors import DesignInfeasible
-from gridsec.lure import Lure
+from gridsec.lure import Lure, Readout
 
 # Shares of 1 / slope on the diagonal of P that `reactance` tries, see Theorem 1.
 SHARES = (0.01, 0.03, 0.1, 0.3, 0.6, 1.0)
@@ -263,7 +263,7 @@ def verify(certificate: Certificate, lure: Lure, trusted: Bools | None = None) -
     raise DesignInfeasible(f"{certificate.kind} certificate", "its numbers do not fit the system")
 
 
-def feeds(lure: Lure) -> Bools:
+def feeds(lure: Readout) -> Bools:
     """Which meter can drive which inverter of the observer: those that see the same voltage.
 
     Parameters

@@ -14,6 +14,7 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from scipy.linalg import expm
@@ -68,6 +69,19 @@ class Lure:
         ]
         if wrong:
             raise ValueError("; ".join(wrong))
+
+
+class Readout(Protocol):
+    """What `z = H x + F u` and `y = C x + D u` are read from: a `Lure`, or a system in discrete time."""
+
+    @property
+    def H(self) -> Floats: ...  # noqa: D102, N802
+    @property
+    def F(self) -> Floats: ...  # noqa: D102, N802
+    @property
+    def C(self) -> Floats: ...  # noqa: D102, N802
+    @property
+    def D(self) -> Floats: ...  # noqa: D102, N802
 
 
 def close_loop(feeder: Feeder, droop: Droop, meters: Ints) -> Lure:

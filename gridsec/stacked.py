@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gridsec.arrays import Bools, Floats
+from gridsec.certificates import feeds
 from gridsec.lure import Lure, StepPolicy, Transition, transition, unit
 
 _QUOTIENT = 1e-7
@@ -51,8 +52,7 @@ def direct_gains(lure: Lure, masks: Bools) -> Gains:
     masks : (o, p)
         Sensor subsets.
     """
-    own, seen_by = np.hstack([lure.H, lure.F]), np.hstack([lure.C, lure.D])
-    same = (own[:, None, :] == seen_by[None, :, :]).all(axis=-1)
+    same = feeds(lure)
     # One meter drives an inverter, even if two of them sit there.
     first = same & (np.cumsum(same, axis=1) == 1)
     return Gains(

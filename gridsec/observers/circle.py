@@ -25,7 +25,7 @@ from gridsec.certificates import Certificate, certify, error_bound, feeds
 from gridsec.errors import DesignInfeasible
 from gridsec.gains import CircleGains, CircleOptions, margin, sensitivity, state_bound
 from gridsec.lmi import circle, contraction
-from gridsec.lure import POLICY, Lure, StepPolicy, advance
+from gridsec.lure import POLICY, Lure, Readout, StepPolicy, advance
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,7 +75,7 @@ class CircleState:
     x: Floats
 
 
-def direct_gain(lure: Lure, trusted: Bools) -> Floats:
+def direct_gain(lure: Readout, trusted: Bools) -> Floats:
     """K of direct injection: the inverter of a trusted meter is driven by that meter.
 
     `K = E_J`: `K_ij = 1` where the argument of nonlinearity i is the output of the trusted meter j;

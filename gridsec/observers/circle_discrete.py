@@ -36,6 +36,7 @@ from gridsec.lmi.discrete_bounds import (
 )
 from gridsec.lmi.sampled import DiscreteLure, measure
 from gridsec.lmi.sampled import advance as advance_plant
+from gridsec.observers.circle import direct_gain
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,29 +88,6 @@ class DiscreteState:
 
     t: float
     x: Floats
-
-
-def direct_gain(system: DiscreteLure, trusted: Bools) -> Floats:
-    """K of direct injection: the nonlinearity whose argument a trusted meter reads is driven by it.
-
-    Parameters
-    ----------
-    system
-        Plant.
-    trusted : (p,)
-        J as a mask.
-
-    Returns
-    -------
-    Floats
-        (m, p); the first such meter where there are several.
-    """
-    own, read = np.hstack([system.H, system.F]), np.hstack([system.C, system.D])
-    match = (own[:, None, :] == read[None, :, :]).all(axis=-1) & trusted
-    K = np.zeros(match.shape)
-    driven = np.flatnonzero(match.any(axis=1))
-    K[driven, np.argmax(match[driven], axis=1)] = 1.0
-    return K
 
 
 def design(
