@@ -11,7 +11,7 @@ from feeders.meters import BUSBAR
 from feeders.scenario import Reading as Recorded
 from service.alarms import AlarmBook
 from service.align import Clock, Outcome
-from service.reading import Findings, Reading, judge, to_reading
+from service.reading import Findings, Known, Reading, judge, to_reading
 from service.watch import TickResult, Watch, align_rules, design, known_of
 
 
@@ -47,7 +47,8 @@ def replay(
     """
     watch = Watch(site, align_rules(site, Clock.EVENTS, grace_s=grace_s), AlarmBook(site.feeder.name))
     watch.install(design(site))
-    for reading in (checked(site, one, tally) for one in recorded):
+    known = known_of(site)
+    for reading in (_checked(watch.name, known, one, tally) for one in recorded):
         if reading is not None:
             # The arrival times of the recording do not matter: its readings tell the time.
             outcome, results = watch.take(reading, 0.0)
@@ -65,19 +66,8 @@ def _counted(results: list[TickResult], tally: Tally) -> list[TickResult]:
     return results
 
 
-def checked(site: Site, recorded: Recorded, tally: Tally) -> Reading | None:
-    """Return a recorded reading as it would have come off the wire, or None (counted) if it is a bad one.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    recorded
-        The reading.
-    tally
-        Where bad ones are counted.
-    """
-    known = known_of(site)
+def _checked(feeder: str, known: Known, recorded: Recorded, tally: Tally) -> Reading | None:
+    """Return a recorded reading as it would have come off the wire, or None (counted) if it is a bad one."""
     if recorded.meter != BUSBAR and recorded.meter not in known.meters:
         tally.readings["unknown-meter"] += 1
         return None
@@ -92,4 +82,4 @@ def checked(site: Site, recorded: Recorded, tally: Tally) -> Reading | None:
     if isinstance(found, Findings):
         tally.readings[found.reason] += 1
         return None
-    return to_reading(site.feeder.name, None if recorded.meter == BUSBAR else recorded.meter, found)
+    return to_reading(feeder, None if recorded.meter == BUSBAR else recorded.meter, found)
