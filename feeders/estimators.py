@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from types import MappingProxyType
+from typing import Any, Final
 
 import numpy as np
 
@@ -19,8 +20,9 @@ from gridsec.errors import FeederInvalid
 from gridsec.feeder import lindistflow
 from gridsec.gains import CircleOptions, options_for
 from gridsec.lure import Lure, close_loop
+from gridsec.online import Estimate, Frame, Verdict
 
-__all__ = ["DIRECT", "LMI", "choose", "design", "lmi_options"]
+__all__ = ["DIRECT", "FAMILIES", "LMI", "Family", "Job", "Watcher", "choose", "design", "lmi_options"]
 
 DIRECT: Final = "exact-bank"
 """The two banks of chong2020 with direct injection and a closed-form certificate for all sets at once."""
@@ -35,47 +37,157 @@ FLOOR: Final = 0.5
 """Least sensitivity to its own meter that an observer must keep, see `gridsec.gains.CircleOptions`."""
 
 
+@dataclass(frozen=True, slots=True)
+class Job:
+    """How a design is made, apart from what for.
+
+    Attributes
+    ----------
+    workers
+        Processes for designs by matrix inequality.
+    where
+        Folder of the cache of such designs; None: that of `feeders.design_cache.folder`.
+    progress
+        Called with (done, total) while such designs are made.
+    """
+
+    workers: int = 1
+    where: Path | None = None
+    progress: Callable[[int, int], None] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Family:
+    """An estimator family: three functions and a name.
+
+    Attributes
+    ----------
+    name
+        As in `feeder.toml`.
+    summary
+        One line for people.
+    design
+        `design(site, job)` prepares; raises `NotObservable` or `DesignInfeasible`.
+    init
+        `init(design, t)` begins to watch.
+    step
+        `step(design, state, frame)` takes one frame in and never raises on data.
+    observers
+        How many observers, or candidate sets, a design runs.
+    proof
+        One line on why its estimate converges; empty where nothing is proven.
+    """
+
+    name: str
+    summary: str
+    design: Callable[[Site, Job], Any]
+    init: Callable[[Any, float], Any]
+    step: Callable[[Any, Any, Frame], tuple[Any, Estimate, Verdict]]
+    observers: Callable[[Any], int]
+    proof: Callable[[Any], str]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Watcher:
+    """A finished design, ready to watch one feeder.
+
+    Attributes
+    ----------
+    family
+        What kind.
+    design
+        The family's own design.
+    """
+
+    family: Family
+    design: Any
+
+    @property
+    def observers(self) -> int:
+        """How many observers, or candidate sets, run."""
+        return self.family.observers(self.design)
+
+    @property
+    def proof(self) -> str:
+        """One line on why the estimate converges; empty where nothing is proven."""
+        return self.family.proof(self.design)
+
+    def init(self, t: float) -> Any:
+        """Begin to watch.
+
+        Parameters
+        ----------
+        t
+            Unix time, s.
+        """
+        return self.family.init(self.design, t)
+
+    def step(self, state: Any, frame: Frame) -> tuple[Any, Estimate, Verdict]:
+        """Take one frame in.
+
+        Parameters
+        ----------
+        state
+            From `init` or the last step.
+        frame
+            Everything known at one tick.
+        """
+        return self.family.step(self.design, state, frame)
+
+
 def design(
     site: Site,
     *,
     workers: int = 1,
     where: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> monitor.MonitorDesign:
+) -> Watcher:
     """Design the estimator that the feeder's file names.
 
     Parameters
     ----------
     site
         The feeder; `[monitor] estimator`, `max_attacked` and `tick_s` of its file decide.
-    workers
-        Processes for designs by matrix inequality.
-    where
-        Folder of the cache of such designs; by default that of `feeders.design_cache.folder`.
-    progress
-        Called with (done, total) while such designs are made.
+    workers, where, progress
+        As in `Job`.
 
     Raises
     ------
     NotObservable, DesignInfeasible
         If the feeder cannot be watched as its file asks for.
     """
+    family = FAMILIES[site.tables.meta.monitor.estimator]
+    return Watcher(family, family.design(site, Job(workers, where, progress)))
+
+
+def _direct_bank(site: Site, _: Job) -> monitor.MonitorDesign:
     settings = site.tables.meta.monitor
-    watched = plant(site)
-    if settings.estimator == DIRECT:
-        return monitor.design(watched, max_attacked=settings.max_attacked, step_s=settings.tick_s)
+    return monitor.design(plant(site), max_attacked=settings.max_attacked, step_s=settings.tick_s)
+
+
+def _lmi_bank(site: Site, job: Job) -> monitor.MonitorDesign:
+    settings = site.tables.meta.monitor
     lure = close_loop(site.feeder, site.droop, site.meters)
     found = bank_gains(
         lure,
         settings.max_attacked,
         lmi_options(site, lure),
-        workers=workers,
-        where=where,
-        progress=progress,
+        workers=job.workers,
+        where=job.where,
+        progress=job.progress,
     )
     return monitor.design(
-        watched, max_attacked=settings.max_attacked, step_s=settings.tick_s, gains=found.gains
+        plant(site), max_attacked=settings.max_attacked, step_s=settings.tick_s, gains=found.gains
     )
+
+
+def _certificate(design: monitor.MonitorDesign) -> str:
+    proof = design.certificate
+    return f"{proof.kind} certificate, margin {proof.margin:.3g}, decay at least {proof.rate:.3g} 1/s"
+
+
+def _bank(name: str, summary: str, make: Callable[[Site, Job], monitor.MonitorDesign]) -> Family:
+    return Family(name, summary, make, monitor.init, monitor.step, lambda d: int(d.observers), _certificate)
 
 
 def choose(site: Site, *, estimator: str | None = None, max_attacked: int | None = None) -> Site:
@@ -148,3 +260,15 @@ def _load_columns(site: Site) -> Floats:
     dp = loads.p_fraction * loads.load_peak + loads.p_floor
     dq = 0.5 * (loads.tan_max - loads.tan_min) * loads.load_peak + loads.q_floor
     return np.hstack([2.0 * model.R * dp, 2.0 * model.X * dq])
+
+
+FAMILIES: Final[Mapping[str, Family]] = MappingProxyType(
+    {
+        family.name: family
+        for family in (
+            _bank(DIRECT, "banks of circle-criterion observers, direct injection (chong2020)", _direct_bank),
+            _bank(LMI, "the same banks, gains by matrix inequality (chong2020)", _lmi_bank),
+        )
+    }
+)
+"""All families by name; the same names as `feeders.columns.ESTIMATORS`."""

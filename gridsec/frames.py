@@ -9,10 +9,10 @@ import numpy as np
 from gridsec import detect
 from gridsec.arrays import Bools, Floats
 from gridsec.detect import Uncertainty
-from gridsec.feeder import corrected
+from gridsec.feeder import corrected, loss_correction
 from gridsec.lure import known_input
 from gridsec.online import Frame
-from gridsec.plant import MonitorDesign, MonitorState, Plant
+from gridsec.plant import Plant, Setting
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,31 +31,90 @@ class Inputs:
     now: Uncertainty
 
 
-def clean(design: MonitorDesign, state: MonitorState, frame: Frame) -> Inputs:
+@dataclass(frozen=True, slots=True, eq=False)
+class Past:
+    """What the last step left that the next frame is cleaned with. m inverters, p meters.
+
+    Attributes
+    ----------
+    x : (m,)
+        Estimated injections, pu.
+    v0_squared
+        Squared busbar voltage, pu.
+    named : (p,)
+        Meters named as manipulated.
+    """
+
+    x: Floats
+    v0_squared: float
+    named: Bools
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reconstruction:
+    """The voltages that a set of injections explains. N customers, b + 1 buses.
+
+    Attributes
+    ----------
+    v2_bus, v2 : (b + 1,), (N,)
+        Squared voltages of all buses, and of the customers', pu.
+    correction : (b + 1,)
+        What losses add to the linear model in them, squared pu.
+    """
+
+    v2_bus: Floats
+    v2: Floats
+    correction: Floats
+
+
+def reconstruct(setting: Setting, frame: Frame, inputs: Inputs, q: Floats) -> Reconstruction:
+    """Voltages for given injections, with the loss correction at just these; chong2020 (19).
+
+    Parameters
+    ----------
+    setting, frame, inputs
+        What the frame was cleaned with, the frame, and what came of it.
+    q : (N,)
+        Net reactive injections, pu; see `injections`.
+    """
+    plant, model, correction = setting.plant, setting.model, inputs.correction
+    if plant.loss_correction:
+        with np.errstate(all="ignore"):
+            correction = loss_correction(
+                plant.feeder, frame.p, q, inputs.v0_squared, steps=plant.loss_correction
+            )
+        correction = np.where(np.isfinite(correction), correction, inputs.correction)
+    v2_bus = inputs.v0_squared + 2.0 * (model.R_bus @ frame.p + model.X_bus @ q) + correction
+    return Reconstruction(v2_bus, v2_bus[plant.feeder.bus], correction)
+
+
+def clean(setting: Setting, past: Past, frame: Frame) -> Inputs:
     """Clean one frame, and say how uncertain what is left of it is.
 
     Parameters
     ----------
-    design, state
-        From `gridsec.monitor`.
+    setting
+        The feeder, and the numbers that decide.
+    past
+        What the last step left.
     frame
         Everything known at one tick.
     """
-    plant, model, options = design.plant, design.model, design.options
+    plant, model, options = setting.plant, setting.model, setting.options
     at = plant.meters
     live = frame.seen & np.isfinite(frame.y)
     y = np.where(live, frame.y, 0.0)
     low, high = options.v2_limits
     busbar = bool(np.isfinite(frame.v0_squared) and low <= frame.v0_squared <= high)
     # Without a busbar voltage the meters have to imply it, and then nobody's reactive power is believed.
-    told = live & _credible(design, frame) & busbar
+    told = live & _credible(setting, frame) & busbar
     net = np.where(told, frame.q_net[at] - frame.q[at], np.nan) if told.any() else None
-    q_all = injections(plant, frame, state.x, told)
+    q_all = injections(plant, frame, past.x, told)
     q_error = frame.q_error.copy()
     q_error[at] = np.where(told, frame.q_net_error[at], q_error[at])
-    v0 = frame.v0_squared if busbar else state.v0_squared
+    v0 = frame.v0_squared if busbar else past.v0_squared
     correction, rest = _losses(plant, frame.p, q_all, v0, p_error=frame.p_error, q_error=q_error)
-    base = design.errors.R2 @ frame.p_error + design.errors.X2 @ q_error + rest
+    base = setting.errors.R2 @ frame.p_error + setting.errors.X2 @ q_error + rest
     rise = 2.0 * (model.R @ frame.p + model.X @ q_all) + correction[plant.feeder.bus]
     reading = detect.reading_error(plant.accuracy, v0 + rise[at] + base[at] + _ROOM, options.sigmas)
     extra = np.where(told, np.maximum(frame.q_error[at] - frame.q_net_error[at], 0.0), 0.0)
@@ -63,7 +122,7 @@ def clean(design: MonitorDesign, state: MonitorState, frame: Frame) -> Inputs:
     if busbar:
         error = detect.busbar_error(plant.accuracy, v0, options.sigmas)
     else:
-        v0, error = _implied(design, state, now, y - rise[at], v0)
+        v0, error = _implied(setting, past, now, y - rise[at], v0)
     now = replace(now, base=np.minimum(now.base + error, NO_VOLTAGE))
     w = known_input(model, plant.droop.vbar, frame.p, frame.q, v0, correction[plant.feeder.bus])
     z = plant.droop.vbar**2 - y
@@ -76,10 +135,10 @@ _ROOM = 0.05
 NO_VOLTAGE = 4.0
 
 
-def _credible(design: MonitorDesign, frame: Frame) -> Bools:
+def _credible(setting: Setting, frame: Frame) -> Bools:
     """Whose net reactive power is what its load and its inverter can produce together; (p,)."""
-    plant = design.plant
-    if not design.bank.direct:
+    plant = setting.plant
+    if not setting.believes_q:
         return np.zeros(plant.meters.size, dtype=np.bool_)
     count_ = frame.q.size
     most = np.bincount(plant.droop.customer, weights=plant.droop.q[:, 0], minlength=count_)
@@ -119,18 +178,18 @@ def _losses(
 
 
 def _implied(
-    design: MonitorDesign, state: MonitorState, now: Uncertainty, implied: Floats, last: float
+    setting: Setting, past: Past, now: Uncertainty, implied: Floats, last: float
 ) -> tuple[float, float]:
     """Squared busbar voltage that the meters imply, and its error.
 
     The median lies between honest values as long as liars are fewer than half, and then its error is
     at most the largest honest one.
     """
-    use = now.live & ~state.tally.named
-    if np.count_nonzero(use) <= 2 * design.bank.sets.max_attacked:
+    use = now.live & ~past.named
+    if np.count_nonzero(use) <= 2 * setting.max_attacked:
         use = now.live
-    if np.count_nonzero(use) <= 2 * design.bank.sets.max_attacked:
+    if np.count_nonzero(use) <= 2 * setting.max_attacked:
         return last, NO_VOLTAGE
     # The estimate of the injections is that of the last frame; in between each may have moved by its span.
-    stale = detect.gap(design.errors, now, detect.widest(design.errors))[design.plant.meters]
+    stale = detect.gap(setting.errors, now, detect.widest(setting.errors))[setting.plant.meters]
     return float(np.median(implied[use])), float(np.max((stale + now.reading)[use]))

@@ -27,8 +27,8 @@ from gridsec.arrays import Bools, Floats, Ints
 from gridsec.certificates import Certificate, certify, small_gain, verify
 from gridsec.detect import ErrorBound, Majorant, Motion
 from gridsec.errors import DesignInfeasible
-from gridsec.feeder import LinDistFlow, lindistflow, loss_correction
-from gridsec.frames import NO_VOLTAGE, Inputs, clean, injections
+from gridsec.feeder import LinDistFlow, lindistflow
+from gridsec.frames import NO_VOLTAGE, Inputs, Past, clean, injections, reconstruct
 from gridsec.judge import Situation, Tally, count, decide, residual_excess
 from gridsec.lmi import contraction
 from gridsec.lure import Lure, close_loop, rest
@@ -206,7 +206,7 @@ def step(design: MonitorDesign, state: MonitorState, frame: Frame) -> tuple[Moni
     late = state.bank is not None and not frame.t > state.t
     if late or not np.isfinite(frame.t):
         return _unusable(design, state, frame)
-    inputs = clean(design, state, frame)
+    inputs = clean(design.setting, Past(state.x, state.v0_squared, state.tally.named), frame)
     h = 0.0 if state.bank is None else frame.t - state.t
     if state.bank is None:
         bank = banks.init(design.bank, inputs.z, inputs.w, inputs.live, net=inputs.net)
@@ -361,21 +361,13 @@ def _view(  # noqa: PLR0917  # as _conclude
     index: int,
     h: float,
 ) -> _View:
-    plant, model, errors = design.plant, design.model, design.errors
+    plant, errors = design.plant, design.errors
     own, at = plant.droop.customer, plant.meters
     x = banks.estimate(design.bank, bank, index)
     spread = banks.spread(design.bank, bank, index) if index >= 0 else np.zeros(x.shape)
     told = inputs.now.told & (design.bank.masks[index] if index >= 0 else False)
-    q = injections(plant, frame, x, told)
-    correction = inputs.correction
-    if plant.loss_correction:
-        with np.errstate(all="ignore"):
-            correction = loss_correction(
-                plant.feeder, frame.p, q, inputs.v0_squared, steps=plant.loss_correction
-            )
-        correction = np.where(np.isfinite(correction), correction, inputs.correction)
-    v2_bus = inputs.v0_squared + 2.0 * (model.R_bus @ frame.p + model.X_bus @ q) + correction
-    v2 = v2_bus[plant.feeder.bus]
+    seen = reconstruct(design.setting, frame, inputs, injections(plant, frame, x, told))
+    v2 = seen.v2
     z = plant.droop.vbar**2 - v2[own]
     # What the selected set takes from its meters and a liar-free subset may not: the estimate differs by
     # `spread`, and metered reactive power of at most M meters is replaced.
@@ -384,7 +376,7 @@ def _view(  # noqa: PLR0917  # as _conclude
         held = np.bincount(own, weights=x, minlength=v2.size)[at] + inputs.q[at]
         doubt = np.where(told, np.abs(frame.q_net[at] - held), 0.0)
         offset = offset + detect.largest(errors.reach * np.nan_to_num(doubt), errors.quota // 2)
-    moved = np.abs(correction - inputs.correction)[plant.feeder.bus]
+    moved = np.abs(seen.correction - inputs.correction)[plant.feeder.bus]
     now = replace(inputs.now, base=inputs.now.base + moved)
     before = z if state.bank is None else state.z
     lag = _slowed(design, h) * (np.abs(x - state.x) + spread)
@@ -404,7 +396,7 @@ def _view(  # noqa: PLR0917  # as _conclude
         level_at_rest = detect.settled(errors, now, motion, top)
         transient = detect.gap(errors, now, bound)[at] - detect.gap(errors, now, level_at_rest)[at]
         settled = bool(np.all(transient <= design.options.settled * threshold))
-    return _View(index, x, z, spread, bound, level, settled, v2, v2_bus, error, score, threshold)
+    return _View(index, x, z, spread, bound, level, settled, v2, seen.v2_bus, error, score, threshold)
 
 
 def _slowed(design: MonitorDesign, h: float) -> Bools:

@@ -11,7 +11,7 @@ Outcomes are values. UNDECIDED is an answer of its own: no answer must never loo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
@@ -41,6 +41,44 @@ class Cause(StrEnum):
     TOO_MANY_SUSPECTS = "too-many-suspects"
     AMBIGUOUS = "ambiguous"
     DESIGN_INVALID = "design-invalid"
+
+
+class Kind(StrEnum):
+    """What a manipulation looks like, where the data tell."""
+
+    OFFSET = "offset"
+    DRIFT = "drift"
+    STUCK = "stuck"
+    REPLAY = "replay"
+    CLOCK_SHIFT = "clock-shift"
+    COORDINATED = "coordinated"
+
+
+@dataclass(frozen=True, slots=True)
+class Explanation:
+    """One way to explain the readings. p meters, m inverters.
+
+    Attributes
+    ----------
+    meters : (p,)
+        Who would be manipulated.
+    inverters : (m,)
+        Which inverters would be.
+    probability
+        Its share among the explanations given, from 0 to 1.
+    """
+
+    meters: Bools
+    inverters: Bools
+    probability: float
+
+
+def _none() -> Bools:
+    return np.zeros(0, dtype=np.bool_)
+
+
+def _nothing() -> Floats:
+    return np.zeros(0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +140,8 @@ class Estimate:
         The meters that the estimate rests on.
     x : (m,)
         Estimated reactive injection of the droop inverters, pu.
+    std : (N,)
+        Standard deviation of `v2`, squared pu; (0,) from estimators that only bound.
     """
 
     t: float
@@ -110,6 +150,7 @@ class Estimate:
     v2_bus: Floats
     trusted: Bools
     x: Floats
+    std: Floats = field(default_factory=_nothing)
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,6 +174,15 @@ class Verdict:
         The largest score an honest meter can reach, squared pu: `score > threshold` is evidence.
     attack : (p,)
         Reconstructed additive attack on the squared voltage, pu; 0 for meters that are no suspects.
+    inverters : (m,)
+        The droop inverters named as manipulated; (0,) from estimators that do not judge inverters.
+    inverter_attack : (m,)
+        Reconstructed wrong part of their set points, pu of reactive power; (0,) likewise.
+    kinds : (p,)
+        What each suspect's manipulation looks like, None where nobody can tell; () from estimators that
+        do not ask.
+    explanations
+        Where several explanations fit the data about equally well, those, the likeliest first.
     """
 
     decision: Decision
@@ -142,3 +192,7 @@ class Verdict:
     score: Floats
     threshold: Floats
     attack: Floats
+    inverters: Bools = field(default_factory=_none)
+    inverter_attack: Floats = field(default_factory=_nothing)
+    kinds: tuple[Kind | None, ...] = ()
+    explanations: tuple[Explanation, ...] = ()

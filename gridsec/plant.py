@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from gridsec import bank as banks
 from gridsec.arrays import Floats, Ints
 from gridsec.certificates import Certificate
-from gridsec.detect import ErrorBound, ErrorModel, MeterAccuracy
+from gridsec.detect import ErrorBound, ErrorModel, MeterAccuracy, error_model
 from gridsec.droop import Droop
-from gridsec.feeder import Feeder, LinDistFlow
+from gridsec.feeder import Feeder, LinDistFlow, lindistflow
 from gridsec.judge import Tally
 from gridsec.lure import Lure
 from gridsec.online import Estimate, Verdict
@@ -76,6 +76,49 @@ class Options:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Setting:
+    """What every estimator of a feeder needs to make sense of a frame.
+
+    Attributes
+    ----------
+    plant
+        What is watched.
+    model
+        Its linear power flow.
+    errors
+        How errors travel.
+    options
+        The numbers that decide.
+    max_attacked
+        M.
+    believes_q
+        Whether metered net reactive power replaces the load's and the inverter's.
+    """
+
+    plant: Plant
+    model: LinDistFlow
+    errors: ErrorModel
+    options: Options
+    max_attacked: int
+    believes_q: bool
+
+
+def setting(
+    plant: Plant, *, max_attacked: int, options: Options | None = None, believes_q: bool = False
+) -> Setting:
+    """Put a plant's setting together.
+
+    Parameters
+    ----------
+    plant, max_attacked, options, believes_q
+        As in `Setting`; the options' defaults by default.
+    """
+    model = lindistflow(plant.feeder)
+    errors = error_model(plant.droop, model, plant.meters, max_attacked)
+    return Setting(plant, model, errors, Options() if options is None else options, max_attacked, believes_q)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class MonitorDesign:
     """Everything that is prepared offline.
 
@@ -107,6 +150,23 @@ class MonitorDesign:
     proven: Lure
     step_s: float
     options: Options
+
+    @property
+    def setting(self) -> Setting:
+        """What a frame is cleaned with."""
+        return Setting(
+            self.plant,
+            self.model,
+            self.errors,
+            self.options,
+            self.bank.sets.max_attacked,
+            self.bank.direct,
+        )
+
+    @property
+    def observers(self) -> int:
+        """How many observers run."""
+        return len(self.bank.masks)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

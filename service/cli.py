@@ -99,7 +99,7 @@ def serve(
         list[str] | None, typer.Option(help="Folder or name of a feeder; may be repeated.")
     ] = None,
     estimator: Annotated[
-        str | None, typer.Option(help="exact-bank or exact-bank-lmi. [default: as in the feeder's file]")
+        str | None, typer.Option(help="See `feeders estimators`. [default: as in the file]")
     ] = None,
     zenoh_listen: Annotated[
         list[str] | None, typer.Option(help="zenoh endpoint to listen on. [default: tcp/127.0.0.1:7447]")

@@ -52,6 +52,17 @@ def feeders_show(feeder: Feeder) -> None:
     out.print(table)
 
 
+@app.command("estimators")
+def feeders_estimators() -> None:
+    """List the estimators a feeder can be watched with."""
+    from feeders.estimators import FAMILIES
+
+    table = Table("name", "what it is")
+    for family in FAMILIES.values():
+        table.add_row(family.name, escape(family.summary))
+    out.print(table)
+
+
 @app.command("validate")
 def feeders_validate(
     folder: Annotated[list[Path], typer.Argument(help="Folders of feeders.")],
@@ -85,7 +96,8 @@ def feeders_design(
     feeder: Feeder,
     *,
     estimator: Annotated[
-        str | None, typer.Option(help="exact-bank or exact-bank-lmi. [default: as in the feeder's file]")
+        str | None,
+        typer.Option(help="See `feeders estimators`. [default: as in the file]"),
     ] = None,
     max_attacked: Annotated[
         int | None, typer.Option(help="How many meters may be manipulated. [default: as in the file]")
@@ -108,9 +120,10 @@ def feeders_design(
             workers=workers or os.cpu_count() or 1,
             progress=lambda done, total: bar.update(task, completed=done, total=total, visible=True),
         )
-    proof, settings = finished.certificate, site.tables.meta.monitor
+    settings = site.tables.meta.monitor
     out.print(
         f"{escape(site.feeder.name)}: {settings.estimator}, M = {settings.max_attacked}, "
-        f"{len(finished.bank.masks)} observers, {time.monotonic() - started:.2f} s"
+        f"{finished.observers} observers, {time.monotonic() - started:.2f} s"
     )
-    out.print(f"{proof.kind} certificate, margin {proof.margin:.3g}, decay at least {proof.rate:.3g} 1/s")
+    if finished.proof:
+        out.print(finished.proof)

@@ -18,10 +18,10 @@ from typing import Any, TypeVar
 
 import structlog
 
+from feeders.estimators import Watcher
 from feeders.load import Site, from_tables
 from feeders.schema import from_json
 from gridsec.errors import FeederInvalid, GridsecError
-from gridsec.monitor import MonitorDesign
 from service import describe
 from service.align import Clock
 from service.bus import Sample
@@ -242,7 +242,7 @@ class Runtime:
 
         def run() -> None:
             started = time.monotonic()
-            finished: MonitorDesign | None = None
+            finished: Watcher | None = None
             problem = ""
             try:
                 finished = design(watch.site, _said(watch.name))
@@ -352,7 +352,7 @@ class Runtime:
         """
         self._make_room(name)
 
-        def prepare() -> tuple[Site, MonitorDesign]:
+        def prepare() -> tuple[Site, Watcher]:
             parsed = from_json(tables)
             if parsed.meta.name != name:
                 raise FeederInvalid([f"feeder: name {parsed.meta.name!r} does not fit the address {name!r}"])
@@ -428,7 +428,7 @@ class Runtime:
             queue.put_nowait(kind)
 
 
-def _install(watch: Watch, finished: MonitorDesign | None, problem: str) -> None:
+def _install(watch: Watch, finished: Watcher | None, problem: str) -> None:
     if finished is None:
         watch.fail(problem)
     else:

@@ -10,10 +10,10 @@ import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Any
 
 from feeders import estimators
 from feeders.load import Site, to_frame
-from gridsec import monitor
 from gridsec.online import Cause
 from service.alarms import AlarmBook, AlarmRules, Transition, acknowledge, advance
 from service.align import Aligner, AlignRules, Clock, Outcome, Tick, rules
@@ -81,7 +81,7 @@ def alarm_rules(site: Site) -> AlarmRules:
     return AlarmRules(settings.on_delay_s, settings.off_delay_s)
 
 
-def design(site: Site, progress: Callable[[int, int], None] | None = None) -> monitor.MonitorDesign:
+def design(site: Site, progress: Callable[[int, int], None] | None = None) -> estimators.Watcher:
     """Return the design of the estimator that a feeder's file names; takes its time on large ones.
 
     Parameters
@@ -129,10 +129,10 @@ class Watch:
         self.problem = ""
         self.report: FeederReport | None = None
         self._alarm_rules = alarm_rules(site)
-        self._design: monitor.MonitorDesign | None = None
-        self._state: monitor.MonitorState | None = None
+        self._watcher: estimators.Watcher | None = None
+        self._state: Any = None
 
-    def install(self, finished: monitor.MonitorDesign) -> None:
+    def install(self, finished: estimators.Watcher) -> None:
         """Begin to watch with a finished design.
 
         Parameters
@@ -140,7 +140,7 @@ class Watch:
         finished
             The design.
         """
-        self._design, self._state = finished, None
+        self._watcher, self._state = finished, None
         self.phase, self.problem = Phase.WATCHING, ""
 
     def fail(self, problem: str) -> None:
@@ -151,7 +151,7 @@ class Watch:
         problem
             Why, for the operator.
         """
-        self._design = self._state = None
+        self._watcher = self._state = None
         self.phase, self.problem = Phase.FAILED, problem
 
     def take(self, reading: Reading, now: float) -> tuple[Outcome, list[TickResult]]:
@@ -201,7 +201,7 @@ class Watch:
         return results
 
     def _judge(self, tick: Tick) -> FeederReport:
-        if self._design is None:
+        if self._watcher is None:
             if self.phase is Phase.FAILED:
                 cause, reason = Cause.DESIGN_INVALID, f"nobody watches: {self.problem}"
             else:
@@ -209,7 +209,7 @@ class Watch:
             return blind(self.site, tick, self.max_attacked, cause, reason)
         if self._state is None or (self.report is not None and tick.t <= self.report.t):
             # The first tick, or the clock was set back: what was known belongs to another time.
-            self._state = monitor.init(self._design, tick.t)
+            self._state = self._watcher.init(tick.t)
         frame = to_frame(self.site, snapshot(tick))
-        self._state, estimate, verdict = monitor.step(self._design, self._state, frame)
+        self._state, estimate, verdict = self._watcher.step(self._state, frame)
         return build(self.site, tick, self.max_attacked, estimate, verdict)

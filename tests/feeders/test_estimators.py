@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from feeders.estimators import DIRECT, LMI, choose, design, lmi_options
+from feeders.columns import ESTIMATORS
+from feeders.estimators import DIRECT, FAMILIES, LMI, choose, design, lmi_options
 from feeders.load import load, to_frame
 from feeders.powerflow import PowerFlow
 from feeders.scenario import START, Scenario, random_attacks, simulate, snapshots
-from gridsec import monitor
 from gridsec.errors import FeederInvalid, NotObservable
 from gridsec.lure import close_loop
 from gridsec.online import Decision
@@ -27,6 +27,11 @@ def test_the_file_is_the_default_and_can_be_overruled() -> None:
     assert (other.tables.meta.monitor.estimator, other.tables.meta.monitor.max_attacked) == (LMI, 2)
     assert other.digest != site.digest
     assert choose(other, estimator=DIRECT, max_attacked=1).digest == site.digest
+
+
+def test_every_name_that_a_file_may_hold_has_a_family() -> None:
+    assert tuple(FAMILIES) == ESTIMATORS
+    assert all(family.summary for family in FAMILIES.values())
 
 
 def test_every_mistake_is_named() -> None:
@@ -62,10 +67,10 @@ def test_both_name_exactly_the_liar(estimator: str, tmp_path: Path) -> None:
     assert (estimator == LMI) == bool(seen)
     assert not seen or seen[-1] == (21, 21)
     (attack,) = attacks = random_attacks(site, 5, "bias", 1, 0.06, t_on=START + 30, t_off=START + 60)
-    state = monitor.init(finished, START)
+    state = finished.init(START)
     decisions: Counter[Decision] = Counter()
     for k, snapshot in enumerate(snapshots(simulate(site, Scenario(seed=5, duration_s=60, attacks=attacks)))):
-        state, _, verdict = monitor.step(finished, state, to_frame(site, snapshot))
+        state, _, verdict = finished.step(state, to_frame(site, snapshot))
         decisions[verdict.decision] += 1
         named = np.flatnonzero(verdict.suspects)
         assert named.tolist() == (attack.meters.tolist() if k >= 31 else [])
@@ -81,7 +86,7 @@ def test_kept_designs_are_used_again(tmp_path: Path) -> None:
         raise AssertionError(f"designed again: {done} of {total}")
 
     second = design(site, where=tmp_path, progress=never)
-    np.testing.assert_array_equal(first.bank.masks, second.bank.masks)
+    np.testing.assert_array_equal(first.design.bank.gains.K, second.design.bank.gains.K)
 
 
 def test_too_many_liars_are_refused() -> None:

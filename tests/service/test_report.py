@@ -12,7 +12,6 @@ import pytest
 
 from feeders.load import Site, load, to_frame
 from feeders.scenario import Scenario, random_attacks, simulate
-from gridsec import monitor
 from gridsec.online import Cause, Decision, Estimate, Verdict
 from service.align import Tick
 from service.reading import Reading
@@ -104,12 +103,12 @@ def test_the_monitor_s_own_sentences_name_no_customer(site: Site) -> None:
     attacks = random_attacks(site, 5, "bias", 3, 0.03, t_on=T + 5, t_off=T + 30)
     names = re.compile("|".join(re.escape(name) for name in site.feeder.customers))
     finished, said = design(site), set()
-    state = monitor.init(finished, T)
+    state = finished.init(T)
     for sample in simulate(site, Scenario(seed=4, start=T, duration_s=40.0, attacks=attacks)):
         heard = {r.meter: r for r in sample.readings if not (r.meter == "m01" and 32 <= sample.t - T < 36)}
         readings = tuple(heard.get(meter) for meter in site.meter_ids)
         now = Tick(sample.t, readings, heard[""], ())  # type: ignore[arg-type]
-        state, estimate, verdict = monitor.step(finished, state, to_frame(site, snapshot(now)))
+        state, estimate, verdict = finished.step(state, to_frame(site, snapshot(now)))
         report = build(site, now, 2, estimate, verdict)
         said.add(report.cause)
         assert not names.search(report.reason), report.reason

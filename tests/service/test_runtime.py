@@ -13,9 +13,9 @@ from typing import Any
 
 import pytest
 
+from feeders.estimators import Watcher
 from feeders.load import Site, load
 from feeders.scenario import Scenario, by_arrival, random_attacks, simulate
-from gridsec import monitor
 from service.alarms import AlarmState, AlarmUnknown, AlreadyAcknowledged, Change, Transition
 from service.align import Clock
 from service.bus import Sample
@@ -406,7 +406,7 @@ def test_a_defect_in_one_feeder_s_monitor_is_shown_and_blinds_no_other(
         before, after = until(attacked, 5.0)
         live.round(before)
         with monkeypatch.context() as patch:
-            patch.setattr(monitor, "step", broken)
+            patch.setattr(Watcher, "step", broken)
             live.round(after[:100])
         live.round(after[100:])
         watch = live.watches[FEEDER]
