@@ -259,6 +259,25 @@ def loss_correction(
     return _correction(feeder, _linear_flows(feeder, p, q, v0_squared), steps)
 
 
+def bus_voltages(
+    feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1
+) -> Floats:
+    """Squared voltage of every bus, losses and charging corrected; O(b), without the N x N matrices.
+
+    Parameters
+    ----------
+    feeder, p, q, v0_squared, steps
+        As in `loss_correction`; with no steps LinDistFlow alone.
+
+    Returns
+    -------
+    (…, b + 1)
+        Squared voltages, pu.
+    """
+    flows = _linear_flows(feeder, p, q, v0_squared)
+    return flows.v2 + _correction(feeder, flows, steps) if steps else flows.v2
+
+
 def corrected(
     feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1
 ) -> tuple[Floats, Floats]:

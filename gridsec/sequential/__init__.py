@@ -1,0 +1,17 @@
+"""The monitor that scales: one observer, correlated loads, evidence on several time scales.
+
+    design(plant, doubt=..., step_s=...) -> SequentialDesign
+    init(design, t) -> SequentialState
+    step(design, state, frame) -> (SequentialState, Estimate, Verdict)
+
+One circle-criterion observer carries the inverters, certified for every set of trusted meters and every
+switching between them. What the readings then deviate from it is explained by loads that are wrong in a
+way that neighbours share, by meters' errors, and, where these do not suffice, by as few liars as possible.
+"""
+
+from gridsec.sequential.design import SequentialDesign, SequentialOptions, design
+from gridsec.sequential.loads import LoadDoubt
+from gridsec.sequential.state import SequentialState, init
+from gridsec.sequential.step import step
+
+__all__ = ["LoadDoubt", "SequentialDesign", "SequentialOptions", "SequentialState", "design", "init", "step"]

@@ -1,0 +1,278 @@
+"""What is prepared offline for the sequential monitor.
+
+References
+----------
+docs/theory-sequential.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.stats import norm
+
+from gridsec.arrays import Floats, Ints
+from gridsec.certificates import Certificate, certify, verify
+from gridsec.detect import busbar_error
+from gridsec.errors import DesignInfeasible, NotObservable
+from gridsec.feeder import LinDistFlow, lindistflow
+from gridsec.lmi import contraction
+from gridsec.lure import Lure, close_loop
+from gridsec.plant import Plant
+from gridsec.sequential.conditional import Prior
+from gridsec.sequential.loads import LoadDoubt, injection_doubt, prior
+from gridsec.sequential.search import Dictionary
+
+YEAR_S = 365.25 * 86400.0
+
+
+@dataclass(frozen=True, slots=True)
+class SequentialOptions:
+    """Numbers that decide; none is hidden.
+
+    Attributes
+    ----------
+    alarms_per_year
+        False alarms that the feeder may raise by chance in a year.
+    scales_s
+        Time scales of the running means, s; those shorter than a tick are one tick.
+    enough
+        A scale judges a meter of which it has at least this part of the readings.
+    focus
+        Standard deviations within which the robust fit trusts; the final set is decided by `sigmas`.
+    several
+        With more suspects than this at once the robust fit is asked.
+    release
+        Ticks in a row without evidence after which a meter is trusted again.
+    like
+        Explanations no more than this factor less likely than the best are given with it.
+    hidden_power
+        Power that a customer's readings may hide, standard deviation, pu: prior of accusing a customer's
+        powers instead of meters.
+    widest, v2_limits, settled
+        As in `gridsec.plant.Options`.
+    """
+
+    alarms_per_year: float = 1.0
+    scales_s: tuple[float, ...] = (0.0, 5.0, 15.0, 60.0)
+    enough: float = 0.8
+    focus: float = 3.0
+    several: int = 3
+    release: int = 6
+    like: float = 20.0
+    hidden_power: float = 0.05
+    widest: float = 0.1
+    v2_limits: tuple[float, float] = (0.25, 2.25)
+    settled: float = 0.1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SequentialDesign:
+    """Everything that is prepared offline. N customers, n buses, p meters, m inverters, s scales.
+
+    Attributes
+    ----------
+    plant
+        What is watched.
+    model
+        Its linear power flow.
+    lure
+        The closed loop.
+    certificate
+        Why the observer converges, for every trusted set and every switching between them.
+    doubt
+        How wrong powers may be.
+    prior
+        What follows for the voltages.
+    injections : (N,)
+        Standard deviation of the observed injections, pu.
+    busbar
+        Standard deviation of the squared busbar voltage, squared pu.
+    lengths : (s,)
+        Ticks of each scale.
+    sigmas : (s,)
+        Standard deviations beyond which an offset is evidence, for the false-alarm rate asked for.
+    white, fixed : (p,)
+        Variance of a squared reading from tick to tick, and of its unknown fixed part, squared pu^2.
+    allowed : (p,)
+        Largest fixed part by the accuracy class, squared pu.
+    reach : (p,)
+        What all inverters between their limits can do to the voltage at each meter, squared pu.
+    meter_of : (m,)
+        Meter that drives each inverter; -1 for none.
+    most
+        How many liars it claims to tell apart: a third of the meters.
+    step_s
+        Expected interval between frames, s.
+    options
+        The numbers that decide.
+    """
+
+    plant: Plant
+    model: LinDistFlow
+    lure: Lure
+    certificate: Certificate
+    doubt: LoadDoubt
+    prior: Prior
+    injections: Floats
+    busbar: float
+    lengths: tuple[int, ...]
+    sigmas: tuple[float, ...]
+    white: Floats
+    fixed: Floats
+    allowed: Floats
+    reach: Floats
+    meter_of: Ints
+    most: int
+    step_s: float
+    options: SequentialOptions = field(repr=False)
+
+    @property
+    def observers(self) -> int:
+        """One observer, whatever is trusted."""
+        return 1
+
+
+def design(
+    plant: Plant,
+    *,
+    doubt: LoadDoubt,
+    step_s: float,
+    options: SequentialOptions | None = None,
+    max_attacked: int | None = None,
+) -> SequentialDesign:
+    """Prepare to watch a feeder.
+
+    Parameters
+    ----------
+    plant
+        What is watched.
+    doubt
+        How wrong the powers of the frames may be.
+    step_s
+        Expected interval between frames, s.
+    options
+        The numbers that decide.
+    max_attacked
+        With more liars than this the verdict is UNDECIDED; by default a third of the meters.
+
+    Raises
+    ------
+    NotObservable
+        With fewer than three meters.
+    DesignInfeasible
+        If no certificate holds for the droop loop.
+    ValueError
+        If two meters sit at one customer, `doubt` is that of other customers, or `step_s` is no time.
+    """
+    options = SequentialOptions() if options is None else options
+    meters = plant.meters
+    _check(plant, doubt, step_s)
+    most = meters.size // 3 if max_attacked is None else max_attacked
+    model = lindistflow(plant.feeder)
+    lure = close_loop(plant.feeder, plant.droop, meters)
+    certificate = _proof(lure)
+    margin = verify(certificate, lure)
+    if not margin > 0:
+        raise DesignInfeasible(f"{certificate.kind} certificate", "it fails its verification", margin)
+    injections = injection_doubt(plant.droop, plant.accuracy, meters, plant.feeder.bus.size)
+    busbar = busbar_error(plant.accuracy, plant.droop.vbar**2, 2.0) / 2.0
+    lengths = _lengths(options.scales_s, step_s)
+    accuracy, slope = plant.accuracy, 2.0 * _HIGH * plant.droop.vbar
+    return SequentialDesign(
+        plant=plant,
+        model=model,
+        lure=lure,
+        certificate=certificate,
+        doubt=doubt,
+        prior=prior(model, plant.feeder.bus[meters], doubt, busbar=busbar, inverters=injections),
+        injections=injections,
+        busbar=busbar,
+        lengths=lengths,
+        sigmas=tuple(_sigmas(options.alarms_per_year, meters.size, n, step_s, lengths) for n in lengths),
+        white=slope**2 * (accuracy.jitter**2 + accuracy.resolution**2 / 12.0),
+        fixed=slope**2 * accuracy.class_fraction**2 / 3.0,
+        allowed=slope * accuracy.class_fraction,
+        reach=np.abs(lure.C) @ (2.0 * plant.droop.limit),
+        meter_of=_meter_of(plant),
+        most=most,
+        step_s=step_s,
+        options=options,
+    )
+
+
+# Voltage at which a meter's relative errors are turned into squared ones, in parts of the nominal.
+_HIGH = 1.03
+
+
+def _check(plant: Plant, doubt: LoadDoubt, step_s: float) -> None:
+    meters, customers = plant.meters, plant.feeder.bus.size
+    if meters.size < _FEWEST:
+        why = f"{meters.size} meters; at least {_FEWEST} are needed to outvote one"
+        raise NotObservable(meters.tolist(), meters.size, why)
+    if np.unique(meters).size != meters.size:
+        raise ValueError("two meters at one customer; combine them before")
+    if doubt.p.shape != (customers,) or doubt.q.shape != (customers,):
+        raise ValueError(f"doubt is given for {doubt.p.size} and {doubt.q.size} customers of {customers}")
+    if plant.accuracy.class_fraction.shape != meters.shape:
+        raise ValueError(
+            f"accuracy is given for {plant.accuracy.class_fraction.size} meters of {meters.size}"
+        )
+    if not (np.isfinite(step_s) and step_s > 0):
+        raise ValueError(f"step_s is {step_s}; it must be a positive number of seconds")
+
+
+_FEWEST = 3
+# Decay rate asked of the solver, as a part of the slowest inverter's.
+_RATE = 0.1
+
+
+def _proof(lure: Lure) -> Certificate:
+    """The best closed form, or the solver's certificate where none applies."""
+    try:
+        return certify(lure)
+    except DesignInfeasible:
+        return contraction(lure, rate=_RATE * float(np.min(-np.diagonal(lure.A))))
+
+
+def _lengths(scales_s: tuple[float, ...], step_s: float) -> tuple[int, ...]:
+    """Ticks of the scales, each once."""
+    return tuple(sorted({max(1, round(scale / step_s)) for scale in scales_s}))
+
+
+def _sigmas(rate: float, meters: int, length: int, step_s: float, lengths: tuple[int, ...]) -> float:
+    """Two-sided Gaussian limit such that all scales together exceed it `rate` times a year by chance.
+
+    Means over `length` ticks are new once in that time; between, they hardly change.
+    """
+    tests = meters * len(lengths) * YEAR_S / (step_s * length)
+    return float(norm.isf(min(rate / tests, 0.5) / 2.0))
+
+
+def suspicions(design: SequentialDesign) -> Dictionary:
+    """What else but meters can be wrong: every customer's active power, then every inverter.
+
+    Parameters
+    ----------
+    design
+        The design.
+    """
+    plant, model = design.plant, design.model
+    own, at = plant.droop.customer, plant.feeder.bus[plant.meters]
+    customers = plant.feeder.bus.size
+
+    def column(k: int) -> Floats:
+        return np.asarray(2.0 * (model.R_bus[:, k] if k < customers else model.X_bus[:, own[k - customers]]))
+
+    return Dictionary(
+        at_meters=2.0 * np.hstack([model.R_bus[at], model.X_bus[at][:, own]]),
+        std=np.concatenate([np.full(customers, design.options.hidden_power), 2.0 * plant.droop.limit]),
+        column=column,
+    )
+
+
+def _meter_of(plant: Plant) -> Ints:
+    at = np.full(plant.feeder.bus.size, -1, dtype=np.intp)
+    at[plant.meters] = np.arange(plant.meters.size)
+    return np.asarray(at[plant.droop.customer])

@@ -1,0 +1,108 @@
+"""How wrong the customers' powers may be, and what that does to voltages.
+
+Readings differ from the model because powers are not known exactly: dp, dq at every customer move *all*
+voltages by ``2 R dp + 2 X dq``, and neighbours nearly alike. That correlation is what makes a lying meter
+visible among its neighbours.
+
+References
+----------
+docs/theory-sequential.md, section 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gridsec.arrays import Floats, Ints
+from gridsec.detect import MeterAccuracy
+from gridsec.droop import Droop
+from gridsec.feeder import LinDistFlow
+from gridsec.sequential.conditional import Prior
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoadDoubt:
+    """How wrong the powers may be that the frames give. N customers.
+
+    Attributes
+    ----------
+    p, q : (N,)
+        Standard deviation of the error of each customer's active and reactive power, pu. A frame whose
+        `p_error` or `q_error` says more is believed.
+    time_s
+        Correlation time of these errors, s: means over much less time still contain all of them.
+    common
+        Share of the variance that all customers have in common (weather, time of day), 0 to 1.
+    """
+
+    p: Floats
+    q: Floats
+    time_s: float
+    common: float = 0.0
+
+    def __post_init__(self) -> None:
+        problems = [
+            f"{name} must be finite and not negative"
+            for name in ("p", "q")
+            if not (np.isfinite(getattr(self, name)).all() and (getattr(self, name) >= 0).all())
+        ]
+        if not self.time_s > 0:
+            problems.append(f"time_s is {self.time_s}; it must be positive")
+        if not 0 <= self.common <= 1:
+            problems.append(f"common is {self.common}; it must be from 0 to 1")
+        if problems:
+            raise ValueError("; ".join(problems))
+
+
+def prior(
+    model: LinDistFlow, at: Ints, doubt: LoadDoubt, *, busbar: float, inverters: Floats | None = None
+) -> Prior:
+    """Covariance of the buses' squared voltages without any meter.
+
+    ``S = 4 R V_p R^T + 4 X V_q X^T + busbar^2 1 1^T``, where ``V = (1 - common) diag(s^2) + common s s^T``.
+
+    Parameters
+    ----------
+    model
+        The linear power flow.
+    at : (p,)
+        Bus of each meter.
+    doubt
+        How wrong the powers may be.
+    busbar
+        Standard deviation of the squared busbar voltage, squared pu.
+    inverters : (N,)
+        Standard deviation of the injections that observers attribute to the customers' inverters, pu.
+    """
+    q = doubt.q if inverters is None else np.hypot(doubt.q, inverters)
+    of_meters = np.full((len(model.R_bus), at.size), busbar**2)
+    variance = np.full(len(model.R_bus), busbar**2)
+    for matrix, std in ((model.R_bus, doubt.p), (model.X_bus, q)):
+        spread = matrix * (2.0 * np.sqrt(1.0 - doubt.common) * std)
+        shared = 2.0 * np.sqrt(doubt.common) * (matrix @ std)
+        of_meters += spread @ spread[at].T + np.multiply.outer(shared, shared[at])
+        variance += np.einsum("ij,ij->i", spread, spread) + shared * shared
+    return Prior(of_meters, at, variance)
+
+
+def injection_doubt(droop: Droop, accuracy: MeterAccuracy, meters: Ints, customers: int) -> Floats:
+    """Standard deviation of what the meters' own errors do to the observers' injections, (N,) in pu.
+
+    An inverter that is driven by its meter's reading follows the reading's error: the fixed part of it
+    through the steepest part of its curve, at most up to saturation.
+
+    Parameters
+    ----------
+    droop, accuracy, meters
+        The inverters and the meters.
+    customers
+        N.
+    """
+    error = np.zeros(customers)
+    error[meters] = 2.0 * np.sqrt(
+        accuracy.class_fraction**2 / 3.0 + accuracy.resolution**2 / 12.0 + accuracy.jitter**2
+    )
+    own = np.minimum(droop.slope * error[droop.customer], droop.limit)
+    return np.asarray(np.sqrt(np.bincount(droop.customer, weights=own**2, minlength=customers)))

@@ -1,0 +1,336 @@
+"""Which meters lie: the likeliest set, without swamping honest meters or masking liars.
+
+An explanation drops some meters and loosens some directions (a customer's powers, an inverter). Its cost is
+
+    J = m_T^T Q m_T + penalty * (number of dropped meters and loosened directions)
+
+which is, up to a constant, minus twice the log-likelihood of the readings, every accusation charged with
+`penalty`. Dropping trusted meter j lowers the misfit by ``offset_j^2 / std_j^2`` exactly, loosening direction
+a by ``(a^T Q m)^2 / (1 / std_a^2 + a^T Q a)``; admitting a meter raises it likewise. So steepest descent
+needs no refitting, J falls with every move, and the search ends.
+
+Descent alone swamps when many lie in the same way: their neighbours look wrong. So there are two starts:
+the set that was trusted before, and a robust one by graduated non-convexity, which first fits with a convex
+cost and hardens it step by step. The cheaper explanation wins.
+
+References
+----------
+Yang, Antonante, Tzoumas and Carlone 2020 (graduated non-convexity, truncated least squares).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from gridsec.arrays import Bools, Floats, Ints
+from gridsec.sequential.conditional import Fit, Judged, Prior, admit, drop, judge, loosen
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Dictionary:
+    """Directions that can be loosened. n buses, p meters, k directions.
+
+    Attributes
+    ----------
+    at_meters : (p, k)
+        Change of the squared voltage at each meter, per unit of what is doubted.
+    std : (k,)
+        How much it may be, pu.
+    column
+        `column(k)` is the change at every bus, (n,).
+    """
+
+    at_meters: Floats
+    std: Floats
+    column: Callable[[int], Floats]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Limits:
+    """What is evidence. p meters.
+
+    Attributes
+    ----------
+    sigmas
+        Standard deviations beyond which an offset is none of chance.
+    model : (p,)
+        What the model's own error may add, squared pu.
+    allowed : (p,)
+        Offsets that are honest whatever their probability, the accuracy class, squared pu.
+    certain : (p,)
+        Variance within the meters' noise that `allowed` stands for.
+    """
+
+    sigmas: float
+    model: Floats
+    allowed: Floats
+    certain: Floats
+
+    @property
+    def penalty(self) -> float:
+        """What an accusation costs."""
+        return self.sigmas**2
+
+    def of(self, std: Floats) -> Floats:
+        """Largest honest offset: by chance alone, or by the class and chance for the rest; the smaller.
+
+        Parameters
+        ----------
+        std : (p,)
+            Standard deviation of each offset.
+        """
+        rest = np.sqrt(np.maximum(std * std - self.certain, 0.0))
+        within = np.minimum(self.sigmas * std, self.allowed + self.sigmas * rest)
+        return np.asarray(self.model + within)
+
+
+@dataclass(slots=True, eq=False)
+class Explanation:
+    """A fit, and what it accuses.
+
+    Attributes
+    ----------
+    fit
+        The trusted meters.
+    judged
+        Every meter, judged by them.
+    loosened
+        Indices into the dictionary.
+    cost
+        J.
+    """
+
+    fit: Fit
+    judged: Judged
+    loosened: list[int] = field(default_factory=list)
+    cost: float = np.inf
+
+
+_MOVES_PER_METER = 4
+
+
+def descend(
+    start: Fit, m: Floats, live: Bools, limits: Limits, *, keep: Bools, dictionary: Dictionary | None = None
+) -> Explanation:
+    """Drop, admit and loosen until no move makes the explanation better.
+
+    Parameters
+    ----------
+    start
+        Where to begin; not changed.
+    m : (p,)
+        Readings minus what the model explains, squared pu.
+    live : (p,)
+        Which meters have a reading.
+    limits
+        What is evidence.
+    keep : (p,)
+        Meters that must not be admitted.
+    dictionary
+        Directions that may be loosened; none by default.
+    """
+    now = start.copy()
+    barred = ~live | keep
+    for j in np.flatnonzero(now.trusted & ~live):
+        drop(now, int(j))
+    powers = None if dictionary is None else _Powers(now, dictionary)
+    accused: list[int] = []
+    judged = judge(now, m)
+    for _ in range(_MOVES_PER_METER * m.size):
+        move = _best(_Place(now, judged, limits, barred, powers, accused))
+        if move is None:
+            break
+        move()
+        judged = judge(now, m)
+    dropped = int(np.count_nonzero(live & ~now.trusted))
+    cost = judged.misfit + limits.penalty * (dropped + len(accused))
+    return Explanation(now, judged, accused, cost)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Place:
+    """Where a descent stands."""
+
+    fit: Fit
+    judged: Judged
+    limits: Limits
+    barred: Bools
+    powers: _Powers | None
+    accused: list[int]
+
+
+def _best(here: _Place) -> Callable[[], None] | None:
+    """The next move, or None where none helps."""
+    now, judged, powers = here.fit, here.judged, here.powers
+    excess = np.abs(judged.offset) / here.limits.of(judged.std)
+    inside = np.where(now.trusted, excess, -np.inf)
+    worst = int(np.argmax(inside))
+    drops = bool(inside[worst] > 1.0)
+    if powers is not None:
+        gains = powers.gains(judged.weights)
+        gains[here.accused] = -np.inf
+        first = int(np.argmax(gains))
+        other = (judged.offset[worst] / judged.std[worst]) ** 2 if drops else 0.0
+        if gains[first] > max(other, here.limits.penalty):
+            return lambda: powers.loosen(now, first, here.accused)
+    if drops:
+        return lambda: _drop(now, worst, powers)
+    outside = np.where(now.trusted | here.barred, np.inf, excess)
+    nearest = int(np.argmin(outside))
+    if outside[nearest] < 1.0:
+        return lambda: _admit(now, nearest, powers)
+    return None
+
+
+def _drop(now: Fit, j: int, powers: _Powers | None) -> None:
+    if powers is not None:
+        powers.change(now.Q[:, j], -1.0 / now.Q[j, j])
+    drop(now, j)
+
+
+def _admit(now: Fit, j: int, powers: _Powers | None) -> None:
+    admit(now, j)
+    if powers is not None:
+        # The change of Q is q q^T / Q_jj with the new column q.
+        powers.change(now.Q[:, j], 1.0 / now.Q[j, j])
+
+
+class _Powers:
+    """Gains of loosening, kept up to date: diag(A^T Q A) changes with Q by squares of one vector."""
+
+    def __init__(self, now: Fit, dictionary: Dictionary) -> None:
+        self.dictionary, self.std, self.seen = dictionary, dictionary.std, dictionary.at_meters
+        self.form = np.einsum("ij,ij->j", now.Q @ self.seen, self.seen)
+
+    def gains(self, weights: Floats) -> Floats:
+        """How much each direction would lower the misfit, (k,)."""
+        return np.asarray((weights @ self.seen) ** 2 / (self.std**-2.0 + self.form))
+
+    def change(self, q: Floats, factor: float) -> None:
+        """Q has gained, or is about to lose, ``|factor| q q^T``."""
+        self.form += factor * (q @ self.seen) ** 2
+
+    def loosen(self, now: Fit, k: int, accused: list[int]) -> None:
+        """Loosen a direction."""
+        u = self.std[k] * self.seen[:, k]
+        Qu = now.Q @ u
+        self.change(Qu, -1.0 / (1.0 + float(u @ Qu)))
+        loosen(now, self.dictionary.column(k), float(self.std[k]))
+        accused.append(k)
+
+
+_HARDER = 2.5
+_ROUNDS = 30
+# Weights below this are zero to the fit, and well above where Cholesky would notice.
+_FEATHER = 1e-6
+
+
+def robust(prior: Prior, noise: Floats, m: Floats, live: Bools, bound: Floats) -> Bools:
+    """Meters that a robust fit trusts, whatever was trusted before; O(p^3).
+
+    Minimises ``w^T S^-1 w + sum_j min((m_j - w_j)^2, bound_j^2) / d_j`` by graduated non-convexity.
+
+    Parameters
+    ----------
+    prior, noise
+        As in `conditional.fit`.
+    m : (p,)
+        Readings minus what the model explains.
+    live : (p,)
+        Which meters have a reading.
+    bound : (p,)
+        Largest honest difference between a reading and the truth, squared pu.
+
+    Returns
+    -------
+    (p,)
+        The trusted ones.
+    """
+    at: Ints = np.flatnonzero(live)
+    trusted = np.zeros(m.size, dtype=np.bool_)
+    if not at.size:
+        return trusted
+    K, d, y, limit = prior.of_meters[np.ix_(prior.meters[at], at)], noise[at], m[at], bound[at] ** 2
+    weight = np.ones(at.size)
+    rest = _residual(K, d, weight, y)
+    largest = float(np.max(rest * rest / limit))
+    if largest <= 1.0:
+        trusted[at] = True
+        return trusted
+    hardness = 1.0 / (2.0 * largest - 1.0)
+    for _ in range(_ROUNDS):
+        ratio = np.maximum(rest * rest / limit, np.finfo(np.float64).tiny)
+        soft = np.sqrt(hardness * (hardness + 1.0) / ratio) - hardness
+        weight = np.clip(soft, 0.0, 1.0)
+        rest = _residual(K, d, np.maximum(weight, _FEATHER), y)
+        if np.all((weight == 0.0) | (weight == 1.0)):
+            break
+        hardness *= _HARDER
+    trusted[at] = rest * rest <= limit
+    return trusted
+
+
+def _residual(K: Floats, d: Floats, weight: Floats, y: Floats) -> Floats:
+    """``y - w_hat`` for meters with noise ``d / weight``."""
+    noise = d / weight
+    whole = K + np.diag(noise)
+    return np.asarray(noise * cho_solve(cho_factor(whole, lower=True, check_finite=False), y))
+
+
+@dataclass(frozen=True, slots=True)
+class Swap:
+    """Accusing `innocent` instead of `accused` fits almost as well.
+
+    Attributes
+    ----------
+    accused, innocent
+        Meters.
+    worse
+        By how much J would rise; half of it is the logarithm of the likelihood ratio.
+    """
+
+    accused: int
+    innocent: int
+    worse: float
+
+
+def swaps(found: Explanation, live: Bools, within: float) -> list[Swap]:
+    """Exchanges of one accused meter for a trusted one that cost at most `within`; O(p^2) per accused.
+
+    With accused k back, ``Q' = Q + v v^T / s`` with ``v = Q S_:k - e_k`` and ``s = M_kk + d_k``, and then
+    meter j gains ``(Q' m)_j^2 / Q'_jj``.
+
+    Parameters
+    ----------
+    found
+        An explanation.
+    live : (p,)
+        Which meters have a reading.
+    within
+        Largest rise of J.
+
+    Returns
+    -------
+    list of Swap
+        The best exchange of each accused meter for which there is one, cheapest first.
+    """
+    now, judged = found.fit, found.judged
+    prior, out = now.prior, []
+    for k in np.flatnonzero(live & ~now.trusted).tolist():
+        column = prior.of_meters[prior.meters, k]
+        if now.loose.shape[1]:
+            column = column + now.loose[prior.meters] @ now.loose[prior.meters[k]]
+        v = now.Q @ column
+        s = judged.std[k] ** 2
+        weights = judged.weights - v * (judged.offset[k] / s)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            gain = np.where(now.trusted, weights**2 / (now.Q.diagonal() + v**2 / s), -np.inf)
+        j = int(np.argmax(gain))
+        worse = float(judged.offset[k] ** 2 / s - gain[j])
+        if worse <= within:
+            out.append(Swap(k, j, max(worse, 0.0)))
+    return sorted(out, key=lambda swap: swap.worse)

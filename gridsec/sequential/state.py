@@ -1,0 +1,138 @@
+"""What the sequential monitor carries from frame to frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats, Ints
+from gridsec.online import Estimate, Verdict
+from gridsec.sequential.conditional import Fit, Prior
+from gridsec.sequential.design import SequentialDesign
+from gridsec.sequential.windows import Window, empty
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trust:
+    """Who is believed, and since when not. p meters, s scales.
+
+    Attributes
+    ----------
+    trusted : (p,)
+        Meters that the estimate rests on.
+    scale : (p,)
+        Scale on which each distrusted meter was caught.
+    age : (p,)
+        Ticks since then.
+    quiet : (p,)
+        Ticks without evidence against a distrusted meter.
+    bad : (s, p)
+        Evidence at the last look on each scale.
+    named : (p,)
+        Meters named as manipulated.
+    accused : tuple of int
+        Other suspicions, indices of `design.suspicions`.
+    """
+
+    trusted: Bools
+    scale: Ints
+    age: Ints
+    quiet: Ints
+    bad: Bools
+    named: Bools
+    accused: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Doubts:
+    """How much less the frames know than the design assumes. N customers.
+
+    Attributes
+    ----------
+    p, q : (N,)
+        Factors, powers of two, on the standard deviations of the design.
+    busbar
+        Whether there is a busbar voltage.
+    prior
+        What follows.
+    """
+
+    p: Floats
+    q: Floats
+    busbar: bool
+    prior: Prior
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SequentialState:
+    """What is carried from frame to frame. N customers, m inverters, p meters, s scales.
+
+    Attributes
+    ----------
+    t, since
+        Time of the last frame used, and of the first one, s.
+    ticks
+        Frames used.
+    x : (m,) or None
+        Injections, pu; None before the first frame.
+    v0_squared
+        Last squared busbar voltage, pu.
+    window
+        The last residuals.
+    trust
+        Who is believed.
+    fits : (s,)
+        What the trusted meters say on each scale; None where no meter can be judged yet.
+    doubts
+        What the frames do not know.
+    bias : (p,)
+        Learned fixed part of each meter's error, squared pu.
+    model_error : (p,)
+        What the model may be off at each meter, squared pu.
+    last
+        The last answer.
+    """
+
+    t: float
+    since: float
+    ticks: int
+    x: Floats | None
+    v0_squared: float
+    window: Window
+    trust: Trust
+    fits: tuple[Fit | None, ...]
+    doubts: Doubts
+    bias: Floats
+    model_error: Floats
+    last: tuple[Estimate, Verdict] | None
+
+
+def init(design: SequentialDesign, t: float) -> SequentialState:
+    """Begin to watch; the observer starts with the first frame.
+
+    Parameters
+    ----------
+    design
+        From `design`.
+    t
+        Unix time, s.
+    """
+    p, s, customers = design.plant.meters.size, len(design.lengths), design.plant.feeder.bus.size
+    zeros = np.zeros(p, dtype=np.intp)
+    no = np.zeros(p, dtype=np.bool_)
+    one = np.ones(customers)
+    return SequentialState(
+        t=t,
+        since=t,
+        ticks=0,
+        x=None,
+        v0_squared=design.plant.droop.vbar**2,
+        window=empty(design.lengths, p),
+        trust=Trust(~no, zeros, zeros, zeros, np.zeros((s, p), dtype=np.bool_), no),
+        fits=(None,) * s,
+        doubts=Doubts(one, one, True, design.prior),
+        bias=np.zeros(p),
+        model_error=np.zeros(p),
+        last=None,
+    )

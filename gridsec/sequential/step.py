@@ -1,0 +1,407 @@
+"""One frame in, an estimate and a verdict out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats
+from gridsec.feeder import bus_voltages, model_error_bound
+from gridsec.judge import Situation, decide
+from gridsec.lure import known_input
+from gridsec.online import Cause, Decision, Estimate, Explanation, Frame, Verdict
+from gridsec.sequential.design import SequentialDesign
+from gridsec.sequential.drive import drive
+from gridsec.sequential.examine import Examined, examine
+from gridsec.sequential.loads import LoadDoubt, prior
+from gridsec.sequential.search import swaps
+from gridsec.sequential.state import Doubts, SequentialState, Trust
+from gridsec.sequential.windows import push
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Heard:
+    """One frame, cleaned. N customers, p meters, m inverters."""
+
+    live: Bools  # (p,)
+    y: Floats  # (p,) 0 where not live
+    q: Floats  # (N,) of the loads, or metered net where told
+    told: Bools  # (N,)
+    v0_squared: float
+    busbar: bool
+
+
+def step(
+    design: SequentialDesign, state: SequentialState, frame: Frame
+) -> tuple[SequentialState, Estimate, Verdict]:
+    """Take one frame in.
+
+    Parameters
+    ----------
+    design, state
+        From `design`, and from `init` or the last step.
+    frame
+        Everything known at one tick. A frame that is not later than the last one changes nothing: it
+        gets the last estimate again, and UNDECIDED.
+
+    Returns
+    -------
+    SequentialState, Estimate, Verdict
+        As every estimator's step; see `gridsec.online`.
+    """
+    if not np.isfinite(frame.t) or (state.x is not None and not frame.t > state.t):
+        return _unusable(design, state, frame)
+    plant = design.plant
+    at = plant.feeder.bus[plant.meters]
+    heard = _clean(design, state, frame)
+    doubts = _doubts(design, state.doubts, frame, heard.busbar)
+    if doubts is not state.doubts and doubts.prior is not state.doubts.prior:
+        state = replace(state, fits=(None,) * len(state.fits))
+    x = _inverters(design, state, frame, heard)
+    q = heard.q + np.where(
+        heard.told, 0.0, np.bincount(plant.droop.customer, weights=x, minlength=heard.q.size)
+    )
+    with np.errstate(all="ignore"):
+        v2_bus = bus_voltages(plant.feeder, frame.p, q, heard.v0_squared, steps=plant.loss_correction)
+    v2_bus = np.where(np.isfinite(v2_bus), v2_bus, heard.v0_squared)
+    window = push(state.window, design.lengths, heard.y - v2_bus[at] - state.bias, heard.live)
+    model = state.model_error
+    if state.ticks % _STALE == 0:
+        model = _model_error(design, frame.p, q, heard.v0_squared)
+    since = frame.t if state.x is None else state.since
+    transient = design.reach * np.exp(-design.certificate.rate * (frame.t - since))
+    seen = examine(
+        design,
+        state.trust,
+        state.fits,
+        window,
+        doubts.prior,
+        tick=state.ticks,
+        model=model + transient,
+    )
+    trust, doubtful = _name(design, state.trust, seen)
+    seen = replace(seen, trust=trust)
+    after = replace(
+        state,
+        t=frame.t,
+        since=since,
+        ticks=state.ticks + 1,
+        x=x,
+        v0_squared=heard.v0_squared,
+        window=window,
+        trust=trust,
+        fits=seen.fits,
+        doubts=doubts,
+        model_error=model,
+    )
+    estimate, verdict = _conclude(design, after, heard, seen, v2_bus, transient, doubtful)
+    return replace(after, last=(estimate, verdict)), estimate, verdict
+
+
+# The model's error is bounded anew every so many ticks.
+_STALE = 16
+
+
+def _clean(design: SequentialDesign, state: SequentialState, frame: Frame) -> _Heard:
+    plant = design.plant
+    live = frame.seen & np.isfinite(frame.y)
+    low, high = design.options.v2_limits
+    busbar = bool(np.isfinite(frame.v0_squared) and low <= frame.v0_squared <= high)
+    told = np.zeros(frame.q.size, dtype=np.bool_)
+    reported = np.isfinite(frame.q_net)
+    if reported.any():
+        trusted = np.zeros(frame.q.size, dtype=np.bool_)
+        trusted[plant.meters] = live & state.trust.trusted
+        count = frame.q.size
+        most = np.bincount(plant.droop.customer, weights=plant.droop.q[:, 0], minlength=count)
+        least = np.bincount(plant.droop.customer, weights=plant.droop.q[:, 3], minlength=count)
+        rest, room = np.nan_to_num(frame.q_net) - frame.q, frame.q_error + np.nan_to_num(frame.q_net_error)
+        told = trusted & reported & (least - room <= rest) & (rest <= most + room)
+    return _Heard(
+        live=live,
+        y=np.where(live, frame.y, 0.0),
+        q=np.where(told, np.nan_to_num(frame.q_net), frame.q),
+        told=told,
+        v0_squared=frame.v0_squared if busbar else state.v0_squared,
+        busbar=busbar,
+    )
+
+
+# Frames that claim to know loads so much less well than the design assumes are believed.
+_MUCH_LESS = 4.0
+# Squared busbar voltage that is not metered: its standard deviation, squared pu.
+_UNMETERED = 0.1
+
+
+def _doubts(design: SequentialDesign, before: Doubts, frame: Frame, busbar: bool) -> Doubts:
+    """What this frame does not know; a new prior only where that changed."""
+    p, q = (
+        _factor(error, std, old)
+        for error, std, old in (
+            (frame.p_error, design.doubt.p, before.p),
+            (frame.q_error, design.doubt.q, before.q),
+        )
+    )
+    if busbar == before.busbar and np.array_equal(p, before.p) and np.array_equal(q, before.q):
+        return before
+    doubt = LoadDoubt(design.doubt.p * p, design.doubt.q * q, design.doubt.time_s, design.doubt.common)
+    plain = busbar and bool((p == 1.0).all() and (q == 1.0).all())
+    found = (
+        design.prior
+        if plain
+        else prior(
+            design.model,
+            design.prior.meters,
+            doubt,
+            busbar=design.busbar if busbar else _UNMETERED,
+            inverters=design.injections,
+        )
+    )
+    return Doubts(p, q, busbar, found)
+
+
+def _factor(error: Floats, std: Floats, old: Floats) -> Floats:
+    """Power of two by which a frame knows a power less well than the design assumes, with hysteresis."""
+    ratio = error / np.sqrt(3.0) / np.maximum(std, np.finfo(np.float64).tiny)
+    keep = (ratio <= old * _MUCH_LESS) & (ratio * _MUCH_LESS >= old) & (old > 1.0)
+    raised = np.exp2(np.ceil(np.log2(np.maximum(ratio, 1.0))))
+    return np.where(keep, old, np.where(ratio > _MUCH_LESS, raised, 1.0))
+
+
+def _inverters(design: SequentialDesign, state: SequentialState, frame: Frame, heard: _Heard) -> Floats:
+    """The injections at this frame: at rest at the first one, a step later at every other."""
+    droop, meter = design.plant.droop, design.meter_of
+    believed = state.trust.trusted & heard.live
+    driven = (meter >= 0) & believed[meter]
+    y = np.where(driven, heard.y[meter], heard.v0_squared) if meter.size else np.zeros(0)
+    if state.x is None:
+        return np.asarray(droop(droop.vbar**2 - y))
+    w = None
+    if not driven.all():
+        correction = np.zeros(heard.q.size)
+        if state.last is not None:
+            # What losses took off at the last frame is close enough for inverters without a meter.
+            correction = state.last[0].v2 - _linear(design, frame, state, heard)
+        w = known_input(design.model, droop.vbar, frame.p, frame.q, heard.v0_squared, correction)
+    return drive(design, state.x, y, driven, w, frame.t - state.t)
+
+
+def _linear(design: SequentialDesign, frame: Frame, state: SequentialState, heard: _Heard) -> Floats:
+    """Squared voltages by the linear model at the last injections, (N,)."""
+    plant, model = design.plant, design.model
+    x = np.zeros(plant.droop.tau.size) if state.x is None else state.x
+    q = frame.q + np.bincount(plant.droop.customer, weights=x, minlength=frame.q.size)
+    return np.asarray(heard.v0_squared + 2.0 * (model.R @ frame.p + model.X @ q))
+
+
+def _model_error(design: SequentialDesign, p: Floats, q: Floats, v0_squared: float) -> Floats:
+    """What the loss-corrected model may be off at each meter, (p,)."""
+    plant = design.plant
+    with np.errstate(all="ignore"):
+        error = model_error_bound(plant.feeder, p, q, v0_squared)[plant.meters]
+    return np.where(np.isfinite(error), error, design.options.widest)
+
+
+def _confirm(length: int) -> int:
+    """Ticks that evidence on a scale must last before a meter is named."""
+    return 2 + length // 6
+
+
+def _name(design: SequentialDesign, before: Trust, seen: Examined) -> tuple[Trust, tuple[Explanation, ...]]:
+    """Who is named now; and explanations that fit about as well where a meter would have been named."""
+    trust = seen.trust
+    judged = np.zeros(trust.trusted.size, dtype=np.bool_)
+    for s, fitted in enumerate(seen.fits):
+        if fitted is not None:
+            judged |= trust.bad[s] | (seen.views[s] is not None)
+    evidence = trust.bad.any(axis=0)
+    quiet = np.where(trust.trusted | evidence, 0, trust.quiet + 1)
+    back = ~trust.trusted & (quiet >= design.options.release)
+    trusted = trust.trusted | back
+    age = np.where(trusted, 0, trust.age + 1)
+    need = np.array([_confirm(length) for length in design.lengths])[trust.scale]
+    due = ~trusted & evidence & (age >= need)
+    named = (before.named & ~trusted) | due
+    trust = replace(trust, trusted=trusted, age=age, quiet=quiet, named=named)
+    fresh = named & ~before.named
+    if not fresh.any():
+        return trust, ()
+    rivals = _rivals(design, seen, fresh)
+    held = np.zeros_like(fresh)
+    for rival in rivals:
+        held |= fresh & ~rival.meters
+    return replace(trust, named=named & ~held), rivals
+
+
+def _rivals(design: SequentialDesign, seen: Examined, fresh: Bools) -> tuple[Explanation, ...]:
+    """Explanations about as likely as the one found that leave out a meter about to be named."""
+    within = 2.0 * float(np.log(design.options.like))
+    m = design.plant.droop.tau.size
+    out: list[tuple[Bools, float]] = []
+    for found in seen.found.values():
+        accused = ~found.fit.trusted
+        live = np.isfinite(found.judged.offset)
+        for swap in swaps(found, live, within):
+            if fresh[swap.accused]:
+                other = accused.copy()
+                other[swap.accused], other[swap.innocent] = False, True
+                out.append((other, float(np.exp(-0.5 * swap.worse))))
+        if out:
+            out.insert(0, (accused, 1.0))
+    total = sum(weight for _, weight in out)
+    return tuple(Explanation(meters, np.zeros(m, dtype=np.bool_), weight / total) for meters, weight in out)
+
+
+def _conclude(  # noqa: PLR0917  # everything one tick brought
+    design: SequentialDesign,
+    state: SequentialState,
+    heard: _Heard,
+    seen: Examined,
+    v2_bus: Floats,
+    transient: Floats,
+    rivals: tuple[Explanation, ...],
+) -> tuple[Estimate, Verdict]:
+    plant, trust = design.plant, state.trust
+    at = plant.feeder.bus[plant.meters]
+    w, variance = _reconstructed(design, state)
+    v2_bus = v2_bus + w
+    v2_bus[0] = heard.v0_squared if heard.busbar else v2_bus[0]
+    v2, std = v2_bus[plant.feeder.bus], np.sqrt(variance[plant.feeder.bus])
+    far = float(np.max(state.model_error + transient, initial=0.0))
+    estimate = Estimate(
+        t=state.t,
+        v2=v2,
+        bound=design.sigmas[0] * std + far,
+        v2_bus=v2_bus,
+        trusted=trust.trusted & heard.live,
+        x=np.zeros(0) if state.x is None else state.x,
+        std=std,
+    )
+    score, threshold, judged = _worst(design, seen, heard.live.size)
+    settled = bool(np.all(transient <= design.options.settled * threshold))
+    attack = np.where(trust.named & heard.live, heard.y - state.bias - v2_bus[at], 0.0)
+    decision, cause, reason = _decide(design, state, judged, threshold, settled)
+    verdict = Verdict(
+        decision,
+        cause,
+        reason,
+        trust.named,
+        score,
+        threshold,
+        attack,
+        inverters=_inverters_accused(design, trust),
+        inverter_attack=np.zeros(plant.droop.tau.size),
+        explanations=rivals,
+    )
+    return estimate, verdict
+
+
+def _inverters_accused(design: SequentialDesign, trust: Trust) -> Bools:
+    out = np.zeros(design.plant.droop.tau.size, dtype=np.bool_)
+    customers = design.plant.feeder.bus.size
+    out[[k - customers for k in trust.accused if k >= customers]] = True
+    return out
+
+
+def _reconstructed(design: SequentialDesign, state: SequentialState) -> tuple[Floats, Floats]:
+    """What the trusted meters add to the model at every bus, and its variance, on the best scale."""
+    prior_ = state.doubts.prior
+    best: tuple[float, Floats, Floats] | None = None
+    for s, (now, length) in enumerate(zip(state.fits, design.lengths, strict=True)):
+        if now is None or not now.trusted.any():
+            continue
+        lag = min(1.0, length * design.step_s / design.doubt.time_s) * (length > 1)
+        variance = now.variance + lag * prior_.variance
+        mean = float(variance.mean())
+        if best is None or mean < best[0]:
+            m = state.window.sums[s] / np.maximum(state.window.counts[s], 1)
+            weights = now.Q @ m
+            w = prior_.of_meters @ weights
+            if now.loose.shape[1]:
+                w += now.loose @ (weights @ now.loose[prior_.meters])
+            best = (mean, w, variance)
+    if best is None:
+        return np.zeros_like(prior_.variance), prior_.variance
+    return best[1], best[2]
+
+
+def _worst(design: SequentialDesign, seen: Examined, p: int) -> tuple[Floats, Floats, Bools]:
+    """Offset and limit of each meter on the scale that speaks most against it; who was judged."""
+    score, threshold = np.full(p, np.nan), np.full(p, design.options.widest)
+    ratio = np.full(p, -1.0)
+    judged = np.zeros(p, dtype=np.bool_)
+    for view in seen.views:
+        if view is None:
+            continue
+        judged |= view.enough
+        offset = np.abs(view.judged.offset)
+        now = np.where(view.enough, offset / view.limit, -1.0)
+        more = now > ratio
+        score, threshold = np.where(more, offset, score), np.where(more, view.limit, threshold)
+        ratio = np.maximum(ratio, now)
+    return np.where(judged, score, np.nan), threshold, judged
+
+
+def _decide(
+    design: SequentialDesign,
+    state: SequentialState,
+    judged: Bools,
+    threshold: Floats,
+    settled: bool,
+) -> tuple[Decision, Cause, str]:
+    plant, trust = design.plant, state.trust
+    names = tuple(plant.feeder.customers[c] for c in plant.meters)
+    return decide(
+        Situation(
+            names=names,
+            max_attacked=max(1, min(design.most, int(np.count_nonzero(judged)) // 3)),
+            live=judged,
+            suspected=~trust.trusted,
+            named=trust.named,
+            wide=judged & (threshold > design.options.widest),
+            valid=True,
+            settled=settled,
+            busbar=True,
+        )
+    )
+
+
+def _unusable(
+    design: SequentialDesign, state: SequentialState, frame: Frame
+) -> tuple[SequentialState, Estimate, Verdict]:
+    """The answer to a frame that is not later than the last one: nothing new, and certainly not CLEAN."""
+    plant = design.plant
+    p, n, m = plant.meters.size, len(plant.feeder.buses), plant.droop.tau.size
+    reason = f"A frame of time {frame.t} is not later than the last one, {state.t}; it was not used."
+    if state.last is not None:
+        estimate, verdict = state.last
+        return (
+            state,
+            estimate,
+            replace(verdict, decision=Decision.UNDECIDED, cause=Cause.SETTLING, reason=reason),
+        )
+    v2_bus = np.full(n, state.v0_squared)
+    estimate = Estimate(
+        t=state.t,
+        v2=v2_bus[plant.feeder.bus],
+        bound=np.full(plant.feeder.bus.size, _NO_VOLTAGE),
+        v2_bus=v2_bus,
+        trusted=np.zeros(p, dtype=np.bool_),
+        x=np.zeros(m),
+        std=np.full(plant.feeder.bus.size, _NO_VOLTAGE),
+    )
+    verdict = Verdict(
+        Decision.UNDECIDED,
+        Cause.SETTLING,
+        reason,
+        np.zeros(p, dtype=np.bool_),
+        np.full(p, np.nan),
+        np.full(p, _NO_VOLTAGE),
+        np.zeros(p),
+    )
+    return state, estimate, verdict
+
+
+# Errors of squared voltages end here: no voltage is above 2 pu.
+_NO_VOLTAGE = 4.0
