@@ -45,11 +45,19 @@ class SequentialOptions:
         With more suspects than this at once the robust fit is asked.
     release
         Ticks in a row without evidence after which a meter is trusted again.
+    suspect
+        Once something is beyond chance, others are suspected beyond so many standard deviations, and an
+        accusation costs the square of it. To be named takes what the false-alarm rate asks for.
+    lower
+        A distrusted meter must come below this part of `sigmas` to be trusted again.
     like
         Explanations no more than this factor less likely than the best are given with it.
     hidden_power
         Power that a customer's readings may hide, standard deviation, pu: prior of accusing a customer's
         powers instead of meters.
+    hidden_charge
+        What accusing a customer's powers costs, in accusations of a meter. Loads are promised to be
+        within `LoadDoubt`; the higher, the more meters' word is against that of one promise.
     widest, v2_limits, settled
         As in `gridsec.plant.Options`.
     """
@@ -60,8 +68,11 @@ class SequentialOptions:
     focus: float = 3.0
     several: int = 3
     release: int = 6
-    like: float = 20.0
+    suspect: float = 4.0
+    lower: float = 0.6
+    like: float = 100.0
     hidden_power: float = 0.05
+    hidden_charge: float = 5.0
     widest: float = 0.1
     v2_limits: tuple[float, float] = (0.25, 2.25)
     settled: float = 0.1
@@ -101,6 +112,8 @@ class SequentialDesign:
         What all inverters between their limits can do to the voltage at each meter, squared pu.
     meter_of : (m,)
         Meter that drives each inverter; -1 for none.
+    book
+        What else but meters can be wrong: every customer's active power, then every inverter.
     most
         How many liars it claims to tell apart: a third of the meters.
     step_s
@@ -124,6 +137,7 @@ class SequentialDesign:
     allowed: Floats
     reach: Floats
     meter_of: Ints
+    book: Dictionary = field(repr=False)
     most: int
     step_s: float
     options: SequentialOptions = field(repr=False)
@@ -196,6 +210,7 @@ def design(
         allowed=slope * accuracy.class_fraction,
         reach=np.abs(lure.C) @ (2.0 * plant.droop.limit),
         meter_of=_meter_of(plant),
+        book=_suspicions(plant, model, options),
         most=most,
         step_s=step_s,
         options=options,
@@ -250,15 +265,8 @@ def _sigmas(rate: float, meters: int, length: int, step_s: float, lengths: tuple
     return float(norm.isf(min(rate / tests, 0.5) / 2.0))
 
 
-def suspicions(design: SequentialDesign) -> Dictionary:
-    """What else but meters can be wrong: every customer's active power, then every inverter.
-
-    Parameters
-    ----------
-    design
-        The design.
-    """
-    plant, model = design.plant, design.model
+def _suspicions(plant: Plant, model: LinDistFlow, options: SequentialOptions) -> Dictionary:
+    """Columns of 2R for the customers' active powers, and of 2X for the inverters."""
     own, at = plant.droop.customer, plant.feeder.bus[plant.meters]
     customers = plant.feeder.bus.size
 
@@ -267,7 +275,8 @@ def suspicions(design: SequentialDesign) -> Dictionary:
 
     return Dictionary(
         at_meters=2.0 * np.hstack([model.R_bus[at], model.X_bus[at][:, own]]),
-        std=np.concatenate([np.full(customers, design.options.hidden_power), 2.0 * plant.droop.limit]),
+        std=np.concatenate([np.full(customers, options.hidden_power), 2.0 * plant.droop.limit]),
+        charge=np.repeat([options.hidden_charge, 1.0], [customers, own.size]),
         column=column,
     )
 

@@ -14,8 +14,8 @@ import numpy as np
 from gridsec.arrays import Bools, Floats
 from gridsec.sequential import search
 from gridsec.sequential.conditional import Fit, Judged, Prior, admit, drop, fit, judge
-from gridsec.sequential.design import SequentialDesign, suspicions
-from gridsec.sequential.search import Explanation, Limits
+from gridsec.sequential.design import SequentialDesign
+from gridsec.sequential.search import Dictionary, Explanation, Limits
 from gridsec.sequential.state import Trust
 from gridsec.sequential.windows import Window
 
@@ -32,11 +32,17 @@ class View:
         Meters with enough readings on this scale.
     limit : (p,)
         Largest honest offset, squared pu.
+    over : (p,)
+        Whose offset is larger.
+    still : (p,)
+        Whose offset is larger than what is expected of a meter that is to be trusted again.
     """
 
     judged: Judged
     enough: Bools
     limit: Floats
+    over: Bools
+    still: Bools
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,13 +56,13 @@ class Examined:
     fits, views : (s,)
         By scale; a view is None where the scale was not looked at.
     found
-        The explanations that searches came to, by scale.
+        The explanations that searches came to, by scale, the likeliest first.
     """
 
     trust: Trust
     fits: tuple[Fit | None, ...]
     views: tuple[View | None, ...]
-    found: dict[int, Explanation]
+    found: dict[int, tuple[Explanation, ...]]
 
 
 # A long scale hardly changes from tick to tick: it is looked at this many times per length.
@@ -95,48 +101,78 @@ def examine(
     """
     views: list[View | None] = []
     after: list[Fit | None] = []
-    found: dict[int, Explanation] = {}
+    found: dict[int, tuple[Explanation, ...]] = {}
+    scales = _Scales(design, prior, window, model)
     for s, length in enumerate(design.lengths):
         if tick % max(1, length // _LOOKS):
             views.append(None)
             after.append(fits[s])
             continue
-        need = max(1, int(np.ceil(design.options.enough * length)))
-        enough = window.counts[s] >= need
-        noise = design.white / need + design.fixed
-        now = adapt(fits[s], prior, noise, trust.trusted & enough, _directions(design, trust))
-        m = window.sums[s] / np.maximum(window.counts[s], 1)
-        limits = Limits(design.sigmas[s], model, design.allowed, design.fixed)
-        judged = judge(now, m)
-        limit = limits.of(judged.std)
-        over = enough & (np.abs(judged.offset) > limit)
-        if (over & trust.trusted).any():
-            best = _explain(design, now, m, enough, limits, _elsewhere(trust, s))
-            trust = _retrust(trust, best, enough, s)
-            now, judged = best.fit, best.judged
-            limit = limits.of(judged.std)
-            over = enough & (np.abs(judged.offset) > limit)
-            found[s] = best
-        bad = trust.bad.copy()
-        bad[s] = over & ~trust.trusted
-        trust = replace(trust, bad=bad)
-        views.append(View(judged, enough, limit))
+        here = scales[s]
+        now = adapt(
+            fits[s], prior, here.noise, trust.trusted & here.enough, _directions(design, trust.accused)
+        )
+        view = _view(design, here, now)
+        if (view.over & trust.trusted).any() or _due(design, trust, s, tick):
+            found[s], trust = _Search(design, scales, fits, trust, s)(now)
+            now = found[s][0].fit
+            view = _view(design, here, now)
+        bad, still = trust.bad.copy(), trust.still.copy()
+        bad[s], still[s] = view.over & ~trust.trusted, view.still & ~trust.trusted
+        trust = replace(trust, bad=bad, still=still)
+        views.append(view)
         after.append(now)
     return Examined(trust, tuple(after), tuple(views), found)
 
 
-def _elsewhere(trust: Trust, s: int) -> Bools:
-    """Meters against which other scales have evidence."""
-    other = np.delete(trust.bad, s, axis=0)
-    return np.asarray(other.any(axis=0) & ~trust.trusted)
+def _due(design: SequentialDesign, trust: Trust, s: int, tick: int) -> bool:
+    """Whether what is believed is looked into again, though nothing speaks against it."""
+    if any(scale <= s for _, scale in trust.accused):
+        return True
+    last = len(design.lengths) - 1
+    return s == last and tick % design.lengths[last] == 0 and not trust.trusted.all()
 
 
-def _directions(design: SequentialDesign, trust: Trust) -> Floats | None:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Scale:
+    """What one scale has to judge by."""
+
+    noise: Floats
+    m: Floats
+    enough: Bools
+    limits: Limits
+
+
+class _Scales:
+    """All scales at one tick."""
+
+    def __init__(self, design: SequentialDesign, prior: Prior, window: Window, model: Floats) -> None:
+        self.design, self.prior, self.window, self.model = design, prior, window, model
+
+    def __getitem__(self, s: int) -> _Scale:
+        design, counts = self.design, self.window.counts[s]
+        need = max(1, int(np.ceil(design.options.enough * design.lengths[s])))
+        return _Scale(
+            noise=design.white / need + design.fixed,
+            m=self.window.sums[s] / np.maximum(counts, 1),
+            enough=counts >= need,
+            limits=Limits(design.sigmas[s], self.model, design.allowed, design.fixed),
+        )
+
+
+def _view(design: SequentialDesign, here: _Scale, now: Fit) -> View:
+    judged = judge(now, here.m)
+    limit = here.limits.of(judged.std)
+    offset = np.abs(judged.offset)
+    lower = here.limits.of(judged.std, design.options.lower)
+    return View(judged, here.enough, limit, here.enough & (offset > limit), here.enough & (offset > lower))
+
+
+def _directions(design: SequentialDesign, accused: tuple[tuple[int, int], ...]) -> Floats | None:
     """Loosened directions, (n, k)."""
-    if not trust.accused:
+    if not accused:
         return None
-    book = suspicions(design)
-    return np.column_stack([book.std[k] * book.column(k) for k in trust.accused])
+    return np.column_stack([design.book.std[k] * design.book.column(k) for k, _ in accused])
 
 
 def adapt(before: Fit | None, prior: Prior, noise: Floats, wanted: Bools, loose: Floats | None) -> Fit:
@@ -167,35 +203,88 @@ def adapt(before: Fit | None, prior: Prior, noise: Floats, wanted: Bools, loose:
     return now
 
 
-def _explain(  # noqa: PLR0917  # what a search depends on, in the order of its stages
-    design: SequentialDesign, now: Fit, m: Floats, live: Bools, limits: Limits, keep: Bools
-) -> Explanation:
-    """The cheapest explanation that any start leads to."""
-    best = search.descend(now, m, live, limits, keep=keep)
-    if np.count_nonzero(live & ~best.fit.trusted) > design.options.several:
-        std = np.sqrt(now.noise)
-        bound = limits.model + design.options.focus * std
-        chosen = search.robust(now.prior, now.noise, m, live & ~keep, bound)
-        again = fit(now.prior, now.noise, chosen, now.loose)
-        best = _cheaper(best, search.descend(again, m, live, limits, keep=keep))
-    if np.count_nonzero(live & ~best.fit.trusted) > 1:
-        book = suspicions(design)
-        best = _cheaper(best, search.descend(now, m, live, limits, keep=keep, dictionary=book))
-    return best
+class _Search:
+    """The explanations that several starts lead to on one scale.
+
+    The starts: what was believed, without what this scale and shorter ones suspect besides meters; a
+    robust fit, where several meters are suspected; and with suspicions besides meters, where more than
+    one is. Longer means know better, so they decide anew about what shorter ones suspected.
+
+    Meters against which other scales have evidence are not admitted, or lies that have just begun would
+    be believed again. Unless the explanation that does admit them is cheaper over all scales together.
+    """
+
+    def __init__(
+        self, design: SequentialDesign, scales: _Scales, fits: tuple[Fit | None, ...], trust: Trust, s: int
+    ) -> None:
+        self.design, self.scales, self.fits, self.trust, self.s = design, scales, fits, trust, s
+        here = scales[s]
+        sigmas = min(design.options.suspect, here.limits.sigmas)
+        self.here = replace(here, limits=replace(here.limits, sigmas=sigmas))
+        self.keep = _held(trust, s)
+        self.accused = tuple(suspicion for suspicion in trust.accused if suspicion[1] > s)
+
+    def __call__(self, now: Fit) -> tuple[tuple[Explanation, ...], Trust]:
+        """The explanations, the likeliest first, and whom that leaves trusted."""
+        here, design = self.here, self.design
+        start = now if len(self.accused) == len(self.trust.accused) else self._fit(now.trusted)
+        found = [self._descend(start, self.keep)]
+        free = None
+        if _suspected(here, found[0]) > design.options.several:
+            bound = here.limits.model + design.options.focus * np.sqrt(here.noise)
+            chosen = search.robust(self.scales.prior, here.noise, here.m, here.enough, bound)
+            free = self._descend(self._fit(chosen), np.zeros_like(chosen))
+            if (free.fit.trusted & self.keep).any():
+                found.append(self._descend(self._fit(chosen & ~self.keep), self.keep))
+            else:
+                found.append(free)
+                free = None
+        if min(_suspected(here, each) for each in found) > 1:
+            found.append(self._descend(start, self.keep, design.book))
+        found.sort(key=lambda each: each.cost)
+        if free is not None and free.cost < found[0].cost and self._total(free) < self._total(found[0]):
+            found.insert(0, free)
+        return tuple(found), self._believe(found[0])
+
+    def _descend(self, start: Fit, keep: Bools, book: Dictionary | None = None) -> Explanation:
+        here = self.here
+        return search.descend(start, here.m, here.enough, here.limits, keep=keep, dictionary=book)
+
+    def _fit(self, trusted: Bools) -> Fit:
+        loose = _directions(self.design, self.accused)
+        return fit(self.scales.prior, self.here.noise, trusted & self.here.enough, loose)
+
+    def _total(self, found: Explanation) -> float:
+        """The misfit on all scales and, once, what the accusations cost."""
+        trusted = np.where(self.here.enough, found.fit.trusted, self.trust.trusted)
+        loose = found.fit.loose if found.fit.loose.shape[1] else None
+        total = found.charge + self.here.limits.penalty * np.count_nonzero(~trusted)
+        for s, before in enumerate(self.fits):
+            there = self.scales[s]
+            wanted = trusted & there.enough
+            now = found.fit if s == self.s else adapt(before, self.scales.prior, there.noise, wanted, loose)
+            total += judge(now, there.m).misfit
+        return float(total)
+
+    def _believe(self, best: Explanation) -> Trust:
+        trust = self.trust
+        trusted = np.where(self.here.enough, best.fit.trusted, trust.trusted)
+        fallen = trust.trusted & ~trusted
+        return replace(
+            trust,
+            trusted=trusted,
+            scale=np.where(fallen, self.s, trust.scale),
+            age=np.where(fallen, 0, trust.age),
+            quiet=np.where(fallen, 0, trust.quiet),
+            accused=(*self.accused, *((k, self.s) for k in best.loosened)),
+        )
 
 
-def _cheaper(one: Explanation, other: Explanation) -> Explanation:
-    return other if other.cost < one.cost else one
+def _suspected(here: _Scale, found: Explanation) -> int:
+    return int(np.count_nonzero(here.enough & ~found.fit.trusted))
 
 
-def _retrust(trust: Trust, best: Explanation, enough: Bools, s: int) -> Trust:
-    trusted = np.where(enough, best.fit.trusted, trust.trusted)
-    fallen = trust.trusted & ~trusted
-    return replace(
-        trust,
-        trusted=trusted,
-        scale=np.where(fallen, s, trust.scale),
-        age=np.where(fallen, 0, trust.age),
-        quiet=np.where(fallen, 0, trust.quiet),
-        accused=(*trust.accused, *best.loosened),
-    )
+def _held(trust: Trust, s: int) -> Bools:
+    """Meters that must stay distrusted: named ones, and those other scales have evidence against."""
+    other = np.delete(trust.still, s, axis=0).any(axis=0)
+    return np.asarray(~trust.trusted & (other | (trust.named & trust.still[s])))

@@ -21,7 +21,7 @@ Yang, Antonante, Tzoumas and Carlone 2020 (graduated non-convexity, truncated le
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -40,12 +40,15 @@ class Dictionary:
         Change of the squared voltage at each meter, per unit of what is doubted.
     std : (k,)
         How much it may be, pu.
+    charge : (k,)
+        What accusing it costs, in accusations of a meter.
     column
         `column(k)` is the change at every bus, (n,).
     """
 
     at_meters: Floats
     std: Floats
+    charge: Floats
     column: Callable[[int], Floats]
 
 
@@ -75,16 +78,18 @@ class Limits:
         """What an accusation costs."""
         return self.sigmas**2
 
-    def of(self, std: Floats) -> Floats:
+    def of(self, std: Floats, part: float = 1.0) -> Floats:
         """Largest honest offset: by chance alone, or by the class and chance for the rest; the smaller.
 
         Parameters
         ----------
         std : (p,)
             Standard deviation of each offset.
+        part
+            Of `sigmas`, how many count.
         """
-        rest = np.sqrt(np.maximum(std * std - self.certain, 0.0))
-        within = np.minimum(self.sigmas * std, self.allowed + self.sigmas * rest)
+        rest, sigmas = np.sqrt(np.maximum(std * std - self.certain, 0.0)), part * self.sigmas
+        within = np.minimum(sigmas * std, self.allowed + sigmas * rest)
         return np.asarray(self.model + within)
 
 
@@ -99,18 +104,23 @@ class Explanation:
     judged
         Every meter, judged by them.
     loosened
-        Indices into the dictionary.
+        What the search loosened, indices into the dictionary.
+    charge
+        What that costs.
     cost
         J.
     """
 
     fit: Fit
     judged: Judged
-    loosened: list[int] = field(default_factory=list)
-    cost: float = np.inf
+    loosened: list[int]
+    charge: float
+    cost: float
 
 
 _MOVES_PER_METER = 4
+# Weights below this are zero to the fit, and well above where Cholesky would notice.
+_FEATHER = 1e-6
 
 
 def descend(
@@ -137,9 +147,9 @@ def descend(
     barred = ~live | keep
     for j in np.flatnonzero(now.trusted & ~live):
         drop(now, int(j))
-    powers = None if dictionary is None else _Powers(now, dictionary)
-    accused: list[int] = []
     judged = judge(now, m)
+    powers = None if dictionary is None else _Powers(now, dictionary, judged.weights)
+    accused: list[int] = []
     for _ in range(_MOVES_PER_METER * m.size):
         move = _best(_Place(now, judged, limits, barred, powers, accused))
         if move is None:
@@ -147,8 +157,9 @@ def descend(
         move()
         judged = judge(now, m)
     dropped = int(np.count_nonzero(live & ~now.trusted))
-    cost = judged.misfit + limits.penalty * (dropped + len(accused))
-    return Explanation(now, judged, accused, cost)
+    loosened = [] if powers is None else powers.index[accused].tolist()
+    charge = 0.0 if dictionary is None else limits.penalty * float(dictionary.charge[loosened].sum())
+    return Explanation(now, judged, loosened, charge, judged.misfit + limits.penalty * dropped + charge)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -171,11 +182,11 @@ def _best(here: _Place) -> Callable[[], None] | None:
     worst = int(np.argmax(inside))
     drops = bool(inside[worst] > 1.0)
     if powers is not None:
-        gains = powers.gains(judged.weights)
+        gains = powers.gains(judged.weights) - here.limits.penalty * powers.charge
         gains[here.accused] = -np.inf
         first = int(np.argmax(gains))
-        other = (judged.offset[worst] / judged.std[worst]) ** 2 if drops else 0.0
-        if gains[first] > max(other, here.limits.penalty):
+        other = (judged.offset[worst] / judged.std[worst]) ** 2 - here.limits.penalty if drops else 0.0
+        if gains[first] > max(other, 0.0):
             return lambda: powers.loosen(now, first, here.accused)
     if drops:
         return lambda: _drop(now, worst, powers)
@@ -199,11 +210,19 @@ def _admit(now: Fit, j: int, powers: _Powers | None) -> None:
         powers.change(now.Q[:, j], 1.0 / now.Q[j, j])
 
 
+# So many directions of a dictionary are tried, those that the residuals point at most.
+_CANDIDATES = 64
+
+
 class _Powers:
     """Gains of loosening, kept up to date: diag(A^T Q A) changes with Q by squares of one vector."""
 
-    def __init__(self, now: Fit, dictionary: Dictionary) -> None:
-        self.dictionary, self.std, self.seen = dictionary, dictionary.std, dictionary.at_meters
+    def __init__(self, now: Fit, dictionary: Dictionary, weights: Floats) -> None:
+        seen = dictionary.at_meters
+        towards = (weights @ seen) ** 2 / np.maximum(np.einsum("ij,ij->j", seen, seen), _FEATHER)
+        self.index = np.argsort(-towards)[:_CANDIDATES]
+        self.dictionary, self.seen = dictionary, seen[:, self.index]
+        self.std, self.charge = dictionary.std[self.index], dictionary.charge[self.index]
         self.form = np.einsum("ij,ij->j", now.Q @ self.seen, self.seen)
 
     def gains(self, weights: Floats) -> Floats:
@@ -219,14 +238,12 @@ class _Powers:
         u = self.std[k] * self.seen[:, k]
         Qu = now.Q @ u
         self.change(Qu, -1.0 / (1.0 + float(u @ Qu)))
-        loosen(now, self.dictionary.column(k), float(self.std[k]))
+        loosen(now, self.dictionary.column(int(self.index[k])), float(self.std[k]))
         accused.append(k)
 
 
 _HARDER = 2.5
 _ROUNDS = 30
-# Weights below this are zero to the fit, and well above where Cholesky would notice.
-_FEATHER = 1e-6
 
 
 def robust(prior: Prior, noise: Floats, m: Floats, live: Bools, bound: Floats) -> Bools:

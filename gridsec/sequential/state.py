@@ -29,10 +29,12 @@ class Trust:
         Ticks without evidence against a distrusted meter.
     bad : (s, p)
         Evidence at the last look on each scale.
+    still : (s, p)
+        Evidence enough to go on distrusting a meter.
     named : (p,)
         Meters named as manipulated.
-    accused : tuple of int
-        Other suspicions, indices of `design.suspicions`.
+    accused : tuple of (k, s)
+        What else is suspected, indices of `design.book`, each with the scale that found it.
     """
 
     trusted: Bools
@@ -40,8 +42,9 @@ class Trust:
     age: Ints
     quiet: Ints
     bad: Bools
+    still: Bools
     named: Bools
-    accused: tuple[int, ...] = ()
+    accused: tuple[tuple[int, int], ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,6 +124,7 @@ def init(design: SequentialDesign, t: float) -> SequentialState:
     p, s, customers = design.plant.meters.size, len(design.lengths), design.plant.feeder.bus.size
     zeros = np.zeros(p, dtype=np.intp)
     no = np.zeros(p, dtype=np.bool_)
+    none = np.zeros((s, p), dtype=np.bool_)
     one = np.ones(customers)
     return SequentialState(
         t=t,
@@ -129,7 +133,7 @@ def init(design: SequentialDesign, t: float) -> SequentialState:
         x=None,
         v0_squared=design.plant.droop.vbar**2,
         window=empty(design.lengths, p),
-        trust=Trust(~no, zeros, zeros, zeros, np.zeros((s, p), dtype=np.bool_), no),
+        trust=Trust(~no, zeros, zeros, zeros, none, none, no),
         fits=(None,) * s,
         doubts=Doubts(one, one, True, design.prior),
         bias=np.zeros(p),

@@ -15,6 +15,7 @@ from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.drive import drive
 from gridsec.sequential.examine import Examined, examine
 from gridsec.sequential.loads import LoadDoubt, prior
+from gridsec.sequential.search import Explanation as Found
 from gridsec.sequential.search import swaps
 from gridsec.sequential.state import Doubts, SequentialState, Trust
 from gridsec.sequential.windows import push
@@ -211,46 +212,42 @@ def _confirm(length: int) -> int:
 def _name(design: SequentialDesign, before: Trust, seen: Examined) -> tuple[Trust, tuple[Explanation, ...]]:
     """Who is named now; and explanations that fit about as well where a meter would have been named."""
     trust = seen.trust
-    judged = np.zeros(trust.trusted.size, dtype=np.bool_)
-    for s, fitted in enumerate(seen.fits):
-        if fitted is not None:
-            judged |= trust.bad[s] | (seen.views[s] is not None)
-    evidence = trust.bad.any(axis=0)
-    quiet = np.where(trust.trusted | evidence, 0, trust.quiet + 1)
-    back = ~trust.trusted & (quiet >= design.options.release)
-    trusted = trust.trusted | back
+    quiet = np.where(trust.still.any(axis=0), 0, trust.quiet + 1)
+    trusted = trust.trusted | (quiet >= design.options.release)
     age = np.where(trusted, 0, trust.age + 1)
     need = np.array([_confirm(length) for length in design.lengths])[trust.scale]
-    due = ~trusted & evidence & (age >= need)
-    named = (before.named & ~trusted) | due
-    trust = replace(trust, trusted=trusted, age=age, quiet=quiet, named=named)
-    fresh = named & ~before.named
-    if not fresh.any():
-        return trust, ()
-    rivals = _rivals(design, seen, fresh)
-    held = np.zeros_like(fresh)
+    fresh = ~trusted & ~before.named & trust.bad.any(axis=0) & (age >= need)
+    named = before.named & (quiet < design.options.release)
+    rivals = _rivals(design, seen, fresh) if fresh.any() else ()
     for rival in rivals:
-        held |= fresh & ~rival.meters
-    return replace(trust, named=named & ~held), rivals
+        fresh = fresh & rival.meters
+    return replace(trust, trusted=trusted, age=age, quiet=quiet, named=named | fresh), rivals
 
 
 def _rivals(design: SequentialDesign, seen: Examined, fresh: Bools) -> tuple[Explanation, ...]:
-    """Explanations about as likely as the one found that leave out a meter about to be named."""
+    """All explanations about as likely as the best, where one leaves out a meter about to be named."""
     within = 2.0 * float(np.log(design.options.like))
-    m = design.plant.droop.tau.size
-    out: list[tuple[Bools, float]] = []
+    out: list[tuple[Bools, Bools, float]] = []
     for found in seen.found.values():
-        accused = ~found.fit.trusted
-        live = np.isfinite(found.judged.offset)
-        for swap in swaps(found, live, within):
-            if fresh[swap.accused]:
-                other = accused.copy()
-                other[swap.accused], other[swap.innocent] = False, True
-                out.append((other, float(np.exp(-0.5 * swap.worse))))
-        if out:
-            out.insert(0, (accused, 1.0))
-    total = sum(weight for _, weight in out)
-    return tuple(Explanation(meters, np.zeros(m, dtype=np.bool_), weight / total) for meters, weight in out)
+        best = found[0]
+        near = [(_meters(each), each, each.cost - best.cost) for each in found]
+        for swap in swaps(best, np.isfinite(best.judged.offset), within):
+            other = near[0][0].copy()
+            other[swap.accused], other[swap.innocent] = False, True
+            near.append((other, best, swap.worse))
+        out += [
+            (meters, _inverters_of(design, each.loosened), float(np.exp(-0.5 * worse)))
+            for meters, each, worse in near
+            if each is best or (worse <= within and (fresh & ~meters).any())
+        ]
+    if not any((fresh & ~meters).any() for meters, _, _ in out):
+        return ()
+    total = sum(weight for _, _, weight in out)
+    return tuple(Explanation(meters, inverters, weight / total) for meters, inverters, weight in out)
+
+
+def _meters(found: Found) -> Bools:
+    return ~found.fit.trusted
 
 
 def _conclude(  # noqa: PLR0917  # everything one tick brought
@@ -290,17 +287,18 @@ def _conclude(  # noqa: PLR0917  # everything one tick brought
         score,
         threshold,
         attack,
-        inverters=_inverters_accused(design, trust),
+        inverters=_inverters_of(design, [k for k, _ in trust.accused]),
         inverter_attack=np.zeros(plant.droop.tau.size),
         explanations=rivals,
     )
     return estimate, verdict
 
 
-def _inverters_accused(design: SequentialDesign, trust: Trust) -> Bools:
+def _inverters_of(design: SequentialDesign, accused: list[int]) -> Bools:
+    """Which inverters are among other suspicions, (m,)."""
     out = np.zeros(design.plant.droop.tau.size, dtype=np.bool_)
     customers = design.plant.feeder.bus.size
-    out[[k - customers for k in trust.accused if k >= customers]] = True
+    out[[k - customers for k in accused if k >= customers]] = True
     return out
 
 
