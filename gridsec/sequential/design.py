@@ -58,6 +58,10 @@ class SequentialOptions:
     hidden_charge
         What accusing a customer's powers costs, in accusations of a meter. Loads are promised to be
         within `LoadDoubt`; the higher, the more meters' word is against that of one promise.
+    commission_s
+        The meters' fixed errors are learned over this time, s; 0 for never.
+    stability
+        Part of its accuracy class by which an honest meter may change after that.
     widest, v2_limits, settled
         As in `gridsec.plant.Options`.
     """
@@ -73,6 +77,8 @@ class SequentialOptions:
     like: float = 100.0
     hidden_power: float = 0.05
     hidden_charge: float = 5.0
+    commission_s: float = 86400.0
+    stability: float = 0.1
     widest: float = 0.1
     v2_limits: tuple[float, float] = (0.25, 2.25)
     settled: float = 0.1

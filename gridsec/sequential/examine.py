@@ -13,6 +13,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats
 from gridsec.sequential import search
+from gridsec.sequential.commission import Learned
 from gridsec.sequential.conditional import Fit, Judged, Prior, admit, drop, fit, judge
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.search import Dictionary, Explanation, Limits
@@ -77,8 +78,9 @@ def examine(
     trust: Trust,
     fits: tuple[Fit | None, ...],
     window: Window,
-    prior: Prior,
     *,
+    prior: Prior,
+    learned: Learned,
     tick: int,
     model: Floats,
 ) -> Examined:
@@ -94,6 +96,8 @@ def examine(
         The residuals.
     prior
         What is known without meters.
+    learned
+        What is known of the meters.
     tick
         Number of this tick.
     model : (p,)
@@ -102,7 +106,7 @@ def examine(
     views: list[View | None] = []
     after: list[Fit | None] = []
     found: dict[int, tuple[Explanation, ...]] = {}
-    scales = _Scales(design, prior, window, model)
+    scales = _Scales(design, prior, window, learned, model)
     for s, length in enumerate(design.lengths):
         if tick % max(1, length // _LOOKS):
             views.append(None)
@@ -146,17 +150,20 @@ class _Scale:
 class _Scales:
     """All scales at one tick."""
 
-    def __init__(self, design: SequentialDesign, prior: Prior, window: Window, model: Floats) -> None:
+    def __init__(
+        self, design: SequentialDesign, prior: Prior, window: Window, learned: Learned, model: Floats
+    ) -> None:
         self.design, self.prior, self.window, self.model = design, prior, window, model
+        self.learned = learned
 
     def __getitem__(self, s: int) -> _Scale:
         design, counts = self.design, self.window.counts[s]
         need = max(1, int(np.ceil(design.options.enough * design.lengths[s])))
         return _Scale(
-            noise=design.white / need + design.fixed,
+            noise=design.white / need + self.learned.variance,
             m=self.window.sums[s] / np.maximum(counts, 1),
             enough=counts >= need,
-            limits=Limits(design.sigmas[s], self.model, design.allowed, design.fixed),
+            limits=Limits(design.sigmas[s], self.model, self.learned.allowed, self.learned.variance),
         )
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.online import Estimate, Verdict
+from gridsec.sequential.commission import Learned, Learning, begin, nothing
 from gridsec.sequential.conditional import Fit, Prior
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.windows import Window, empty
@@ -89,8 +90,10 @@ class SequentialState:
         What the trusted meters say on each scale; None where no meter can be judged yet.
     doubts
         What the frames do not know.
-    bias : (p,)
-        Learned fixed part of each meter's error, squared pu.
+    learning
+        What was gathered of the meters' fixed errors; None once they are known.
+    learned
+        What is known of them.
     model_error : (p,)
         What the model may be off at each meter, squared pu.
     last
@@ -106,12 +109,13 @@ class SequentialState:
     trust: Trust
     fits: tuple[Fit | None, ...]
     doubts: Doubts
-    bias: Floats
+    learning: Learning | None
+    learned: Learned
     model_error: Floats
     last: tuple[Estimate, Verdict] | None
 
 
-def init(design: SequentialDesign, t: float) -> SequentialState:
+def init(design: SequentialDesign, t: float, learned: Learned | None = None) -> SequentialState:
     """Begin to watch; the observer starts with the first frame.
 
     Parameters
@@ -120,6 +124,8 @@ def init(design: SequentialDesign, t: float) -> SequentialState:
         From `design`.
     t
         Unix time, s.
+    learned
+        The meters' fixed errors, if they were learned before.
     """
     p, s, customers = design.plant.meters.size, len(design.lengths), design.plant.feeder.bus.size
     zeros = np.zeros(p, dtype=np.intp)
@@ -136,7 +142,8 @@ def init(design: SequentialDesign, t: float) -> SequentialState:
         trust=Trust(~no, zeros, zeros, zeros, none, none, no),
         fits=(None,) * s,
         doubts=Doubts(one, one, True, design.prior),
-        bias=np.zeros(p),
+        learning=begin(p) if learned is None and design.options.commission_s > 0 else None,
+        learned=nothing(design) if learned is None else learned,
         model_error=np.zeros(p),
         last=None,
     )

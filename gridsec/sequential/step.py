@@ -11,6 +11,7 @@ from gridsec.feeder import bus_voltages, model_error_bound
 from gridsec.judge import Situation, decide
 from gridsec.lure import known_input
 from gridsec.online import Cause, Decision, Estimate, Explanation, Frame, Verdict
+from gridsec.sequential.commission import conclude, gather
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.drive import drive
 from gridsec.sequential.examine import Examined, examine
@@ -18,7 +19,7 @@ from gridsec.sequential.loads import LoadDoubt, prior
 from gridsec.sequential.search import Explanation as Found
 from gridsec.sequential.search import swaps
 from gridsec.sequential.state import Doubts, SequentialState, Trust
-from gridsec.sequential.windows import push
+from gridsec.sequential.windows import push, shift
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,7 +67,8 @@ def step(
     with np.errstate(all="ignore"):
         v2_bus = bus_voltages(plant.feeder, frame.p, q, heard.v0_squared, steps=plant.loss_correction)
     v2_bus = np.where(np.isfinite(v2_bus), v2_bus, heard.v0_squared)
-    window = push(state.window, design.lengths, heard.y - v2_bus[at] - state.bias, heard.live)
+    residual = heard.y - v2_bus[at] - state.learned.bias
+    window = push(state.window, design.lengths, residual, heard.live)
     model = state.model_error
     if state.ticks % _STALE == 0:
         model = _model_error(design, frame.p, q, heard.v0_squared)
@@ -77,7 +79,8 @@ def step(
         state.trust,
         state.fits,
         window,
-        doubts.prior,
+        prior=doubts.prior,
+        learned=state.learned,
         tick=state.ticks,
         model=model + transient,
     )
@@ -96,8 +99,23 @@ def step(
         doubts=doubts,
         model_error=model,
     )
+    after = _learn(design, after, residual, heard.live & trust.trusted, frame.t - state.t)
     estimate, verdict = _conclude(design, after, heard, seen, v2_bus, transient, doubtful)
     return replace(after, last=(estimate, verdict)), estimate, verdict
+
+
+def _learn(
+    design: SequentialDesign, state: SequentialState, residual: Floats, use: Bools, h: float
+) -> SequentialState:
+    """Gather what the meters' fixed errors are, and from some time on rely on it."""
+    if state.learning is None or state.ticks == 1:
+        return state
+    learning = gather(state.learning, residual, use, h)
+    if learning.time_s < design.options.commission_s or not state.trust.trusted.all():
+        return replace(state, learning=learning)
+    learned = conclude(design, learning)
+    window = shift(state.window, state.learned.bias - learned.bias)
+    return replace(state, learning=None, learned=learned, window=window, fits=(None,) * len(state.fits))
 
 
 # The model's error is bounded anew every so many ticks.
@@ -277,7 +295,7 @@ def _conclude(  # noqa: PLR0917  # everything one tick brought
     )
     score, threshold, judged = _worst(design, seen, heard.live.size)
     settled = bool(np.all(transient <= design.options.settled * threshold))
-    attack = np.where(trust.named & heard.live, heard.y - state.bias - v2_bus[at], 0.0)
+    attack = np.where(trust.named & heard.live, heard.y - state.learned.bias - v2_bus[at], 0.0)
     decision, cause, reason = _decide(design, state, judged, threshold, settled)
     verdict = Verdict(
         decision,
