@@ -46,8 +46,8 @@ class SequentialOptions:
     release
         Ticks in a row without evidence after which a meter is trusted again.
     suspect
-        Once something is beyond chance, others are suspected beyond so many standard deviations, and an
-        accusation costs the square of it. To be named takes what the false-alarm rate asks for.
+        Once something is beyond chance, smaller offsets are suspected too: so that one search suspects
+        any honest meter with this probability. To be named takes what the false-alarm rate asks for.
     lower
         A distrusted meter must come below this part of `sigmas` to be trusted again.
     like
@@ -72,7 +72,7 @@ class SequentialOptions:
     focus: float = 3.0
     several: int = 3
     release: int = 6
-    suspect: float = 4.0
+    suspect: float = 0.05
     lower: float = 0.6
     like: float = 100.0
     hidden_power: float = 0.05
@@ -92,6 +92,8 @@ class SequentialDesign:
     ----------
     plant
         What is watched.
+    names : (p,)
+        The meters' customers, for sentences.
     model
         Its linear power flow.
     lure
@@ -110,6 +112,8 @@ class SequentialDesign:
         Ticks of each scale.
     sigmas : (s,)
         Standard deviations beyond which an offset is evidence, for the false-alarm rate asked for.
+    suspect
+        Standard deviations beyond which a search suspects; an accusation costs the square of it.
     white, fixed : (p,)
         Variance of a squared reading from tick to tick, and of its unknown fixed part, squared pu^2.
     allowed : (p,)
@@ -129,6 +133,7 @@ class SequentialDesign:
     """
 
     plant: Plant
+    names: tuple[str, ...]
     model: LinDistFlow
     lure: Lure
     certificate: Certificate
@@ -138,6 +143,7 @@ class SequentialDesign:
     busbar: float
     lengths: tuple[int, ...]
     sigmas: tuple[float, ...]
+    suspect: float
     white: Floats
     fixed: Floats
     allowed: Floats
@@ -202,6 +208,7 @@ def design(
     accuracy, slope = plant.accuracy, 2.0 * _HIGH * plant.droop.vbar
     return SequentialDesign(
         plant=plant,
+        names=tuple(plant.feeder.customers[c] for c in meters),
         model=model,
         lure=lure,
         certificate=certificate,
@@ -211,6 +218,7 @@ def design(
         busbar=busbar,
         lengths=lengths,
         sigmas=tuple(_sigmas(options.alarms_per_year, meters.size, n, step_s, lengths) for n in lengths),
+        suspect=float(norm.isf(0.5 * options.suspect / meters.size)),
         white=slope**2 * (accuracy.jitter**2 + accuracy.resolution**2 / 12.0),
         fixed=slope**2 * accuracy.class_fraction**2 / 3.0,
         allowed=slope * accuracy.class_fraction,

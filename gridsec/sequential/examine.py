@@ -108,13 +108,15 @@ def examine(
     found: dict[int, tuple[Explanation, ...]] = {}
     scales = _Scales(design, prior, window, learned, model)
     for s, length in enumerate(design.lengths):
-        if tick % max(1, length // _LOOKS):
+        before = fits[s]
+        stale = before is None or bool((before.trusted & ~trust.trusted).any())
+        if tick % max(1, round(length / _LOOKS)) and not stale:
             views.append(None)
-            after.append(fits[s])
+            after.append(before)
             continue
         here = scales[s]
         now = adapt(
-            fits[s], prior, here.noise, trust.trusted & here.enough, _directions(design, trust.accused)
+            before, prior, here.noise, trust.trusted & here.enough, _directions(design, trust.accused)
         )
         view = _view(design, here, now)
         if (view.over & trust.trusted).any() or _due(design, trust, s, tick):
@@ -226,7 +228,7 @@ class _Search:
     ) -> None:
         self.design, self.scales, self.fits, self.trust, self.s = design, scales, fits, trust, s
         here = scales[s]
-        sigmas = min(design.options.suspect, here.limits.sigmas)
+        sigmas = min(design.suspect, here.limits.sigmas)
         self.here = replace(here, limits=replace(here.limits, sigmas=sigmas))
         self.keep = _held(trust, s)
         self.accused = tuple(suspicion for suspicion in trust.accused if suspicion[1] > s)

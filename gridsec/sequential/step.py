@@ -12,6 +12,7 @@ from gridsec.judge import Situation, decide
 from gridsec.lure import known_input
 from gridsec.online import Cause, Decision, Estimate, Explanation, Frame, Verdict
 from gridsec.sequential.commission import conclude, gather
+from gridsec.sequential.conditional import judge
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.drive import drive
 from gridsec.sequential.examine import Examined, examine
@@ -279,7 +280,7 @@ def _conclude(  # noqa: PLR0917  # everything one tick brought
 ) -> tuple[Estimate, Verdict]:
     plant, trust = design.plant, state.trust
     at = plant.feeder.bus[plant.meters]
-    w, variance = _reconstructed(design, state)
+    w, variance = _reconstructed(design, state, seen)
     v2_bus = v2_bus + w
     v2_bus[0] = heard.v0_squared if heard.busbar else v2_bus[0]
     v2, std = v2_bus[plant.feeder.bus], np.sqrt(variance[plant.feeder.bus])
@@ -320,26 +321,22 @@ def _inverters_of(design: SequentialDesign, accused: list[int]) -> Bools:
     return out
 
 
-def _reconstructed(design: SequentialDesign, state: SequentialState) -> tuple[Floats, Floats]:
+def _reconstructed(design: SequentialDesign, state: SequentialState, seen: Examined) -> tuple[Floats, Floats]:
     """What the trusted meters add to the model at every bus, and its variance, on the best scale."""
     prior_ = state.doubts.prior
-    best: tuple[float, Floats, Floats] | None = None
+    best, at, mean = prior_.variance, -1, np.inf
     for s, (now, length) in enumerate(zip(state.fits, design.lengths, strict=True)):
-        if now is None or not now.trusted.any():
+        if now is None:
             continue
         lag = min(1.0, length * design.step_s / design.doubt.time_s) * (length > 1)
         variance = now.variance + lag * prior_.variance
-        mean = float(variance.mean())
-        if best is None or mean < best[0]:
-            m = state.window.sums[s] / np.maximum(state.window.counts[s], 1)
-            weights = now.Q @ m
-            w = prior_.of_meters @ weights
-            if now.loose.shape[1]:
-                w += now.loose @ (weights @ now.loose[prior_.meters])
-            best = (mean, w, variance)
-    if best is None:
-        return np.zeros_like(prior_.variance), prior_.variance
-    return best[1], best[2]
+        if variance.sum() < mean:
+            best, at, mean = variance, s, float(variance.sum())
+    now, view = (None, None) if at < 0 else (state.fits[at], seen.views[at])
+    if now is None:
+        return np.zeros_like(best), best
+    m = state.window.sums[at] / np.maximum(state.window.counts[at], 1)
+    return (judge(now, m).w if view is None else view.judged.w), best
 
 
 def _worst(design: SequentialDesign, seen: Examined, p: int) -> tuple[Floats, Floats, Bools]:
@@ -366,11 +363,10 @@ def _decide(
     threshold: Floats,
     settled: bool,
 ) -> tuple[Decision, Cause, str]:
-    plant, trust = design.plant, state.trust
-    names = tuple(plant.feeder.customers[c] for c in plant.meters)
+    trust = state.trust
     return decide(
         Situation(
-            names=names,
+            names=design.names,
             max_attacked=max(1, min(design.most, int(np.count_nonzero(judged)) // 3)),
             live=judged,
             suspected=~trust.trusted,
