@@ -142,6 +142,15 @@ CUSTOMER_COLUMNS: tuple[Column, ...] = (
         low=0.0,
         high=1e9,
     ),
+    Column("p_std_kw", Kind.NUMBER, "1 sigma error of the active power known, kW", None, low=0.0, high=1e9),
+    Column(
+        "q_std_kvar",
+        Kind.NUMBER,
+        "1 sigma error of the load's reactive power known, kvar",
+        None,
+        low=0.0,
+        high=1e9,
+    ),
     Column("pv_kw", Kind.NUMBER, "peak of the generation, kW", 0.0, low=0.0, high=1e9),
     Column("pv_profile", Kind.TEXT, "generation profile of the library", ""),
     Column("inverter_kva", Kind.NUMBER, "rating of the droop inverter, kVA; 0: none", 0.0, low=0.0, high=1e9),
@@ -156,7 +165,7 @@ CUSTOMER_COLUMNS: tuple[Column, ...] = (
     ),
 )
 
-ESTIMATORS = ("exact-bank", "exact-bank-lmi")
+ESTIMATORS = ("sequential", "exact-bank", "exact-bank-lmi")
 SUSPICIONS = ("voltage", "impedance", "ratio", "rating", "load", "class")
 
 META_COLUMNS: dict[str, tuple[Column, ...]] = {
@@ -236,6 +245,14 @@ META_COLUMNS: dict[str, tuple[Column, ...]] = {
             low=0.0,
             high=100.0,
         ),
+        Column(
+            "correlation_s",
+            Kind.NUMBER,
+            "how long what is not known of the loads lasts, s",
+            600.0,
+            above=0.0,
+            high=1e7,
+        ),
     ),
     "monitor": (
         Column("estimator", Kind.TEXT, "estimator family", "exact-bank", choices=ESTIMATORS),
@@ -257,6 +274,22 @@ META_COLUMNS: dict[str, tuple[Column, ...]] = {
             10.0,
             above=0.0,
             high=1e6,
+        ),
+        Column(
+            "alarms_per_year",
+            Kind.NUMBER,
+            "false alarms allowed by chance, per feeder and year",
+            1.0,
+            above=0.0,
+            high=1e6,
+        ),
+        Column(
+            "commission_s",
+            Kind.NUMBER,
+            "time over which the meters' fixed errors are learned, s; 0: never",
+            86400.0,
+            low=0.0,
+            high=1e8,
         ),
     ),
 }

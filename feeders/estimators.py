@@ -12,8 +12,9 @@ import numpy as np
 
 from feeders.columns import ESTIMATORS
 from feeders.design_cache import bank_gains
+from feeders.doubts import load_doubt
 from feeders.load import Site, from_tables, plant
-from gridsec import monitor
+from gridsec import monitor, sequential
 from gridsec.arrays import Floats
 from gridsec.certificates import certify
 from gridsec.errors import FeederInvalid
@@ -22,7 +23,21 @@ from gridsec.gains import CircleOptions, options_for
 from gridsec.lure import Lure, close_loop
 from gridsec.online import Estimate, Frame, Verdict
 
-__all__ = ["DIRECT", "FAMILIES", "LMI", "Family", "Job", "Watcher", "choose", "design", "lmi_options"]
+__all__ = [
+    "DIRECT",
+    "FAMILIES",
+    "LMI",
+    "SEQUENTIAL",
+    "Family",
+    "Job",
+    "Watcher",
+    "choose",
+    "design",
+    "lmi_options",
+]
+
+SEQUENTIAL: Final = "sequential"
+"""One observer, a decoder that knows how loads are correlated, evidence on several time scales."""
 
 DIRECT: Final = "exact-bank"
 """The two banks of chong2020 with direct injection and a closed-form certificate for all sets at once."""
@@ -76,6 +91,8 @@ class Family:
         How many observers, or candidate sets, a design runs.
     proof
         One line on why its estimate converges; empty where nothing is proven.
+    withstands
+        How many manipulated meters a design tells apart; None: as many as the feeder's file asks for.
     """
 
     name: str
@@ -85,6 +102,7 @@ class Family:
     step: Callable[[Any, Any, Frame], tuple[Any, Estimate, Verdict]]
     observers: Callable[[Any], int]
     proof: Callable[[Any], str]
+    withstands: Callable[[Any], int] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,10 +115,18 @@ class Watcher:
         What kind.
     design
         The family's own design.
+    asked
+        M of the feeder's file.
     """
 
     family: Family
     design: Any
+    asked: int = 0
+
+    @property
+    def max_attacked(self) -> int:
+        """How many manipulated meters it tells apart."""
+        return self.asked if self.family.withstands is None else self.family.withstands(self.design)
 
     @property
     def observers(self) -> int:
@@ -156,8 +182,17 @@ def design(
     NotObservable, DesignInfeasible
         If the feeder cannot be watched as its file asks for.
     """
-    family = FAMILIES[site.tables.meta.monitor.estimator]
-    return Watcher(family, family.design(site, Job(workers, where, progress)))
+    settings = site.tables.meta.monitor
+    family = FAMILIES[settings.estimator]
+    return Watcher(family, family.design(site, Job(workers, where, progress)), settings.max_attacked)
+
+
+def _sequential(site: Site, _: Job) -> sequential.SequentialDesign:
+    settings = site.tables.meta.monitor
+    options = sequential.SequentialOptions(
+        alarms_per_year=settings.alarms_per_year, commission_s=settings.commission_s
+    )
+    return sequential.design(plant(site), doubt=load_doubt(site), step_s=settings.tick_s, options=options)
 
 
 def _direct_bank(site: Site, _: Job) -> monitor.MonitorDesign:
@@ -181,7 +216,7 @@ def _lmi_bank(site: Site, job: Job) -> monitor.MonitorDesign:
     )
 
 
-def _certificate(design: monitor.MonitorDesign) -> str:
+def _certificate(design: monitor.MonitorDesign | sequential.SequentialDesign) -> str:
     proof = design.certificate
     return f"{proof.kind} certificate, margin {proof.margin:.3g}, decay at least {proof.rate:.3g} 1/s"
 
@@ -266,6 +301,16 @@ FAMILIES: Final[Mapping[str, Family]] = MappingProxyType(
     {
         family.name: family
         for family in (
+            Family(
+                SEQUENTIAL,
+                "one switched observer, correlated loads, evidence on several time scales",
+                _sequential,
+                sequential.init,
+                sequential.step,
+                lambda d: int(d.observers),
+                _certificate,
+                lambda d: int(d.most),
+            ),
             _bank(DIRECT, "banks of circle-criterion observers, direct injection (chong2020)", _direct_bank),
             _bank(LMI, "the same banks, gains by matrix inequality (chong2020)", _lmi_bank),
         )

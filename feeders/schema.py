@@ -63,6 +63,8 @@ class CustomerRow:
     power_factor_min: float | None = None
     power_factor_max: float | None = None
     q_floor_kvar: float | None = None
+    p_std_kw: float | None = None
+    q_std_kvar: float | None = None
     pv_kw: float = 0.0
     pv_profile: str = ""
     inverter_kva: float = 0.0
@@ -98,6 +100,7 @@ class LoadDefaults:
     power_factor_min: float = 0.9
     power_factor_max: float = 1.0
     q_floor_percent: float = 2.0
+    correlation_s: float = 600.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,6 +113,8 @@ class MonitorDefaults:
     on_delay_s: float = 2.0
     off_delay_s: float = 5.0
     silence_s: float = 10.0
+    alarms_per_year: float = 1.0
+    commission_s: float = 86400.0
 
 
 @dataclass(frozen=True, slots=True)

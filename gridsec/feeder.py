@@ -367,7 +367,9 @@ def _linear_flows(feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats | flo
     P, Q = _below(feeder, -_at_buses(feeder, both))[..., 1:]
     base = np.asarray(v0_squared, dtype=np.float64)[..., None]
     v2 = base + _from_busbar(feeder, -2.0 * (feeder.r * P + feeder.x * Q))
-    half = np.bincount(feeder.parent, weights=0.5 * feeder.charging, minlength=len(feeder.buses))
+    half = np.asarray(
+        np.bincount(feeder.parent, weights=0.5 * feeder.charging, minlength=len(feeder.buses)), np.float64
+    )
     half[1:] += 0.5 * feeder.charging
     return _Flows(P, Q, Q - _below(feeder, half * v2)[..., 1:], v2, half)
 

@@ -141,6 +141,7 @@ class Watch:
             The design.
         """
         self._watcher, self._state = finished, None
+        self.max_attacked = finished.max_attacked
         self.phase, self.problem = Phase.WATCHING, ""
 
     def fail(self, problem: str) -> None:

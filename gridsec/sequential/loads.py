@@ -33,14 +33,15 @@ class LoadDoubt:
         `p_error` or `q_error` says more is believed.
     time_s
         Correlation time of these errors, s: means over much less time still contain all of them.
-    common
-        Share of the variance that all customers have in common (weather, time of day), 0 to 1.
+    common_p, common_q
+        Shares of their variances that all customers have in common (weather, time of day), 0 to 1.
     """
 
     p: Floats
     q: Floats
     time_s: float
-    common: float = 0.0
+    common_p: float = 0.0
+    common_q: float = 0.0
 
     def __post_init__(self) -> None:
         problems = [
@@ -50,8 +51,11 @@ class LoadDoubt:
         ]
         if not self.time_s > 0:
             problems.append(f"time_s is {self.time_s}; it must be positive")
-        if not 0 <= self.common <= 1:
-            problems.append(f"common is {self.common}; it must be from 0 to 1")
+        problems += [
+            f"{name} is {getattr(self, name)}; it must be from 0 to 1"
+            for name in ("common_p", "common_q")
+            if not 0 <= getattr(self, name) <= 1
+        ]
         if problems:
             raise ValueError("; ".join(problems))
 
@@ -61,7 +65,7 @@ def prior(
 ) -> Prior:
     """Covariance of the buses' squared voltages without any meter.
 
-    ``S = 4 R V_p R^T + 4 X V_q X^T + busbar^2 1 1^T``, where ``V = (1 - common) diag(s^2) + common s s^T``.
+    ``S = 4 R V_p R^T + 4 X V_q X^T + busbar^2 1 1^T`` with ``V = (1 - common) diag(s^2) + common s s^T``.
 
     Parameters
     ----------
@@ -79,9 +83,12 @@ def prior(
     q = doubt.q if inverters is None else np.hypot(doubt.q, inverters)
     of_meters = np.full((len(model.R_bus), at.size), busbar**2)
     variance = np.full(len(model.R_bus), busbar**2)
-    for matrix, std in ((model.R_bus, doubt.p), (model.X_bus, q)):
-        spread = matrix * (2.0 * np.sqrt(1.0 - doubt.common) * std)
-        shared = 2.0 * np.sqrt(doubt.common) * (matrix @ std)
+    for matrix, std, common in (
+        (model.R_bus, doubt.p, doubt.common_p),
+        (model.X_bus, q, doubt.common_q),
+    ):
+        spread = matrix * (2.0 * np.sqrt(1.0 - common) * std)
+        shared = 2.0 * np.sqrt(common) * (matrix @ std)
         of_meters += spread @ spread[at].T + np.multiply.outer(shared, shared[at])
         variance += np.einsum("ij,ij->i", spread, spread) + shared * shared
     return Prior(of_meters, at, variance)

@@ -16,7 +16,7 @@ from gridsec.sequential.conditional import judge
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.drive import drive
 from gridsec.sequential.examine import Examined, examine
-from gridsec.sequential.loads import LoadDoubt, prior
+from gridsec.sequential.loads import prior
 from gridsec.sequential.search import Explanation as Found
 from gridsec.sequential.search import swaps
 from gridsec.sequential.state import Doubts, SequentialState, Trust
@@ -165,7 +165,7 @@ def _doubts(design: SequentialDesign, before: Doubts, frame: Frame, busbar: bool
     )
     if busbar == before.busbar and np.array_equal(p, before.p) and np.array_equal(q, before.q):
         return before
-    doubt = LoadDoubt(design.doubt.p * p, design.doubt.q * q, design.doubt.time_s, design.doubt.common)
+    doubt = replace(design.doubt, p=design.doubt.p * p, q=design.doubt.q * q)
     plain = busbar and bool((p == 1.0).all() and (q == 1.0).all())
     found = (
         design.prior

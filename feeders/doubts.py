@@ -1,0 +1,103 @@
+"""How wrong the powers may be that a feeder's readings give: from its files, or from its history."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from gridsec.arrays import Floats
+from gridsec.sequential import LoadDoubt
+
+if TYPE_CHECKING:
+    from feeders.load import Site
+
+TYPICAL: Final = 0.5
+"""Share of its peak at which a load's errors are sized where they grow with the load."""
+
+ALIKE: Final = 0.5
+"""Share of the variance of reactive power, where only power factors are known, that customers have in common:
+seasons and habits move all of them the same way."""
+
+
+def load_doubt(site: Site) -> LoadDoubt:
+    """What a feeder's files say about its customers' powers.
+
+    Metered active power is as wrong as its register may be, the load's reactive power as the limits of its
+    power factor allow; taken as uniform within these. `p_std_kw` and `q_std_kvar` of a customer say it
+    directly and are believed as they are.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    """
+    rows, loads, base = site.tables.customers, site.loads, site.feeder.base_kva
+    typical = TYPICAL * loads.load_peak
+    p = (loads.p_fraction * np.maximum(typical, loads.pv_peak) + loads.p_floor) / np.sqrt(3.0)
+    q = (0.5 * (loads.tan_max - loads.tan_min) * typical + loads.q_floor) / np.sqrt(3.0)
+    told_p = np.array([np.nan if row.p_std_kw is None else row.p_std_kw for row in rows])
+    told_q = np.array([np.nan if row.q_std_kvar is None else row.q_std_kvar for row in rows])
+    by_factor = bool(np.isnan(told_q).any())
+    return LoadDoubt(
+        p=np.where(np.isnan(told_p), p, told_p / base),
+        q=np.where(np.isnan(told_q), q, told_q / base),
+        time_s=site.tables.meta.load.correlation_s,
+        common_q=ALIKE if by_factor else 0.0,
+    )
+
+
+def from_history(error_p: Floats, error_q: Floats, step_s: float) -> LoadDoubt:
+    """Learn from a history of errors, true powers minus those that were assumed.
+
+    The correlation time is that of a first-order process with the same correlation from sample to sample,
+    the median over the customers; the common share is what the customers' mean varies more than
+    independent ones would.
+
+    Parameters
+    ----------
+    error_p, error_q : (T, N)
+        Errors, pu, at equal intervals.
+    step_s
+        The interval, s.
+
+    Raises
+    ------
+    ValueError
+        With fewer than three samples, or values that are not finite.
+    """
+    if error_p.ndim != 2 or error_p.shape != error_q.shape or len(error_p) < _FEWEST:
+        raise ValueError(f"errors of shapes {error_p.shape} and {error_q.shape}; need (T, N) with T >= 3")
+    if not (np.isfinite(error_p).all() and np.isfinite(error_q).all() and step_s > 0):
+        raise ValueError("errors and their interval must be finite, and the interval positive")
+    return LoadDoubt(
+        p=np.sqrt(np.mean(error_p**2, axis=0)),
+        q=np.sqrt(np.mean(error_q**2, axis=0)),
+        time_s=step_s / -float(np.log(_from_sample_to_sample(error_p))),
+        common_p=_common(error_p),
+        common_q=_common(error_q),
+    )
+
+
+_FEWEST = 3
+# Correlations outside these are no first-order process that this history could show.
+_RANGE = (1e-3, 1.0 - 1e-6)
+
+
+def _from_sample_to_sample(error: Floats) -> float:
+    energy = np.sum(error[:-1] ** 2, axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = np.sum(error[1:] * error[:-1], axis=0) / energy
+    share = share[np.isfinite(share)]
+    return float(np.clip(np.median(share), *_RANGE)) if share.size else _RANGE[0]
+
+
+def _common(error: Floats) -> float:
+    """Share c of ``var(sum e / s) = N (1 - c) + N^2 c``."""
+    std = np.sqrt(np.mean(error**2, axis=0))
+    use = std > 0
+    count = int(np.count_nonzero(use))
+    if count < 2:
+        return 0.0
+    total = float(np.mean(np.sum(error[:, use] / std[use], axis=1) ** 2))
+    return float(np.clip((total / count - 1.0) / (count - 1.0), 0.0, 1.0))
