@@ -119,7 +119,7 @@ def examine(
             before, prior, here.noise, trust.trusted & here.enough, _directions(design, trust.accused)
         )
         view = _view(design, here, now)
-        if (view.over & trust.trusted).any() or _due(design, trust, s, tick):
+        if (view.over & trust.trusted).any() or _due(design, trust, view, s, tick):
             found[s], trust = _Search(design, scales, fits, trust, s)(now)
             now = found[s][0].fit
             view = _view(design, here, now)
@@ -131,12 +131,29 @@ def examine(
     return Examined(trust, tuple(after), tuple(views), found)
 
 
-def _due(design: SequentialDesign, trust: Trust, s: int, tick: int) -> bool:
-    """Whether what is believed is looked into again, though nothing speaks against it."""
+def _due(design: SequentialDesign, trust: Trust, view: View, s: int, tick: int) -> bool:
+    """Whether what is believed is looked into again, though nothing new speaks against it.
+
+    Before a meter is named; while more is suspected than meters; and from time to time.
+    """
     if any(scale <= s for _, scale in trust.accused):
+        return True
+    about = ~trust.trusted & ~trust.named & view.over & (trust.scale == s)
+    if (about & (trust.age + 1 >= confirm(design.lengths[s]))).any():
         return True
     last = len(design.lengths) - 1
     return s == last and tick % design.lengths[last] == 0 and not trust.trusted.all()
+
+
+def confirm(length: int) -> int:
+    """Ticks that evidence on a scale must last before a meter is named.
+
+    Parameters
+    ----------
+    length
+        Ticks of the scale.
+    """
+    return 2 + length // 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -267,7 +284,7 @@ class _Search:
         """The misfit on all scales and, once, what the accusations cost."""
         trusted = np.where(self.here.enough, found.fit.trusted, self.trust.trusted)
         loose = found.fit.loose if found.fit.loose.shape[1] else None
-        total = found.charge + self.here.limits.penalty * np.count_nonzero(~trusted)
+        total = found.charge + search.price(trusted.size, int(np.count_nonzero(~trusted)))
         for s, before in enumerate(self.fits):
             there = self.scales[s]
             wanted = trusted & there.enough

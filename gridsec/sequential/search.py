@@ -2,12 +2,15 @@
 
 An explanation drops some meters and loosens some directions (a customer's powers, an inverter). Its cost is
 
-    J = m_T^T Q m_T + penalty * (number of dropped meters and loosened directions)
+    J = m_T^T Q m_T + 2 ln binom(p, k) + what the loosened directions are charged
 
-which is, up to a constant, minus twice the log-likelihood of the readings, every accusation charged with
-`penalty`. Dropping trusted meter j lowers the misfit by ``offset_j^2 / std_j^2`` exactly, loosening direction
-a by ``(a^T Q m)^2 / (1 / std_a^2 + a^T Q a)``; admitting a meter raises it likewise. So steepest descent
-needs no refitting, J falls with every move, and the search ends.
+which is, up to a constant, minus twice the logarithm of its posterior probability when every number k of
+liars is as likely as any other, and every set of k as any other of k. Many accusations at once are thus
+cheaper, each, than a single one: where a third of the meters lies, the next liar is no surprise.
+
+Dropping trusted meter j lowers the misfit by ``offset_j^2 / std_j^2`` exactly, loosening direction a by
+``(a^T Q m)^2 / (1 / std_a^2 + a^T Q a)``; admitting a meter raises it likewise. So steepest descent needs no
+refitting. It drops and admits where an offset is beyond, or back within, what chance explains.
 
 Descent alone swamps when many lie in the same way: their neighbours look wrong. So there are two starts:
 the set that was trusted before, and a robust one by graduated non-convexity, which first fits with a convex
@@ -15,13 +18,15 @@ cost and hardens it step by step. The cheaper explanation wins.
 
 References
 ----------
-Yang, Antonante, Tzoumas and Carlone 2020 (graduated non-convexity, truncated least squares).
+Chen and Chen 2008 (the prior over sets); Yang, Antonante, Tzoumas and Carlone 2020 (graduated
+non-convexity, truncated least squares).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -75,7 +80,7 @@ class Limits:
 
     @property
     def penalty(self) -> float:
-        """What an accusation costs."""
+        """What dropping a meter must gain at least."""
         return self.sigmas**2
 
     def of(self, std: Floats, part: float = 1.0) -> Floats:
@@ -158,8 +163,26 @@ def descend(
         judged = judge(now, m)
     dropped = int(np.count_nonzero(live & ~now.trusted))
     loosened = [] if powers is None else powers.index[accused].tolist()
-    charge = 0.0 if dictionary is None else limits.penalty * float(dictionary.charge[loosened].sum())
-    return Explanation(now, judged, loosened, charge, judged.misfit + limits.penalty * dropped + charge)
+    size = int(np.count_nonzero(live))
+    charge = 0.0 if dictionary is None else float(dictionary.charge[loosened].sum()) * price(size, 1)
+    return Explanation(now, judged, loosened, charge, judged.misfit + price(size, dropped) + charge)
+
+
+@cache
+def price(meters: int, liars: int) -> float:
+    """What accusing so many of so many meters costs: `2 ln binom(meters, liars)`, but always rising.
+
+    Parameters
+    ----------
+    meters, liars
+        p and k.
+    """
+    k = np.arange(liars)
+    return float(np.sum(np.maximum(2.0 * np.log((meters - k) / (k + 1.0)), _LEAST)))
+
+
+# Beyond half of the meters, each further accusation still costs this.
+_LEAST = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

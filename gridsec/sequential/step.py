@@ -15,7 +15,7 @@ from gridsec.sequential.commission import conclude, gather
 from gridsec.sequential.conditional import judge
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.drive import drive
-from gridsec.sequential.examine import Examined, examine
+from gridsec.sequential.examine import Examined, confirm, examine
 from gridsec.sequential.loads import prior
 from gridsec.sequential.search import Explanation as Found
 from gridsec.sequential.search import swaps
@@ -223,18 +223,13 @@ def _model_error(design: SequentialDesign, p: Floats, q: Floats, v0_squared: flo
     return np.where(np.isfinite(error), error, design.options.widest)
 
 
-def _confirm(length: int) -> int:
-    """Ticks that evidence on a scale must last before a meter is named."""
-    return 2 + length // 6
-
-
 def _name(design: SequentialDesign, before: Trust, seen: Examined) -> tuple[Trust, tuple[Explanation, ...]]:
     """Who is named now; and explanations that fit about as well where a meter would have been named."""
     trust = seen.trust
     quiet = np.where(trust.still.any(axis=0), 0, trust.quiet + 1)
     trusted = trust.trusted | (quiet >= design.options.release)
     age = np.where(trusted, 0, trust.age + 1)
-    need = np.array([_confirm(length) for length in design.lengths])[trust.scale]
+    need = np.array([confirm(length) for length in design.lengths])[trust.scale]
     fresh = ~trusted & ~before.named & trust.bad.any(axis=0) & (age >= need)
     named = before.named & (quiet < design.options.release)
     rivals = _rivals(design, seen, fresh) if fresh.any() else ()
