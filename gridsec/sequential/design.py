@@ -40,9 +40,9 @@ class SequentialOptions:
     enough
         A scale judges a meter of which it has at least this part of the readings.
     focus
-        Standard deviations within which the robust fit trusts; the final set is decided by `sigmas`.
+        Standard deviations within which a search begins to trust, where it begins anew.
     several
-        With more suspects than this at once the robust fit is asked.
+        With more suspects than this at once a search begins anew as well.
     release
         Ticks in a row without evidence after which a meter is trusted again.
     suspect
@@ -69,7 +69,7 @@ class SequentialOptions:
     alarms_per_year: float = 1.0
     scales_s: tuple[float, ...] = (0.0, 5.0, 15.0, 60.0)
     enough: float = 0.8
-    focus: float = 3.0
+    focus: float = 2.0
     several: int = 3
     release: int = 6
     suspect: float = 0.05

@@ -232,9 +232,10 @@ def adapt(before: Fit | None, prior: Prior, noise: Floats, wanted: Bools, loose:
 class _Search:
     """The explanations that several starts lead to on one scale.
 
-    The starts: what was believed, without what this scale and shorter ones suspect besides meters; a
-    robust fit, where several meters are suspected; and with suspicions besides meters, where more than
-    one is. Longer means know better, so they decide anew about what shorter ones suspected.
+    The starts: what was believed, without what this scale and shorter ones suspect besides meters; where
+    several meters are suspected, a robust fit and all meters close to the model; and where more than one
+    is, what was believed with suspicions besides meters. Longer means know better, so they decide anew
+    about what shorter ones suspected.
 
     Meters against which other scales have evidence are not admitted, or lies that have just begun would
     be believed again. Unless the explanation that does admit them is cheaper over all scales together.
@@ -257,13 +258,12 @@ class _Search:
         found = [self._descend(start, self.keep)]
         free = None
         if _suspected(here, found[0]) > design.options.several:
-            bound = here.limits.model + design.options.focus * np.sqrt(here.noise)
-            chosen = search.robust(self.scales.prior, here.noise, here.m, here.enough, bound)
-            free = self._descend(self._fit(chosen), np.zeros_like(chosen))
+            starts = [self._descend(self._fit(chosen), np.zeros_like(chosen)) for chosen in self._starts()]
+            free = min(starts, key=lambda each: each.cost)
             if (free.fit.trusted & self.keep).any():
-                found.append(self._descend(self._fit(chosen & ~self.keep), self.keep))
+                found.append(self._descend(self._fit(free.fit.trusted & ~self.keep), self.keep))
             else:
-                found.append(free)
+                found += starts
                 free = None
         if min(_suspected(here, each) for each in found) > 1:
             found.append(self._descend(start, self.keep, design.book))
@@ -271,6 +271,14 @@ class _Search:
         if free is not None and free.cost < found[0].cost and self._total(free) < self._total(found[0]):
             found.insert(0, free)
         return tuple(found), self._believe(found[0])
+
+    def _starts(self) -> tuple[Bools, Bools]:
+        """Sets that owe nothing to what was believed: a robust fit, and the meters close to the model."""
+        here, prior = self.here, self.scales.prior
+        focus, std = self.design.options.focus, np.sqrt(here.noise)
+        chosen = search.robust(prior, here.noise, here.m, here.enough, here.limits.model + focus * std)
+        alone = np.sqrt(prior.variance[prior.meters] + here.noise)
+        return chosen, here.enough & (np.abs(here.m) <= here.limits.model + focus * alone)
 
     def _descend(self, start: Fit, keep: Bools, book: Dictionary | None = None) -> Explanation:
         here = self.here
