@@ -1,0 +1,206 @@
+"""The search for the likeliest liars, against all sets there are."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from math import comb, log
+
+import numpy as np
+import pytest
+
+from gridsec.arrays import Bools, Floats
+from gridsec.feeder import lindistflow
+from gridsec.sequential.conditional import Prior, fit, judge
+from gridsec.sequential.loads import LoadDoubt, prior
+from gridsec.sequential.search import Dictionary, Limits, descend, price, robust, swaps
+from tests.gridsec.street import random_tree
+
+SIGMAS = 3.5
+
+
+def street(rng: np.random.Generator, customers: int) -> tuple[Floats, Prior]:
+    """A random tree; 2R, and what errors of 0.6 kW do to its voltages."""
+    model = lindistflow(random_tree(customers, rng, drop=0.04))
+    doubt = LoadDoubt(np.full(customers, 0.006), np.full(customers, 0.002), 600.0)
+    return 2.0 * model.R_bus, prior(model, np.arange(1, customers + 1), doubt, busbar=4e-4)
+
+
+def readings(rng: np.random.Generator, p: Prior, noise: Floats) -> Floats:
+    count = noise.size
+    w = rng.multivariate_normal(np.zeros(count), p.between + 1e-18 * np.eye(count))
+    return np.asarray(w + np.sqrt(noise) * rng.normal(size=count))
+
+
+def limits(count: int) -> Limits:
+    return Limits(SIGMAS, np.zeros(count), np.zeros(count), np.zeros(count))
+
+
+def cost(p: Prior, noise: Floats, m: Floats, trusted: Bools) -> float:
+    """J by definition: a dense solve, and a binomial coefficient."""
+    at = np.flatnonzero(trusted)
+    whole = p.between[np.ix_(at, at)] + np.diag(noise[at])
+    liars = int((~trusted).sum())
+    assert liars <= m.size // 2
+    return float(m[at] @ np.linalg.solve(whole, m[at])) + 2.0 * log(comb(m.size, liars))
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_no_set_explains_better_and_the_liars_are_it(seed: int) -> None:
+    """All sets of up to three of ten meters are tried; three lie by 3 %."""
+    rng = np.random.default_rng([1, seed])
+    _, p = street(rng, 10)
+    noise = np.full(10, 0.002**2)
+    liars = np.sort(rng.choice(10, 3, replace=False))
+    m = readings(rng, p, noise)
+    m[liars] += 0.06 * rng.choice([-1.0, 1.0], 3)
+    live, none = np.ones(10, dtype=bool), np.zeros(10, dtype=bool)
+    start = fit(p, noise, robust(p, noise, m, live, 2.0 * np.sqrt(noise)))
+    found = descend(start, m, live, limits(10), keep=none)
+    everything = [
+        (cost(p, noise, m, ~np.isin(np.arange(10), out)), out)
+        for size in range(4)
+        for out in combinations(range(10), size)
+    ]
+    best, who = min(everything)
+    assert found.cost == pytest.approx(best, rel=1e-9)
+    assert tuple(np.flatnonzero(~found.fit.trusted)) == who == tuple(liars)
+
+
+@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("one_way", [False, True])
+def test_a_third_of_the_meters_in_collusion(seed: int, one_way: bool) -> None:
+    rng = np.random.default_rng([2, seed])
+    _, p = street(rng, 60)
+    noise = np.full(60, 0.002**2)
+    liars = rng.choice(60, 20, replace=False)
+    m = readings(rng, p, noise)
+    m[liars] += 0.04 * (-1.0 if one_way else rng.choice([-1.0, 1.0], 20))
+    live, none = np.ones(60, dtype=bool), np.zeros(60, dtype=bool)
+    start = fit(p, noise, robust(p, noise, m, live, 2.0 * np.sqrt(noise)))
+    found = descend(start, m, live, limits(60), keep=none)
+    wrong = set(np.flatnonzero(~found.fit.trusted)) ^ set(liars)
+    assert not wrong
+
+
+def test_honest_meters_are_all_trusted_at_once() -> None:
+    rng = np.random.default_rng(3)
+    _, p = street(rng, 30)
+    noise = np.full(30, 0.002**2)
+    m = readings(rng, p, noise)
+    live = np.arange(30) != 4
+    m[4] = 0.0
+    np.testing.assert_array_equal(robust(p, noise, m, live, 6.0 * np.sqrt(noise)), live)
+    found = descend(fit(p, noise, np.ones(30, dtype=bool)), m, live, limits(30), keep=~live)
+    np.testing.assert_array_equal(found.fit.trusted, live)
+    assert found.cost == pytest.approx(judge(fit(p, noise, live), m).misfit)
+    assert not robust(p, noise, m, np.zeros(30, dtype=bool), np.ones(30)).any()
+
+
+def test_the_truncated_cost_is_not_higher_than_anywhere_near() -> None:
+    """The robust fit minimises what it says: no change of one meter lowers it."""
+    rng = np.random.default_rng(4)
+    _, p = street(rng, 14)
+    noise = np.full(14, 0.002**2)
+    m = readings(rng, p, noise)
+    m[[2, 3, 7]] -= 0.05
+    bound = 2.5 * np.sqrt(noise)
+    chosen = robust(p, noise, m, np.ones(14, dtype=bool), bound)
+
+    def truncated(trusted: Bools) -> float:
+        out = float((~trusted).sum()) * 2.5**2
+        return judge(fit(p, noise, trusted), m).misfit + out
+
+    for j in range(14):
+        other = chosen.copy()
+        other[j] = ~other[j]
+        assert truncated(chosen) <= truncated(other) + 1e-9
+
+
+def test_a_load_that_nobody_knows_is_one_suspicion_and_not_many_liars() -> None:
+    """A customer draws 20 kW that its meter does not show: everyone below reads less."""
+    rng = np.random.default_rng(5)
+    columns, p = street(rng, 20)
+    noise = np.full(20, 0.001**2)
+    where = int(np.argmax(columns[1:].sum(axis=0)))
+    m = readings(rng, p, noise) - 0.2 * columns[1:, where]
+    book = Dictionary(columns[1:], np.full(20, 0.1), np.full(20, 3.0), lambda k: columns[:, k])
+    live, none = np.ones(20, dtype=bool), np.zeros(20, dtype=bool)
+    start = fit(p, noise, live)
+    plain = descend(start, m, live, limits(20), keep=none)
+    wider = descend(start, m, live, limits(20), keep=none, dictionary=book)
+    assert plain.fit.trusted.sum() < 20
+    assert wider.loosened == [where]
+    assert wider.fit.trusted.all()
+    assert wider.cost < plain.cost
+    assert wider.charge == pytest.approx(3.0 * price(20, 1))
+    assert wider.cost == pytest.approx(wider.judged.misfit + wider.charge)
+
+
+def test_swaps_are_what_the_cost_rises_by() -> None:
+    """Two meters at one bus: which of them lies is anyone's guess, and that is said."""
+    rng = np.random.default_rng(6)
+    columns, _ = street(rng, 8)
+    S = columns @ columns.T * 0.006**2
+    at = np.array([3, 3, 5, 6, 7])
+    p = Prior(S[:, at], at, S.diagonal().copy())
+    noise = np.full(5, 0.002**2)
+    m = np.array([0.04, -0.04, 0.0, 0.0, 0.0])
+    live, none = np.ones(5, dtype=bool), np.zeros(5, dtype=bool)
+    found = descend(fit(p, noise, live), m, live, limits(5), keep=none)
+    accused = np.flatnonzero(~found.fit.trusted)
+    assert accused.size >= 1
+    for swap in swaps(found, live, 50.0):
+        trusted = found.fit.trusted.copy()
+        trusted[swap.accused], trusted[swap.innocent] = True, False
+        now = judge(fit(p, noise, trusted), m).misfit
+        assert swap.worse == pytest.approx(max(now - found.judged.misfit, 0.0), rel=1e-6, abs=1e-9)
+    assert swaps(found, live, -1.0) == []
+
+
+def test_swaps_with_a_loosened_direction() -> None:
+    rng = np.random.default_rng(7)
+    columns, p = street(rng, 9)
+    noise = np.full(9, 0.002**2)
+    m = readings(rng, p, noise)
+    m[4] += 0.05
+    live, none = np.ones(9, dtype=bool), np.zeros(9, dtype=bool)
+    loose = 0.05 * columns[:, [6]]
+    found = descend(fit(p, noise, live, loose), m, live, limits(9), keep=none)
+    assert list(np.flatnonzero(~found.fit.trusted)) == [4]
+    (swap,) = swaps(found, live, 1e9)
+    trusted = live.copy()
+    trusted[swap.innocent] = False
+    now = judge(fit(p, noise, trusted, loose), m).misfit
+    assert swap.worse == pytest.approx(now - found.judged.misfit, rel=1e-6)
+
+
+def test_meters_to_keep_out_are_kept_out() -> None:
+    rng = np.random.default_rng(8)
+    _, p = street(rng, 9)
+    noise = np.full(9, 0.002**2)
+    m = readings(rng, p, noise)
+    live = np.ones(9, dtype=bool)
+    keep = np.arange(9) == 2
+    found = descend(fit(p, noise, ~keep), m, live, limits(9), keep=keep)
+    assert not found.fit.trusted[2]
+    back = descend(fit(p, noise, ~keep), m, live, limits(9), keep=np.zeros(9, dtype=bool))
+    assert back.fit.trusted[2]
+
+
+def test_price_is_the_binomial_up_to_the_middle_and_rises_for_ever() -> None:
+    for count in (5, 13, 146):
+        for k in range(count // 2 + 1):
+            if k and (count - k + 1) / k < np.exp(0.5):
+                break
+            assert price(count, k) == pytest.approx(2.0 * log(comb(count, k)))
+        steps = np.diff([price(count, k) for k in range(count + 1)])
+        assert (steps >= 1.0 - 1e-12).all()
+
+
+def test_a_bounded_fixed_error_is_allowed_as_a_bound() -> None:
+    """Within the class by bound, beyond by chance: the smaller of both views."""
+    std = np.array([1.0, 1.0])
+    both = Limits(4.0, np.array([0.1, 0.0]), np.array([1.5, 9.0]), np.array([0.75, 0.75]))
+    np.testing.assert_allclose(both.of(std), [0.1 + 1.5 + 4.0 * 0.5, 4.0])
+    np.testing.assert_allclose(both.of(std, 0.5), [0.1 + 2.0, 2.0])
+    assert both.penalty == 16.0
