@@ -33,7 +33,7 @@ def expected(
     w, M = conditioned(T)
     offset, std = np.empty(m.size), np.empty(m.size)
     for j in range(m.size):
-        others = T[T != j]
+        others = np.setdiff1d(T, [j])
         mean, rest = conditioned(others)
         offset[j] = m[j] - mean[at[j]]
         std[j] = np.sqrt(rest[at[j], at[j]] + noise[j])

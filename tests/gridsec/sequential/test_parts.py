@@ -1,0 +1,133 @@
+"""Loads, windows and learned fixed errors, each against its definition."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gridsec.droop import fleet
+from gridsec.feeder import lindistflow
+from gridsec.sequential import LoadDoubt, SequentialOptions, design
+from gridsec.sequential.commission import Learning, begin, conclude, gather, nothing
+from gridsec.sequential.loads import injection_doubt, prior
+from gridsec.sequential.windows import empty, forget, push, shift
+from tests.gridsec.street import ac_voltages, accuracy, make_plant, random_tree
+
+
+class TestLoads:
+    def test_the_prior_is_the_covariance_of_what_power_flow_makes_of_load_errors(self) -> None:
+        """Monte Carlo through AC power flow; common parts and the busbar's error included."""
+        rng = np.random.default_rng(1)
+        tree = random_tree(6, rng, drop=0.004)
+        p, q = np.full(6, 0.01), np.full(6, 0.02)
+        doubt = LoadDoubt(p, q, 600.0, common_p=0.5, common_q=0.3)
+        found = prior(lindistflow(tree), np.arange(1, 7), doubt, busbar=1e-3)
+        base = ac_voltages(tree, np.zeros(6, dtype=complex), 1.0) ** 2
+        draws = []
+        for _ in range(6000):
+            dp = p * (np.sqrt(0.5) * rng.normal(size=6) + np.sqrt(0.5) * rng.normal())
+            dq = q * (np.sqrt(0.7) * rng.normal(size=6) + np.sqrt(0.3) * rng.normal())
+            v2 = ac_voltages(tree, dp + 1j * dq, 1.0) ** 2 + 1e-3 * rng.normal()
+            draws.append(v2 - base)
+        sample = np.cov(np.array(draws).T)
+        scale = np.sqrt(np.outer(found.variance, found.variance))
+        np.testing.assert_allclose(found.of_meters / scale[:, 1:], sample[:, 1:] / scale[:, 1:], atol=0.06)
+        np.testing.assert_allclose(found.variance, np.diagonal(sample), rtol=0.08, atol=1e-7)
+        np.testing.assert_allclose(found.between, found.between.T)
+
+    def test_every_problem_is_named(self) -> None:
+        with pytest.raises(ValueError, match=r"p must be.*q must be.*time_s.*common_p.*common_q"):
+            LoadDoubt(np.array([-1.0]), np.array([np.nan]), 0.0, common_p=2.0, common_q=-1.0)
+
+    def test_inverters_follow_their_meters_errors_up_to_saturation(self) -> None:
+        droop = fleet(np.array([0, 2, 2]), ["ieee1547-b"] * 3, np.array([5.0, 5.0, 8.0]), 100.0)
+        found = injection_doubt(droop, accuracy(2), np.array([0, 1]), 3)
+        std = 2.0 * np.sqrt(0.005**2 / 3.0 + (0.1 / 230.0) ** 2 / 12.0 + 0.0005**2)
+        assert found[0] == pytest.approx(min(droop.slope[0] * std, droop.limit[0]))
+        np.testing.assert_array_equal(found[1:], 0.0)
+
+
+class TestWindows:
+    @settings(max_examples=50)
+    @given(seed=st.integers(0, 2**32 - 1), ticks=st.integers(1, 60))
+    def test_sums_are_sums(self, seed: int, ticks: int) -> None:
+        rng = np.random.default_rng(seed)
+        lengths = (1, 4, 9)
+        window = empty(lengths, 3)
+        rows, marks = [], []
+        for _ in range(ticks):
+            values, heard = rng.normal(size=3), rng.random(3) < 0.7
+            window = push(window, lengths, np.where(heard, values, np.nan), heard)
+            rows.append(np.where(heard, values, 0.0))
+            marks.append(heard)
+            if rng.random() < 0.1:
+                gone = rng.random(3) < 0.3
+                window = forget(window, gone)
+                rows = [np.where(gone, 0.0, row) for row in rows]
+                marks = [mark & ~gone for mark in marks]
+            if rng.random() < 0.1:
+                change = rng.normal(size=3)
+                window = shift(window, change)
+                rows = [np.where(m, row + change, 0.0) for row, m in zip(rows, marks, strict=True)]
+        for s, length in enumerate(lengths):
+            np.testing.assert_allclose(window.sums[s], np.sum(rows[-length:], axis=0), atol=1e-12)
+            np.testing.assert_array_equal(window.counts[s], np.sum(marks[-length:], axis=0))
+
+    def test_rounding_errors_do_not_gather(self) -> None:
+        window = empty((1, 7), 1)
+        for k in range(5000):
+            window = push(window, (1, 7), np.array([1e8 if k < 100 else 1e-8]), np.array([True]))
+        np.testing.assert_allclose(window.sums[:, 0], [1e-8, 7e-8], rtol=1e-12)
+
+
+class TestCommissioning:
+    def test_fixed_errors_are_their_posterior(self) -> None:
+        """Against the textbook posterior of a linear Gaussian model, made dense."""
+        rng = np.random.default_rng(2)
+        plant = make_plant(rng, customers=8)
+        doubt = LoadDoubt(np.full(8, 0.006), np.full(8, 0.002), 600.0)
+        made = design(plant, doubt=doubt, step_s=1.0, options=SequentialOptions(stability=0.0))
+        count = np.array([900, 900, 900, 0, 450, 900, 900, 900])
+        mean = rng.normal(size=8) * 0.004
+        found = conclude(made, Learning(mean * count, count, 3600.0))
+        heard = count > 0
+        rho = 600.0 / 3600.0
+        share = 2 * rho * (1 - rho * (1 - np.exp(-1 / rho)))
+        S = made.prior.between[np.ix_(heard, heard)] * share
+        B = np.diag(made.fixed[heard])
+        K = S + B + np.diag(made.white[heard] / count[heard])
+        gain = B @ np.linalg.inv(K)
+        np.testing.assert_allclose(found.bias[heard], gain @ mean[heard], rtol=1e-9)
+        np.testing.assert_allclose(found.variance[heard], np.diagonal(B - gain @ B), rtol=1e-6)
+        assert found.bias[3] == 0.0
+        assert found.variance[3] == made.fixed[3]
+        assert found.allowed[3] == made.allowed[3]
+        assert (found.allowed[heard] < made.allowed[heard]).all()
+
+    def test_mean_of_a_correlated_process_varies_as_is_said(self) -> None:
+        """The factor on S, against an Ornstein-Uhlenbeck process."""
+        rng = np.random.default_rng(3)
+        rho, steps = 0.25, 400
+        keep = np.exp(-1.0 / (rho * steps))
+        x = rng.normal(size=20_000)
+        total = np.zeros_like(x)
+        for _ in range(steps):
+            total += x
+            x = keep * x + np.sqrt(1 - keep**2) * rng.normal(size=x.size)
+        share = 2.0 * rho * (1.0 + rho * np.expm1(-1.0 / rho))
+        assert np.var(total / steps) == pytest.approx(share, rel=0.03)
+
+    def test_nothing_gathered_is_the_class(self) -> None:
+        rng = np.random.default_rng(4)
+        plant = make_plant(rng, customers=5)
+        made = design(plant, doubt=LoadDoubt(np.full(5, 0.01), np.full(5, 0.01), 600.0), step_s=1.0)
+        start = begin(5)
+        assert np.array_equal(conclude(made, start).variance, nothing(made).variance)
+        some = gather(
+            start, np.array([1.0, 2.0, np.nan, 4.0, 5.0]), np.array([1, 1, 0, 1, 0], dtype=bool), 2.0
+        )
+        np.testing.assert_array_equal(some.total, [1.0, 2.0, 0.0, 4.0, 0.0])
+        np.testing.assert_array_equal(some.count, [1, 1, 0, 1, 0])
+        assert some.time_s == 2.0
