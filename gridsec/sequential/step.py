@@ -74,7 +74,9 @@ def step(
     if state.ticks % _STALE == 0:
         model = _model_error(design, frame.p, q, heard.v0_squared)
     since = frame.t if state.x is None else state.since
-    transient = design.reach * np.exp(-design.certificate.rate * (frame.t - since))
+    # Without inverters the rate is infinite, and times no time at all it would be no number.
+    left = np.exp(-design.certificate.rate * (frame.t - since)) if frame.t > since else 1.0
+    transient = design.reach * left
     seen = examine(
         design,
         state.trust,
@@ -227,7 +229,7 @@ def _name(design: SequentialDesign, before: Trust, seen: Examined) -> tuple[Trus
     """Who is named now; and explanations that fit about as well where a meter would have been named."""
     trust = seen.trust
     quiet = np.where(trust.still.any(axis=0), 0, trust.quiet + 1)
-    trusted = trust.trusted | (quiet >= design.options.release)
+    trusted = (trust.trusted & ~before.named) | (quiet >= design.options.release)
     age = np.where(trusted, 0, trust.age + 1)
     need = np.array([confirm(length) for length in design.lengths])[trust.scale]
     fresh = ~trusted & ~before.named & trust.bad.any(axis=0) & (age >= need)
