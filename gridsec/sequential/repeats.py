@@ -1,0 +1,380 @@
+"""Meters that repeat themselves: stuck ones, and such that play an earlier stretch again.
+
+A reading is ``round((v + n) / step)`` with white jitter n of standard deviation sigma. Whatever the voltage
+does and whatever was read before, the next reading equals any given number with a probability of at most
+
+    P(step) = erf(step / (2 sqrt(2) sigma))
+
+so k coincidences in a row with the previous reading (stuck), or with the reading one fixed lag earlier
+(replay), have a probability of at most P^k. That is evidence once it is so small that all meters, ticks
+and, for a replay, lags of a year together see it less often than the false-alarm rate says.
+
+Meters may be calmer than their data sheets promise. So each meter's own longest run counts too: in n
+readings a run of L is to be expected if ``n P^L = 1``; the larger P of the two decides. A meter is judged
+after the first minutes, when that is known; one without promised jitter is never judged.
+
+Every tick costs O(p): a hash of the last readings is compared with one block of the past; blocks take
+turns. A hit is verified reading by reading.
+
+References
+----------
+docs/theory-sequential.md, "What a manipulation looks like".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import erf
+
+from gridsec.arrays import Bools, Floats, Ints
+
+_Codes: TypeAlias = NDArray[np.int32]
+_Hashes: TypeAlias = NDArray[np.uint32]
+
+ROWS = 64
+"""Ticks of one block of the past."""
+
+BLOCKS = 60
+"""Blocks that are kept: a little more than an hour at one reading per second, 12 bytes per meter and tick."""
+
+SPAN = 32
+"""Ticks that a hash covers: one bit leaves it with every tick."""
+
+SILENT = np.iinfo(np.int32).min
+"""Code of a tick without a reading."""
+
+# Fewer repetitions than this are no evidence whatever their probability: readings may be sent twice.
+_FEWEST = 6
+# Time after which a meter's own longest run says something, s, and fewest readings.
+_KNOWN_S, _KNOWN = 300.0, 16
+# Readings without a register step are compared on this grid, pu.
+_FINEST = 1e-6
+# Hits that are verified at one tick.
+_VERIFIED = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rules:
+    """When repetition is evidence. p meters.
+
+    Attributes
+    ----------
+    step : (p,)
+        Step of each register, pu.
+    surprise : (p,)
+        ``-log P``: how little one repetition is expected of each meter.
+    stuck, replay
+        Surprise that makes a run, or a repeated stretch, evidence.
+    known
+        Readings after which a meter is judged.
+    """
+
+    step: Floats
+    surprise: Floats
+    stuck: float
+    replay: float
+    known: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Block:
+    """Consecutive ticks of the past. p meters.
+
+    Attributes
+    ----------
+    code : (ROWS, p)
+        Readings in steps of the register; SILENT where there was none.
+    hash : (ROWS, p)
+        Of the SPAN ticks that end here.
+    model : (ROWS, p)
+        Squared voltage that the others' reconstruction gives each meter, squared pu.
+    """
+
+    code: _Codes
+    hash: _Hashes
+    model: NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Memory:
+    """What is remembered of the readings. p meters.
+
+    Attributes
+    ----------
+    tick
+        Number of the newest tick, from 0; -1 before the first.
+    kept
+        Number after that of the newest tick in the past.
+    code : (p,)
+        Last reading of each meter, steps.
+    now : (p,)
+        The same at the newest tick, SILENT where there was none.
+    hash : (p,)
+        Of the last SPAN ticks.
+    count : (p,)
+        Readings heard.
+    run : (p,)
+        How often the last reading was repeated so far.
+    longest : (p,)
+        Longest run that was no evidence.
+    stuck : (p,)
+        Evidence that the meter is stuck.
+    lag : (p,)
+        Ticks after which the meter repeats itself, with evidence; 0 for none.
+    blocks
+        The past, oldest first; at most BLOCKS.
+    tail
+        Rows (code, hash, model) after the last whole block.
+    """
+
+    tick: int
+    kept: int
+    code: _Codes
+    now: _Codes
+    hash: _Hashes
+    count: Ints
+    run: Ints
+    longest: Ints
+    stuck: Bools
+    lag: Ints
+    blocks: tuple[Block, ...]
+    tail: tuple[tuple[_Codes, _Hashes, NDArray[np.float32]], ...]
+
+    @property
+    def first(self) -> int:
+        """Number of the oldest tick kept."""
+        return self.kept - len(self.tail) - ROWS * len(self.blocks)
+
+
+def rules(resolution: Floats, jitter: Floats, chance: float, step_s: float) -> Rules:
+    """When repetition is evidence.
+
+    Parameters
+    ----------
+    resolution : (p,)
+        Step of each register, pu.
+    jitter : (p,)
+        Standard deviation of the jitter, pu.
+    chance
+        Probability, per meter and tick, that honest readings may become evidence of one kind.
+    step_s
+        Expected time between readings, s.
+    """
+    step = np.maximum(resolution, _FINEST)
+    with np.errstate(divide="ignore"):
+        once = erf(step / (np.sqrt(8.0) * jitter))
+        surprise = 0.0 - np.log(once)
+    budget = -float(np.log(chance))
+    return Rules(
+        step=step,
+        surprise=surprise,
+        stuck=budget,
+        replay=budget + float(np.log(ROWS * BLOCKS)),
+        known=max(_KNOWN, int(np.ceil(_KNOWN_S / step_s))),
+    )
+
+
+def empty(meters: int) -> Memory:
+    """Nothing remembered.
+
+    Parameters
+    ----------
+    meters
+        p.
+    """
+    silent = np.full(meters, SILENT, dtype=np.int32)
+    zero = np.zeros(meters, dtype=np.intp)
+    no = np.zeros(meters, dtype=np.bool_)
+    return Memory(
+        -1, 0, silent, silent, np.zeros(meters, dtype=np.uint32), zero, zero, zero, no, zero, (), ()
+    )
+
+
+def listen(law: Rules, before: Memory, y: Floats, live: Bools) -> Memory:
+    """Take one tick's readings in. `keep` has to follow before the next.
+
+    Parameters
+    ----------
+    law
+        When repetition is evidence.
+    before
+        So far; not changed.
+    y : (p,)
+        Squared readings, pu; any finite numbers where not live.
+    live : (p,)
+        Where there is a reading.
+    """
+    tick = before.tick + 1
+    code = np.rint(np.sqrt(np.maximum(y, 0.0)) / law.step).astype(np.int32)
+    now = np.where(live, code, np.int32(SILENT))
+    same = code == before.code
+    run = np.where(live, np.where(same, before.run + 1, 0), before.run)
+    ended = live & ~same & ~before.stuck & (before.run > before.longest)
+    longest = np.where(ended, before.run, before.longest)
+    count = before.count + live
+    surprise = _surprise(law, count, longest)
+    after = replace(
+        before,
+        tick=tick,
+        code=np.where(live, code, before.code),
+        now=now,
+        hash=_roll(before.hash, now, tick),
+        count=count,
+        run=run,
+        longest=longest,
+        stuck=(run >= _FEWEST) & (run * surprise >= law.stuck) & (count >= law.known),
+        lag=_follow(before, now, tick),
+    )
+    return _search(law, after, surprise)
+
+
+def keep(memory: Memory, model: Floats) -> Memory:
+    """Remember the tick that was just heard, with what the others say of it.
+
+    Parameters
+    ----------
+    memory
+        From `listen`.
+    model : (p,)
+        Squared voltage that the others' reconstruction gives each meter, squared pu.
+    """
+    tail = (*memory.tail, (memory.now, memory.hash, model.astype(np.float32)))
+    if len(tail) < ROWS:
+        return replace(memory, kept=memory.kept + 1, tail=tail)
+    code, hashes, models = zip(*tail, strict=True)
+    block = Block(np.stack(code), np.stack(hashes), np.stack(models))
+    return replace(memory, kept=memory.kept + 1, blocks=(*memory.blocks, block)[-BLOCKS:], tail=())
+
+
+def suspicious(memory: Memory) -> Bools:
+    """Meters that repeat themselves beyond chance, (p,).
+
+    Parameters
+    ----------
+    memory
+        From `listen`.
+    """
+    return memory.stuck | (memory.lag > 0)
+
+
+def past(memory: Memory, meter: int, start: int, stop: int) -> tuple[Floats, Floats]:
+    """Readings, in steps, and models of one meter at the ticks start to stop - 1.
+
+    Parameters
+    ----------
+    memory
+        From `keep`.
+    meter
+        Which.
+    start, stop
+        Numbers of ticks, ``memory.first <= start < stop <= memory.kept``.
+
+    Returns
+    -------
+    code, model : (stop - start,)
+        Readings are NaN where there was none.
+    """
+    code = _column(memory, "code", meter, start, stop).astype(np.float64)
+    model = _column(memory, "model", meter, start, stop)
+    code[code == SILENT] = np.nan
+    return code, model.astype(np.float64)
+
+
+def _surprise(law: Rules, count: Ints, longest: Ints) -> Floats:
+    """The smaller of what the data sheet and the meter's own longest run say, (p,)."""
+    return np.minimum(law.surprise, np.log(np.maximum(count, 2)) / np.maximum(longest, 1))
+
+
+def _roll(before: _Hashes, now: _Codes, tick: int) -> _Hashes:
+    """Hash of the last SPAN ticks: older ones have been shifted out (a gear hash)."""
+    mixed = np.where(now == SILENT, np.int32(tick % 2**31), now).view(np.uint32) * np.uint32(0x9E3779B1)
+    mixed ^= mixed >> np.uint32(16)
+    mixed *= np.uint32(0x85EBCA6B)
+    mixed ^= mixed >> np.uint32(13)
+    return (before << np.uint32(1)) + mixed
+
+
+def _follow(before: Memory, now: _Codes, tick: int) -> Ints:
+    """Lags at which meters still repeat themselves."""
+    if not before.lag.any():
+        return before.lag
+    lag = before.lag.copy()
+    for j in np.flatnonzero(lag).tolist():
+        at = tick - int(lag[j])
+        if at < before.first:
+            lag[j] = 0
+            continue
+        (then,) = _column(before, "code", j, at, at + 1).tolist()
+        if SILENT not in (then, int(now[j])) and then != now[j]:
+            lag[j] = 0
+    return lag
+
+
+def _search(law: Rules, memory: Memory, surprise: Floats) -> Memory:
+    """Look for the newest stretch in one block of the past."""
+    if not memory.blocks:
+        return memory
+    turn = memory.tick % len(memory.blocks)
+    rows, meters = np.nonzero(memory.blocks[turn].hash == memory.hash)
+    if not rows.size:
+        return memory
+    ask = (memory.lag == 0) & (memory.now != SILENT) & (memory.run < SPAN) & (memory.count >= law.known)
+    with np.errstate(divide="ignore"):
+        need = np.maximum(np.ceil(law.replay / surprise), _FEWEST)
+    ask &= need <= ROWS * BLOCKS // 2
+    wanted = np.flatnonzero(ask[meters])
+    begin = memory.first + ROWS * turn
+    lag = memory.lag.copy()
+    for k in np.roll(wanted, -memory.tick)[:_VERIFIED].tolist():
+        j, back = int(meters[k]), memory.tick - begin - int(rows[k])
+        if repeated(memory, j, back, int(need[j])) >= need[j]:
+            lag[j] = back
+    return replace(memory, lag=lag)
+
+
+def repeated(memory: Memory, meter: int, lag: int, most: int) -> int:
+    """How many of a meter's last readings equal those one lag earlier, without a difference between.
+
+    Parameters
+    ----------
+    memory
+        From `listen`, before `keep`.
+    meter
+        Which.
+    lag
+        Ticks, >= 1.
+    most
+        Ticks to look back at most, the newest included.
+
+    Returns
+    -------
+    int
+        Pairs of which one reading is missing are passed over.
+    """
+    # The missing ones have to be made up for.
+    start = max(memory.tick + 1 - 2 * most, memory.first + lag)
+    if start > memory.tick:
+        return 0
+    new = memory.now[meter : meter + 1]
+    if start < memory.tick:
+        new = np.append(_column(memory, "code", meter, start, memory.tick), new)
+    old = _column(memory, "code", meter, start - lag, memory.tick - lag + 1)
+    both = (new != SILENT) & (old != SILENT)
+    differ = np.flatnonzero(both & (new != old))
+    return int(np.count_nonzero(both[differ[-1] + 1 if differ.size else 0 :]))
+
+
+def _column(memory: Memory, name: str, meter: int, start: int, stop: int) -> NDArray[Any]:
+    """One meter's past at the ticks start to stop - 1, from the blocks and the tail."""
+    place = ("code", "hash", "model").index(name)
+    begin = memory.first
+    skip, last = (start - begin) // ROWS, (stop - 1 - begin) // ROWS
+    parts = [getattr(block, name)[:, meter] for block in memory.blocks[skip : last + 1]]
+    if last >= len(memory.blocks):
+        parts.append(np.array([row[place][meter] for row in memory.tail]))
+    skipped = begin + ROWS * min(skip, len(memory.blocks))
+    return np.concatenate(parts)[start - skipped : stop - skipped]
