@@ -53,6 +53,8 @@ _FEWEST = 6
 _KNOWN_S, _KNOWN = 300.0, 16
 # Readings without a register step are compared on this grid, pu.
 _FINEST = 1e-6
+# A good multiplier for hashes: 2^32 over the golden ratio.
+_ODD, _HALF, _ONE = np.uint32(0x9E3779B1), np.uint32(16), np.uint32(1)
 # Hits that are verified at one tick.
 _VERIFIED = 4
 
@@ -209,27 +211,34 @@ def listen(law: Rules, before: Memory, y: Floats, live: Bools) -> Memory:
         Where there is a reading.
     """
     tick = before.tick + 1
-    code = np.rint(np.sqrt(np.maximum(y, 0.0)) / law.step).astype(np.int32)
-    now = np.where(live, code, np.int32(SILENT))
+    code = now = np.rint(np.sqrt(np.maximum(y, 0.0)) / law.step).astype(np.int32)
     same = code == before.code
-    run = np.where(live, np.where(same, before.run + 1, 0), before.run)
-    ended = live & ~same & ~before.stuck & (before.run > before.longest)
-    longest = np.where(ended, before.run, before.longest)
-    count = before.count + live
-    surprise = _surprise(law, count, longest)
-    after = replace(
-        before,
+    run, longest = (before.run + same) * same, before.longest
+    if not live.all():
+        run = np.where(live, run, before.run)
+        now, code = np.where(live, code, np.int32(SILENT)), np.where(live, code, before.code)
+    # Rare, so only looked at where there is something to see.
+    longer = before.run > longest
+    if longer.any():
+        longest = np.where(longer & (run == 0) & ~before.stuck, before.run, longest)
+    count, stuck = before.count + live, run >= _FEWEST
+    if stuck.any():
+        stuck &= (run * _surprise(law, count, longest) >= law.stuck) & (count >= law.known)
+    after = Memory(
         tick=tick,
-        code=np.where(live, code, before.code),
+        kept=before.kept,
+        code=code,
         now=now,
         hash=_roll(before.hash, now, tick),
         count=count,
         run=run,
         longest=longest,
-        stuck=(run >= _FEWEST) & (run * surprise >= law.stuck) & (count >= law.known),
+        stuck=stuck,
         lag=_follow(before, now, tick),
+        blocks=before.blocks,
+        tail=before.tail,
     )
-    return _search(law, after, surprise)
+    return _search(law, after)
 
 
 def keep(memory: Memory, model: Floats) -> Memory:
@@ -291,11 +300,11 @@ def _surprise(law: Rules, count: Ints, longest: Ints) -> Floats:
 
 def _roll(before: _Hashes, now: _Codes, tick: int) -> _Hashes:
     """Hash of the last SPAN ticks: older ones have been shifted out (a gear hash)."""
-    mixed = np.where(now == SILENT, np.int32(tick % 2**31), now).view(np.uint32) * np.uint32(0x9E3779B1)
-    mixed ^= mixed >> np.uint32(16)
-    mixed *= np.uint32(0x85EBCA6B)
-    mixed ^= mixed >> np.uint32(13)
-    return (before << np.uint32(1)) + mixed
+    silent = now == SILENT
+    told = np.where(silent, np.int32(tick % 2**31), now) if silent.any() else now
+    mixed = told.view(np.uint32) * _ODD
+    mixed ^= mixed >> _HALF
+    return (before << _ONE) + mixed
 
 
 def _follow(before: Memory, now: _Codes, tick: int) -> Ints:
@@ -314,17 +323,18 @@ def _follow(before: Memory, now: _Codes, tick: int) -> Ints:
     return lag
 
 
-def _search(law: Rules, memory: Memory, surprise: Floats) -> Memory:
+def _search(law: Rules, memory: Memory) -> Memory:
     """Look for the newest stretch in one block of the past."""
     if not memory.blocks:
         return memory
     turn = memory.tick % len(memory.blocks)
-    rows, meters = np.nonzero(memory.blocks[turn].hash == memory.hash)
-    if not rows.size:
+    hit = memory.blocks[turn].hash == memory.hash
+    if not hit.any():
         return memory
+    rows, meters = np.nonzero(hit)
     ask = (memory.lag == 0) & (memory.now != SILENT) & (memory.run < SPAN) & (memory.count >= law.known)
     with np.errstate(divide="ignore"):
-        need = np.maximum(np.ceil(law.replay / surprise), _FEWEST)
+        need = np.maximum(np.ceil(law.replay / _surprise(law, memory.count, memory.longest)), _FEWEST)
     ask &= need <= ROWS * BLOCKS // 2
     wanted = np.flatnonzero(ask[meters])
     begin = memory.first + ROWS * turn
