@@ -165,7 +165,18 @@ CUSTOMER_COLUMNS: tuple[Column, ...] = (
     ),
 )
 
-ESTIMATORS = ("sequential", "exact-bank", "exact-bank-lmi")
+ESTIMATORS = (
+    "sequential",
+    "exact-bank",
+    "exact-bank-lmi",
+    "weighted-least-squares",
+    "l0-decoder",
+    "basis-pursuit",
+    "matching-pursuit",
+    "partial-observers",
+    "set-search",
+    "unknown-input",
+)
 SUSPICIONS = ("voltage", "impedance", "ratio", "rating", "load", "class")
 
 META_COLUMNS: dict[str, tuple[Column, ...]] = {

@@ -18,10 +18,12 @@ from gridsec import monitor, sequential
 from gridsec.arrays import Floats
 from gridsec.certificates import certify
 from gridsec.errors import FeederInvalid
+from gridsec.families import decoders, ticks
 from gridsec.feeder import lindistflow
 from gridsec.gains import CircleOptions, options_for
 from gridsec.lure import Lure, close_loop
 from gridsec.online import Estimate, Frame, Verdict
+from gridsec.sequential.decoder import Decoder
 
 __all__ = [
     "DIRECT",
@@ -297,6 +299,25 @@ def _load_columns(site: Site) -> Floats:
     return np.hstack([2.0 * model.R * dp, 2.0 * model.X * dq])
 
 
+def _ticks(name: str, summary: str, decoder: Decoder) -> Family:
+    """A family that judges every tick by itself."""
+
+    def make(site: Site, _: Job) -> sequential.SequentialDesign:
+        settings = site.tables.meta.monitor
+        return ticks.design(
+            plant(site),
+            decoder,
+            doubt=load_doubt(site),
+            step_s=settings.tick_s,
+            max_attacked=settings.max_attacked,
+            alarms_per_year=settings.alarms_per_year,
+        )
+
+    return Family(
+        name, summary, make, sequential.init, sequential.step, lambda d: int(d.observers), _certificate
+    )
+
+
 FAMILIES: Final[Mapping[str, Family]] = MappingProxyType(
     {
         family.name: family
@@ -313,6 +334,29 @@ FAMILIES: Final[Mapping[str, Family]] = MappingProxyType(
             ),
             _bank(DIRECT, "banks of circle-criterion observers, direct injection (chong2020)", _direct_bank),
             _bank(LMI, "the same banks, gains by matrix inequality (chong2020)", _lmi_bank),
+            _ticks(
+                "weighted-least-squares",
+                "chi-square test and largest normalised residual (lee2018, 2)",
+                decoders.least_squares,
+            ),
+            _ticks("l0-decoder", "the smallest set that explains a tick (lee2018, 2)", decoders.fewest),
+            _ticks("basis-pursuit", "the attack of smallest l1 norm (lee2018, 2)", decoders.pursue),
+            _ticks("matching-pursuit", "orthogonal matching pursuit (lee2018, 2)", decoders.match),
+            _ticks(
+                "partial-observers",
+                "one observer per meter, l0 decoding of their stack (lee2018, 4)",
+                decoders.meter_and_its_observer,
+            ),
+            _ticks(
+                "set-search",
+                "one estimate, a new set when its test fails (kim2018, lee2018, 5)",
+                decoders.search_on_failure,
+            ),
+            _ticks(
+                "unknown-input",
+                "meters and inverters; accused injections are unknown inputs (yang2021)",
+                decoders.meters_or_inverters,
+            ),
         )
     }
 )

@@ -21,6 +21,7 @@ from gridsec.lmi import contraction
 from gridsec.lure import Lure, close_loop
 from gridsec.plant import Plant
 from gridsec.sequential.conditional import Prior
+from gridsec.sequential.decoder import Decoder
 from gridsec.sequential.loads import LoadDoubt, injection_doubt, prior
 from gridsec.sequential.search import Dictionary
 
@@ -130,6 +131,10 @@ class SequentialDesign:
         Expected interval between frames, s.
     options
         The numbers that decide.
+    decoder
+        What decides in place of the search; None: the search.
+    own
+        Whether every inverter follows its own meter, also one that is not trusted.
     """
 
     plant: Plant
@@ -153,6 +158,8 @@ class SequentialDesign:
     most: int
     step_s: float
     options: SequentialOptions = field(repr=False)
+    decoder: Decoder | None = None
+    own: bool = False
 
     @property
     def observers(self) -> int:

@@ -14,7 +14,8 @@ import numpy as np
 from gridsec.arrays import Bools, Floats
 from gridsec.sequential import search
 from gridsec.sequential.commission import Learned
-from gridsec.sequential.conditional import Fit, Judged, Prior, admit, drop, fit, judge
+from gridsec.sequential.conditional import Fit, Judged, Prior, admit, drop, fit, judge, loosen
+from gridsec.sequential.decoder import Accused, Evidence
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.search import Dictionary, Explanation, Limits
 from gridsec.sequential.state import Trust
@@ -119,7 +120,11 @@ def examine(
             before, prior, here.noise, trust.trusted & here.enough, _directions(design, trust.accused)
         )
         view = _view(design, here, now)
-        if (view.over & trust.trusted).any() or _due(design, trust, view, s, tick):
+        if design.decoder is not None:
+            found[s], trust = _decoded(design, here, now, trust, s)
+            now = found[s][0].fit
+            view = _view(design, here, now)
+        elif (view.over & trust.trusted).any() or _due(design, trust, view, s, tick):
             found[s], trust = _Search(design, scales, fits, trust, s)(now)
             now = found[s][0].fit
             view = _view(design, here, now)
@@ -215,8 +220,9 @@ def adapt(before: Fit | None, prior: Prior, noise: Floats, wanted: Bools, loose:
     loose : (n, k)
         Loosened directions.
     """
-    width = 0 if loose is None else loose.shape[1]
-    if before is None or before.prior is not prior or before.loose.shape[1] != width:
+    if before is None or before.prior is not prior:
+        return fit(prior, noise, wanted, loose)
+    if before.loose.shape[1] if loose is None else not np.array_equal(before.loose, loose):
         return fit(prior, noise, wanted, loose)
     change = np.flatnonzero(before.trusted != wanted)
     if not change.size:
@@ -312,6 +318,51 @@ class _Search:
             quiet=np.where(fallen, 0, trust.quiet),
             accused=(*self.accused, *((k, self.s) for k in best.loosened)),
         )
+
+
+def _decoded(
+    design: SequentialDesign, here: _Scale, now: Fit, trust: Trust, s: int
+) -> tuple[tuple[Explanation, ...], Trust]:
+    """What the design's decoder says, as explanations, and whom that leaves trusted."""
+    judged = judge(now, here.m)
+    over = here.enough & (np.abs(judged.offset) > here.limits.of(judged.std))
+    tight = now if not now.loose.shape[1] else None
+    whole = adapt(tight, now.prior, here.noise, here.enough, None)
+    evidence = Evidence(
+        whole=whole,
+        m=here.m,
+        live=here.enough,
+        limits=here.limits,
+        believed=trust.trusted,
+        over=over,
+        book=design.book,
+        meter_of=design.meter_of,
+        most=design.most,
+        like=design.options.like,
+    )
+    assert design.decoder is not None  # noqa: S101  # the caller has looked
+    answers = design.decoder(evidence)
+    found = tuple(_explanation(design, here, whole, answer) for answer in answers)
+    best = answers[0]
+    trusted = np.where(here.enough, ~best.meters, trust.trusted)
+    fallen = trust.trusted & ~trusted
+    return found, replace(
+        trust,
+        trusted=trusted,
+        scale=np.where(fallen, s, trust.scale),
+        age=np.where(fallen, 0, trust.age),
+        quiet=np.where(fallen, 0, trust.quiet),
+        accused=tuple((k, s) for k in best.others),
+    )
+
+
+def _explanation(design: SequentialDesign, here: _Scale, whole: Fit, answer: Accused) -> Explanation:
+    now = whole.copy()
+    for j in np.flatnonzero(answer.meters & here.enough).tolist():
+        drop(now, j)
+    for k in answer.others:
+        loosen(now, design.book.column(k), float(design.book.std[k]))
+    return Explanation(now, judge(now, here.m), list(answer.others), 0.0, answer.worse)
 
 
 def _suspected(here: _Scale, found: Explanation) -> int:

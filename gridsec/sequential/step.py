@@ -194,7 +194,7 @@ def _factor(error: Floats, std: Floats, old: Floats) -> Floats:
 def _inverters(design: SequentialDesign, state: SequentialState, frame: Frame, heard: _Heard) -> Floats:
     """The injections at this frame: at rest at the first one, a step later at every other."""
     droop, meter = design.plant.droop, design.meter_of
-    believed = state.trust.trusted & heard.live
+    believed = heard.live if design.own else state.trust.trusted & heard.live
     driven = (meter >= 0) & believed[meter]
     y = np.where(driven, heard.y[meter], heard.v0_squared) if meter.size else np.zeros(0)
     if state.x is None:
@@ -303,7 +303,7 @@ def _conclude(  # noqa: PLR0917  # everything one tick brought
         score,
         threshold,
         attack,
-        inverters=_inverters_of(design, [k for k, _ in trust.accused]),
+        inverters=_inverters_of(design, [] if design.own else [k for k, _ in trust.accused]),
         inverter_attack=np.zeros(plant.droop.tau.size),
         explanations=rivals,
     )

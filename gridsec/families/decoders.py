@@ -1,0 +1,212 @@
+"""The papers' ways to tell who lies, as decoders of one tick of a feeder.
+
+They share the model ``m = w + e + a`` of `gridsec.sequential`: w is what the loads' errors do to all
+voltages, known by its covariance S (the pseudo-measurements "this load draws what its meter says", which
+nobody attacks); e are the meters' honest errors; a is the attack, in as few entries as possible.
+
+References
+----------
+lee2018, chapters 2, 4 and 5; kim2018; yang2021; docs/estimators.md.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import chi2, norm
+
+from gridsec.arrays import Bools, Floats, Ints
+from gridsec.decode.sparse import basis_pursuit, matching_pursuit
+from gridsec.families.sets import (
+    Atoms,
+    Outcome,
+    meters_and_inverters,
+    meters_only,
+    meters_with_their_inverters,
+    outcomes,
+)
+from gridsec.sequential.conditional import drop, judge
+from gridsec.sequential.decoder import Accused, Evidence
+
+
+def least_squares(evidence: Evidence) -> tuple[Accused, ...]:
+    """Weighted least squares, the chi-square test, and the largest normalised residual, again and again.
+
+    Parameters
+    ----------
+    evidence
+        One tick.
+
+    Returns
+    -------
+    tuple of Accused
+        At most `most` meters, in the order of their residuals; it never takes a meter back.
+
+    References
+    ----------
+    lee2018, Algorithm 2.2 with the corrected degrees of freedom.
+    """
+    now, live = evidence.whole.copy(), evidence.live
+    accused = np.zeros(live.size, dtype=np.bool_)
+    alarm = float(np.clip(2.0 * norm.sf(evidence.limits.sigmas) * max(live.sum(), 1), 1e-300, 0.5))
+    for _ in range(evidence.most):
+        judged = judge(now, evidence.m)
+        freedom = int(np.count_nonzero(now.trusted))
+        offset = np.abs(judged.offset) / evidence.limits.of(judged.std)
+        worst = int(np.argmax(np.where(now.trusted, offset, -1.0)))
+        if not freedom or (judged.misfit <= chi2.isf(alarm, freedom) and offset[worst] <= 1.0):
+            break
+        accused[worst] = True
+        drop(now, worst)
+    return (Accused(accused),)
+
+
+def fewest(evidence: Evidence) -> tuple[Accused, ...]:
+    """The smallest set of meters without which every other one is within its limits.
+
+    Parameters
+    ----------
+    evidence
+        One tick.
+
+    Returns
+    -------
+    tuple of Accused
+        The set with the smallest misfit of all those of the smallest size, and its rivals.
+
+    References
+    ----------
+    lee2018 (2.2.8'): l0 decoding with bounded noise, the sets tried in the order of their size.
+    """
+    return _smallest(evidence, meters_only(evidence.live))
+
+
+def search_on_failure(evidence: Evidence) -> tuple[Accused, ...]:
+    """Go on believing the same meters as long as these agree; search only when they do not.
+
+    Parameters
+    ----------
+    evidence
+        One tick.
+
+    References
+    ----------
+    kim2018 and lee2018, chapter 5: monitor one estimate, switch to another set when its own test fails.
+    """
+    if not (evidence.over & evidence.believed).any():
+        return (Accused(evidence.live & ~evidence.believed),)
+    return fewest(evidence)
+
+
+def meter_and_its_observer(evidence: Evidence) -> tuple[Accused, ...]:
+    """As `fewest`, but each meter is the only input of its own observer, which a lie spoils as well.
+
+    Parameters
+    ----------
+    evidence
+        One tick, its inverters driven by their own meters whoever is believed.
+
+    References
+    ----------
+    lee2018, Algorithm 4.1: block j of the stack is what sensor j alone says, its observer's state and its
+    own reading.
+    """
+    return _smallest(evidence, meters_with_their_inverters(evidence))
+
+
+def meters_or_inverters(evidence: Evidence) -> tuple[Accused, ...]:
+    """The smallest set of meters and inverters: an accused inverter's injection is an unknown input.
+
+    Parameters
+    ----------
+    evidence
+        One tick.
+
+    References
+    ----------
+    yang2021 (22) to (24): the pair of sensors and inputs whose estimate is consistent.
+    """
+    return _smallest(evidence, meters_and_inverters(evidence))
+
+
+def pursue(evidence: Evidence) -> tuple[Accused, ...]:
+    """Basis pursuit: the attack and load errors of smallest weighted sum that explain the readings exactly.
+
+    ``min |a / sigma|_1 + |c|_1`` subject to ``a + V c = m`` with ``S = V V^T``: the stack of readings and
+    pseudo-measurements, annihilated. Meters whose share is beyond their limit are accused.
+
+    Parameters
+    ----------
+    evidence
+        One tick.
+
+    References
+    ----------
+    lee2018 (2.2.7); Theorem 2.1.1 for when it is exact.
+    """
+    at, F, y = _stack(evidence)
+    attack = np.sqrt(evidence.whole.noise[at]) * basis_pursuit(F, y)[: at.size]
+    return (_beyond(evidence, at, attack),)
+
+
+def match(evidence: Evidence) -> tuple[Accused, ...]:
+    """Orthogonal matching pursuit on the readings, whitened: column after column, never taken back.
+
+    Parameters
+    ----------
+    evidence
+        One tick.
+
+    References
+    ----------
+    lee2018, Algorithm 2.1, Theorem 2.1.2.
+    """
+    at = np.flatnonzero(evidence.live)
+    if not at.size:
+        return (Accused(np.zeros_like(evidence.live)),)
+    root = np.asarray(np.linalg.cholesky(evidence.whole.Q[np.ix_(at, at)]).T, np.float64)
+    attack, _ = matching_pursuit(root, root @ evidence.m[at], min(evidence.most, at.size))
+    return (_beyond(evidence, at, attack),)
+
+
+def _stack(evidence: Evidence) -> tuple[Ints, Floats, Floats]:
+    """Columns of unit weight: the meters' own, then the principal directions of the loads' covariance."""
+    at = np.flatnonzero(evidence.live)
+    prior = evidence.whole.prior
+    S = prior.of_meters[np.ix_(prior.meters[at], at)]
+    values, vectors = np.linalg.eigh(S)
+    keep = values > values.max(initial=0.0) * at.size * np.finfo(np.float64).eps
+    F = np.hstack([np.diag(np.sqrt(evidence.whole.noise[at])), vectors[:, keep] * np.sqrt(values[keep])])
+    return at, F, evidence.m[at]
+
+
+def _beyond(evidence: Evidence, at: Ints, attack: Floats) -> Accused:
+    """Accuse the meters whose share of the attack no honest meter has."""
+    now = judge(evidence.whole, evidence.m)
+    accused = np.zeros(evidence.live.size, dtype=np.bool_)
+    accused[at] = np.abs(attack) > evidence.limits.of(now.std)[at]
+    return Accused(accused)
+
+
+def _smallest(evidence: Evidence, atoms: Atoms) -> tuple[Accused, ...]:
+    """The smallest set that leaves everybody within the limits; else the best of the largest size."""
+    within = 2.0 * float(np.log(evidence.like))
+    found: Outcome | None = None
+    for size in range(min(evidence.most, len(atoms.of)) + 1):
+        found = outcomes(evidence, atoms, size)
+        fine = np.flatnonzero(found.excess <= 1.0)
+        if fine.size:
+            order = fine[np.argsort(found.misfit[fine], kind="stable")]
+            near = order[found.misfit[order] - found.misfit[order[0]] <= within]
+            return tuple(_answer(evidence.live, atoms, found, int(c), int(order[0])) for c in near)
+    assert found is not None  # noqa: S101  # size 0 is always tried
+    best = int(np.argmin(found.misfit))
+    return (_answer(evidence.live, atoms, found, best, best),)
+
+
+def _answer(live: Bools, atoms: Atoms, found: Outcome, which: int, best: int) -> Accused:
+    members = found.members[which]
+    accused = np.zeros(live.size, dtype=np.bool_)
+    meters, others = atoms.meter[members], atoms.other[members]
+    accused[meters[meters >= 0]] = True
+    worse = float(found.misfit[which] - found.misfit[best])
+    return Accused(accused, tuple(others[others >= 0].tolist()), worse)
