@@ -1,0 +1,387 @@
+"""What a manipulation looks like: stuck, replayed, of another time, one load's trace, drifting, constant.
+
+Stuck and replaying meters are evidence of their own and come from `gridsec.sequential.repeats`. For meters
+that are named, whatever the evidence, the last readings are compared with what the *other* meters say, by
+the question that explains most first:
+
+    clock shift    y(t) = v2(t - lag):  reading and reconstruction agree at another time, level included
+    drift          y(t) - v2(t) is a ramp, and no step explains it nearly as well
+    offset         y(t) - v2(t) is a constant, perhaps after a step
+    coordinated    the offsets of several meters are those that one customer's load would leave
+
+None where nothing fits: no kind is not no attack.
+
+References
+----------
+docs/theory-sequential.md, "What a manipulation looks like".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from scipy.stats import chi2
+
+from gridsec.arrays import Bools, Floats, Ints
+from gridsec.online import Kind
+from gridsec.sequential import repeats
+from gridsec.sequential.repeats import Memory, Rules
+
+# A named meter's readings are looked at every so many ticks.
+_EVERY = 16
+# Surprise from which a run of a meter that is named anyway is called stuck.
+_CALLED_STUCK = 12.0
+# Means that the shape of a lie is judged by, and fewest ticks for it.
+_BINS, _SHORTEST = 32, 8
+# A drift must last this part of what is seen, and a ramp leave this part of what the best step leaves.
+_LASTS, _BETTER = 0.25, 0.5
+# A shape explains a lie if this part of its size is the most that is left, as a standard deviation.
+_LEFT = 0.5
+# Readings that are looked for at other times: fewest and most; lags from two ticks on.
+_FEW, _MANY, _NEAREST = 64, 512, 2
+# Readings follow each other slowly: so many count as one. And surprise asked for beyond the number of lags.
+_ALIKE, _SURE = 4.0, 5.0
+# The linear model of a load's trace is off by this part.
+_TRACE = 0.05
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shapes:
+    """What lies are compared with. p meters, K traces.
+
+    Attributes
+    ----------
+    rules
+        When repetition is evidence.
+    traces : (p, K)
+        Squared voltage at each meter per customer's power: columns of 2R and 2X.
+    noise : (p,)
+        Variance of a squared reading from tick to tick, squared pu^2.
+    """
+
+    rules: Rules
+    traces: Floats
+    noise: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Kinds:
+    """What is remembered, and what was found. p meters.
+
+    Attributes
+    ----------
+    memory
+        Past readings and reconstructions.
+    since : (p,)
+        Tick at which each named meter was named; -1 for others.
+    alone : (p,)
+        What each named meter's manipulation looks like by itself.
+    told : (p,)
+        Meters that together tell of a load that is not there.
+    """
+
+    memory: Memory
+    since: Ints
+    alone: tuple[Kind | None, ...]
+    told: Bools
+
+    @property
+    def kinds(self) -> tuple[Kind | None, ...]:
+        """What each named meter's manipulation looks like, (p,)."""
+        if not self.told.any():
+            return self.alone
+        return tuple(
+            Kind.COORDINATED if told and kind in (None, Kind.OFFSET) else kind
+            for kind, told in zip(self.alone, self.told.tolist(), strict=True)
+        )
+
+
+def empty(meters: int) -> Kinds:
+    """Nothing seen yet.
+
+    Parameters
+    ----------
+    meters
+        p.
+    """
+    return Kinds(
+        repeats.empty(meters),
+        np.full(meters, -1, dtype=np.intp),
+        (None,) * meters,
+        np.zeros(meters, dtype=np.bool_),
+    )
+
+
+def listen(shapes: Shapes, before: Kinds, y: Floats, live: Bools) -> Kinds:
+    """Take readings in; `describe` has to follow before the next.
+
+    Parameters
+    ----------
+    shapes
+        What lies are compared with.
+    before
+        So far; not changed.
+    y : (p,)
+        Squared readings, pu; any finite numbers where not live.
+    live : (p,)
+        Where there is a reading.
+    """
+    return Kinds(
+        repeats.listen(shapes.rules, before.memory, y, live), before.since, before.alone, before.told
+    )
+
+
+def suspicious(kinds: Kinds) -> Bools:
+    """Meters whose readings are evidence by themselves, whatever the others say, (p,).
+
+    Parameters
+    ----------
+    kinds
+        From `listen`.
+    """
+    return repeats.suspicious(kinds.memory)
+
+
+def describe(shapes: Shapes, heard: Kinds, model: Floats, named: Bools, variance: Floats) -> Kinds:
+    """Say what the manipulation of every named meter looks like.
+
+    Parameters
+    ----------
+    shapes
+        What lies are compared with.
+    heard
+        From `listen`.
+    model : (p,)
+        What each meter should read by what the *others* say, its fixed error included, squared pu.
+    named : (p,)
+        Who is named.
+    variance : (p,)
+        Of `model`, fixed errors included, squared pu^2.
+    """
+    memory = repeats.keep(heard.memory, model)
+    if not named.any():
+        return Kinds(memory, *(_nobody(named.size)))
+    tick = memory.tick
+    since = np.where(named, np.where(heard.since < 0, tick, heard.since), -1)
+    alone = [kind if there else None for kind, there in zip(heard.alone, named.tolist(), strict=True)]
+    told, new = heard.told & named, bool((since == tick).any())
+    for j in np.flatnonzero(named).tolist():
+        if memory.stuck[j] or memory.run[j] * shapes.rules.surprise[j] >= _CALLED_STUCK:
+            alone[j] = Kind.STUCK
+        elif memory.lag[j]:
+            alone[j] = Kind.REPLAY
+        elif since[j] == tick or (tick + j) % _EVERY == 0:
+            alone[j] = _alone(shapes, memory, j, int(tick - since[j]), float(variance[j]), alone[j])
+    if new or tick % _EVERY == 0:
+        told = _together(shapes, memory, since, variance)
+    return Kinds(memory, since, tuple(alone), told)
+
+
+@cache
+def _nobody(meters: int) -> tuple[Ints, tuple[Kind | None, ...], Bools]:
+    none = empty(meters)
+    return none.since, none.alone, none.told
+
+
+def _alone(  # noqa: PLR0917  # one meter, and what is known of it
+    shapes: Shapes, memory: Memory, meter: int, age: int, variance: float, before: Kind | None
+) -> Kind | None:
+    """What one meter's lie looks like by itself."""
+    if before is Kind.DRIFT:
+        # A drift that has arrived somewhere is one still.
+        return before
+    step, heard = shapes.rules.step[meter], min(age, _MANY)
+    if heard >= _FEW:
+        code, model = repeats.past(memory, meter, memory.first, memory.kept)
+        if shifted((code * step) ** 2, model, heard, age, 3.0 * float(np.sqrt(variance))):
+            return Kind.CLOCK_SHIFT
+    start = max(memory.first, memory.tick - 2 * age - 4 * _BINS)
+    code, model = repeats.past(memory, meter, start, memory.kept)
+    return shape((code * step) ** 2 - model, float(np.sqrt(shapes.noise[meter])), age)
+
+
+def shape(lie: Floats, noise: float, age: int) -> Kind | None:
+    """Whether a lie is constant or grows.
+
+    A ramp from nothing to its full size that begins and ends at any two of `_BINS` moments is fitted by
+    least squares; one of no duration is a step. The ramp is a drift where it lasts, and leaves far less
+    than the best step.
+
+    Parameters
+    ----------
+    lie : (n,)
+        Readings minus reconstruction, squared pu; NaN where there is none.
+    noise
+        Its standard deviation from tick to tick, squared pu.
+    age
+        How many ticks ago the meter was named.
+    """
+    means, white = _means(lie, noise)
+    if means.size < _SHORTEST:
+        return _constant(lie, noise, age)
+    ramps, lasts = _ramps(means.size)
+    left = _left(ramps, means)
+    step = float(left[lasts <= 1].min())
+    best = int(left.argmin())
+    grown = ramps[best] @ (means - means.mean()) / (ramps[best] @ ramps[best])
+    floor = means.size * white**2
+    lasting = lasts[best] >= _LASTS * means.size and left[best] + floor < _BETTER * (step + floor)
+    # What is left must be small against what has grown, or this is just a wild lie.
+    if lasting and np.sqrt(left[best] / means.size) < _LEFT * abs(grown):
+        return Kind.DRIFT
+    return _constant(lie, noise, age)
+
+
+def _constant(lie: Floats, noise: float, age: int) -> Kind | None:
+    """OFFSET where the lie has been about the same since it was named."""
+    now = lie[-(age + 2) :]
+    now = now[np.isfinite(now)]
+    return Kind.OFFSET if now.size and now.std() < _LEFT * abs(now.mean()) + noise else None
+
+
+def _means(lie: Floats, noise: float) -> tuple[Floats, float]:
+    """Means over equal parts of what was heard, and the noise of one."""
+    heard = lie[np.isfinite(lie)]
+    width = max(1, heard.size // _BINS)
+    count = heard.size // width
+    return heard[heard.size - count * width :].reshape(count, width).mean(axis=1), noise / np.sqrt(width)
+
+
+@cache
+def _ramps(n: int) -> tuple[Floats, Ints]:
+    """All ramps from 0 to 1 over n bins, less their means, and how many bins they last."""
+    begin, end = np.triu_indices(n, 1)
+    at = np.arange(n)
+    ramps = np.clip((at - begin[:, None]) / (end - begin)[:, None], 0.0, 1.0)
+    return ramps - ramps.mean(axis=1, keepdims=True), np.asarray(end - begin)
+
+
+def _left(ramps: Floats, means: Floats) -> Floats:
+    """Squares that each ramp, of any size and on any level, leaves."""
+    centred = means - means.mean()
+    fit = (ramps @ centred) ** 2 / np.einsum("ij,ij->i", ramps, ramps)
+    return np.asarray(np.maximum(centred @ centred - fit, 0.0))
+
+
+def shifted(y: Floats, model: Floats, heard: int, age: int, room: float) -> int:
+    """Lag in ticks at which readings agree with the reconstruction far better than at their own time.
+
+    At each lag the mean square of ``y(t) - v2(t - lag)`` about a level within what a meter's fixed error
+    allows is compared with that at lag 0 about *any* level and slope; n readings that follow each other
+    slowly count as n / 4. The lag is believed if
+
+        (n / 8) log(left at 0 / left at lag) > log(lags) + 5
+
+    Parameters
+    ----------
+    y, model : (n,)
+        Readings, NaN where there is none, and what the others say; squared pu, up to now.
+    heard
+        How many of the last are looked for.
+    age
+        How long the readings have been wrong, ticks: the reconstruction is looked for among that many of
+        them where a clock is behind.
+    room
+        Largest difference of the levels that a fixed error explains, squared pu.
+
+    Returns
+    -------
+    int
+        Negative where readings are ahead of their time; 0 for none.
+    """
+    if np.isnan(y[-heard:]).mean() > 1.0 / _ALIKE:
+        return 0
+    y = _filled(y)
+    at = np.arange(heard)
+    lie = y[-heard:] - model[-heard:]
+    lie = lie - lie.mean()
+    slope = at - at.mean()
+    own = float(lie @ lie - (slope @ lie) ** 2 / (slope @ slope)) / heard
+    late = _lags(y[-heard:], model, room)
+    early = _lags(model[-heard:], y[-max(age, heard) :], room)
+    lags = np.concatenate([late[_NEAREST:], early[_NEAREST:]])
+    if not lags.size:
+        return 0
+    best = int(lags.argmin())
+    surprise = 0.5 * heard / _ALIKE * np.log(own / max(float(lags[best]), np.finfo(np.float64).tiny))
+    if not surprise > np.log(lags.size) + _SURE:
+        return 0
+    split = max(late.size - _NEAREST, 0)
+    return best + _NEAREST if best < split else -(best - split + _NEAREST)
+
+
+def _lags(short: Floats, long: Floats, room: float) -> Floats:
+    """Mean square of the difference of `short` and each stretch of `long`, the newest first."""
+    n = short.size
+    level = long.mean()
+    short, long = short - level, long - level
+    sums = np.cumsum(np.concatenate([[0.0], long]))
+    squares = np.cumsum(np.concatenate([[0.0], long**2]))
+    mean = short.mean() - (sums[n:] - sums[:-n]) / n
+    whole = (short @ short + squares[n:] - squares[:-n] - 2.0 * np.correlate(long, short, "valid")) / n
+    # About the level that is nearest to the mean and within the room.
+    return np.asarray(whole - mean**2 + np.maximum(np.abs(mean) - room, 0.0) ** 2)[::-1]
+
+
+def _filled(y: Floats) -> Floats:
+    """Missing readings repeat the one before; those at the beginning the first one."""
+    there = np.isfinite(y)
+    last = np.maximum.accumulate(np.where(there, np.arange(y.size), 0))
+    return np.where(there[last], y[last], y[there.argmax()])
+
+
+def _together(shapes: Shapes, memory: Memory, since: Ints, variance: Floats) -> Bools:
+    """Named meters whose lies are one load's trace."""
+    named = since >= 0
+    who = np.flatnonzero(named)
+    if who.size < 2:  # noqa: PLR2004  # one meter has no story to share
+        return np.zeros_like(named)
+    # From when all of them are named; evidence is a tick older than a name.
+    start = max(memory.first, memory.kept - _EVERY, int(since.max()) - 1)
+    lies, heard = np.zeros(who.size), np.zeros(who.size)
+    for k, j in enumerate(who.tolist()):
+        code, model = repeats.past(memory, j, start, memory.kept)
+        lie = (code * shapes.rules.step[j]) ** 2 - model
+        lie = lie[np.isfinite(lie)]
+        lies[k], heard[k] = lie.mean() if lie.size else 0.0, lie.size
+    if not heard.all():
+        return np.zeros_like(named)
+    spread = variance[who] + shapes.noise[who] / heard
+    return np.where(traced(shapes.traces, who, lies, spread), named, np.zeros_like(named))
+
+
+def traced(traces: Floats, who: Ints, lies: Floats, variance: Floats) -> bool:
+    """Whether several meters' lies are the trace of one customer's load, rather than anything else.
+
+    The lies must be proportional to a column of 2R or 2X within their errors; the meters must be among
+    those that this load affects most, twice their number at most, since it is these a consistent story
+    needs; and one constant for all must fit worse by more than the number of columns explains.
+
+    Parameters
+    ----------
+    traces : (p, K)
+        Columns of 2R and 2X.
+    who : (k,)
+        The meters.
+    lies : (k,)
+        Readings minus reconstruction, squared pu.
+    variance : (k,)
+        Of them.
+    """
+    weight = 1.0 / (variance + (_TRACE * lies) ** 2)
+    columns = traces[who]
+
+    def misfit(of: Floats) -> Floats:
+        power = (weight * lies) @ of / np.maximum(weight @ of**2, np.finfo(np.float64).tiny)
+        return np.asarray(weight @ (lies[:, None] - power * of) ** 2)
+
+    same = misfit(np.ones((who.size, 1)))[0]
+    weakest = columns.min(axis=0)
+    affected = (traces >= weakest).sum(axis=0) <= max(2 * who.size, 3)
+    fits = misfit(columns)
+    fits = np.where(affected & (weakest > 0.0), fits, np.inf)
+    best = float(fits.min())
+    enough = float(chi2.isf(0.01, who.size - 1))
+    return bool(best <= enough and same - best > 2.0 * np.log(traces.shape[1]))
