@@ -169,6 +169,7 @@ ESTIMATORS = (
     "sequential",
     "exact-bank",
     "exact-bank-lmi",
+    "windowed-bank",
     "weighted-least-squares",
     "l0-decoder",
     "basis-pursuit",

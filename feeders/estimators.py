@@ -18,7 +18,7 @@ from gridsec import monitor, sequential
 from gridsec.arrays import Floats
 from gridsec.certificates import certify
 from gridsec.errors import FeederInvalid
-from gridsec.families import decoders, ticks
+from gridsec.families import decoders, ticks, windowed
 from gridsec.feeder import lindistflow
 from gridsec.gains import CircleOptions, options_for
 from gridsec.lure import Lure, close_loop
@@ -299,6 +299,13 @@ def _load_columns(site: Site) -> Floats:
     return np.hstack([2.0 * model.R * dp, 2.0 * model.X * dq])
 
 
+def _windowed(site: Site, _: Job) -> windowed.WindowedDesign:
+    settings = site.tables.meta.monitor
+    return windowed.design(
+        plant(site), doubt=load_doubt(site), step_s=settings.tick_s, max_attacked=settings.max_attacked
+    )
+
+
 def _ticks(name: str, summary: str, decoder: Decoder) -> Family:
     """A family that judges every tick by itself."""
 
@@ -334,6 +341,15 @@ FAMILIES: Final[Mapping[str, Family]] = MappingProxyType(
             ),
             _bank(DIRECT, "banks of circle-criterion observers, direct injection (chong2020)", _direct_bank),
             _bank(LMI, "the same banks, gains by matrix inequality (chong2020)", _lmi_bank),
+            Family(
+                "windowed-bank",
+                "windows of consistency of discrete-time observers (yang2019)",
+                _windowed,
+                windowed.init,
+                windowed.step,
+                lambda d: int(d.observers),
+                lambda d: _certificate(d.chain),
+            ),
             _ticks(
                 "weighted-least-squares",
                 "chi-square test and largest normalised residual (lee2018, 2)",

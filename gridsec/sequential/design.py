@@ -22,7 +22,9 @@ from gridsec.lure import Lure, close_loop
 from gridsec.plant import Plant
 from gridsec.sequential.conditional import Prior
 from gridsec.sequential.decoder import Decoder
+from gridsec.sequential.kinds import Shapes
 from gridsec.sequential.loads import LoadDoubt, injection_doubt, prior
+from gridsec.sequential.repeats import rules
 from gridsec.sequential.search import Dictionary
 
 YEAR_S = 365.25 * 86400.0
@@ -125,6 +127,8 @@ class SequentialDesign:
         Meter that drives each inverter; -1 for none.
     book
         What else but meters can be wrong: every customer's active power, then every inverter.
+    shapes
+        What manipulations are compared with, and when repetition is evidence.
     most
         How many liars it claims to tell apart: a third of the meters.
     step_s
@@ -155,6 +159,7 @@ class SequentialDesign:
     reach: Floats
     meter_of: Ints
     book: Dictionary = field(repr=False)
+    shapes: Shapes = field(repr=False)
     most: int
     step_s: float
     options: SequentialOptions = field(repr=False)
@@ -232,6 +237,7 @@ def design(
         reach=np.abs(lure.C) @ (2.0 * plant.droop.limit),
         meter_of=_meter_of(plant),
         book=_suspicions(plant, model, options),
+        shapes=_shapes(plant, model, options.alarms_per_year, step_s, lengths),
         most=most,
         step_s=step_s,
         options=options,
@@ -277,13 +283,29 @@ def _lengths(scales_s: tuple[float, ...], step_s: float) -> tuple[int, ...]:
     return tuple(sorted({max(1, round(scale / step_s)) for scale in scales_s}))
 
 
+# Besides the scales, stuck meters and replays have their share of the false alarms.
+_REPEATS = 2
+
+
 def _sigmas(rate: float, meters: int, length: int, step_s: float, lengths: tuple[int, ...]) -> float:
     """Two-sided Gaussian limit such that all scales together exceed it `rate` times a year by chance.
 
     Means over `length` ticks are new once in that time; between, they hardly change.
     """
-    tests = meters * len(lengths) * YEAR_S / (step_s * length)
+    tests = meters * (len(lengths) + _REPEATS) * YEAR_S / (step_s * length)
     return float(norm.isf(min(rate / tests, 0.5) / 2.0))
+
+
+def _shapes(plant: Plant, model: LinDistFlow, rate: float, step_s: float, lengths: tuple[int, ...]) -> Shapes:
+    """What manipulations look like at this feeder's meters."""
+    accuracy, slope = plant.accuracy, 2.0 * _HIGH * plant.droop.vbar
+    tests = plant.meters.size * (len(lengths) + _REPEATS) * YEAR_S / step_s
+    at = plant.feeder.bus[plant.meters]
+    return Shapes(
+        rules=rules(accuracy.resolution, accuracy.jitter, min(rate / tests, 0.5), step_s),
+        traces=2.0 * np.hstack([model.R_bus[at], model.X_bus[at]]),
+        noise=slope**2 * (accuracy.jitter**2 + accuracy.resolution**2 / 12.0),
+    )
 
 
 def _suspicions(plant: Plant, model: LinDistFlow, options: SequentialOptions) -> Dictionary:

@@ -336,7 +336,7 @@ def _together(shapes: Shapes, memory: Memory, since: Ints, variance: Floats) -> 
     """Named meters whose lies are one load's trace."""
     named = since >= 0
     who = np.flatnonzero(named)
-    if who.size < 2:  # noqa: PLR2004  # one meter has no story to share
+    if who.size < 2:  # one meter has no story to share
         return np.zeros_like(named)
     # From when all of them are named; evidence is a tick older than a name.
     start = max(memory.first, memory.kept - _EVERY, int(since.max()) - 1)

@@ -11,6 +11,8 @@ from gridsec.online import Estimate, Verdict
 from gridsec.sequential.commission import Learned, Learning, begin, nothing
 from gridsec.sequential.conditional import Fit, Prior
 from gridsec.sequential.design import SequentialDesign
+from gridsec.sequential.kinds import Kinds
+from gridsec.sequential.kinds import empty as no_kinds
 from gridsec.sequential.windows import Window, empty
 
 
@@ -96,6 +98,8 @@ class SequentialState:
         What is known of them.
     model_error : (p,)
         What the model may be off at each meter, squared pu.
+    kinds
+        The past, and what the named meters' manipulations look like.
     last
         The last answer.
     """
@@ -112,6 +116,7 @@ class SequentialState:
     learning: Learning | None
     learned: Learned
     model_error: Floats
+    kinds: Kinds
     last: tuple[Estimate, Verdict] | None
 
 
@@ -145,5 +150,6 @@ def init(design: SequentialDesign, t: float, learned: Learned | None = None) -> 
         learning=begin(p) if learned is None and design.options.commission_s > 0 else None,
         learned=nothing(design) if learned is None else learned,
         model_error=np.zeros(p),
+        kinds=no_kinds(p),
         last=None,
     )

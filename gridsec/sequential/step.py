@@ -16,11 +16,12 @@ from gridsec.sequential.conditional import judge
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.drive import drive
 from gridsec.sequential.examine import Examined, confirm, examine
+from gridsec.sequential.kinds import Kinds, describe, listen, suspicious
 from gridsec.sequential.loads import prior
 from gridsec.sequential.search import Explanation as Found
 from gridsec.sequential.search import swaps
 from gridsec.sequential.state import Doubts, SequentialState, Trust
-from gridsec.sequential.windows import push, shift
+from gridsec.sequential.windows import Window, push, shift
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,6 +62,9 @@ def step(
     doubts = _doubts(design, state.doubts, frame, heard.busbar)
     if doubts is not state.doubts and doubts.prior is not state.doubts.prior:
         state = replace(state, fits=(None,) * len(state.fits))
+    kinds = listen(design.shapes, state.kinds, heard.y, heard.live)
+    copies = suspicious(kinds) & (design.decoder is None)
+    begun = _distrust(state.trust, copies)
     x = _inverters(design, state, frame, heard)
     q = heard.q + np.where(
         heard.told, 0.0, np.bincount(plant.droop.customer, weights=x, minlength=heard.q.size)
@@ -79,7 +83,7 @@ def step(
     transient = design.reach * left
     seen = examine(
         design,
-        state.trust,
+        begun,
         state.fits,
         window,
         prior=doubts.prior,
@@ -87,7 +91,8 @@ def step(
         tick=state.ticks,
         model=model + transient,
     )
-    trust, doubtful = _name(design, state.trust, seen)
+    trust, doubtful = _name(design, begun, seen)
+    trust = _distrust(trust, copies)
     seen = replace(seen, trust=trust)
     after = replace(
         state,
@@ -101,10 +106,38 @@ def step(
         fits=seen.fits,
         doubts=doubts,
         model_error=model,
+        kinds=_kinds(design, state, kinds, seen, window, v2_bus[at]),
     )
     after = _learn(design, after, residual, heard.live & trust.trusted, frame.t - state.t)
     estimate, verdict = _conclude(design, after, heard, seen, v2_bus, transient, doubtful)
     return replace(after, last=(estimate, verdict)), estimate, verdict
+
+
+def _distrust(trust: Trust, copies: Bools) -> Trust:
+    """Meters that repeat themselves are named, whatever the others say."""
+    if not copies.any():
+        return trust
+    return replace(
+        trust,
+        trusted=trust.trusted & ~copies,
+        quiet=np.where(copies, 0, trust.quiet),
+        still=trust.still | copies,
+        named=trust.named | copies,
+    )
+
+
+def _kinds(  # noqa: PLR0917  # everything that lies are compared with
+    design: SequentialDesign, state: SequentialState, kinds: Kinds, seen: Examined, window: Window, v2: Floats
+) -> Kinds:
+    """What the manipulations look like, by what the other meters say of each."""
+    view, prior_ = seen.views[0], state.doubts.prior
+    expected = v2 + state.learned.bias
+    if view is None:
+        variance = prior_.variance[prior_.meters] + design.white + state.learned.variance
+    else:
+        mean = window.sums[0] / np.maximum(window.counts[0], 1)
+        expected, variance = expected + mean - view.judged.offset, view.judged.std**2
+    return describe(design.shapes, kinds, expected, seen.trust.named, variance)
 
 
 def _learn(
@@ -294,7 +327,19 @@ def _conclude(  # noqa: PLR0917  # everything one tick brought
     score, threshold, judged = _worst(design, seen, heard.live.size)
     settled = bool(np.all(transient <= design.options.settled * threshold))
     attack = np.where(trust.named & heard.live, heard.y - state.learned.bias - v2_bus[at], 0.0)
-    decision, cause, reason = _decide(design, state, judged, threshold, settled)
+    decision, cause, reason = decide(
+        Situation(
+            names=design.names,
+            max_attacked=max(1, min(design.most, int(np.count_nonzero(judged)) // 3)),
+            live=judged,
+            suspected=~trust.trusted | (judged & (np.nan_to_num(score) > threshold)),
+            named=trust.named,
+            wide=judged & (threshold > design.options.widest),
+            valid=True,
+            settled=settled,
+            busbar=True,
+        )
+    )
     verdict = Verdict(
         decision,
         cause,
@@ -305,6 +350,7 @@ def _conclude(  # noqa: PLR0917  # everything one tick brought
         attack,
         inverters=_inverters_of(design, [] if design.own else [k for k, _ in trust.accused]),
         inverter_attack=np.zeros(plant.droop.tau.size),
+        kinds=state.kinds.kinds,
         explanations=rivals,
     )
     return estimate, verdict
@@ -351,29 +397,6 @@ def _worst(design: SequentialDesign, seen: Examined, p: int) -> tuple[Floats, Fl
         score, threshold = np.where(more, offset, score), np.where(more, view.limit, threshold)
         ratio = np.maximum(ratio, now)
     return np.where(judged, score, np.nan), threshold, judged
-
-
-def _decide(
-    design: SequentialDesign,
-    state: SequentialState,
-    judged: Bools,
-    threshold: Floats,
-    settled: bool,
-) -> tuple[Decision, Cause, str]:
-    trust = state.trust
-    return decide(
-        Situation(
-            names=design.names,
-            max_attacked=max(1, min(design.most, int(np.count_nonzero(judged)) // 3)),
-            live=judged,
-            suspected=~trust.trusted,
-            named=trust.named,
-            wide=judged & (threshold > design.options.widest),
-            valid=True,
-            settled=settled,
-            busbar=True,
-        )
-    )
 
 
 def _unusable(
