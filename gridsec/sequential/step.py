@@ -66,12 +66,7 @@ def step(
     copies = suspicious(kinds) & (design.decoder is None)
     begun = _distrust(state.trust, copies)
     x = _inverters(design, state, frame, heard)
-    q = heard.q + np.where(
-        heard.told, 0.0, np.bincount(plant.droop.customer, weights=x, minlength=heard.q.size)
-    )
-    with np.errstate(all="ignore"):
-        v2_bus = bus_voltages(plant.feeder, frame.p, q, heard.v0_squared, steps=plant.loss_correction)
-    v2_bus = np.where(np.isfinite(v2_bus), v2_bus, heard.v0_squared)
+    q, v2_bus = _voltages(design, frame, heard, x)
     residual = heard.y - v2_bus[at] - state.learned.bias
     window = push(state.window, design.lengths, residual, heard.live)
     model = state.model_error
@@ -111,6 +106,17 @@ def step(
     after = _learn(design, after, residual, heard.live & trust.trusted, frame.t - state.t)
     estimate, verdict = _conclude(design, after, heard, seen, v2_bus, transient, doubtful)
     return replace(after, last=(estimate, verdict)), estimate, verdict
+
+
+def _voltages(design: SequentialDesign, frame: Frame, heard: _Heard, x: Floats) -> tuple[Floats, Floats]:
+    """Reactive injections, (N,), and what the model makes of all of them, (n,)."""
+    plant = design.plant
+    q = heard.q + np.where(
+        heard.told, 0.0, np.bincount(plant.droop.customer, weights=x, minlength=heard.q.size)
+    )
+    with np.errstate(all="ignore"):
+        v2_bus = bus_voltages(plant.feeder, frame.p, q, heard.v0_squared, steps=plant.loss_correction)
+    return q, np.where(np.isfinite(v2_bus), v2_bus, heard.v0_squared)
 
 
 def _distrust(trust: Trust, copies: Bools) -> Trust:
