@@ -238,6 +238,10 @@ def scenario_to_json(scenario: Scenario) -> dict[str, Any]:
         | {field.name: getattr(attack, field.name) for field in fields(attack)}
         for attack in scenario.attacks
     ]
+    plain["inverter_attacks"] = [
+        {field.name: getattr(attack, field.name) for field in fields(attack)}
+        for attack in scenario.inverter_attacks
+    ]
     out: dict[str, Any] = _plain(plain)
     return out
 
@@ -259,6 +263,15 @@ def scenario_from_json(obj: dict[str, Any]) -> Scenario:
     given["variation"] = Variation(**given["variation"])
     given["errors"] = MeterErrors(**given["errors"])
     given["attacks"] = tuple(_attack(entry) for entry in given["attacks"])
+    given["inverter_attacks"] = tuple(
+        attacks.InverterAttack(
+            np.array(entry["inverters"], dtype=np.intp),
+            np.array(entry["q"], dtype=np.float64),
+            float(entry["t_on"]),
+            float(entry["t_off"]),
+        )
+        for entry in given.get("inverter_attacks", ())
+    )
     given["duration_s"] = float(given["duration_s"])
     return Scenario(**given)
 

@@ -21,7 +21,7 @@ from feeders.meters import BUSBAR, Channel, Delivery, MeterErrors, Meters, Regis
 from feeders.truth import Block, net_reactive, truth
 from feeders.variation import Variation
 from gridsec.arrays import Bools, Floats, Ints
-from gridsec.attack import Attack, Reports, apply_all, manipulated, reach
+from gridsec.attack import Attack, InverterAttack, Reports, apply_all, manipulated, reach
 
 if TYPE_CHECKING:
     from feeders.load import Site
@@ -71,6 +71,8 @@ class Scenario:
         How loads and busbar vary, what errors meters have, what happens to readings on the way.
     attacks
         Who lies, when and how, applied in this order. Meters are indices into `Site.meters`.
+    inverter_attacks
+        Which inverters inject a wrong reactive power; they add up. Inverters are indices into `Site.droop`.
     """
 
     seed: int = 0
@@ -83,6 +85,7 @@ class Scenario:
     errors: MeterErrors = field(default_factory=MeterErrors)
     channel: Channel = field(default_factory=Channel)
     attacks: tuple[Attack, ...] = ()
+    inverter_attacks: tuple[InverterAttack, ...] = ()
 
     def __post_init__(self) -> None:
         if self.seed < 0:
@@ -350,7 +353,7 @@ def _tick_count(scenario: Scenario) -> float:
 
 def _honest(site: Site, meters: Meters, block: Block) -> Registers:
     return meters.read(
-        block.ticks, block.v_volt, block.demand.p_kw, net_reactive(site, block), block.demand.v0_volt
+        block.ticks, block.v_volt, block.shown_kw, net_reactive(site, block), block.demand.v0_volt
     )
 
 
@@ -368,6 +371,12 @@ def _attacked(
 
 
 def _check(site: Site, scenario: Scenario) -> None:
+    for wrong in scenario.inverter_attacks:
+        if wrong.inverters.max() >= site.droop.tau.size:
+            raise ValueError(
+                f"an attack names inverter {wrong.inverters.max()}, but {site.feeder.name} has "
+                f"{site.droop.tau.size}"
+            )
     for attack in scenario.attacks:
         if attack.meters.max() >= site.meters.size:
             raise ValueError(

@@ -12,6 +12,7 @@ from feeders.inverters import TOLERANCE_PU, ClosedLoop, Loads, Point
 from feeders.powerflow import PowerFlow
 from feeders.variation import Customers, Demand
 from gridsec.arrays import Floats, Ints
+from gridsec.attack import InverterAttack
 
 if TYPE_CHECKING:
     from feeders.load import Site
@@ -51,9 +52,11 @@ class Block:
     v_bus_volt : (T, b + 1)
         Voltage of each bus, V.
     x : (T, m)
-        Reactive injection of each inverter, pu.
+        Reactive injection of each inverter as its droop curve has it, pu.
     demand
         What customers draw without their inverters' reactive power, and the busbar's voltage.
+    shown_kw : (T, N)
+        The active power that readings show.
     """
 
     ticks: Ints
@@ -62,6 +65,7 @@ class Block:
     v_bus_volt: Floats
     x: Floats
     demand: Demand
+    shown_kw: Floats
 
 
 def truth(site: Site, scenario: Scenario, first: int, end: float) -> Iterator[Block]:
@@ -77,12 +81,29 @@ def truth(site: Site, scenario: Scenario, first: int, end: float) -> Iterator[Bl
         back = scenario.dt_s * np.arange(steps - 1, -1, -1) / steps
         # The very first tick is where the course begins: nothing has to lead up to it.
         skip = steps - 1 if begin == first else 0
-        fine = customers.at((t[:, None] - back).ravel()[skip:])
+        moments = (t[:, None] - back).ravel()[skip:]
+        told = customers.at(moments)
+        p, q = customers.hidden(moments)
+        q = q - site.feeder.base_kva * injected(site, scenario.inverter_attacks, moments)
+        fine = Demand(told.p_kw + p, told.q_kvar + q, told.v0_volt)
         v_volt, v_bus_volt, x = course.run(fine)
         at = slice(steps - 1 - skip, None, steps)
         demand = Demand(fine.p_kw[at], fine.q_kvar[at], fine.v0_volt[at])
-        yield Block(ticks, t, v_volt[at], v_bus_volt[at], x[at], demand)
+        yield Block(ticks, t, v_volt[at], v_bus_volt[at], x[at], demand, told.p_kw[at])
         begin += ticks.size
+
+
+def injected(site: Site, attacks: tuple[InverterAttack, ...], t: Floats) -> Floats | float:
+    """What attacked inverters inject beside their droop curves at times t (T,), pu per customer, (T, N)."""
+    if not attacks:
+        return 0.0
+    count = len(site.tables.customers)
+    out = np.zeros((t.size, count))
+    for attack in attacks:
+        at = site.droop.customer[attack.inverters]
+        on = (attack.t_on <= t) & (t < attack.t_off)
+        out[on] += np.bincount(at, weights=attack.q, minlength=count)
+    return out
 
 
 class _Course:

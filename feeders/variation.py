@@ -46,6 +46,8 @@ class Stream(IntEnum):
     JITTER = 7
     CHANNEL = 8
     ATTACK = 9
+    HIDDEN_P = 10
+    HIDDEN_Q = 11
 
 
 def generator(seed: int, stream: Stream, index: int = 0) -> np.random.Generator:
@@ -76,6 +78,9 @@ class Variation:
         Height of one step of the transformer's tap changer upstream, pu; 0: none.
     tap_interval_s
         There is one tap event in each interval of this length, at a random time in it, s.
+    hidden_kw, hidden_kvar, hidden_correlation_s
+        Standard deviations and correlation time, s, of what every customer draws beyond the power that its
+        readings show: readings that are forecasts rather than metered.
     """
 
     load_scale: float = 1.0
@@ -89,6 +94,9 @@ class Variation:
     busbar_correlation_s: float = 1800.0
     tap_step_pu: float = 0.0125
     tap_interval_s: float = 7200.0
+    hidden_kw: float = 0.0
+    hidden_kvar: float = 0.0
+    hidden_correlation_s: float = 600.0
 
 
 class Fluctuation:
@@ -216,6 +224,8 @@ class Customers:
         self._cloud = Fluctuation(seed, Stream.CLOUD, count, variation.cloud_correlation_s)
         self._sky = Fluctuation(seed, Stream.COMMON_CLOUD, 1, variation.cloud_correlation_s)
         self._busbar = Fluctuation(seed, Stream.BUSBAR, 1, variation.busbar_correlation_s)
+        self._hidden_p = Fluctuation(seed, Stream.HIDDEN_P, count, variation.hidden_correlation_s)
+        self._hidden_q = Fluctuation(seed, Stream.HIDDEN_Q, count, variation.hidden_correlation_s)
 
     def at(self, t: Floats) -> Demand:
         """Everything at times t (T,), Unix s."""
@@ -225,6 +235,11 @@ class Customers:
             q_kvar=self._tan * load + self._q_floor_kvar,
             v0_volt=self._busbar_volt(t),
         )
+
+    def hidden(self, t: Floats) -> tuple[Floats | float, Floats | float]:
+        """What is drawn at times t (T,) beyond `at`, kW and kvar, (T, N) each; 0.0 where nothing is."""
+        kw, kvar = self._variation.hidden_kw, self._variation.hidden_kvar
+        return kw * self._hidden_p.at(t) if kw else 0.0, kvar * self._hidden_q.at(t) if kvar else 0.0
 
     def _loads(self, t: Floats) -> Floats:
         spread = self._variation.load_spread

@@ -199,6 +199,37 @@ class Coordinated(_Attack):
 Attack: TypeAlias = Bias | Scaling | Drift | Stuck | Replay | Random | Coordinated
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class InverterAttack:
+    """Inverters inject a wrong reactive power, `x + q` instead of what their droop curves say.
+
+    Attributes
+    ----------
+    inverters : (k,)
+        Index of each manipulated inverter, every one once.
+    q : (k,)
+        What each injects in addition, pu.
+    t_on, t_off
+        While t_on <= t < t_off, Unix s.
+
+    References
+    ----------
+    yang2021 (2): the attack signal a_u on the inputs.
+    """
+
+    inverters: Ints
+    q: Floats
+    t_on: float
+    t_off: float
+
+    def __post_init__(self) -> None:
+        _check_meters(self.inverters, self.t_on, self.t_off, what="inverters")
+        if self.q.shape != self.inverters.shape or not np.all(np.isfinite(self.q)):
+            raise ValueError(
+                f"q has shape {self.q.shape} or is not finite; one number per inverter is needed"
+            )
+
+
 def apply(attack: Attack, t: Floats, honest: Reports, past: Past) -> Reports:
     """Reports under one attack.
 
@@ -391,11 +422,11 @@ def _scramble(bits: _Bits) -> _Bits:
     return z ^ (z >> np.uint64(31))
 
 
-def _check_meters(meters: Ints, t_on: float, t_off: float) -> None:
+def _check_meters(meters: Ints, t_on: float, t_off: float, *, what: str = "meters") -> None:
     if meters.ndim != 1 or meters.size == 0:
-        raise ValueError("an attack needs a one-dimensional, non-empty array of meters")
+        raise ValueError(f"an attack needs a one-dimensional, non-empty array of {what}")
     if np.unique(meters).size != meters.size or np.any(meters < 0):
-        raise ValueError(f"meters of an attack must be different indices from 0, got {meters.tolist()}")
+        raise ValueError(f"{what} of an attack must be different indices from 0, got {meters.tolist()}")
     if not t_on < t_off:
         raise ValueError(f"an attack must begin before it ends, got t_on={t_on} and t_off={t_off}")
 
