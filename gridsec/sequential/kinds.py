@@ -45,6 +45,8 @@ _FEW, _MANY, _NEAREST = 64, 512, 2
 _ALIKE, _SURE = 4.0, 5.0
 # The linear model of a load's trace is off by this part.
 _TRACE = 0.05
+# Entries of two columns this close, as a part, are equal.
+_SAME = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -189,14 +191,16 @@ def _alone(  # noqa: PLR0917  # one meter, and what is known of it
     shapes: Shapes, memory: Memory, meter: int, age: int, variance: float, before: Kind | None
 ) -> Kind | None:
     """What one meter's lie looks like by itself."""
-    if before is Kind.DRIFT:
-        # A drift that has arrived somewhere is one still.
+    # What takes a long look to see stays true when the lie rests: a drift that has arrived, a clock in calm.
+    if before is Kind.CLOCK_SHIFT:
         return before
     step, heard = shapes.rules.step[meter], min(age, _MANY)
     if heard >= _FEW:
         code, model = repeats.past(memory, meter, memory.first, memory.kept)
         if shifted((code * step) ** 2, model, heard, age, 3.0 * float(np.sqrt(variance))):
             return Kind.CLOCK_SHIFT
+    if before is Kind.DRIFT:
+        return before
     start = max(memory.first, memory.tick - 2 * age - 4 * _BINS)
     code, model = repeats.past(memory, meter, start, memory.kept)
     return shape((code * step) ** 2 - model, float(np.sqrt(shapes.noise[meter])), age)
@@ -379,7 +383,8 @@ def traced(traces: Floats, who: Ints, lies: Floats, variance: Floats) -> bool:
 
     same = misfit(np.ones((who.size, 1)))[0]
     weakest = columns.min(axis=0)
-    affected = (traces >= weakest).sum(axis=0) <= max(2 * who.size, 3)
+    # Meters beyond the same branch feel it alike: only those that feel more are counted.
+    affected = (traces > weakest * (1.0 + _SAME)).sum(axis=0) <= 2 * who.size
     fits = misfit(columns)
     fits = np.where(affected & (weakest > 0.0), fits, np.inf)
     best = float(fits.min())
