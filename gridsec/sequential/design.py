@@ -167,6 +167,11 @@ class SequentialDesign:
     own: bool = False
 
     @property
+    def customers(self) -> int:
+        """N."""
+        return self.plant.feeder.bus.size
+
+    @property
     def observers(self) -> int:
         """One observer, whatever is trusted."""
         return 1

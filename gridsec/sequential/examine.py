@@ -239,9 +239,9 @@ class _Search:
     """The explanations that several starts lead to on one scale.
 
     The starts: what was believed, without what this scale and shorter ones suspect besides meters; where
-    several meters are suspected, a robust fit and all meters close to the model; and where more than one
-    is, what was believed with suspicions besides meters. Longer means know better, so they decide anew
-    about what shorter ones suspected.
+    several meters are suspected, a robust fit and all meters close to the model; and where any is, what was
+    believed with suspicions besides meters. Longer means know better, so they decide anew about what
+    shorter ones suspected.
 
     Meters against which other scales have evidence are not admitted, or lies that have just begun would
     be believed again. Unless the explanation that does admit them is cheaper over all scales together.
@@ -271,7 +271,7 @@ class _Search:
             else:
                 found += starts
                 free = None
-        if min(_suspected(here, each) for each in found) > 1:
+        if min(_suspected(here, each) for each in found) > 0:
             found.append(self._descend(start, self.keep, design.book))
         found.sort(key=lambda each: each.cost)
         if free is not None and free.cost < found[0].cost and self._total(free) < self._total(found[0]):

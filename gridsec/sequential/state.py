@@ -38,6 +38,10 @@ class Trust:
         Meters named as manipulated.
     accused : tuple of (k, s)
         What else is suspected, indices of `design.book`, each with the scale that found it.
+    counted : (m,)
+        Ticks that accused each inverter, less those that did not.
+    inverters : (m,)
+        Inverters named as manipulated.
     """
 
     trusted: Bools
@@ -47,7 +51,9 @@ class Trust:
     bad: Bools
     still: Bools
     named: Bools
-    accused: tuple[tuple[int, int], ...] = ()
+    accused: tuple[tuple[int, int], ...]
+    counted: Ints
+    inverters: Bools
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -133,6 +139,7 @@ def init(design: SequentialDesign, t: float, learned: Learned | None = None) -> 
         The meters' fixed errors, if they were learned before.
     """
     p, s, customers = design.plant.meters.size, len(design.lengths), design.plant.feeder.bus.size
+    m = design.plant.droop.tau.size
     zeros = np.zeros(p, dtype=np.intp)
     no = np.zeros(p, dtype=np.bool_)
     none = np.zeros((s, p), dtype=np.bool_)
@@ -144,7 +151,18 @@ def init(design: SequentialDesign, t: float, learned: Learned | None = None) -> 
         x=None,
         v0_squared=design.plant.droop.vbar**2,
         window=empty(design.lengths, p),
-        trust=Trust(~no, zeros, zeros, zeros, none, none, no),
+        trust=Trust(
+            ~no,
+            zeros,
+            zeros,
+            zeros,
+            none,
+            none,
+            no,
+            (),
+            np.zeros(m, dtype=np.intp),
+            np.zeros(m, dtype=np.bool_),
+        ),
         fits=(None,) * s,
         doubts=Doubts(one, one, True, design.prior),
         learning=begin(p) if learned is None and design.options.commission_s > 0 else None,

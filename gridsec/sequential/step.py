@@ -8,18 +8,17 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats
 from gridsec.feeder import bus_voltages, model_error_bound
-from gridsec.judge import Situation, decide
 from gridsec.lure import known_input
-from gridsec.online import Cause, Decision, Estimate, Explanation, Frame, Verdict
-from gridsec.sequential.commission import conclude, gather
-from gridsec.sequential.conditional import judge
+from gridsec.online import Estimate, Frame, Verdict
+from gridsec.sequential.commission import conclude as learn
+from gridsec.sequential.commission import gather
+from gridsec.sequential.conclude import Tick, conclude, unusable
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.drive import drive
-from gridsec.sequential.examine import Examined, confirm, examine
+from gridsec.sequential.examine import Examined, examine
 from gridsec.sequential.kinds import Kinds, describe, listen, suspicious
 from gridsec.sequential.loads import prior
-from gridsec.sequential.search import Explanation as Found
-from gridsec.sequential.search import swaps
+from gridsec.sequential.naming import name
 from gridsec.sequential.state import Doubts, SequentialState, Trust
 from gridsec.sequential.windows import Window, push, shift
 
@@ -55,7 +54,7 @@ def step(
         As every estimator's step; see `gridsec.online`.
     """
     if not np.isfinite(frame.t) or (state.x is not None and not frame.t > state.t):
-        return _unusable(design, state, frame)
+        return unusable(design, state, frame)
     plant = design.plant
     at = plant.feeder.bus[plant.meters]
     heard = _clean(design, state, frame)
@@ -86,7 +85,7 @@ def step(
         tick=state.ticks,
         model=model + transient,
     )
-    trust, doubtful = _name(design, begun, seen)
+    trust, rivals = name(design, begun, seen)
     trust = _distrust(trust, copies)
     seen = replace(seen, trust=trust)
     after = replace(
@@ -104,7 +103,8 @@ def step(
         kinds=_kinds(design, state, kinds, seen, window, v2_bus[at]),
     )
     after = _learn(design, after, residual, heard.live & trust.trusted, frame.t - state.t)
-    estimate, verdict = _conclude(design, after, heard, seen, v2_bus, transient, doubtful)
+    tick = Tick(heard.y, heard.live, heard.v0_squared, heard.busbar, v2_bus, transient, seen, rivals)
+    estimate, verdict = conclude(design, after, tick)
     return replace(after, last=(estimate, verdict)), estimate, verdict
 
 
@@ -155,7 +155,7 @@ def _learn(
     learning = gather(state.learning, residual, use, h)
     if learning.time_s < design.options.commission_s or not state.trust.trusted.all():
         return replace(state, learning=learning)
-    learned = conclude(design, learning)
+    learned = learn(design, learning)
     window = shift(state.window, state.learned.bias - learned.bias)
     return replace(state, learning=None, learned=learned, window=window, fits=(None,) * len(state.fits))
 
@@ -262,184 +262,3 @@ def _model_error(design: SequentialDesign, p: Floats, q: Floats, v0_squared: flo
     with np.errstate(all="ignore"):
         error = model_error_bound(plant.feeder, p, q, v0_squared)[plant.meters]
     return np.where(np.isfinite(error), error, design.options.widest)
-
-
-def _name(design: SequentialDesign, before: Trust, seen: Examined) -> tuple[Trust, tuple[Explanation, ...]]:
-    """Who is named now; and explanations that fit about as well where a meter would have been named."""
-    trust = seen.trust
-    quiet = np.where(trust.still.any(axis=0), 0, trust.quiet + 1)
-    trusted = (trust.trusted & ~before.named) | (quiet >= design.options.release)
-    age = np.where(trusted, 0, trust.age + 1)
-    need = np.array([confirm(length) for length in design.lengths])[trust.scale]
-    fresh = ~trusted & ~before.named & trust.bad.any(axis=0) & (age >= need)
-    named = before.named & (quiet < design.options.release)
-    rivals = _rivals(design, seen, fresh) if fresh.any() else ()
-    for rival in rivals:
-        fresh = fresh & rival.meters
-    return replace(trust, trusted=trusted, age=age, quiet=quiet, named=named | fresh), rivals
-
-
-def _rivals(design: SequentialDesign, seen: Examined, fresh: Bools) -> tuple[Explanation, ...]:
-    """All explanations about as likely as the best, where one leaves out a meter about to be named."""
-    within = 2.0 * float(np.log(design.options.like))
-    out: list[tuple[Bools, Bools, float]] = []
-    for found in seen.found.values():
-        best = found[0]
-        near = [(_meters(each), each, each.cost - best.cost) for each in found]
-        for swap in swaps(best, np.isfinite(best.judged.offset), within):
-            other = near[0][0].copy()
-            other[swap.accused], other[swap.innocent] = False, True
-            near.append((other, best, swap.worse))
-        out += [
-            (meters, _inverters_of(design, each.loosened), float(np.exp(-0.5 * worse)))
-            for meters, each, worse in near
-            if each is best or (worse <= within and (fresh & ~meters).any())
-        ]
-    if not any((fresh & ~meters).any() for meters, _, _ in out):
-        return ()
-    total = sum(weight for _, _, weight in out)
-    return tuple(Explanation(meters, inverters, weight / total) for meters, inverters, weight in out)
-
-
-def _meters(found: Found) -> Bools:
-    return ~found.fit.trusted
-
-
-def _conclude(  # noqa: PLR0917  # everything one tick brought
-    design: SequentialDesign,
-    state: SequentialState,
-    heard: _Heard,
-    seen: Examined,
-    v2_bus: Floats,
-    transient: Floats,
-    rivals: tuple[Explanation, ...],
-) -> tuple[Estimate, Verdict]:
-    plant, trust = design.plant, state.trust
-    at = plant.feeder.bus[plant.meters]
-    w, variance = _reconstructed(design, state, seen)
-    v2_bus = v2_bus + w
-    v2_bus[0] = heard.v0_squared if heard.busbar else v2_bus[0]
-    v2, std = v2_bus[plant.feeder.bus], np.sqrt(variance[plant.feeder.bus])
-    far = float(np.max(state.model_error + transient, initial=0.0))
-    estimate = Estimate(
-        t=state.t,
-        v2=v2,
-        bound=design.sigmas[0] * std + far,
-        v2_bus=v2_bus,
-        trusted=trust.trusted & heard.live,
-        x=np.zeros(0) if state.x is None else state.x,
-        std=std,
-    )
-    score, threshold, judged = _worst(design, seen, heard.live.size)
-    settled = bool(np.all(transient <= design.options.settled * threshold))
-    attack = np.where(trust.named & heard.live, heard.y - state.learned.bias - v2_bus[at], 0.0)
-    decision, cause, reason = decide(
-        Situation(
-            names=design.names,
-            max_attacked=max(1, min(design.most, int(np.count_nonzero(judged)) // 3)),
-            live=judged,
-            suspected=~trust.trusted | (judged & (np.nan_to_num(score) > threshold)),
-            named=trust.named,
-            wide=judged & (threshold > design.options.widest),
-            valid=True,
-            settled=settled,
-            busbar=True,
-        )
-    )
-    verdict = Verdict(
-        decision,
-        cause,
-        reason,
-        trust.named,
-        score,
-        threshold,
-        attack,
-        inverters=_inverters_of(design, [] if design.own else [k for k, _ in trust.accused]),
-        inverter_attack=np.zeros(plant.droop.tau.size),
-        kinds=state.kinds.kinds,
-        explanations=rivals,
-    )
-    return estimate, verdict
-
-
-def _inverters_of(design: SequentialDesign, accused: list[int]) -> Bools:
-    """Which inverters are among other suspicions, (m,)."""
-    out = np.zeros(design.plant.droop.tau.size, dtype=np.bool_)
-    customers = design.plant.feeder.bus.size
-    out[[k - customers for k in accused if k >= customers]] = True
-    return out
-
-
-def _reconstructed(design: SequentialDesign, state: SequentialState, seen: Examined) -> tuple[Floats, Floats]:
-    """What the trusted meters add to the model at every bus, and its variance, on the best scale."""
-    prior_ = state.doubts.prior
-    best, at, mean = prior_.variance, -1, np.inf
-    for s, (now, length) in enumerate(zip(state.fits, design.lengths, strict=True)):
-        if now is None:
-            continue
-        lag = min(1.0, length * design.step_s / design.doubt.time_s) * (length > 1)
-        variance = now.variance + lag * prior_.variance
-        if variance.sum() < mean:
-            best, at, mean = variance, s, float(variance.sum())
-    now, view = (None, None) if at < 0 else (state.fits[at], seen.views[at])
-    if now is None:
-        return np.zeros_like(best), best
-    m = state.window.sums[at] / np.maximum(state.window.counts[at], 1)
-    return (judge(now, m).w if view is None else view.judged.w), best
-
-
-def _worst(design: SequentialDesign, seen: Examined, p: int) -> tuple[Floats, Floats, Bools]:
-    """Offset and limit of each meter on the scale that speaks most against it; who was judged."""
-    score, threshold = np.full(p, np.nan), np.full(p, design.options.widest)
-    ratio = np.full(p, -1.0)
-    judged = np.zeros(p, dtype=np.bool_)
-    for view in seen.views:
-        if view is None:
-            continue
-        judged |= view.enough
-        offset = np.abs(view.judged.offset)
-        now = np.where(view.enough, offset / view.limit, -1.0)
-        more = now > ratio
-        score, threshold = np.where(more, offset, score), np.where(more, view.limit, threshold)
-        ratio = np.maximum(ratio, now)
-    return np.where(judged, score, np.nan), threshold, judged
-
-
-def _unusable(
-    design: SequentialDesign, state: SequentialState, frame: Frame
-) -> tuple[SequentialState, Estimate, Verdict]:
-    """The answer to a frame that is not later than the last one: nothing new, and certainly not CLEAN."""
-    plant = design.plant
-    p, n, m = plant.meters.size, len(plant.feeder.buses), plant.droop.tau.size
-    reason = f"A frame of time {frame.t} is not later than the last one, {state.t}; it was not used."
-    if state.last is not None:
-        estimate, verdict = state.last
-        return (
-            state,
-            estimate,
-            replace(verdict, decision=Decision.UNDECIDED, cause=Cause.SETTLING, reason=reason),
-        )
-    v2_bus = np.full(n, state.v0_squared)
-    estimate = Estimate(
-        t=state.t,
-        v2=v2_bus[plant.feeder.bus],
-        bound=np.full(plant.feeder.bus.size, _NO_VOLTAGE),
-        v2_bus=v2_bus,
-        trusted=np.zeros(p, dtype=np.bool_),
-        x=np.zeros(m),
-        std=np.full(plant.feeder.bus.size, _NO_VOLTAGE),
-    )
-    verdict = Verdict(
-        Decision.UNDECIDED,
-        Cause.SETTLING,
-        reason,
-        np.zeros(p, dtype=np.bool_),
-        np.full(p, np.nan),
-        np.full(p, _NO_VOLTAGE),
-        np.zeros(p),
-    )
-    return state, estimate, verdict
-
-
-# Errors of squared voltages end here: no voltage is above 2 pu.
-_NO_VOLTAGE = 4.0

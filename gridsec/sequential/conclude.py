@@ -1,0 +1,265 @@
+"""What one tick comes to: an estimate with its error, and a verdict with its reason.
+
+References
+----------
+docs/theory-sequential.md, sections 5 and 7.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats
+from gridsec.judge import Situation, decide
+from gridsec.online import Cause, Decision, Estimate, Explanation, Frame, Verdict
+from gridsec.sequential.conditional import judge
+from gridsec.sequential.design import SequentialDesign
+from gridsec.sequential.examine import Examined
+from gridsec.sequential.state import SequentialState
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tick:
+    """What one tick brought. p meters, n buses.
+
+    Attributes
+    ----------
+    y : (p,)
+        Squared voltages; any finite value where there is none.
+    live : (p,)
+        Which meters have a reading.
+    v0_squared
+        Squared busbar voltage.
+    busbar
+        Whether it is metered.
+    v2_bus : (n,)
+        Squared voltages that the model alone says.
+    transient : (p,)
+        What is left of the unknown initial state at each meter, squared pu.
+    seen
+        What the scales say.
+    rivals
+        Explanations about as likely as the one that was found.
+    """
+
+    y: Floats
+    live: Bools
+    v0_squared: float
+    busbar: bool
+    v2_bus: Floats
+    transient: Floats
+    seen: Examined
+    rivals: tuple[Explanation, ...]
+
+
+def conclude(design: SequentialDesign, state: SequentialState, tick: Tick) -> tuple[Estimate, Verdict]:
+    """Put the answer together.
+
+    Parameters
+    ----------
+    design, state
+        The design, and the state after this tick.
+    tick
+        What it brought.
+    """
+    plant, trust = design.plant, state.trust
+    w, variance = _reconstructed(design, state, tick.seen)
+    v2_bus = tick.v2_bus + w
+    v2_bus[0] = tick.v0_squared if tick.busbar else v2_bus[0]
+    v2, std = v2_bus[plant.feeder.bus], np.sqrt(variance[plant.feeder.bus])
+    far = float(np.max(state.model_error + tick.transient, initial=0.0))
+    estimate = Estimate(
+        t=state.t,
+        v2=v2,
+        bound=design.sigmas[0] * std + far,
+        v2_bus=v2_bus,
+        trusted=trust.trusted & tick.live,
+        x=np.zeros(0) if state.x is None else state.x,
+        std=std,
+    )
+    score, threshold, judged = _worst(design, tick.seen, tick.live.size)
+    at = plant.feeder.bus[plant.meters]
+    attack = np.where(trust.named & tick.live, tick.y - state.learned.bias - v2_bus[at], 0.0)
+    amounts = _amounts(design, state, tick.seen)
+    settled = bool(np.all(tick.transient <= design.options.settled * threshold))
+    said = decide(
+        Situation(
+            names=design.names,
+            max_attacked=max(1, min(design.most, int(np.count_nonzero(judged)) // 3)),
+            live=judged,
+            suspected=~trust.trusted | (judged & (np.nan_to_num(score) > threshold)),
+            named=trust.named,
+            wide=judged & (threshold > design.options.widest),
+            valid=True,
+            settled=settled,
+            busbar=True,
+        )
+    )
+    decision, cause, reason = _beside_meters(design, state, tick, amounts, said)
+    injected = np.array([amounts.get(design.customers + i, 0.0) for i in range(plant.droop.tau.size)])
+    verdict = Verdict(
+        decision,
+        cause,
+        reason,
+        trust.named,
+        score,
+        threshold,
+        attack,
+        inverters=trust.inverters,
+        inverter_attack=np.where(trust.inverters, injected, 0.0),
+        kinds=state.kinds.kinds,
+        explanations=tick.rivals,
+    )
+    return estimate, verdict
+
+
+_Said = tuple[Decision, Cause, str]
+# What a verdict about inverters and loads may add to: nothing more serious was found.
+_MILD = (Cause.AGREEMENT, Cause.AMBIGUOUS)
+
+
+def _beside_meters(
+    design: SequentialDesign, state: SequentialState, tick: Tick, amounts: dict[int, float], said: _Said
+) -> _Said:
+    """The answer, with what was found besides meters."""
+    decision, cause, reason = said
+    plant, inverters = design.plant, state.trust.inverters
+    owners = ", ".join(plant.feeder.customers[c] for c in plant.droop.customer[inverters])
+    if owners and cause is Cause.RESIDUALS:
+        return decision, cause, f"{reason[:-1]}; and the inverters of {owners}."
+    if cause not in _MILD:
+        return said
+    if owners:
+        sentence = (
+            f"Manipulated: the inverters of {owners}; their reactive power is not that of their curves."
+        )
+        return Decision.ATTACKED, Cause.RESIDUALS, sentence
+    sentence = ""
+    if tick.rivals:
+        ways = " or ".join(_way(design, each) for each in tick.rivals)
+        sentence = f"Manipulated is either {ways}; both explain the readings."
+    elif amounts and not design.own:
+        sentence = _doubt(design, *next(iter(amounts.items())))
+    return (Decision.UNDECIDED, Cause.AMBIGUOUS, sentence) if sentence else said
+
+
+def _doubt(design: SequentialDesign, k: int, amount: float) -> str:
+    """What a suspicion besides meters means, in one sentence."""
+    plant = design.plant
+    power = f"{abs(amount) * plant.feeder.base_kva:.1f}"
+    if k < design.customers:
+        way = "feeds in" if amount > 0 else "draws"
+        return f"It looks as if {plant.feeder.customers[k]} {way} {power} kW more than its readings say."
+    who = plant.feeder.customers[plant.droop.customer[k - design.customers]]
+    return f"The inverter of {who} may inject {power} kvar that its curve does not ask for."
+
+
+def _way(design: SequentialDesign, explanation: Explanation) -> str:
+    plant = design.plant
+    meters = [name for name, bad in zip(design.names, explanation.meters, strict=True) if bad]
+    owners = [plant.feeder.customers[c] for c in plant.droop.customer[explanation.inverters]]
+    parts = [
+        f"the {what} of {', '.join(who)}" for what, who in (("meters", meters), ("inverters", owners)) if who
+    ]
+    return " and ".join(parts) if parts else "nobody"
+
+
+def _amounts(design: SequentialDesign, state: SequentialState, seen: Examined) -> dict[int, float]:
+    """How much of each suspicion besides meters there is, by index of the book, pu.
+
+    With prior variance s^2 and direction a the posterior mean is ``s^2 a^T Q m``.
+    """
+    out: dict[int, float] = {}
+    for k, s in state.trust.accused:
+        view, now = seen.views[s], state.fits[s]
+        if view is not None:
+            weights = view.judged.weights
+        elif now is not None:
+            weights = now.Q @ (state.window.sums[s] / np.maximum(state.window.counts[s], 1))
+        else:
+            continue
+        out[k] = float(design.book.std[k] ** 2 * (design.book.at_meters[:, k] @ weights))
+    return out
+
+
+def _reconstructed(design: SequentialDesign, state: SequentialState, seen: Examined) -> tuple[Floats, Floats]:
+    """What the trusted meters add to the model at every bus, and its variance, on the best scale."""
+    prior_ = state.doubts.prior
+    best, at, mean = prior_.variance, -1, np.inf
+    for s, (now, length) in enumerate(zip(state.fits, design.lengths, strict=True)):
+        if now is None:
+            continue
+        lag = min(1.0, length * design.step_s / design.doubt.time_s) * (length > 1)
+        variance = now.variance + lag * prior_.variance
+        if variance.sum() < mean:
+            best, at, mean = variance, s, float(variance.sum())
+    now, view = (None, None) if at < 0 else (state.fits[at], seen.views[at])
+    if now is None:
+        return np.zeros_like(best), best
+    m = state.window.sums[at] / np.maximum(state.window.counts[at], 1)
+    return (judge(now, m).w if view is None else view.judged.w), best
+
+
+def _worst(design: SequentialDesign, seen: Examined, p: int) -> tuple[Floats, Floats, Bools]:
+    """Offset and limit of each meter on the scale that speaks most against it; who was judged."""
+    score, threshold = np.full(p, np.nan), np.full(p, design.options.widest)
+    ratio = np.full(p, -1.0)
+    judged = np.zeros(p, dtype=np.bool_)
+    for view in seen.views:
+        if view is None:
+            continue
+        judged |= view.enough
+        offset = np.abs(view.judged.offset)
+        now = np.where(view.enough, offset / view.limit, -1.0)
+        more = now > ratio
+        score, threshold = np.where(more, offset, score), np.where(more, view.limit, threshold)
+        ratio = np.maximum(ratio, now)
+    return np.where(judged, score, np.nan), threshold, judged
+
+
+def unusable(
+    design: SequentialDesign, state: SequentialState, frame: Frame
+) -> tuple[SequentialState, Estimate, Verdict]:
+    """The answer to a frame that is not later than the last one: nothing new, and certainly not CLEAN.
+
+    Parameters
+    ----------
+    design, state, frame
+        As in `step`.
+    """
+    plant = design.plant
+    p, n, m = plant.meters.size, len(plant.feeder.buses), plant.droop.tau.size
+    reason = f"A frame of time {frame.t} is not later than the last one, {state.t}; it was not used."
+    if state.last is not None:
+        estimate, verdict = state.last
+        return (
+            state,
+            estimate,
+            replace(verdict, decision=Decision.UNDECIDED, cause=Cause.SETTLING, reason=reason),
+        )
+    v2_bus = np.full(n, state.v0_squared)
+    estimate = Estimate(
+        t=state.t,
+        v2=v2_bus[plant.feeder.bus],
+        bound=np.full(plant.feeder.bus.size, _NO_VOLTAGE),
+        v2_bus=v2_bus,
+        trusted=np.zeros(p, dtype=np.bool_),
+        x=np.zeros(m),
+        std=np.full(plant.feeder.bus.size, _NO_VOLTAGE),
+    )
+    verdict = Verdict(
+        Decision.UNDECIDED,
+        Cause.SETTLING,
+        reason,
+        np.zeros(p, dtype=np.bool_),
+        np.full(p, np.nan),
+        np.full(p, _NO_VOLTAGE),
+        np.zeros(p),
+    )
+    return state, estimate, verdict
+
+
+# Errors of squared voltages end here: no voltage is above 2 pu.
+_NO_VOLTAGE = 4.0

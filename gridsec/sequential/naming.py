@@ -1,0 +1,105 @@
+"""Who is named: evidence that lasts, and no explanation about as likely that leaves them out.
+
+References
+----------
+docs/theory-sequential.md, section 5.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from gridsec.arrays import Bools, Ints
+from gridsec.online import Explanation
+from gridsec.sequential.design import SequentialDesign
+from gridsec.sequential.examine import Examined, confirm
+from gridsec.sequential.search import Explanation as Found
+from gridsec.sequential.search import swaps
+from gridsec.sequential.state import Trust
+
+# An accusation of an inverter counts up with every tick that repeats it, and down with every other.
+_MOST_COUNTED = 12
+
+
+def name(design: SequentialDesign, before: Trust, seen: Examined) -> tuple[Trust, tuple[Explanation, ...]]:
+    """Who is named now; and explanations that fit about as well where somebody would have been named.
+
+    Parameters
+    ----------
+    design
+        The design.
+    before
+        From the last tick.
+    seen
+        What this tick brought.
+    """
+    trust = seen.trust
+    quiet = np.where(trust.still.any(axis=0), 0, trust.quiet + 1)
+    trusted = (trust.trusted & ~before.named) | (quiet >= design.options.release)
+    age = np.where(trusted, 0, trust.age + 1)
+    need = np.array([confirm(length) for length in design.lengths])[trust.scale]
+    fresh = ~trusted & ~before.named & trust.bad.any(axis=0) & (age >= need)
+    named = before.named & (quiet < design.options.release)
+    count, inverters = _inverters(design, before, trust)
+    new = inverters & ~before.inverters
+    rivals = _rivals(design, seen, fresh, new) if fresh.any() or new.any() else ()
+    for rival in rivals:
+        fresh = fresh & rival.meters
+        inverters = inverters & (before.inverters | rival.inverters)
+    trust = replace(trust, trusted=trusted, age=age, quiet=quiet, named=named | fresh)
+    return replace(trust, counted=count, inverters=inverters), rivals
+
+
+def _inverters(design: SequentialDesign, before: Trust, trust: Trust) -> tuple[Ints, Bools]:
+    """How long every inverter has been accused, and which are named, (m,) each."""
+    accused = [] if design.own else [k for k, _ in trust.accused]
+    now = inverters_of(design, accused)
+    count = np.clip(before.counted + np.where(now, 1, -1), 0, _MOST_COUNTED)
+    need = np.full(now.size, _MOST_COUNTED)
+    for k, s in trust.accused:
+        if k >= design.customers:
+            need[k - design.customers] = min(confirm(design.lengths[s]), _MOST_COUNTED)
+    return count, (before.inverters & (count > 0)) | (now & (count >= need))
+
+
+def inverters_of(design: SequentialDesign, accused: list[int]) -> Bools:
+    """Which inverters are among other suspicions, (m,).
+
+    Parameters
+    ----------
+    design
+        The design.
+    accused
+        Indices of its book.
+    """
+    out = np.zeros(design.plant.droop.tau.size, dtype=np.bool_)
+    out[[k - design.customers for k in accused if k >= design.customers]] = True
+    return out
+
+
+def _rivals(design: SequentialDesign, seen: Examined, fresh: Bools, new: Bools) -> tuple[Explanation, ...]:
+    """All explanations about as likely as the best, where one leaves out somebody about to be named."""
+    within = 2.0 * float(np.log(design.options.like))
+    out: list[tuple[Bools, Bools, float]] = []
+    for found in seen.found.values():
+        best = found[0]
+        near = [(_meters(each), each, each.cost - best.cost) for each in found]
+        for swap in swaps(best, np.isfinite(best.judged.offset), within):
+            other = near[0][0].copy()
+            other[swap.accused], other[swap.innocent] = False, True
+            near.append((other, best, swap.worse))
+        for meters, each, worse in near:
+            inverters = inverters_of(design, [] if design.own else each.loosened)
+            differs = (fresh & ~meters).any() or (new & ~inverters).any()
+            if (each is best and worse == 0.0) or (worse <= within and differs):
+                out.append((meters, inverters, float(np.exp(-0.5 * worse))))
+    if not any((fresh & ~meters).any() or (new & ~inverters).any() for meters, inverters, _ in out):
+        return ()
+    total = sum(weight for _, _, weight in out)
+    return tuple(Explanation(meters, inverters, weight / total) for meters, inverters, weight in out)
+
+
+def _meters(found: Found) -> Bools:
+    return ~found.fit.trusted
