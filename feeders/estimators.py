@@ -301,9 +301,7 @@ def _load_columns(site: Site) -> Floats:
 
 def _windowed(site: Site, _: Job) -> windowed.WindowedDesign:
     settings = site.tables.meta.monitor
-    return windowed.design(
-        plant(site), doubt=load_doubt(site), step_s=settings.tick_s, max_attacked=settings.max_attacked
-    )
+    return windowed.design(plant(site), max_attacked=settings.max_attacked, step_s=settings.tick_s)
 
 
 def _ticks(name: str, summary: str, decoder: Decoder) -> Family:

@@ -1,18 +1,28 @@
-"""Windows of consistency, yang2019, on a feeder that is read at regular times.
+"""Windows of consistency, yang2019, on a feeder.
 
-The bank of discrete-time observers with direct injection estimates the inverters' injections once with all
-meters, once without every q of them, once without every 2 q. A window of N readings without a contradiction
-is CLEAN; Algorithm 2 names the meters without which the estimates agree. Everything around it (cleaning,
-reconstruction, residuals beside their limits) is that of `gridsec.sequential`; who is named is decided by
-the windows alone.
+One observer with direct injection trusts all meters, one every p - M of them, one every p - 2M. As long as
+no meter of theirs lies, two observers J and S differ at inverter i by no more than what their errors may be:
 
-The thresholds are worst cases over all meters at once: fixed errors inside the accuracy class count as
-noise that never averages out. And a lie inside the dead band of a droop curve moves no injection, so that no
-window can see it.
+    |x_J,i - x_S,i| <= level_J,i + level_S,i,    level_J,i = driven_i if J holds the meter of i, else free_i.
+
+`driven` and `free` are the worst-case bounds of `gridsec.detect`: meters at the limits of their class, loads
+anywhere in their intervals, what losses and sampling leave, and the transient. They belong to the frame, so
+that the thresholds of yang2019 (10) and (19), one number each, become one for every inverter and tick;
+pi and pi_J are measured in them, and evidence is a value above 1. A window of N readings then
+
+- detects if pi exceeded 1 at any of them (Algorithm 1), and
+- names the meters that no set J holds which passes (Algorithm 2, or its sound variant "survivors").
+
+The estimate is that of the J with the smallest disagreement. The lags of the inverters are discretised anew
+for every interval, so that readings may be 1 s or 15 min apart; a window counts readings, not seconds.
+
+A lie inside the dead band of a curve, beyond its saturation, or at a meter without an inverter moves no
+injection: windows cannot see it, whatever its size. Output residuals can, and where they contradict, the
+answer is UNDECIDED. CLEAN needs the word of both.
 
 References
 ----------
-yang2019, Algorithms 1 and 2; docs/theory-discrete.md, section 5.
+yang2019, Algorithms 1 and 2, (8), (10), (17), (19); docs/theory-discrete.md, sections 3 and 6.
 """
 
 from __future__ import annotations
@@ -21,29 +31,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gridsec import sequential, windows
-from gridsec.arrays import Bools, spectral_radius
+from gridsec import bank as banks
+from gridsec import monitor
+from gridsec.arrays import Bools, Floats
+from gridsec.detect import ErrorBound
 from gridsec.errors import DesignInfeasible
-from gridsec.lmi.discrete import discrete_contraction
-from gridsec.lmi.sampled import drift_error, sample
-from gridsec.lure import known_input
 from gridsec.online import Cause, Decision, Estimate, Frame, Verdict
-from gridsec.plant import Plant
-from gridsec.sequential import LoadDoubt, SequentialDesign, SequentialOptions, SequentialState
-from gridsec.sequential.decoder import Accused, Evidence
-from gridsec.windows import WindowDesign, WindowState, WindowVerdict
+from gridsec.plant import MonitorDesign, MonitorState, Plant
+from gridsec.slots import SlotState
+from gridsec.windows import Rule, detection, isolation
 
-LENGTH = 50
-"""Readings in a window: the shortest of the paper's, since an alarm waits for a window's end."""
+LENGTHS = (50, 100, 200)
+"""Readings in a window, as in the paper's example."""
 
-PARTS = (0.95, 0.8, 0.6, 0.4)
-"""Candidates for the decay that is proven, as powers of the slowest inverter's own."""
-
-SIGMAS = 4.0
-"""Standard deviations of jitter and of what is not known of the loads inside the thresholds."""
-
-IRREGULAR = 0.05
-"""Readings further from their regular time than this part of the interval begin a new window."""
+LENGTH = LENGTHS[0]
+"""The shortest: a window answers at its end only, up to two lengths after a lie began. Longer ones collect no
+more evidence here, since worst-case thresholds do not become finer with time."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,44 +56,69 @@ class WindowedDesign:
     Attributes
     ----------
     chain
-        What frames are cleaned and voltages are reconstructed with.
-    windows
-        The bank and its thresholds.
-    step_s
-        Interval between frames, s.
+        The observers, their certificate, and what frames are cleaned and voltages reconstructed with.
+    length
+        N, readings in a window.
+    rule
+        "survivors" or "majority", see `gridsec.windows.rules.isolation`.
     """
 
-    chain: SequentialDesign
-    windows: WindowDesign
-    step_s: float
+    chain: MonitorDesign
+    length: int
+    rule: Rule
 
     @property
     def observers(self) -> int:
-        """How many observers run."""
-        return len(self.windows.observers.masks)
+        """How many observers run: those of both banks, and the one that trusts all meters."""
+        return 1 + self.chain.observers
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Window:
+    """What one full window says. p meters.
+
+    Attributes
+    ----------
+    judged
+        Whether enough meters were alive at every reading.
+    detected
+        Algorithm 1: whether pi exceeded its threshold.
+    decided
+        Algorithm 2: whether there is an answer.
+    suspects : (p,)
+        It.
+    """
+
+    judged: bool
+    detected: bool
+    decided: bool
+    suspects: Bools
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WindowedState:
-    """What is carried from frame to frame.
+    """What is carried from frame to frame. s large sets.
 
     Attributes
     ----------
     chain
         Of the chain.
-    windows
-        Of the bank; None before the first frame.
-    verdict
-        Of the last full window.
+    pi : (i,)
+        pi of the window's readings so far, in thresholds; NaN where it could not be judged.
+    pi_sets : (i, s)
+        Likewise pi_J.
+    said
+        Of the last full window; None before the first one.
     """
 
-    chain: SequentialState
-    windows: WindowState | None
-    verdict: WindowVerdict | None
+    chain: MonitorState
+    pi: Floats
+    pi_sets: Floats
+    said: Window | None
 
 
 def design(
-    plant: Plant, *, doubt: LoadDoubt, step_s: float, max_attacked: int, length: int = LENGTH
+    plant: Plant, *, max_attacked: int, step_s: float, length: int = LENGTH, rule: Rule = "survivors"
 ) -> WindowedDesign:
     """Prepare to watch a feeder.
 
@@ -98,49 +126,31 @@ def design(
     ----------
     plant
         What is watched.
-    doubt
-        How wrong the powers of the frames may be.
-    step_s
-        Interval between frames, s.
     max_attacked
-        q, at least 1.
+        M, at least 1.
+    step_s
+        Expected interval between frames, s.
     length
-        N, readings in a window.
+        N, readings in a window; one of `LENGTHS`, or any other.
+    rule
+        How a window isolates. The thresholds are bounds, so that one exceedance counts: "survivors". The
+        paper's vote, "majority", wants the lie to be seen at more than half of the readings.
 
     Raises
     ------
     NotObservable
-        Unless there are more than 2 q meters.
+        Unless there are more than 2M meters.
     DesignInfeasible
-        If there are no droop inverters, no contraction is proven, or the bank would be too large.
+        If no certificate holds, the bank would be too large, there is no droop inverter whose injection
+        could be estimated, or nobody may lie.
     """
     if not plant.droop.tau.size:
-        raise DesignInfeasible(
-            "windows of consistency", "no droop inverter whose injection could be estimated"
-        )
+        raise DesignInfeasible("windows of consistency", "no droop inverter whose injection is estimated")
     if max_attacked < 1:
-        raise DesignInfeasible(
-            "windows of consistency", "without a possible liar there is nothing to isolate"
-        )
-    options = SequentialOptions(scales_s=(0.0,), commission_s=0.0)
-    chain = sequential.design(plant, doubt=doubt, step_s=step_s, options=options, max_attacked=max_attacked)
-    sampled = sample(chain.lure, step_s)
-    slowest = spectral_radius(sampled.A)
-    proof = discrete_contraction(sampled, decays=tuple(slowest**part for part in PARTS))
-    own = plant.feeder.bus[plant.droop.customer]
-    unknown = SIGMAS * np.sqrt(chain.prior.variance[own])
-    start = float(np.linalg.norm(plant.droop.limit))
-    made = windows.design(
-        windows.bank(sampled, max_attacked, proof=proof),
-        max_attacked,
-        noise=float(np.linalg.norm(chain.allowed + SIGMAS * np.sqrt(chain.white))),
-        length=length,
-        start=2.0 * start,
-        epsilon=1e-3 * start,
-        unknown=float(np.linalg.norm(unknown + drift_error(chain.lure, step_s, unknown))),
-        rule="survivors",
-    )
-    return WindowedDesign(chain, made, step_s)
+        raise DesignInfeasible("windows of consistency", "without a possible liar nothing is isolated")
+    if length < 1:
+        raise ValueError("a window has at least one reading")
+    return WindowedDesign(monitor.design(plant, max_attacked=max_attacked, step_s=step_s), length, rule)
 
 
 def init(design: WindowedDesign, t: float) -> WindowedState:
@@ -153,7 +163,11 @@ def init(design: WindowedDesign, t: float) -> WindowedState:
     t
         Unix time, s.
     """
-    return WindowedState(sequential.init(design.chain, t), None, None)
+    return WindowedState(monitor.init(design.chain, t), *_empty(design), None)
+
+
+def _empty(design: WindowedDesign) -> tuple[Floats, Floats]:
+    return np.zeros(0), np.zeros((0, design.chain.bank.sets.count_large))
 
 
 def step(
@@ -166,7 +180,8 @@ def step(
     design, state
         From `design`, and from `init` or the last step.
     frame
-        Everything known at one tick.
+        Everything known at one tick. A frame that is not later than the last one changes nothing: it
+        gets the last estimate again, and UNDECIDED.
 
     Returns
     -------
@@ -174,85 +189,136 @@ def step(
         As every estimator's step. What a window says holds until the next one is full.
     """
     before = state.chain
-    bank, said = state.windows, state.verdict
-    suspects = np.zeros(frame.y.size, dtype=np.bool_) if said is None else said.suspects
-
-    def known(evidence: Evidence) -> tuple[Accused, ...]:
-        return (Accused(suspects & evidence.live),)
-
-    chain, estimate, verdict = sequential.step(replace(design.chain, decoder=known), before, frame)
-    if chain is before:
-        return state, estimate, verdict
-    plant = design.chain.plant
-    off = abs(frame.t - before.t - design.step_s) > IRREGULAR * design.step_s
-    if bank is None or off:
-        x = np.zeros(plant.droop.tau.size) if before.x is None else before.x
-        bank = windows.init(design.windows, frame.t, x)
-    v0 = chain.v0_squared
-    u = known_input(
-        design.chain.model, plant.droop.vbar, frame.p, frame.q, v0, _losses(design, frame, estimate)
+    if state.said is not None:
+        # No estimate rests on whom a window named.
+        tally = replace(before.tally, named=before.tally.named | state.said.suspects)
+        before = replace(before, tally=tally)
+    chain, estimate, verdict = monitor.step(design.chain, before, frame)
+    off = (
+        np.where(frame.seen & np.isfinite(frame.y), frame.y, np.nan) - estimate.v2[design.chain.plant.meters]
     )
-    seen = frame.seen & np.isfinite(frame.y) & bool(np.isfinite(frame.v0_squared))
-    z = plant.droop.vbar**2 - np.where(seen, frame.y, 0.0)
-    bank, window = windows.step(design.windows, bank, z, u, seen)
-    said = said if window is None else window
-    after = WindowedState(chain, bank, said)
-    return after, estimate, _verdict(design, frame, verdict, said, seen, estimate)
+    if chain is before:
+        held = np.zeros_like(verdict.suspects) if state.said is None else state.said.suspects
+        return state, estimate, replace(verdict, suspects=held, attack=np.where(held, verdict.attack, 0.0))
+    now, now_sets = consistency(design.chain, chain.bank, chain.bound)
+    pi, pi_sets, said = np.append(state.pi, now), np.vstack([state.pi_sets, now_sets]), state.said
+    if pi.size == design.length:
+        said = _judge(design, pi, pi_sets)
+        pi, pi_sets = _empty(design)
+    if said is not None:
+        estimate = replace(estimate, trusted=estimate.trusted & ~said.suspects)
+    return WindowedState(chain, pi, pi_sets, said), estimate, _combine(design, verdict, said, off)
 
 
-def _losses(design: WindowedDesign, frame: Frame, estimate: Estimate) -> np.ndarray:
-    """What the chain's loss correction adds to the linear model at every customer, squared pu."""
-    plant, model = design.chain.plant, design.chain.model
-    q = frame.q + np.bincount(plant.droop.customer, weights=estimate.x, minlength=frame.q.size)
-    v0 = estimate.v2_bus[0] if not np.isfinite(frame.v0_squared) else frame.v0_squared
-    linear = v0 + 2.0 * (model.R @ frame.p + model.X @ q)
-    return np.asarray(np.clip(estimate.v2 - linear, -1.0, 1.0))
+def consistency(
+    design: MonitorDesign, bank: banks.BankState | None, bound: ErrorBound
+) -> tuple[float, Floats]:
+    """Measures of disagreement, pi and pi_J, over their thresholds.
+
+    Parameters
+    ----------
+    design
+        The observers.
+    bank
+        Where they are.
+    bound
+        What is known about the error of those that no liar moves.
+
+    Returns
+    -------
+    pi, pi_J : scalar, (s,)
+        Above 1 is evidence. NaN while 2M or fewer meters are alive.
+
+    References
+    ----------
+    yang2019 (8), (17), each entry over the sum of both observers' levels.
+    """
+    sets, count = design.bank.sets, design.bank.sets.count_large
+    if not isinstance(bank, SlotState) or bank.plan is None or design.bank.layout is None:
+        return np.nan, np.full(count, np.nan)
+    lay, plan, m = design.bank.layout, bank.plan, bound.free.size
+    x = []
+    for block, slots in ((plan.large, bank.large), (plan.small, bank.small)):
+        whole = np.tile(bank.driven, (slots.shape[1], 1))
+        np.put_along_axis(whole, block.units.T, slots.T, axis=1)
+        x.append(whole[:, :m])
+    holds = design.bank.masks[:, lay.driver] & lay.metered & bank.seen[lay.driver]
+    rounding = design.options.tie * design.plant.droop.limit
+    level = np.where(holds, bound.driven, bound.free) + rounding
+    every = np.where(lay.metered & bank.seen[lay.driver], bound.driven, bound.free) + rounding
+    pi = np.max(np.abs(x[0] - bank.driven[:m]) / (level[:count] + every), initial=0.0)
+    gaps = np.stack(
+        [
+            np.max(np.abs(x[1] - x[0][parent]) / (level[count:] + level[parent]), axis=1, initial=0.0)
+            for parent in sets.parent
+        ]
+    )
+    return float(pi), np.asarray(gaps.ravel()[sets.pairs].max(axis=1))
 
 
-def _verdict(  # noqa: PLR0917  # what the answer is put together from
-    design: WindowedDesign,
-    frame: Frame,
-    verdict: Verdict,
-    said: WindowVerdict | None,
-    seen: Bools,
-    estimate: Estimate,
-) -> Verdict:
-    """The windows' answer, with the chain's residuals beside it."""
-    chain = design.chain
-    suspects = np.zeros_like(seen) if said is None else said.suspects
-    y = np.where(seen, frame.y, 0.0)
-    attack = np.where(suspects & seen, y - estimate.v2[chain.plant.meters], 0.0)
-    names = ", ".join(name for name, bad in zip(chain.names, suspects, strict=True) if bad)
-    over = seen & (np.nan_to_num(verdict.score) > verdict.threshold)
-    answer: tuple[Decision, Cause, str]
-    if said is None:
-        answer = Decision.UNDECIDED, Cause.SETTLING, "The first window of readings is not full yet."
-    elif suspects.any():
-        answer = (
+def _judge(design: WindowedDesign, pi: Floats, pi_sets: Floats) -> Window:
+    """Both algorithms on one full window."""
+    bank = design.chain.bank
+    masks = bank.masks[: bank.sets.count_large]
+    detected = bool(detection(np.nan_to_num(pi), 1.0, design.length)[0])
+    found = isolation(pi_sets, np.ones(len(masks)), masks, design.length, design.rule)
+    return Window(
+        bool(np.isfinite(pi).all()), detected, bool(found.decided[0]), np.asarray(found.suspects[0])
+    )
+
+
+def _answer(verdict: Verdict, said: Window | None, names: tuple[str, ...]) -> tuple[Decision, Cause, str]:
+    """The windows' answer, where the residuals' leaves one; what comes first makes the rest worthless."""
+    undecided, open_ = Decision.UNDECIDED, verdict.decision is Decision.UNDECIDED
+    first = verdict.cause in {Cause.DESIGN_INVALID, Cause.TOO_FEW_METERS, Cause.NO_BUSBAR}
+    known = Window(True, False, True, np.zeros(len(names), dtype=np.bool_)) if said is None else said
+    who = ", ".join(name for name, bad in zip(names, known.suspects, strict=True) if bad)
+    answers = (
+        (first or (said is None and open_), undecided, verdict.cause, verdict.reason),
+        (said is None, undecided, Cause.SETTLING, "The first window of readings is not full yet."),
+        (
+            bool(who),
             Decision.ATTACKED,
             Cause.RESIDUALS,
-            f"Manipulated: {names}; the other meters agree over a window.",
-        )
-    elif not seen.all():
-        answer = Decision.UNDECIDED, Cause.SILENT_METERS, "Windows with missing readings are not judged."
-    elif over.any():
-        off = ", ".join(name for name, bad in zip(chain.names, over, strict=True) if bad)
-        reason = f"{off}: further off than allowed, but no window contradicts itself."
-        answer = Decision.UNDECIDED, Cause.AMBIGUOUS, reason
-    elif said.isolation is Decision.UNDECIDED or said.detection is not Decision.CLEAN:
-        answer = (
-            Decision.UNDECIDED,
+            f"Manipulated: {who}; no set of meters that holds them agreed over a window of readings.",
+        ),
+        (
+            not known.judged,
+            undecided,
+            Cause.TOO_FEW_METERS,
+            "Too few meters reported during a part of the last window of readings.",
+        ),
+        (
+            not known.decided,
+            undecided,
+            Cause.TOO_MANY_SUSPECTS,
+            "No set of meters agreed over a window of readings: more are manipulated than assumed.",
+        ),
+        (
+            verdict.decision is Decision.ATTACKED,
+            undecided,
             Cause.AMBIGUOUS,
-            "The readings of a window contradict each other, and no set of meters explains it alone.",
-        )
-    else:
-        answer = Decision.CLEAN, Cause.AGREEMENT, "All meters agree over a window of readings."
-    return replace(
-        verdict,
-        decision=answer[0],
-        cause=answer[1],
-        reason=answer[2],
-        suspects=suspects,
-        attack=attack,
-        explanations=(),
+            f"{verdict.reason} No window of readings says so, and windows decide who is named.",
+        ),
+        (open_, undecided, verdict.cause, verdict.reason),
+        (
+            known.detected,
+            undecided,
+            Cause.AMBIGUOUS,
+            "The readings of a window contradict each other, and every set of meters agrees with itself.",
+        ),
     )
+    for holds, decision, cause, reason in answers:
+        if holds:
+            return decision, cause, reason
+    return Decision.CLEAN, Cause.AGREEMENT, "All meters agree over a window of readings."
+
+
+def _combine(design: WindowedDesign, verdict: Verdict, said: Window | None, off: Floats) -> Verdict:
+    """The windows' verdict; `off` is how far each reading is from the reconstruction, signed."""
+    plant = design.chain.plant
+    names = tuple(plant.feeder.customers[c] for c in plant.meters)
+    decision, cause, reason = _answer(verdict, said, names)
+    suspects = np.zeros_like(verdict.suspects) if said is None else said.suspects
+    attack = np.where(suspects, np.nan_to_num(off), 0.0)
+    return replace(verdict, decision=decision, cause=cause, reason=reason, suspects=suspects, attack=attack)
