@@ -1,0 +1,117 @@
+"""Lies: who of a feeder's meters or inverters misbehaves in a simulated run, in one line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from feeders.campaign import NoSuchAttack, random_attacks
+from feeders.variation import Stream, generator
+from gridsec.arrays import Floats, Ints
+from gridsec.attack import Attack, Bias, Drift, InverterAttack, Replay, Scaling, Stuck
+
+if TYPE_CHECKING:
+    from feeders.scenario import Scenario
+
+
+class Trick(StrEnum):
+    """How meters lie."""
+
+    BIAS = "bias"
+    TOGETHER = "together"
+    SCALING = "scaling"
+    DRIFT = "drift"
+    STUCK = "stuck"
+    REPLAY = "replay"
+    CLOCK_SHIFT = "clock-shift"
+    COORDINATED = "coordinated"
+    COORDINATED_POWER = "coordinated-power"
+    INVERTER = "inverter"
+
+
+@dataclass(frozen=True, slots=True)
+class Lie:
+    """Who lies, how and when; the seed of the run chooses the liars.
+
+    Attributes
+    ----------
+    trick
+        What they do.
+    count
+        How many meters, or inverters, do it.
+    size
+        How much. Bias (random signs), together (the sign of `size` for all) and scaling: % of nominal.
+        Drift: % of nominal per minute, random signs. Coordinated: % of nominal by which the trace of a load
+        that does not exist moves the least affected liar. Replay and clock shift: how old the reports are,
+        s. Inverter: % of its rating, random signs. Stuck: nothing.
+    onset_s, end_s
+        Seconds after the start of the run.
+    """
+
+    trick: Trick
+    count: int = 1
+    size: float = 3.0
+    onset_s: float = 30.0
+    end_s: float = np.inf
+
+
+def manipulations(trial: Trial, scenario: Scenario) -> tuple[tuple[Attack, ...], tuple[InverterAttack, ...]]:
+    """Turn a lie into attacks.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    lie
+        Who lies; None: nobody.
+    scenario
+        The run without attacks: its seed chooses the liars, its loads lie beneath one that does not exist.
+
+    Raises
+    ------
+    NoSuchAttack
+        When the feeder has too few meters or inverters, or no place for such a load.
+    """
+    if lie is None:
+        return (), ()
+    t_on, t_off = scenario.start + lie.onset_s, scenario.start + min(lie.end_s, scenario.duration_s)
+    if lie.trick in (Trick.COORDINATED, Trick.COORDINATED_POWER):
+        size, kind = lie.size / 100.0, str(lie.trick)
+        return random_attacks(
+            site, scenario.seed, kind, lie.count, size, t_on=t_on, t_off=t_off, scenario=scenario
+        ), ()
+    random = generator(scenario.seed, Stream.ATTACK)
+    there = site.droop.tau.size if lie.trick is Trick.INVERTER else site.meters.size
+    if not 0 < lie.count <= there:
+        raise NoSuchAttack(f"{site.feeder.name} has {there} of what {lie.count} should lie")
+    liars = np.sort(random.choice(there, lie.count, replace=False)).astype(np.intp)
+    signs = random.choice([-1.0, 1.0], lie.count)
+    if lie.trick is Trick.INVERTER:
+        rating = np.array([row.inverter_kva for row in site.tables.customers])[site.droop.customer]
+        q = lie.size / 100.0 * signs * rating[liars] / site.feeder.base_kva
+        return (), (InverterAttack(liars, q, t_on, t_off),)
+    return (_plain(lie, liars, signs, t_on, t_off),), ()
+
+
+def _plain(lie: Lie, liars: Ints, signs: Floats, t_on: float, t_off: float) -> Attack:
+    """Every liar for itself."""
+    share = lie.size / 100.0
+    attack: Attack
+    match lie.trick:
+        case Trick.BIAS:
+            attack = Bias(liars, t_on, t_off, share * signs)
+        case Trick.TOGETHER:
+            attack = Bias(liars, t_on, t_off, np.full(liars.size, share))
+        case Trick.SCALING:
+            attack = Scaling(liars, t_on, t_off, share * signs)
+        case Trick.DRIFT:
+            rate = share / 60.0 * signs
+            attack = Drift(liars, t_on, t_off, rate, np.abs(rate) * (t_off - t_on))
+        case Trick.STUCK:
+            attack = Stuck(liars, t_on, t_off)
+        case _:  # Replay and a clock that is late differ only in how far back they look.
+            attack = Replay(liars, t_on, t_off, lie.size)
+    return attack
