@@ -98,7 +98,10 @@ def conclude(design: SequentialDesign, state: SequentialState, tick: Tick) -> tu
         )
     )
     decision, cause, reason = _beside_meters(design, state, tick, amounts, said)
-    injected = np.array([amounts.get(design.customers + i, 0.0) for i in range(plant.droop.tau.size)])
+    injected = np.zeros(plant.droop.tau.size)
+    for k, amount in amounts.items():
+        if k >= design.customers:
+            injected[k - design.customers] = amount
     verdict = Verdict(
         decision,
         cause,

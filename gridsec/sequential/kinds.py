@@ -95,7 +95,7 @@ class Kinds:
         if not self.told.any():
             return self.alone
         return tuple(
-            Kind.COORDINATED if told and kind in (None, Kind.OFFSET) else kind
+            Kind.COORDINATED if told and kind is Kind.OFFSET else kind
             for kind, told in zip(self.alone, self.told.tolist(), strict=True)
         )
 

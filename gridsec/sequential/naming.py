@@ -55,6 +55,8 @@ def name(design: SequentialDesign, before: Trust, seen: Examined) -> tuple[Trust
 def _inverters(design: SequentialDesign, before: Trust, trust: Trust) -> tuple[Ints, Bools]:
     """How long every inverter has been accused, and which are named, (m,) each."""
     accused = [] if design.own else [k for k, _ in trust.accused]
+    if not accused and not before.counted.any():
+        return before.counted, before.inverters
     now = inverters_of(design, accused)
     count = np.clip(before.counted + np.where(now, 1, -1), 0, _MOST_COUNTED)
     need = np.full(now.size, _MOST_COUNTED)
