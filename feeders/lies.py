@@ -58,7 +58,9 @@ class Lie:
     end_s: float = np.inf
 
 
-def manipulations(trial: Trial, scenario: Scenario) -> tuple[tuple[Attack, ...], tuple[InverterAttack, ...]]:
+def manipulations(
+    site: Site, lie: Lie | None, scenario: Scenario
+) -> tuple[tuple[Attack, ...], tuple[InverterAttack, ...]]:
     """Turn a lie into attacks.
 
     Parameters
