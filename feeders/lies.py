@@ -14,6 +14,7 @@ from gridsec.arrays import Floats, Ints
 from gridsec.attack import Attack, Bias, Drift, InverterAttack, Replay, Scaling, Stuck
 
 if TYPE_CHECKING:
+    from feeders.load import Site
     from feeders.scenario import Scenario
 
 
