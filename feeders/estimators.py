@@ -18,7 +18,7 @@ from gridsec import monitor, sequential
 from gridsec.arrays import Floats
 from gridsec.certificates import certify
 from gridsec.errors import FeederInvalid
-from gridsec.families import decoders, ticks, windowed
+from gridsec.families import decoders, set_search, ticks, windowed
 from gridsec.feeder import lindistflow
 from gridsec.gains import CircleOptions, options_for
 from gridsec.lure import Lure, close_loop
@@ -218,7 +218,9 @@ def _lmi_bank(site: Site, job: Job) -> monitor.MonitorDesign:
     )
 
 
-def _certificate(design: monitor.MonitorDesign | sequential.SequentialDesign) -> str:
+def _certificate(
+    design: monitor.MonitorDesign | sequential.SequentialDesign | set_search.SetSearchDesign,
+) -> str:
     proof = design.certificate
     return f"{proof.kind} certificate, margin {proof.margin:.3g}, decay at least {proof.rate:.3g} 1/s"
 
@@ -304,6 +306,11 @@ def _windowed(site: Site, _: Job) -> windowed.WindowedDesign:
     return windowed.design(plant(site), max_attacked=settings.max_attacked, step_s=settings.tick_s)
 
 
+def _set_search(site: Site, _: Job) -> set_search.SetSearchDesign:
+    settings = site.tables.meta.monitor
+    return set_search.design(plant(site), max_attacked=settings.max_attacked, step_s=settings.tick_s)
+
+
 def _ticks(name: str, summary: str, decoder: Decoder) -> Family:
     """A family that judges every tick by itself."""
 
@@ -361,10 +368,14 @@ FAMILIES: Final[Mapping[str, Family]] = MappingProxyType(
                 "one observer per meter, l0 decoding of their stack (lee2018, 4)",
                 decoders.meter_and_its_observer,
             ),
-            _ticks(
+            Family(
                 "set-search",
-                "one estimate, a new set when its test fails (kim2018, lee2018, 5)",
-                decoders.search_on_failure,
+                "one switched observer, a new set when its test fails (kim2018, lee2018, 5)",
+                _set_search,
+                set_search.init,
+                set_search.step,
+                lambda d: int(d.observers),
+                _certificate,
             ),
             _ticks(
                 "unknown-input",
