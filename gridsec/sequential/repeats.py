@@ -9,9 +9,11 @@ so k coincidences in a row with the previous reading (stuck), or with the readin
 (replay), have a probability of at most P^k. That is evidence once it is so small that all meters, ticks
 and, for a replay, lags of a year together see it less often than the false-alarm rate says.
 
-Meters may be calmer than their data sheets promise. So each meter's own longest run counts too: in n
-readings a run of L is to be expected if ``n P^L = 1``; the larger P of the two decides. A meter is judged
-after the first minutes, when that is known; one without promised jitter is never judged.
+Meters may be calmer than their data sheets promise. Among n runs the data sheet expects one of L with
+``n P^L`` at most; a meter whose longest run has less than e^-7 of that is judged by that run, as if it
+were the longest of twenty: ``P^L = 1 / 20``, since readings near the edge of a step end many runs and say
+little of those in its middle. A meter is judged after the first minutes, when that is known; one without
+promised jitter is never judged.
 
 Every tick costs O(p): a hash of the last readings is compared with one block of the past; blocks take
 turns. A hit is verified reading by reading.
@@ -51,6 +53,8 @@ SILENT = np.iinfo(np.int32).min
 _FEWEST = 6
 # Time after which a meter's own longest run says something, s, and fewest readings.
 _KNOWN_S, _KNOWN = 300.0, 16
+# A run this unlikely by the data sheet shows a calm meter; it then counts as the longest of e^3.
+_UNLIKELY, _FEW_RUNS = 7.0, 3.0
 # Readings without a register step are compared on this grid, pu.
 _FINEST = 1e-6
 # A good multiplier for hashes: 2^32 over the golden ratio.
@@ -121,8 +125,10 @@ class Memory:
         Readings heard.
     run : (p,)
         How often the last reading was repeated so far.
+    runs : (p,)
+        How many ended.
     longest : (p,)
-        Longest run that was no evidence.
+        Longest of them that was no evidence.
     stuck : (p,)
         Evidence that the meter is stuck.
     lag : (p,)
@@ -140,6 +146,7 @@ class Memory:
     hash: _Hashes
     count: Ints
     run: Ints
+    runs: Ints
     longest: Ints
     stuck: Bools
     lag: Ints
@@ -192,7 +199,7 @@ def empty(meters: int) -> Memory:
     zero = np.zeros(meters, dtype=np.intp)
     no = np.zeros(meters, dtype=np.bool_)
     return Memory(
-        -1, 0, silent, silent, np.zeros(meters, dtype=np.uint32), zero, zero, zero, no, zero, (), ()
+        -1, 0, silent, silent, np.zeros(meters, dtype=np.uint32), zero, zero, zero, zero, no, zero, (), ()
     )
 
 
@@ -213,8 +220,9 @@ def listen(law: Rules, before: Memory, y: Floats, live: Bools) -> Memory:
     tick = before.tick + 1
     code = now = np.rint(np.sqrt(np.maximum(y, 0.0)) / law.step).astype(np.int32)
     same = code == before.code
-    run, longest = (before.run + same) * same, before.longest
+    run, runs, longest = (before.run + same) * same, before.runs + ~same, before.longest
     if not live.all():
+        runs = np.where(live, runs, before.runs)
         run = np.where(live, run, before.run)
         now, code = np.where(live, code, np.int32(SILENT)), np.where(live, code, before.code)
     # Rare, so only looked at where there is something to see.
@@ -223,7 +231,7 @@ def listen(law: Rules, before: Memory, y: Floats, live: Bools) -> Memory:
         longest = np.where(longer & (run == 0) & ~before.stuck, before.run, longest)
     count, stuck = before.count + live, run >= _FEWEST
     if stuck.any():
-        stuck &= (run * _surprise(law, count, longest) >= law.stuck) & (count >= law.known)
+        stuck &= (run * _surprise(law, runs, longest) >= law.stuck) & (count >= law.known)
     after = Memory(
         tick=tick,
         kept=before.kept,
@@ -232,6 +240,7 @@ def listen(law: Rules, before: Memory, y: Floats, live: Bools) -> Memory:
         hash=_roll(before.hash, now, tick),
         count=count,
         run=run,
+        runs=runs,
         longest=longest,
         stuck=stuck,
         lag=_follow(before, now, tick),
@@ -293,9 +302,10 @@ def past(memory: Memory, meter: int, start: int, stop: int) -> tuple[Floats, Flo
     return code, model.astype(np.float64)
 
 
-def _surprise(law: Rules, count: Ints, longest: Ints) -> Floats:
-    """The smaller of what the data sheet and the meter's own longest run say, (p,)."""
-    return np.minimum(law.surprise, np.log(np.maximum(count, 2)) / np.maximum(longest, 1))
+def _surprise(law: Rules, runs: Ints, longest: Ints) -> Floats:
+    """What the data sheet says, or, where the meter is calmer than that, what its longest run does; (p,)."""
+    calm = longest * law.surprise > np.log(np.maximum(runs, 1)) + _UNLIKELY
+    return np.where(calm, np.minimum(_FEW_RUNS / np.maximum(longest, 1), law.surprise), law.surprise)
 
 
 def _roll(before: _Hashes, now: _Codes, tick: int) -> _Hashes:
@@ -334,7 +344,7 @@ def _search(law: Rules, memory: Memory) -> Memory:
     rows, meters = np.nonzero(hit)
     ask = (memory.lag == 0) & (memory.now != SILENT) & (memory.run < SPAN) & (memory.count >= law.known)
     with np.errstate(divide="ignore"):
-        need = np.maximum(np.ceil(law.replay / _surprise(law, memory.count, memory.longest)), _FEWEST)
+        need = np.maximum(np.ceil(law.replay / _surprise(law, memory.runs, memory.longest)), _FEWEST)
     ask &= need <= ROWS * BLOCKS // 2
     wanted = np.flatnonzero(ask[meters])
     begin = memory.first + ROWS * turn

@@ -1,0 +1,353 @@
+"""Repetition and the looks of manipulations: brute force, closed forms, AC power flow with liars."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import norm
+
+from benchmarks.kinds import CLOCK_S, DELAY_S, Seen, attacks, watch
+from feeders.estimators import SEQUENTIAL, Watcher, choose, design
+from feeders.load import Site, load, to_frame
+from feeders.meters import MeterErrors
+from feeders.scenario import START, Scenario, simulate, snapshots
+from gridsec.arrays import Bools, Floats
+from gridsec.attack import Replay
+from gridsec.online import Kind
+from gridsec.sequential import kinds, repeats
+from gridsec.sequential.repeats import BLOCKS, ROWS, SPAN, Memory, Rules
+
+STEP = 0.1 / 230.0
+SEEDS = st.integers(0, 2**32 - 1)
+CHANCE = 1e-10
+
+
+def law(jitter: float = 5e-4, meters: int = 1) -> Rules:
+    """Registers of 0.1 V."""
+    return repeats.rules(np.full(meters, STEP), np.full(meters, jitter), CHANCE, 1.0)
+
+
+def play(rule: Rules, v: Floats, heard: Bools | None = None) -> list[Memory]:
+    """All states while meters read v, (T, p) pu."""
+    heard = np.ones(v.shape, dtype=np.bool_) if heard is None else heard
+    memory, out = repeats.empty(v.shape[1]), []
+    for row, live in zip(np.rint(v / rule.step) * rule.step, heard, strict=True):
+        listened = repeats.listen(rule, memory, np.where(live, row**2, 0.0), live)
+        out.append(listened)
+        memory = repeats.keep(listened, row**2)
+    return out
+
+
+def noisy(rng: np.random.Generator, ticks: int, meters: int = 1, jitter: float = 5e-4) -> Floats:
+    slow = 0.003 * np.sin(np.arange(ticks)[:, None] / 300.0 + np.arange(meters))
+    return np.asarray(1.0 + slow + jitter * rng.standard_normal((ticks, meters)))
+
+
+class TestRules:
+    @given(jitter=st.floats(1e-5, 5e-3), place=st.floats(-0.5, 0.5))
+    def test_no_voltage_repeats_a_reading_more_often_than_the_bound(
+        self, jitter: float, place: float
+    ) -> None:
+        """Oracle: the normal distribution function between the edges of a register's step."""
+        edges = STEP * np.array([place - 0.5, place + 0.5]) / jitter
+        repeated = norm.cdf(edges[1]) - norm.cdf(edges[0])
+        bound = np.exp(-law(jitter).surprise[0])
+        assert repeated <= bound * (1.0 + 1e-12)
+        if place == 0.0:
+            assert repeated == pytest.approx(bound, rel=1e-9)
+
+    def test_a_meter_without_jitter_is_never_judged(self) -> None:
+        rule = law(0.0)
+        assert rule.surprise[0] == 0.0
+        still = np.ones((2000, 1))
+        assert not any(repeats.suspicious(memory).any() for memory in play(rule, still))
+
+    def test_a_run_is_evidence_exactly_from_the_surprise_on(self) -> None:
+        rule, rng = law(), np.random.default_rng(1)
+        v = noisy(rng, 700)
+        v[400:] = v[400]
+        states = play(rule, v)
+        need = int(np.ceil(-np.log(CHANCE) / rule.surprise[0]))
+        first = next(k for k, memory in enumerate(states) if memory.stuck[0])
+        begin = first - int(states[first].run[0])
+        assert begin <= 400
+        assert states[first].run[0] == need
+        assert all(memory.stuck[0] for memory in states[first:])
+
+    def test_a_meter_that_moves_again_is_stuck_no_more(self) -> None:
+        rng = np.random.default_rng(2)
+        v = noisy(rng, 600)
+        v[400:500] = v[400]
+        states = play(law(), v)
+        assert states[499].stuck[0]
+        assert not any(memory.stuck[0] for memory in states[502:])
+        assert states[-1].longest[0] < 30, "a run that was evidence says nothing of an honest meter"
+
+
+class TestMemory:
+    @given(seed=SEEDS)
+    @settings(max_examples=30, deadline=None)
+    def test_runs_are_those_of_a_loop(self, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        v = np.asarray(1.0 + STEP * rng.integers(0, 2, (60, 2)), dtype=np.float64)
+        heard = rng.random((60, 2)) < 0.8
+        states = play(law(meters=2), v, heard)
+        for j in range(2):
+            run, before = 0, None
+            for k in range(60):
+                if heard[k, j]:
+                    run = run + 1 if before == v[k, j] else 0
+                    before = v[k, j]
+                assert states[k].run[j] == run
+
+    @given(seed=SEEDS, lag=st.integers(1, 150))
+    @settings(max_examples=30, deadline=None)
+    def test_repeated_readings_are_those_of_a_loop(self, seed: int, lag: int) -> None:
+        rng = np.random.default_rng(seed)
+        ticks = int(rng.integers(2, 200))
+        v = np.asarray(1.0 + STEP * rng.integers(0, 2, (ticks, 1)), dtype=np.float64)
+        copied = int(rng.integers(0, ticks))
+        for k in range(max(lag, ticks - copied), ticks):
+            v[k] = v[k - lag]
+        heard = rng.random((ticks, 1)) < 0.9
+        heard[-1] = True
+        got = repeats.repeated(play(law(), v, heard)[-1], 0, lag, 500)
+        expected = 0
+        for k in range(ticks - 1, lag - 1, -1):
+            if heard[k, 0] and heard[k - lag, 0]:
+                if v[k, 0] != v[k - lag, 0]:
+                    break
+                expected += 1
+        assert got == expected
+
+    def test_the_past_is_what_was_heard_and_no_longer_than_promised(self) -> None:
+        rng = np.random.default_rng(3)
+        ticks = ROWS * (BLOCKS + 2) + 17
+        v, rule = noisy(rng, ticks, 2), law(meters=2)
+        last = play(rule, v)[-1]
+        last = repeats.keep(last, v[-1] ** 2)
+        assert last.kept == ticks
+        assert ROWS * BLOCKS <= last.kept - last.first <= ROWS * (BLOCKS + 1)
+        for start, stop in ((last.first, ticks), (ticks - 5, ticks), (ticks - 100, ticks - 30)):
+            code, model = repeats.past(last, 1, start, stop)
+            np.testing.assert_array_equal(code, np.rint(v[start:stop, 1] / rule.step[1]))
+            read = np.rint(v[start : stop - 1, 1] / rule.step[1]) * rule.step[1]
+            np.testing.assert_allclose(model[:-1][: read.size], read**2, rtol=1e-6, atol=0)
+        kept = sum(block.code.nbytes + block.hash.nbytes + block.model.nbytes for block in last.blocks)
+        tail = ROWS * 12 * 2
+        assert (kept + tail) / 2 * 2000 < 100e6, "2 000 meters at one reading per second"
+
+    @pytest.mark.parametrize("lag", [70, 333, 1999])
+    def test_a_replay_is_found_at_its_lag(self, lag: int) -> None:
+        rng = np.random.default_rng(lag)
+        v = noisy(rng, 2600, 3)
+        for k in range(2200, 2600):
+            v[k, 1] = v[k - lag, 1]
+        states = play(law(meters=3), v)
+        found = [k for k, memory in enumerate(states) if repeats.suspicious(memory)[1]]
+        assert found
+        assert 2200 + SPAN - 1 <= found[0] <= 2200 + SPAN + BLOCKS + ROWS
+        assert found == list(range(found[0], 2600))
+        assert states[-1].lag.tolist() == [0, lag, 0]
+
+    def test_lost_readings_do_not_hide_a_replay(self) -> None:
+        rng = np.random.default_rng(5)
+        v = noisy(rng, 2000)
+        v[1500:] = v[500:1000]
+        heard = rng.random((2000, 1)) < 0.98
+        states = play(law(), v, heard)
+        assert states[-1].lag[0] == 1000
+        assert all(memory.lag[0] in {0, 1000} for memory in states)
+
+
+class TestHonestMeters:
+    def test_at_the_worst_voltage_nothing_repeats_beyond_chance(self) -> None:
+        """Every meter in the middle of a step, where repetition is likeliest: 2.9 million honest readings."""
+        rng = np.random.default_rng(7)
+        rule = repeats.rules(np.full(146, STEP), np.full(146, 5e-4), 1.0 / (146 * 3.2e7 * 6), 1.0)
+        v = np.rint(1.0 / STEP) * STEP + 5e-4 * rng.standard_normal((20_000, 146))
+        memory = repeats.empty(146)
+        live = np.ones(146, dtype=np.bool_)
+        for row in np.rint(v / STEP) * STEP:
+            memory = repeats.keep(repeats.listen(rule, memory, row**2, live), row**2)
+            assert not repeats.suspicious(memory).any()
+        assert memory.longest.max() >= 8
+
+    @pytest.mark.parametrize("share", [0.0, 0.1, 0.3])
+    def test_meters_calmer_than_promised_in_a_still_night(self, share: float) -> None:
+        """The data sheet says 0.05 %, the meter has hardly any jitter, the voltage wanders slowly."""
+        rng = np.random.default_rng(11)
+        steps = 3e-5 * rng.standard_normal((12_000, 20))
+        wander = np.zeros_like(steps)
+        for k in range(1, len(steps)):
+            wander[k] = wander[k - 1] * (1.0 - 1.0 / 1800.0) + steps[k]
+        v = 1.0 + wander + share * 5e-4 * rng.standard_normal(steps.shape)
+        states = play(law(meters=20), v)
+        assert not any(repeats.suspicious(memory).any() for memory in states)
+        assert share > 0.0 or states[-1].longest.max() > 30
+
+
+class TestShapes:
+    NOISE = 1e-3
+
+    def lie(self, rng: np.random.Generator, size: Floats) -> Floats:
+        return np.asarray(size + self.NOISE * rng.standard_normal(size.size))
+
+    @given(seed=SEEDS, size=st.floats(0.02, 0.2), age=st.integers(0, 400))
+    @settings(max_examples=40, deadline=None)
+    def test_a_step_is_an_offset(self, seed: int, size: float, age: int) -> None:
+        ticks = 2 * age + 128
+        step = np.where(np.arange(ticks) >= ticks - age - 2, size, 0.0)
+        assert kinds.shape(self.lie(np.random.default_rng(seed), step), self.NOISE, age) is Kind.OFFSET
+
+    @given(seed=SEEDS, size=st.floats(0.03, 0.2), part=st.floats(0.3, 0.9))
+    @settings(max_examples=40, deadline=None)
+    def test_a_ramp_is_a_drift(self, seed: int, size: float, part: float) -> None:
+        ramp = -size * np.clip(np.linspace(1.0 - 1.0 / part, 1.0, 300), 0.0, 1.0)
+        assert kinds.shape(self.lie(np.random.default_rng(seed), ramp), self.NOISE, 80) is Kind.DRIFT
+
+    def test_wild_lies_have_no_shape(self) -> None:
+        for seed in range(40):
+            rng = np.random.default_rng(seed)
+            wild = rng.choice([-0.1, 0.1], 300) * rng.uniform(1.0, 1.5, 300)
+            assert kinds.shape(self.lie(rng, wild), self.NOISE, 90) is None
+
+    @given(seed=SEEDS, n=st.integers(2, 12), more=st.integers(1, 20), room=st.floats(0.0, 2.0))
+    @settings(max_examples=50, deadline=None)
+    def test_misfits_at_lags_are_those_of_a_loop(self, seed: int, n: int, more: int, room: float) -> None:
+        rng = np.random.default_rng(seed)
+        short, long = rng.standard_normal(n), 1.0 + rng.standard_normal(n + more)
+        expected = []
+        for lag in range(more + 1):
+            stop = long.size - lag
+            difference = short - long[stop - n : stop]
+            level = np.clip(difference.mean(), -room, room)
+            expected.append(np.mean((difference - level) ** 2))
+        np.testing.assert_allclose(kinds._lags(short, long, room), expected, rtol=1e-9, atol=1e-12)
+
+    @pytest.mark.parametrize("lag", [-200, -40, 40, 200, 1500])
+    def test_a_clock_that_is_off_is_read_from_the_voltage(self, lag: int) -> None:
+        for seed in range(5):
+            rng = np.random.default_rng(seed)
+            truth = 1.0 + np.cumsum(5e-4 * rng.standard_normal(6000))
+            model = truth[2000:4500] + self.NOISE * rng.standard_normal(2500)
+            y = truth[2000 - lag : 4500 - lag] + self.NOISE * rng.standard_normal(2500)
+            assert abs(kinds.shifted(y, model, 400, 900, 0.01) - lag) <= 2
+            honest = truth[2000:4500] + self.NOISE * rng.standard_normal(2500)
+            for lie in (0.0, 0.1, np.linspace(0.0, 0.1, 2500)):
+                assert kinds.shifted(honest + lie, model, 400, 900, 0.01) == 0
+
+    def test_one_load_s_trace_and_offsets_that_are_none(self) -> None:
+        made = design(choose(load("kerber-dorfnetz"), estimator=SEQUENTIAL)).design
+        traces, rng = made.shapes.traces, np.random.default_rng(0)
+        found = chance = 0
+        for _ in range(200):
+            column = traces[:, int(rng.integers(traces.shape[1]))]
+            who = np.sort(np.argsort(-column)[:4])
+            if column[who].min() < 0.5 * column.max():
+                variance = np.full(4, 1e-6)
+                lies = -0.1 * column[who] / column[who].max() + 1e-3 * rng.standard_normal(4)
+                found += kinds.traced(traces, who, lies, variance)
+                assert not kinds.traced(traces, who, np.full(4, -0.1), variance)
+            some = np.sort(rng.choice(len(traces), 3, replace=False))
+            chance += kinds.traced(traces, some, rng.uniform(-0.2, -0.1, 3), np.full(3, 4e-5))
+        assert found > 10
+        assert chance <= 4
+
+
+@pytest.fixture(scope="module")
+def street() -> tuple[Site, Watcher]:
+    site = choose(load("cigre-lv"), estimator=SEQUENTIAL)
+    return site, design(site)
+
+
+class TestFeeders:
+    """AC power flow as the truth; the measured rates are in docs/theory-sequential.md."""
+
+    def seen(self, street: tuple[Site, Watcher], kind: str, seeds: range) -> list[Seen]:
+        site, watcher = street
+        out = []
+        for seed in seeds:
+            drawn, end = attacks(site, kind, seed)
+            seen = watch(site, watcher, Scenario(seed=seed, duration_s=end, attacks=drawn))
+            assert not seen.honest
+            out.append(seen)
+        return out
+
+    @pytest.mark.parametrize(
+        ("kind", "look"),
+        [
+            ("bias", Kind.OFFSET),
+            ("scaling", Kind.OFFSET),
+            ("drift", Kind.DRIFT),
+            ("stuck", Kind.STUCK),
+            ("replay", Kind.REPLAY),
+            ("coordinated", Kind.COORDINATED),
+        ],
+    )
+    def test_most_are_called_what_they_are(self, street: tuple[Site, Watcher], kind: str, look: Kind) -> None:
+        runs = self.seen(street, kind, range(20, 23))
+        called = [name for seen in runs for name in seen.kind.values()]
+        assert called.count(look) >= 0.75 * len(called)
+        assert len(called) >= 6
+
+    def test_stuck_and_replaying_meters_are_named_before_the_voltage_moves(
+        self, street: tuple[Site, Watcher]
+    ) -> None:
+        for kind, most in (("stuck", 40.0), ("replay", 40.0 + BLOCKS)):
+            for seen in self.seen(street, kind, range(30, 32)):
+                assert len(seen.named) == 2
+                assert max(seen.named.values()) <= most
+
+    @pytest.mark.slow
+    def test_clocks_that_are_off_are_recognised(self, street: tuple[Site, Watcher]) -> None:
+        runs = self.seen(street, "clock", range(20, 23))
+        assert sum(Kind.CLOCK_SHIFT in seen.kind.values() for seen in runs) >= 1
+        assert CLOCK_S != DELAY_S
+
+    @pytest.mark.parametrize("jitter", [1.0, 0.2, 0.0])
+    @pytest.mark.parametrize("hour", [12.0, 1.0])
+    def test_honest_meters_are_not_called_anything(
+        self, street: tuple[Site, Watcher], jitter: float, hour: float
+    ) -> None:
+        """Registers of 0.1 V, also with less jitter than promised, at a sunny noon and in the night."""
+        site, watcher = street
+        seen = watch(
+            site,
+            watcher,
+            Scenario(
+                seed=3,
+                duration_s=2400.0,
+                errors=MeterErrors(jitter=jitter),
+                profile_s=172_800.0 + 3600.0 * hour,
+            ),
+        )
+        assert not seen.honest
+        assert not seen.alone
+
+    def test_kinds_belong_to_named_meters_and_are_forgotten_with_them(
+        self, street: tuple[Site, Watcher]
+    ) -> None:
+        site, watcher = street
+        stuck, _ = attacks(site, "stuck", 1)
+        short = tuple(replace(one, t_off=START + 500.0) for one in stuck)
+        state, kinds_seen, verdict = watcher.init(START), set(), None
+        for snapshot in snapshots(simulate(site, Scenario(seed=1, duration_s=560.0, attacks=short))):
+            state, _, verdict = watcher.step(state, to_frame(site, snapshot))
+            assert len(verdict.kinds) == site.meters.size
+            for j, kind in enumerate(verdict.kinds):
+                assert kind is None or verdict.suspects[j]
+                kinds_seen.add(kind)
+        assert kinds_seen == {None, Kind.STUCK}
+        assert verdict is not None
+        assert not verdict.suspects.any()
+
+    def test_a_replay_of_what_was_never_reported_is_no_repetition(self, street: tuple[Site, Watcher]) -> None:
+        """A clock that is behind since ever repeats nothing: only the voltage can tell."""
+        site, watcher = street
+        late = (Replay(np.array([2]), START, START + 1e6, delay_s=200.0),)
+        assert not watch(site, watcher, Scenario(seed=4, duration_s=900.0, attacks=late)).alone
