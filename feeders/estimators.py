@@ -18,7 +18,7 @@ from gridsec import monitor, sequential
 from gridsec.arrays import Floats
 from gridsec.certificates import certify
 from gridsec.errors import FeederInvalid
-from gridsec.families import decoders, set_search, ticks, windowed
+from gridsec.families import decoders, partial, set_search, ticks, windowed
 from gridsec.feeder import lindistflow
 from gridsec.gains import CircleOptions, options_for
 from gridsec.lure import Lure, close_loop
@@ -311,6 +311,11 @@ def _set_search(site: Site, _: Job) -> set_search.SetSearchDesign:
     return set_search.design(plant(site), max_attacked=settings.max_attacked, step_s=settings.tick_s)
 
 
+def _partial(site: Site, _: Job) -> partial.PartialDesign:
+    settings = site.tables.meta.monitor
+    return partial.design(plant(site), max_attacked=settings.max_attacked, step_s=settings.tick_s)
+
+
 def _ticks(name: str, summary: str, decoder: Decoder) -> Family:
     """A family that judges every tick by itself."""
 
@@ -363,10 +368,14 @@ FAMILIES: Final[Mapping[str, Family]] = MappingProxyType(
             _ticks("l0-decoder", "the smallest set that explains a tick (lee2018, 2)", decoders.fewest),
             _ticks("basis-pursuit", "the attack of smallest l1 norm (lee2018, 2)", decoders.pursue),
             _ticks("matching-pursuit", "orthogonal matching pursuit (lee2018, 2)", decoders.match),
-            _ticks(
+            Family(
                 "partial-observers",
                 "one observer per meter, l0 decoding of their stack (lee2018, 4)",
-                decoders.meter_and_its_observer,
+                _partial,
+                partial.init,
+                partial.step,
+                lambda d: int(d.observers),
+                lambda d: _certificate(d.model),
             ),
             Family(
                 "set-search",

@@ -1,0 +1,156 @@
+"""l0 decoding where every row has its own bound and some rows cannot be attacked: all sets, in closed form.
+
+    s = B xi + v + e,     |xi_i| <= 1,     |v_k| <= 1,     e zero in all but q blocks
+
+xi is the state in units of what is known about it by itself: rows of an identity that nobody attacks, a
+model's own prediction and loads within their intervals. For every set of q blocks the least-squares fit to
+all others is made. With W = (I + B B^T)^-1, Lambda the rows that are kept, D the others and
+``g = W_DD^-1 W_D s``,
+
+    residual_Lambda = W_Lambda s - W_LambdaD g,     residual_D = g,
+
+and both are known matrices times (xi, v). What a row of honest blocks can reach at most is therefore the sum
+of absolute values of its coefficients, attained by some xi and v; no norm is estimated on the way.
+
+References
+----------
+lee2018 (2.2.8') and Theorem 2.2.11 with r = q, for boxes instead of balls; docs/theory-partial-observers.md,
+section 8.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats, Ints
+from gridsec.decode.stacks import MOST_SUBSETS, subsets
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fits:
+    """Every fit that leaves q blocks out. S sets, p blocks, A rows, n unknowns, F functionals.
+
+    Attributes
+    ----------
+    left_out : (S, p)
+        The blocks that each fit ignores.
+    residual, limit : (S, A)
+        ``s - B xi_hat`` and the largest value it can have if all blocks outside the set are honest and, for
+        rows of the set, these as well.
+    disagree : (S, p)
+        Blocks with a residual above its limit.
+    xi : (S, n)
+        Fitted unknowns.
+    error : (S, F)
+        Bound of ``|f (xi - xi_hat)|`` for each functional, if all blocks outside the set are honest.
+    """
+
+    left_out: Bools
+    residual: Floats
+    limit: Floats
+    disagree: Bools
+    xi: Floats
+    error: Floats
+
+    @property
+    def credible(self) -> Bools:
+        """Fits that explain every block they rest on; (S,). A set of honest blocks always does."""
+        return np.asarray(~(self.disagree & ~self.left_out).any(axis=1))
+
+    @property
+    def certain(self) -> Bools:
+        """Blocks that every credible fit leaves out; (p,). Nobody where no fit is credible.
+
+        If at most q blocks are attacked, an honest block j belongs to some set of p - q honest ones, whose
+        fit is credible and does not leave j out: who is certain is attacked.
+        """
+        fine = self.credible
+        return np.asarray(self.left_out[fine].all(axis=0) & fine.any())
+
+    @property
+    def contradicted(self) -> Bools:
+        """Blocks that some fit rests on and does not explain; (p,). Where there is one, some block lies."""
+        return np.asarray((self.disagree & ~self.left_out).any(axis=0))
+
+
+def fits(  # noqa: PLR0917  # the terms of s = B xi + v, then what is asked of them
+    B: Floats, s: Floats, block: Ints, blocks: int, q: int, functionals: Floats, *, most: int = MOST_SUBSETS
+) -> Fits:
+    """Fit the unknowns without every set of q blocks, and say what honest rows can be off.
+
+    Parameters
+    ----------
+    B : (A, n)
+        Rows that can be attacked, in units of their own bounds.
+    s : (A,)
+        Their values.
+    block : (A,)
+        Block of each row. A block without rows can be left out, too, and never disagrees.
+    blocks
+        p.
+    q
+        How many blocks each fit leaves out; of fewer blocks with rows, all.
+    functionals : (F, n)
+        What else to bound.
+    most
+        Largest number of sets.
+
+    Raises
+    ------
+    DesignInfeasible
+        If there are more sets.
+    """
+    present = np.unique(block)
+    chosen = present[subsets(present.size, min(q, present.size), most)]
+    left_out = np.zeros((len(chosen), blocks), dtype=np.bool_)
+    np.put_along_axis(left_out, chosen.astype(np.intp), values=True, axis=1)
+    W = np.asarray(np.linalg.inv(np.eye(s.size) + B @ B.T), dtype=np.float64)
+    P = W @ B
+    whole = _Whole(W, P, W @ s, functionals - functionals @ (B.T @ P), functionals @ P.T)
+    made = [_without(whole, out[block], functionals) for out in left_out]
+    residual, limit, error = (np.array([one[k] for one in made]) for k in range(3))
+    disagree = np.zeros((len(made), blocks), dtype=np.bool_)
+    over = np.abs(residual) > limit * (1.0 + _ROUNDING)
+    for j in present:
+        disagree[:, j] = over[:, block == j].any(axis=1)
+    # xi_hat = B_Lambda^T W_Lambda s_Lambda, and the residual on Lambda is W_Lambda s_Lambda.
+    xi = np.where(left_out[:, block], 0.0, residual) @ B
+    return Fits(left_out, residual, limit, disagree, xi, error)
+
+
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Whole:
+    """The fit to all rows, which the others are updates of."""
+
+    W: Floats  # (A, A)
+    P: Floats  # (A, n) W B
+    ws: Floats  # (A,)
+    by_xi: Floats  # (F, n) error of the functionals, by xi
+    by_v: Floats  # (F, A) and by v
+
+
+def _without(whole: _Whole, out: Bools, functionals: Floats) -> tuple[Floats, Floats, Floats]:
+    """Residuals, their limits, and the functionals' bounds without some rows; block elimination of W."""
+    W, P, kept = whole.W, whole.P, ~out
+    if not out.any():
+        limit = np.abs(P).sum(axis=1) + np.abs(W).sum(axis=1)
+        return whole.ws, limit, np.abs(whole.by_xi).sum(axis=1) + np.abs(whole.by_v).sum(axis=1)
+    WD = W[out]
+    # (rows of D, [value | by xi | by v]): what the kept rows leave unexplained in D.
+    solved = np.linalg.solve(WD[:, out], np.column_stack([whole.ws[out], P[out], WD * kept]))
+    g, by_xi, by_v = solved[:, 0], solved[:, 1 : 1 + P.shape[1]], solved[:, 1 + P.shape[1] :]
+    residual, limit = np.empty(out.size), np.empty(out.size)
+    residual[out], limit[out] = g, np.abs(by_xi).sum(axis=1) + np.abs(by_v).sum(axis=1) + 1.0
+    across = W[np.ix_(kept, out)]
+    residual[kept] = whole.ws[kept] - across @ g
+    inner = np.abs(W[np.ix_(kept, kept)] - across @ by_v[:, kept]).sum(axis=1)
+    limit[kept] = np.abs(P[kept] - across @ by_xi).sum(axis=1) + inner
+    f = functionals @ P[out].T
+    error = np.abs(whole.by_xi + f @ by_xi).sum(axis=1)
+    error += np.abs(whole.by_v[:, kept] - f @ by_v[:, kept]).sum(axis=1)
+    return residual, limit, error

@@ -1,0 +1,388 @@
+"""Partial observers on a feeder: what each meter says by itself, stacked and decoded; lee2018, Algorithm 4.1.
+
+What a meter sees without the others is little. The part of the state x (the injections of the inverters)
+that belongs to meter j is
+
+- ``x_i`` of the inverter that it sits at: a scalar observer that its own reading drives,
+  ``tau x_hat_i' = -x_hat_i + K_i(vbar^2 - v_j^2)``, whose honest error is bounded by its reading's;
+- the reading, one linear combination of all injections and loads;
+- its customer's net reactive power, where it reports that.
+
+Everything else of x fades without it (section 4.2.1, the detectable part): an observer that hears no meter
+at all, the same for everybody and out of every liar's reach. Likewise the loads and the busbar voltage are
+known within intervals. So the code word is
+
+    s = B xi + v + e,    xi = ((x - x_0) / free, d_p / p_error, d_q / q_error, d_v0 / error),    |xi| <= 1,
+
+with the rows of meter j as block j, each in units of its own worst-case bound from `gridsec.detect`. All
+C(p, M) fits without M meters are made at every frame (`gridsec.decode.boxes`). Shared errors are one
+unknown, not one for every meter: that is where the evidence comes from.
+
+A fit is credible if it explains every meter it rests on, and a meter is named if no credible fit rests on
+it. An honest meter belongs to some set of p - M honest ones, and that set's fit is credible; so, as long as
+at most M lie, no honest meter is ever named, and the truth is within the union of what the credible fits
+allow. The price is power: the more liars are allowed, the more fits can explain a small lie differently.
+Then the answer is UNDECIDED, with these explanations.
+
+The paper's own constants (theta, kappa) are available from `constants`; on feeders they promise less than is
+known without any meter. docs/theory-partial-observers.md, section 8, has the proof and the numbers.
+
+References
+----------
+lee2018, sections 4.2.1 and 4.3.1, Algorithm 4.1, Theorems 2.2.11 and 4.3.2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import comb
+
+import numpy as np
+
+from gridsec import detect
+from gridsec.arrays import Bools, Floats
+from gridsec.certificates import Certificate, verify
+from gridsec.decode.boxes import Fits, fits
+from gridsec.decode.stacks import MOST_SUBSETS
+from gridsec.detect import Uncertainty
+from gridsec.errors import DesignInfeasible, NotObservable
+from gridsec.families.codeword import CodeWord, Parts, code_word, constants, observe, start
+from gridsec.frames import NO_VOLTAGE, Inputs, Past, Reconstruction, clean
+from gridsec.judge import Situation, Tally, count, decide
+from gridsec.lure import close_loop
+from gridsec.observers import circle
+from gridsec.observers.circle import CircleDesign
+from gridsec.online import Cause, Decision, Estimate, Explanation, Frame, Verdict
+from gridsec.plant import Options, Plant, Setting, setting
+
+__all__ = ["PartialDesign", "PartialState", "constants", "design", "init", "step"]
+
+MOST_WORK = 5e8
+"""Multiplications per frame that a design may ask for: about a second of one core."""
+
+_SHOWN = 8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PartialDesign:
+    """Everything that is prepared offline.
+
+    Attributes
+    ----------
+    setting
+        The feeder, how errors travel in it, and the numbers that decide.
+    model
+        The observer that hears no meter.
+    step_s
+        Expected interval between frames, s.
+    """
+
+    setting: Setting
+    model: CircleDesign
+    step_s: float
+
+    @property
+    def observers(self) -> int:
+        """How many observers run: one per inverter with a meter, and the one that hears none."""
+        return 1 + int(np.count_nonzero(self.setting.errors.meter_of >= 0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PartialState:
+    """What is carried from frame to frame. m inverters.
+
+    Attributes
+    ----------
+    t
+        Time of the last frame that was used, s; of `init` before the first one.
+    valid
+        Whether the certificate survived its verification.
+    started
+        Whether there was a frame.
+    parts
+        The observers.
+    settled
+        Whether the unknown initial state is forgotten.
+    tally
+        Who was accused for how long, and who is named.
+    v0_squared
+        Last squared busbar voltage, pu.
+    last
+        The last estimate and verdict; None before the first one.
+    """
+
+    t: float
+    valid: bool
+    started: bool
+    parts: Parts
+    settled: bool
+    tally: Tally
+    v0_squared: float
+    last: tuple[Estimate, Verdict] | None
+
+
+def design(
+    plant: Plant, *, max_attacked: int, step_s: float, options: Options | None = None
+) -> PartialDesign:
+    """Prepare to watch a feeder.
+
+    Parameters
+    ----------
+    plant
+        What is watched.
+    max_attacked
+        M, how many meters may be manipulated at the same time.
+    step_s
+        Expected interval between frames, s; others work, too.
+    options
+        The numbers that decide.
+
+    Raises
+    ------
+    NotObservable
+        Unless there are more than 2M meters.
+    DesignInfeasible
+        If the feeder does not forget its initial state, or there are too many sets of M meters.
+    ValueError
+        If two meters sit at one customer, or the accuracy is that of other meters.
+    """
+    meters, p = plant.meters, plant.meters.size
+    if np.unique(meters).size != p:
+        raise ValueError("two meters at one customer; combine them before")
+    if plant.accuracy.class_fraction.shape != meters.shape:
+        raise ValueError(f"accuracy is given for {plant.accuracy.class_fraction.size} meters of {p}")
+    if not (np.isfinite(step_s) and step_s > 0):
+        raise ValueError(f"step_s is {step_s}; it must be a positive number of seconds")
+    if p <= 2 * max_attacked:
+        why = f"{p} meters, of which {max_attacked} may lie; more than {2 * max_attacked} are needed"
+        raise NotObservable(range(p), p, why)
+    sets, rows = comb(p, max_attacked), 3 * p
+    unknowns = plant.droop.tau.size + 2 * len(plant.feeder.customers) + 1
+    if sets > MOST_SUBSETS or sets * rows * (rows + unknowns) > MOST_WORK:
+        raise DesignInfeasible(f"fits without every {max_attacked} meters", f"{sets} sets of {rows} rows")
+    if options is None:
+        options = Options() if step_s <= 30.0 else Options(release=4)
+    model = circle.design(close_loop(plant.feeder, plant.droop, meters), np.zeros(p, dtype=np.bool_))
+    return PartialDesign(setting(plant, max_attacked=max_attacked, options=options), model, step_s)
+
+
+def init(design: PartialDesign, t: float) -> PartialState:
+    """Begin to watch; the observers start with the first frame.
+
+    Parameters
+    ----------
+    design
+        From `design`. Its certificate is verified once more.
+    t
+        Unix time, s.
+    """
+    plant, proof = design.setting.plant, design.model.certificate
+    p = plant.meters.size
+    try:
+        valid = isinstance(proof, Certificate) and verify(proof, design.model.lure) > 0
+    except DesignInfeasible:
+        valid = False
+    return PartialState(
+        t=t,
+        valid=valid,
+        started=False,
+        parts=start(design.setting),
+        settled=False,
+        tally=Tally(np.zeros(p, dtype=np.intp), np.zeros(p, dtype=np.intp), np.zeros(p, dtype=np.bool_)),
+        v0_squared=plant.droop.vbar**2,
+        last=None,
+    )
+
+
+def step(design: PartialDesign, state: PartialState, frame: Frame) -> tuple[PartialState, Estimate, Verdict]:
+    """Take one frame in.
+
+    Parameters
+    ----------
+    design, state
+        From `design`, and from `init` or the last step.
+    frame
+        Everything known at one tick. A frame that is not later than the last one changes nothing: it
+        gets the last estimate again, and UNDECIDED.
+
+    Returns
+    -------
+    PartialState, Estimate, Verdict
+        As every estimator's step; see `gridsec.online`. Score and threshold are those of the readings in
+        the fit that the estimate is from. Who is named is decided by all fits and all rows: a small lie
+        may be named below the threshold of this one.
+    """
+    if (state.started and not frame.t > state.t) or not np.isfinite(frame.t):
+        return _unusable(design, state, frame)
+    setting = design.setting
+    inputs = clean(setting, Past(state.parts.x, state.v0_squared, state.tally.named), frame)
+    h = frame.t - state.t if state.started else 0.0
+    alone, model, parts, at_rest = observe(setting, design.model, state.parts, frame, inputs, h)
+    word = code_word(setting, parts, frame, inputs, alone, model)
+    after = replace(
+        state,
+        t=frame.t,
+        started=True,
+        parts=parts,
+        settled=state.settled or at_rest,
+        v0_squared=inputs.v0_squared,
+    )
+    return _conclude(design, after, frame, inputs, alone, model, word)
+
+
+def _conclude(  # noqa: PLR0917  # the chain's values, in the order in which they come about
+    design: PartialDesign,
+    after: PartialState,
+    frame: Frame,
+    inputs: Inputs,
+    alone: Uncertainty,
+    model: Reconstruction,
+    word: CodeWord,
+) -> tuple[PartialState, Estimate, Verdict]:
+    setting, options, live = design.setting, design.setting.options, inputs.live
+    plant, most = setting.plant, setting.max_attacked
+    found = fits(word.B, word.s, word.block, live.size, most, word.voltage)
+    everyone = fits(word.B, word.s, word.block, live.size, 0, word.voltage)
+    index = _choose(found, word, after.tally.named)
+    estimate = _estimate(design, after, frame, alone, model, word, found, index)
+    score, threshold = _scores(design, inputs, word, found, index, estimate)
+    accused = found.certain
+    contradicted = found.contradicted | everyone.contradicted
+    hopeless = not found.credible.any()
+    if hopeless and np.count_nonzero(contradicted) > most:
+        accused = contradicted
+    tally = after.tally
+    if np.count_nonzero(live) > 2 * most:
+        tally = count(tally, accused & live, live, confirm=options.confirm, release=options.release)
+    # A contradiction has somebody behind it, even if nobody in particular: never CLEAN.
+    doubtful = contradicted if not found.certain.any() else np.zeros_like(live)
+    decision, cause, reason = decide(
+        Situation(
+            names=tuple(plant.feeder.customers[c] for c in plant.meters),
+            max_attacked=most,
+            live=live,
+            suspected=(tally.above > 0) | doubtful,
+            named=tally.named,
+            wide=live & (threshold > options.widest),
+            valid=after.valid,
+            settled=after.settled,
+            busbar=inputs.busbar,
+        )
+    )
+    if hopeless and decision is Decision.ATTACKED:
+        decision, cause = Decision.UNDECIDED, Cause.TOO_MANY_SUSPECTS
+        reason = f"No {live.size - most} meters agree with each other: more lie than the {most} allowed for."
+    estimate = replace(estimate, trusted=estimate.trusted & ~tally.named)
+    attack = np.where(tally.named & live, inputs.y - estimate.v2[plant.meters], 0.0)
+    verdict = Verdict(
+        decision,
+        cause,
+        reason,
+        tally.named,
+        score,
+        threshold,
+        attack,
+        explanations=_explanations(found) if contradicted.any() else (),
+    )
+    return replace(after, tally=tally, last=(estimate, verdict)), estimate, verdict
+
+
+def _choose(found: Fits, word: CodeWord, named: Bools) -> int:
+    """The fit that is given out: credible, few disagreeing, without the named, and close."""
+    misfit = np.where(found.left_out[:, word.block], 0.0, found.residual) @ word.s
+    order = np.lexsort(
+        (
+            misfit,
+            np.count_nonzero(named & ~found.left_out, axis=1),
+            np.count_nonzero(found.disagree, axis=1),
+            ~found.credible,
+        )
+    )
+    return int(order[0])
+
+
+def _estimate(  # noqa: PLR0917  # as _conclude
+    design: PartialDesign,
+    after: PartialState,
+    frame: Frame,
+    alone: Uncertainty,
+    model: Reconstruction,
+    word: CodeWord,
+    found: Fits,
+    index: int,
+) -> Estimate:
+    """The voltages of one fit, and how far the truth can be from them."""
+    plant, lines, m = design.setting.plant, design.setting.model, after.parts.x.size
+    own, n = plant.droop.customer, frame.p.size
+    step_ = word.scale * found.xi[index]
+    dx, dp, dq = step_[:m], step_[m : m + n], step_[m + n : m + 2 * n]
+    dq = dq + np.bincount(own, weights=dx, minlength=n)
+    v2_bus = model.v2_bus + 2.0 * (lines.R_bus @ dp + lines.X_bus @ dq) + step_[-1]
+    v2 = v2_bus[plant.feeder.bus]
+    # Whoever lies, the unheard observer's own bound holds around it.
+    bound = detect.gap(design.setting.errors, alone, after.parts.bound) + np.abs(v2 - model.v2)
+    fine = found.credible
+    if fine.any():
+        apart = np.abs((found.xi[fine] - found.xi[index]) @ word.voltage.T)
+        bound = np.minimum(bound, (apart + found.error[fine]).max(axis=0) + word.rest)
+    trusted = np.zeros(plant.meters.size, dtype=np.bool_)
+    trusted[word.block] = True
+    trusted &= ~found.left_out[index] & ~found.disagree[index]
+    return Estimate(t=frame.t, v2=v2, bound=bound, v2_bus=v2_bus, trusted=trusted, x=after.parts.x + dx)
+
+
+def _scores(  # noqa: PLR0917  # as _conclude
+    design: PartialDesign,
+    inputs: Inputs,
+    word: CodeWord,
+    found: Fits,
+    index: int,
+    estimate: Estimate,
+) -> tuple[Floats, Floats]:
+    """Residuals of the readings in one fit, and what honest ones can be at most; (p,)."""
+    plant, options = design.setting.plant, design.setting.options
+    around = estimate.bound[plant.meters]
+    top = np.maximum(estimate.v2[plant.meters], 0.0) + around
+    threshold = detect.reading_error(plant.accuracy, top, options.sigmas) + around
+    score = np.where(inputs.live, 0.0, np.nan)
+    at = word.block[word.reading]
+    score[at] = (np.abs(found.residual[index]) * word.unit)[word.reading]
+    threshold[at] = (found.limit[index] * word.unit)[word.reading]
+    return score, threshold
+
+
+def _explanations(found: Fits) -> tuple[Explanation, ...]:
+    """The sets of meters whose lies alone would explain everything; worst-case bounds know no odds."""
+    sets = found.left_out[found.credible]
+    if not 1 < len(sets) <= _SHOWN:
+        return ()
+    return tuple(Explanation(meters, np.zeros(0, dtype=np.bool_), 1.0 / len(sets)) for meters in sets)
+
+
+def _unusable(
+    design: PartialDesign, state: PartialState, frame: Frame
+) -> tuple[PartialState, Estimate, Verdict]:
+    """The answer to a frame that is not later than the last one: nothing new, and certainly not CLEAN."""
+    reason = f"A frame of time {frame.t} is not later than the last one, {state.t}; it was not used."
+    if state.last is not None:
+        estimate, said = state.last
+        return (
+            state,
+            estimate,
+            replace(said, decision=Decision.UNDECIDED, cause=Cause.SETTLING, reason=reason),
+        )
+    plant = design.setting.plant
+    p, buses = plant.meters.size, len(plant.feeder.buses)
+    v2_bus = np.full(buses, state.v0_squared)
+    v2, nobody = v2_bus[plant.feeder.bus], np.zeros(p, dtype=np.bool_)
+    estimate = Estimate(state.t, v2, np.full(v2.size, NO_VOLTAGE), v2_bus, nobody, state.parts.x)
+    verdict = Verdict(
+        Decision.UNDECIDED,
+        Cause.SETTLING,
+        reason,
+        nobody,
+        np.full(p, np.nan),
+        np.full(p, NO_VOLTAGE),
+        np.zeros(p),
+    )
+    return state, estimate, verdict
