@@ -36,7 +36,7 @@ class Index:
         A smallest set of sensors; empty if there is none.
     direction : (n,)
         What he makes the state appear to be off by; empty if there is none. Complex directions stand
-        for their real part, which the same sensors see.
+        for their real part, which the same sensors see and whose norm is at least sqrt(1/2).
     """
 
     count: float
@@ -212,7 +212,13 @@ def _over(spaces: Sequence[Matrix], C: Floats, tol: float, *, below: float = 0.0
         found = fewest(rows, space, tol=tol, below=below)
         if found.count < best.count:
             best = found
-    return Index(best.count, frozen_ints(best.blocks), best.direction)
+    return Index(best.count, frozen_ints(best.blocks), _turned(best.direction))
+
+
+def _turned(direction: Matrix) -> Matrix:
+    """The same direction with its real part as long as possible: an eigenvector's phase is arbitrary."""
+    square = np.sum(direction * direction)
+    return direction if square == 0.0 else direction * np.exp(-0.5j * np.angle(square))
 
 
 def redundant_observable(A: Floats, C: Floats, q: int, *, tol: float, by: By = "eigenvectors") -> bool:

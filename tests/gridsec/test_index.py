@@ -190,7 +190,7 @@ def test_indices_equal_exact_brute_force() -> None:
 
 def test_the_attack_named_with_an_index_is_one() -> None:
     """The direction is seen by exactly the named sensors, at all times (lee2018, Definition 3.2.1)."""
-    for pair, _, _ in cases()[::5]:
+    for pair, _, _ in cases():
         for found in (
             dynamic_index(pair.a, pair.c, tol=TOL),
             dynamic_index(pair.a, pair.c, tol=TOL, by="rank"),
@@ -202,6 +202,10 @@ def test_the_attack_named_with_an_index_is_one() -> None:
             assert found.sensors.size == found.count
             assert np.linalg.norm(found.direction) == pytest.approx(1.0)
             seen = np.linalg.norm(observability(pair.a, pair.c) @ found.direction, axis=1)
+            assert set(np.flatnonzero(seen > 1e-6)) == set(found.sensors)
+            # What an attacker can do is real: the real part alone is as good.
+            assert np.linalg.norm(found.direction.real) >= np.sqrt(0.5) - 1e-9
+            seen = np.linalg.norm(observability(pair.a, pair.c) @ found.direction.real, axis=1)
             assert set(np.flatnonzero(seen > 1e-6)) == set(found.sensors)
 
 
@@ -253,6 +257,32 @@ def test_how_many_lies_can_be_detected_and_undone() -> None:
         if np.isfinite(count) and count > 0:
             assert count > 2 * undone
             assert not count > 2 * (undone + 1)
+
+
+def test_two_stories_fit_the_same_readings_where_the_index_is_at_most_2q() -> None:
+    """lee2018, Propositions 3.3.1 and 3.3.2, (i) => (ii): q liars in each story, equal readings."""
+    told = 0
+    for pair, dynamic, asymptotic in cases()[:60]:
+        for count, found in (
+            (dynamic, dynamic_index(pair.a, pair.c, tol=TOL)),
+            (asymptotic, asymptotic_index(pair.a, pair.c, discrete=True, tol=TOL)),
+        ):
+            if not 0 < count < np.inf:
+                continue
+            half = found.sensors[: int(count) // 2]
+            x, other = np.zeros(4), found.direction.real
+            for _ in range(8):
+                # In the first story one half reports what the second story's sensors would, and vice versa.
+                first, second = pair.c @ x, pair.c @ other
+                first[half] = (pair.c @ other)[half]
+                rest = np.setdiff1d(found.sensors, half)
+                second[rest] = (pair.c @ x)[rest]
+                scale = 1.0 + float(np.abs(second).max())
+                assert np.allclose(first, second, atol=1e-6 * scale)
+                x, other = pair.a @ x, pair.a @ other
+            assert max(len(half), len(rest)) == found.correctable + 1
+            told += 1
+    assert told > 40
 
 
 def same_space(one: Floats, other: Floats) -> bool:
@@ -345,6 +375,12 @@ def test_equivalence_with_strong_detectability() -> None:
             # A defective zero is computed to the root of the rounding error, hence the wide border.
             verdict = all(s.strongly_detectable(discrete=True, tol=1e-3) for s in systems)
             assert verdict == (asymptotic > q)
+            # (iv) with F = -C on the manipulated sensors, which hides the most.
+            fed = [
+                np.where(np.isin(np.arange(5), bad)[:, None], 0.0, pair.c) for bad in manipulated_sets(5, q)
+            ]
+            counts = [asymptotic_index(pair.a, C, discrete=True, tol=TOL).count for C in fed]
+            assert all(count > 0 for count in counts) == (asymptotic > q)
 
 
 def test_erratum_the_controllable_subspace_as_printed_breaks_proposition_3_1_10() -> None:

@@ -10,7 +10,7 @@ from scipy.linalg import sqrtm
 from scipy.stats import chi2, kstest
 
 from gridsec.arrays import Floats
-from gridsec.decode import Stack
+from gridsec.decode import Stack, error_detectable
 from gridsec.decode.gaussian import (
     choose,
     design_hypotheses,
@@ -116,6 +116,25 @@ def test_mean_and_covariance_of_the_residual_under_attack() -> None:
     )
     error = z @ test.estimator.T - x
     assert np.allclose(np.cov(error.T), test.covariance, atol=0.05 * test.covariance.max())
+
+
+def test_no_sparse_error_leaves_the_mean_of_the_residual_at_zero() -> None:
+    """lee2018, Theorem 2.2.19: every error in the fewest blocks that could hide one less is seen."""
+    rng, stack, P = case(10, p=5, n=3, height=1)
+    test = design_test(stack, P)
+    project = np.eye(5) - stack.matrix @ test.estimator
+    assert error_detectable(stack, 2, tol=1e-9)
+    assert not error_detectable(stack, 3, tol=1e-9)
+    for bad in itertools.combinations(range(5), 2):
+        # No combination of the two errors cancels: the columns are independent.
+        assert np.linalg.matrix_rank(project[:, bad], tol=1e-6) == 2
+    for bad in itertools.combinations(range(5), 3):
+        assert np.linalg.matrix_rank(project[:, bad], tol=1e-9) == 2
+    x, z = draws(rng, stack, P, 60_000)
+    error = z @ test.estimator.T - x
+    limit = 5.0 * np.sqrt(np.diagonal(test.covariance) / 60_000)
+    assert np.all(np.abs(error.mean(axis=0)) < limit), "without an error E[x_hat] = x"
+    assert np.allclose(test.estimator @ stack.matrix, np.eye(3))
 
 
 def test_minimum_variance_equals_weighted_least_squares_and_beats_others() -> None:

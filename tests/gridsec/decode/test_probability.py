@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, norm
 
-from gridsec.decode import Stack
-from gridsec.decode.noise import detect
+from gridsec.decode import Stack, design, sensors_in_error
+from gridsec.decode.noise import correct, correction_constants, detect, detection_constants
 from gridsec.decode.probability import bound_for, bound_probability, quadratic_probability
 
 
@@ -68,3 +68,31 @@ def test_bound_for_a_probability_and_what_corollary_2_2_13_means() -> None:
     alarm = detect(stack, v, v_max=v_max).alarm
     assert alarm.sum() > 0, "alarms, all of them with e = 0: given an alarm, Pr(e != 0) is 0 here"
     assert alarm.mean() <= 1.0 - 1e-4
+
+
+def test_all_implications_hold_whenever_the_noise_keeps_its_bound() -> None:
+    """lee2018, Corollaries 2.2.13 (ii), 2.2.14 and 2.2.15 as corrected: all at once, at least at rate p_v."""
+    rng, q, runs = np.random.default_rng(3), 1, 4000
+    stack = Stack.of(rng.standard_normal((5, 2, 2)))
+    P = np.diag(rng.uniform(0.5, 2.0, 10))
+    v_max = bound_for(stack, P, 0.8, tol=1e-12)
+    silent, far = detection_constants(stack, q, tol=1e-9), correction_constants(stack, q, tol=1e-9)
+    x, v = rng.standard_normal((runs, 2)), rng.standard_normal((runs, 10)) * np.sqrt(np.diagonal(P))
+    where = np.eye(5)[rng.integers(0, 5, runs)] @ stack.membership.T
+    e = where * rng.standard_normal((runs, 10)) * v_max * 10.0 ** rng.uniform(-1, 2, (runs, 1))
+    z = x @ stack.matrix.T + v + e
+    kept = np.all(stack.norms(v) <= v_max, axis=1)
+    assert abs(kept.mean() - 0.8) < 4.0 * np.sqrt(0.16 / runs)
+    found = detect(stack, z, v_max=v_max)
+    calm = kept & ~found.alarm
+    assert calm.sum() > 100
+    assert np.all(np.linalg.norm(found.x - x, axis=1)[calm] <= silent.kappa_d * v_max)
+    assert np.all(stack.norms(e)[calm] <= silent.kappa_e * v_max)
+    got = correct(design(stack, q, tol=1e-9), far, z, v_max=v_max)
+    assert np.all(got.credible[kept])
+    assert np.all(np.linalg.norm(got.x - x, axis=1)[kept] <= far.kappa_c * v_max)
+    # An estimate that leaves more than q sensors unexplained is far off (2.2.15 (ii)).
+    guess = x + rng.standard_normal((runs, 2)) * v_max
+    many = sensors_in_error(stack, z, guess, far.theta * v_max) > q
+    assert np.any(kept & many)
+    assert np.all(np.linalg.norm(guess - x, axis=1)[kept & many] > far.kappa_far * v_max)

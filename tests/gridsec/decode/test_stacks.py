@@ -52,8 +52,10 @@ def test_detectable_and_correctable_by_rank(seed: int) -> None:
             for lost in itertools.combinations(range(stack.count), min(q, stack.count))
         )
         assert error_detectable(stack, q, tol=TOL) == by_rank == (found.count > q)
-        if 2 * q <= stack.count:
-            assert error_correctable(stack, q, tol=TOL) == error_detectable(stack, 2 * q, tol=TOL)
+        # Definition 2.2.3: two states collide if they differ only where one error or the other can be.
+        sets = list(itertools.combinations(range(stack.count), min(q, stack.count)))
+        by_pairs = all(full_rank_without(stack, (*one, *other)) for one in sets for other in sets)
+        assert error_correctable(stack, q, tol=TOL) == by_pairs
     # The direction found is an undetectable error of exactly that many blocks (Definition 2.2.1).
     error = stack.matrix @ found.direction
     assert list(stack.support(error, 1e-9)) == list(found.blocks)

@@ -12,7 +12,7 @@ from hypothesis import given as hypothesis_given
 from hypothesis import settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
-from scipy.linalg import solve_continuous_lyapunov
+from scipy.linalg import expm, solve_continuous_lyapunov
 
 from gridsec.errors import NotObservable
 from gridsec.observers.high_gain import Partial, Polynomial, System, affine, defects, linear
@@ -96,6 +96,22 @@ def test_errors_stay_below_all_proven_bounds(n: int, theta: float, seed: int) ->
         for limit in limits:
             assert np.all(sizes <= limit.bound(1.0, path.t) * (1.0 + 1e-6))
         e = path.y[:, -1]
+
+
+@settings(max_examples=10, deadline=None)
+@hypothesis_given(n=st.integers(1, 3), theta=st.floats(8.0, 40.0), seed=st.integers(0, 10_000))
+def test_without_noise_errors_fall_at_the_rate_of_the_dissertation(n: int, theta: float, seed: int) -> None:
+    """lee2018, Lemma 5.2.1 with the factor sqrt(n): eta e^(-theta t / 4); as fast as one likes."""
+    rng = np.random.default_rng(seed)
+    reach = np.tril(rng.uniform(0.0, 0.5, (n, n)))
+    assert margin(Slopes(-reach, reach, proven=True), theta) > 0.0
+    D, start = rng.uniform(-1.0, 1.0, (n, n)) * reach, rng.choice([-1.0, 1.0], n)
+    M = shift(n) - np.outer(gain(n, theta), np.eye(n)[0]) + D
+    limit = decay_lee(n, theta, 0.0)
+    for t in np.linspace(0.0, 24.0 / theta, 60):
+        assert np.abs(expm(M * t) @ start).max() <= limit.bound(1.0, t) * (1.0 + 1e-9)
+    reached = [float(decay_lee(n, high, 0.0).bound(1.0, 0.3)) for high in (100.0, 200.0, 400.0)]
+    assert reached[0] > 10.0 * reached[1] > 100.0 * reached[2]
 
 
 def test_margin_is_the_worst_case_over_the_ranges() -> None:

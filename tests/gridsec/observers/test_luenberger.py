@@ -209,7 +209,17 @@ def test_envelope_and_the_papers_own_bound_all_powers_and_sums(seed: int) -> Non
         for share in (0.3, 0.8):
             beta = radius + share * (1.0 - radius)
             printed = geometric(part, L, 0.3, float(made.bounds.noise[i]), made.bounds.E, beta=beta)
+            assert tail <= printed.limit * (1.0 + 1e-9)
             assert env.limit <= printed.limit / (1.0 - env.powers[-1]) * (1.0 + 1e-9)
+            # eta_F, eta_L, eta_Z by their definition: the smallest that fit beta.
+            eta, power = np.zeros(3), np.eye(len(F))
+            for k in range(120):
+                sizes = [np.linalg.norm(power, 2), np.linalg.norm(power @ L)]
+                sizes.append(np.linalg.norm(power @ part.basis.T @ made.bounds.E, 2))
+                eta, power = np.maximum(eta, np.array(sizes) / beta**k), power @ F
+            assert printed.growth(0) == pytest.approx(eta[0], rel=1e-9)
+            limit = (eta[1] * made.bounds.noise[i] + eta[2] * 0.3) / (1.0 - beta)
+            assert printed.limit == pytest.approx(limit, rel=1e-9)
             for k in (0, 3, 40, 200):
                 size = float(np.linalg.norm(np.linalg.matrix_power(F, k), 2))
                 assert size <= printed.growth(k) * (1.0 + 1e-9) + 1e-15
