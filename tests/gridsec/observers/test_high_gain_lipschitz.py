@@ -16,6 +16,7 @@ from scipy.optimize import least_squares, linprog
 from gridsec.errors import DesignInfeasible, NotObservable
 from gridsec.observers.high_gain import System, linear, nearest, redundancy
 from gridsec.observers.high_gain import given as given_inverse
+from gridsec.observers.high_gain.form import sat
 from gridsec.observers.high_gain.intervals import Interval, interval, supremum
 from gridsec.observers.high_gain.inverse import check, corners_and_interior
 from gridsec.observers.high_gain.lipschitz import (
@@ -110,6 +111,8 @@ def test_lipschitz_constants_of_a_linear_map() -> None:
     assert sampled >= lowest * (1.0 - 1e-6)
     B = np.linalg.pinv(T)
     assert lower_from_inverse(upper_proven(lambda _: B.tolist(), -np.ones(5), np.ones(5))).lower <= lowest
+    x = rng.uniform(-1.0, 1.0, (50, 3))
+    assert np.allclose(sat(x @ T.T @ B.T, 1.0), x), "sat(T^+ y, 1) is a Lipschitz-extended left inverse"
 
 
 def test_lower_constant_of_a_bent_map_is_right_or_says_nothing() -> None:
@@ -231,6 +234,22 @@ def test_theorem_1_and_its_corollary(seed: int, exponent: float, kind: str) -> N
     if passed:  # part (ii)
         assert np.abs(back - x).max() <= kappa_detect(psi.factor, lowest) * delta
         assert np.abs(e).max() <= kappa_error(psi.factor, lowest, steepest) * delta
+
+
+def test_remark_2_without_2q_redundancy_a_set_passes_its_test_with_a_wrong_state() -> None:
+    """Three sensors of two constant states: any two see both states, no one alone does; q = 1."""
+    C = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
+    model = linear(np.zeros((2, 2)), np.ones((2, 1)), C, 1.0)
+    assert redundancy(model, 1).singular > 0.1
+    with pytest.raises(NotObservable):
+        redundancy(model, 2)
+    psi = nearest(model, (0, 1))
+    x, other = np.array([0.2, -0.3]), np.array([0.2, 0.6])
+    e = model.phi(other, (0, 1)) - model.phi(x, (0, 1))
+    assert np.count_nonzero(e) == 1
+    z = model.phi(x, (0, 1)) + e
+    assert np.allclose(model.phi(psi(z), (0, 1)), z, atol=1e-9), "no residual"
+    assert np.allclose(psi(z), other, atol=1e-9), "and the wrong state"
 
 
 def test_saturated_inverses_are_left_inverses_with_the_stated_constant() -> None:
