@@ -21,7 +21,7 @@ import typer
 from rich.markup import escape
 
 from gridsec.errors import DesignInfeasible, FeederInvalid, GridsecError, NotObservable
-from service import cli_feeders, cli_reproduce, console
+from service import cli_feeders, cli_reproduce, cli_study, console
 from service.console import ADDRESS, DATABASE, FAILED, FEEDER, FILE, USAGE, Feeder, complain
 
 if TYPE_CHECKING:
@@ -40,6 +40,7 @@ app = typer.Typer(
     add_completion=False,
 )
 app.add_typer(cli_feeders.app, name="feeders")
+app.add_typer(cli_study.app, name="study")
 app.command()(cli_reproduce.reproduce)
 
 

@@ -1,0 +1,134 @@
+"""`gridsec study`: what estimators do on a feeder, measured in simulation."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.markup import escape
+from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from service import console
+from service.console import Feeder
+
+if TYPE_CHECKING:
+    from feeders.comparison import Plan, Row
+    from feeders.load import Site
+
+app = typer.Typer(no_args_is_help=True, help="Study feeders and estimators in simulation.")
+
+
+@app.callback()
+def study() -> None:
+    """Study feeders and estimators in simulation."""
+
+
+@app.command("compare")
+def study_compare(
+    feeder: Feeder = "simbench-lv-rural1",
+    *,
+    family: Annotated[
+        list[str] | None, typer.Option(help="An estimator; may be repeated. [default: all]")
+    ] = None,
+    case: Annotated[list[str] | None, typer.Option(help="A case; may be repeated. [default: all]")] = None,
+    max_attacked: Annotated[
+        int, typer.Option(help="How many meters lie, and estimators are to withstand.", min=1)
+    ] = 2,
+    seeds: Annotated[int, typer.Option(help="Runs of each case.", min=1)] = 3,
+    duration: Annotated[float, typer.Option(help="Length of a run, s.", min=70.0)] = 240.0,
+    meters: Annotated[str, typer.Option(help="Errors of the meters: site, real or white.")] = "site",
+    load_error_kw: Annotated[
+        float, typer.Option(help="What nobody knows of each customer's active power, 1 sigma.", min=0.0)
+    ] = 0.1,
+    load_error_kvar: Annotated[
+        float, typer.Option(help="The same of its reactive power, 1 sigma.", min=0.0)
+    ] = 0.05,
+    csv: Annotated[Path | None, typer.Option(help="Write all numbers into this file.")] = None,
+    write: Annotated[
+        Path | None, typer.Option(help="Replace the tables between the markers of this Markdown file.")
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(help="Processes for matrix inequalities. [default: all cores]", min=1)
+    ] = None,
+) -> None:
+    """Let all estimators watch the same simulated attacks, and tell who did what.
+
+    The truth is full AC power flow; what the estimators know of loads and meters is as uncertain as it is
+    stated to be. Estimators that cannot watch the feeder are listed with the reason.
+    """
+    from feeders.comparison import CASES, Plan, compare, markdown, splice, write_csv
+    from feeders.estimators import FAMILIES
+    from feeders.load import load
+    from feeders.trials import LoadError, Meters
+
+    plan = Plan(
+        max_attacked=max_attacked,
+        seeds=seeds,
+        duration_s=duration,
+        load_error=LoadError(load_error_kw, load_error_kvar),
+        meters=Meters(_known([meters], tuple(Meters), "--meters")[0]),
+        families=_known(family, tuple(FAMILIES), "--family"),
+        cases=_known(case, tuple(each.name for each in CASES), "--case"),
+        workers=workers or os.cpu_count() or 1,
+    )
+    before = None if write is None else write.read_text(encoding="utf-8")
+    if before is not None:
+        splice(before, "")  # a document without markers is refused before the work, not after it
+    site = load(feeder)
+    with Progress(
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        TimeElapsedColumn(),
+        console=console.err,
+        transient=True,
+        disable=not console.err.is_terminal,
+    ) as bar:
+        task = bar.add_task("", total=None)
+        rows = compare(site, plan, progress=lambda what: bar.update(task, description=escape(what)))
+    _show(rows, plan)
+    if csv is not None:
+        write_csv(rows, csv)
+    if write is not None and before is not None:
+        write.write_text(splice(before, f"{_told(site, plan)}\n\n{markdown(rows, plan)}"), encoding="utf-8")
+
+
+def _known(chosen: list[str] | None, known: tuple[str, ...], option: str) -> tuple[str, ...]:
+    """Check names given as an option; all of them, if none is given."""
+    for name in chosen or ():
+        if name not in known:
+            raise typer.BadParameter(f"{name!r}: expected one of {', '.join(known)}", param_hint=option)
+    return tuple(name for name in known if not chosen or name in chosen)
+
+
+def _told(site: Site, plan: Plan) -> str:
+    """What the tables hold for, in one sentence."""
+    error = plan.load_error
+    return (
+        f"{site.tables.meta.title or site.feeder.name}: {len(site.meter_ids)} meters "
+        f"(errors: {plan.meters}), {site.droop.tau.size} inverters, M = {plan.max_attacked}, "
+        f"{plan.seeds} runs of {plan.duration_s:g} s at {plan.step_s:g} s per case, powers known within "
+        f"{error.p_kw:g} kW and {error.q_kvar:g} kvar (1 sigma, correlated over {error.correlation_s:g} s)."
+    )
+
+
+def _show(rows: list[Row], plan: Plan) -> None:
+    """Print one table for each case; reasons stand below it."""
+    from feeders.comparison import CASES, HEADERS, cells
+
+    meanings = {case.name: case.meaning.format(count=plan.max_attacked) for case in CASES}
+    for name in dict.fromkeys(row.case for row in rows):
+        table = Table(*HEADERS, title_justify="left", title=f"[bold]{name}[/]: {meanings[name]}")
+        reasons: list[str] = []
+        for row in rows:
+            if row.case != name:
+                continue
+            if row.reason:
+                reasons.append(f"{row.family}: {row.reason}")
+            else:
+                table.add_row(*map(escape, cells(row)))
+        console.out.print(table, soft_wrap=False)
+        for reason in reasons:
+            console.out.print(escape(reason))
