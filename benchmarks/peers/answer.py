@@ -1,0 +1,35 @@
+"""What every method answers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from benchmarks.peers.scene import Snapshot
+from gridsec.arrays import Bools, Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Answer:
+    """Who is named. N customers.
+
+    Attributes
+    ----------
+    named : (N,)
+        Whose voltage meter is manipulated.
+    others
+        Other explanations with their likelihood, the best first; `named` has the rest of it.
+    v : (N,)
+        Estimated voltages, pu; None where the method has no answer.
+    failed
+        The method says that it has no result.
+    """
+
+    named: Bools
+    others: tuple[tuple[Bools, float], ...] = ()
+    v: Floats | None = None
+    failed: bool = False
+
+
+Method = Callable[[Snapshot, Floats, float, Floats, Floats, float], Answer]
+"""`method(told, v, v0, p, q, std_v)`: `told` gives the standard deviations of the powers."""

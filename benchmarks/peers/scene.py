@@ -1,0 +1,188 @@
+"""Snapshots of a feeder with known liars: AC power flow is the truth, and every reading has noise.
+
+A voltage meter at every customer and at the busbar, active and reactive power of every customer as
+pseudo-measurements. Loads and generation are random. Three attacks of size 3 %:
+
+`bias`
+    k random meters read 3 % high.
+`coord`
+    A fake load that would drop one customer's voltage by 3 %; the k most affected meters report just the
+    voltages that it would cause.
+`coord+pq`
+    The same, and that customer's active and reactive power are reported as if the load were there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from feeders.load import Site, load
+from feeders.powerflow import PowerFlow
+from gridsec.arrays import Bools, Floats
+
+SIZE = 0.03
+"""Size of every attack, of the voltage."""
+
+ATTACKS = ("bias", "coord", "coord+pq")
+FEEDERS = {"rural1": "simbench-lv-rural1", "rural3": "simbench-lv-rural3"}
+POWER_FACTOR_TAN = 0.33
+# Nobody's powers are known better than this part of the feeder's mean connected load.
+FLOOR = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One cell of the table: a feeder, what its readings are worth, and who lies.
+
+    Attributes
+    ----------
+    feeder
+        Key of `FEEDERS`.
+    std_v, std_pq
+        Standard deviation of a voltage reading, and of the powers, as fractions.
+    attack, liars
+        One of `ATTACKS` and k; "clean" and 0.
+    """
+
+    feeder: str
+    std_v: float
+    std_pq: float
+    attack: str = "clean"
+    liars: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """A feeder, ready to make snapshots and to be estimated.
+
+    Attributes
+    ----------
+    site
+        The feeder.
+    flow
+        Its AC power flow.
+    """
+
+    site: Site
+    flow: PowerFlow
+
+    @property
+    def kw(self) -> float:
+        """1 pu of power, kW."""
+        return self.site.feeder.base_kva
+
+    @property
+    def volt(self) -> float:
+        """1 pu of voltage, V."""
+        return self.site.feeder.base_volt
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Snapshot:
+    """What everybody is told, and what is true. T readings each, N customers.
+
+    Attributes
+    ----------
+    v : (T, N)
+        Voltage readings, pu.
+    v0 : (T,)
+        Voltage readings of the busbar, pu.
+    p, q : (T, N)
+        Net imports as reported, pu.
+    std_v
+        Standard deviation of a voltage reading, pu.
+    std_p, std_q : (N,)
+        Standard deviations of `p` and `q`, pu.
+    liars : (N,)
+        Whose voltage reading is manipulated.
+    true_v : (N,)
+        The voltages, pu.
+    """
+
+    v: Floats
+    v0: Floats
+    p: Floats
+    q: Floats
+    std_v: float
+    std_p: Floats
+    std_q: Floats
+    liars: Bools
+    true_v: Floats
+
+
+def scene(feeder: str) -> Scene:
+    """Prepare a feeder of `FEEDERS`."""
+    site = load(FEEDERS[feeder])
+    return Scene(site, PowerFlow(site))
+
+
+def snapshot(here: Scene, cell: Cell, rng: np.random.Generator, seconds: int = 1) -> Snapshot:
+    """Draw a snapshot; with `seconds`, as many readings of the same state.
+
+    Noise of voltages is new in every reading. The powers' error is that of profiles and stays.
+    """
+    peak = np.array([c.load_kw for c in here.site.tables.customers]) / here.kw
+    sun = np.array([c.pv_kw for c in here.site.tables.customers]) / here.kw
+    n = peak.size
+    use = peak * rng.uniform(0.1, 1.0, n)
+    p = use - sun * rng.uniform(0.0, 0.6)
+    q = POWER_FACTOR_TAN * use
+    v0 = rng.uniform(0.98, 1.03)
+    true_v = _voltages(here, p, q, v0)
+    says_v, says_p, says_q, liars = _attacked(here, cell, rng, (p, q, v0, true_v))
+    std_p, std_q = (
+        cell.std_pq * np.maximum(np.abs(x), FLOOR * peak.mean() * s)
+        for x, s in ((says_p, 1.0), (says_q, POWER_FACTOR_TAN))
+    )
+    says_p = says_p + std_p * rng.normal(size=n)
+    says_q = says_q + std_q * rng.normal(size=n)
+    return Snapshot(
+        v=says_v + cell.std_v * rng.normal(size=(seconds, n)),
+        v0=v0 + cell.std_v * rng.normal(size=seconds),
+        p=np.tile(says_p, (seconds, 1)),
+        q=np.tile(says_q, (seconds, 1)),
+        std_v=cell.std_v,
+        std_p=std_p,
+        std_q=std_q,
+        liars=liars,
+        true_v=true_v,
+    )
+
+
+def _voltages(here: Scene, p: Floats, q: Floats, v0: float) -> Floats:
+    return here.flow.solve(p * here.kw, q * here.kw, v0 * here.volt)[0] / here.volt
+
+
+def _attacked(
+    here: Scene, cell: Cell, rng: np.random.Generator, truth: tuple[Floats, Floats, float, Floats]
+) -> tuple[Floats, Floats, Floats, Bools]:
+    """What is reported before noise: voltages, powers, and who lies."""
+    p, q, v0, v = truth
+    liars = np.zeros(v.size, dtype=np.bool_)
+    if cell.attack == "clean":
+        return v, p, q, liars
+    if cell.attack == "bias":
+        liars[rng.choice(v.size, cell.liars, replace=False)] = True
+        return v * np.where(liars, 1.0 + SIZE, 1.0), p, q, liars
+    customer = int(rng.integers(v.size))
+    fake_p, fake_q, fake_v = _fake_load(here, customer, truth)
+    liars[np.argsort(fake_v - v)[: cell.liars]] = True
+    says = np.where(liars, fake_v, v)
+    return (says, fake_p, fake_q, liars) if cell.attack == "coord+pq" else (says, p, q, liars)
+
+
+def _fake_load(
+    here: Scene, customer: int, truth: tuple[Floats, Floats, float, Floats]
+) -> tuple[Floats, Floats, Floats]:
+    """Powers and voltages with a load at a customer that drops its voltage by `SIZE`."""
+    p, q, v0, v = truth
+    add = 0.1
+    for _ in range(8):
+        fake_p, fake_q = p.copy(), q.copy()
+        fake_p[customer] += add
+        fake_q[customer] += POWER_FACTOR_TAN * add
+        fake_v = _voltages(here, fake_p, fake_q, v0)
+        add *= SIZE / float(v[customer] - fake_v[customer])
+    return fake_p, fake_q, fake_v
