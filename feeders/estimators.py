@@ -18,7 +18,7 @@ from gridsec import monitor, sequential
 from gridsec.arrays import Floats
 from gridsec.certificates import certify
 from gridsec.errors import FeederInvalid
-from gridsec.families import decoders, partial, set_search, ticks, windowed
+from gridsec.families import decoders, partial, set_search, ticks, unknown_input, windowed
 from gridsec.feeder import lindistflow
 from gridsec.gains import CircleOptions, options_for
 from gridsec.lure import Lure, close_loop
@@ -335,6 +335,11 @@ def _ticks(name: str, summary: str, decoder: Decoder) -> Family:
     )
 
 
+def _unknown_input(site: Site, _: Job) -> unknown_input.UnknownInputDesign:
+    settings = site.tables.meta.monitor
+    return unknown_input.design(plant(site), max_attacked=settings.max_attacked, step_s=settings.tick_s)
+
+
 FAMILIES: Final[Mapping[str, Family]] = MappingProxyType(
     {
         family.name: family
@@ -386,10 +391,14 @@ FAMILIES: Final[Mapping[str, Family]] = MappingProxyType(
                 lambda d: int(d.observers),
                 _certificate,
             ),
-            _ticks(
+            Family(
                 "unknown-input",
-                "meters and inverters; accused injections are unknown inputs (yang2021)",
-                decoders.meters_or_inverters,
+                "meters and inverters at once; suspected injections are unknown inputs (yang2021)",
+                _unknown_input,
+                unknown_input.init,
+                unknown_input.step,
+                lambda d: int(d.observers),
+                lambda d: f"intervals of honest inverters; {len(d.missing)} pairs have no observer",
             ),
         )
     }

@@ -1,0 +1,264 @@
+"""What is carried from tick to tick, and one tick as every pair of `unknown_input` sees it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gridsec import detect
+from gridsec.arrays import Bools, Floats
+from gridsec.families.pairs import LeftOut, Pairs, Relation, Trial, try_pair
+from gridsec.families.tubes import Doubt, Seen, Tube, Tubes, advance
+from gridsec.feeder import loss_correction
+from gridsec.frames import NO_VOLTAGE, Inputs, Past, clean
+from gridsec.judge import Tally
+from gridsec.online import Estimate, Frame, Verdict
+from gridsec.plant import Setting
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class UnknownInputDesign:
+    """Everything that is prepared offline. N customers, m inverters, p meters.
+
+    Attributes
+    ----------
+    setting
+        The feeder, and the numbers that decide.
+    max_inverters
+        How many inverters may be attacked at the same time, q_1 of yang2021.
+    pairs
+        The candidates.
+    within : (c, c)
+        Whether the first of two candidates suspects nobody whom the second does not.
+    missing
+        Pairs without an unknown-input observer, by the rank of what voltages say.
+    doubt
+        How many may be attacked, and how far.
+    gain : (N, m)
+        2X from inverters to all customers.
+    """
+
+    setting: Setting
+    max_inverters: int
+    pairs: Pairs
+    within: Bools
+    missing: tuple[LeftOut, ...]
+    doubt: Doubt
+    gain: Floats
+
+    @property
+    def observers(self) -> int:
+        """How many pairs are tried."""
+        return len(self.pairs.meters)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class UnknownInputState:
+    """What is carried from frame to frame. m inverters, p meters.
+
+    Attributes
+    ----------
+    t, began
+        Time of the last frame that was used, and of the first one, s; of `init` before.
+    tubes
+        What is known of honest inverters; None before the first frame.
+    contradicted
+        Which pairs were contradicted lately; those named there are refuted.
+    x : (m,)
+        Estimated injections, wrong parts included, pu.
+    v0_squared
+        Last squared busbar voltage, pu.
+    named : (p,)
+        Meters named as manipulated.
+    last
+        The last estimate and verdict, for frames that cannot be used.
+    """
+
+    t: float
+    began: float
+    tubes: Tubes | None
+    contradicted: Tally
+    x: Floats
+    v0_squared: float
+    named: Bools
+    last: tuple[Estimate, Verdict] | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tick:
+    """One tick as linear relations: who is suspected decides which intervals hold for inverters.
+
+    Attributes
+    ----------
+    design, frame, inputs
+        What watches, what came, and that cleaned.
+    tubes
+        What is known of honest inverters.
+    v2, error : (N,)
+        Squared voltages if no inverter injected, and how far they may be off, squared pu.
+    rest : (N,)
+        The part of that error that is nobody's load and not the busbar's.
+    """
+
+    design: UnknownInputDesign
+    frame: Frame
+    inputs: Inputs
+    tubes: Tubes
+    v2: Floats
+    error: Floats
+    rest: Floats
+
+    def tube(self, meters: Bools) -> Tube:
+        """Where honest inverters are if these meters lie.
+
+        Parameters
+        ----------
+        meters : (p,)
+            Who.
+        """
+        meter = self.design.setting.errors.meter_of
+        believed = self.tubes.metered.copy()
+        if meters.size:
+            believed &= ~meters[meter]
+        return self.tubes.driven.where(believed, self.tubes.free)
+
+    def relation(self, meters: Bools) -> Relation:
+        """The readings if these meters lie.
+
+        Parameters
+        ----------
+        meters : (p,)
+            Who.
+        """
+        now, frame, inputs = self.design.setting, self.frame, self.inputs
+        plant, tube = now.plant, self.tube(meters)
+        live = np.flatnonzero(inputs.live)
+        told = live[np.isfinite(frame.q_net[plant.meters[live]])]
+        at, of = plant.meters[live], plant.meters[told]
+        own = (of[:, None] == plant.droop.customer).astype(np.float64)
+        gain = self.design.gain[at]
+        net = (np.arange(frame.q.size) == of[:, None]).astype(np.float64)
+        v, q = at.size, of.size
+        E = np.block(
+            [
+                [
+                    2.0 * now.model.R[at],
+                    2.0 * now.model.X[at],
+                    gain,
+                    np.eye(v),
+                    np.zeros((v, q)),
+                    np.ones((v, 1)),
+                ],
+                [np.zeros((q, frame.p.size)), net, own, np.zeros((q, v)), np.eye(q), np.zeros((q, 1))],
+            ]
+        )
+        busbar = detect.busbar_error(plant.accuracy, inputs.v0_squared, now.options.sigmas)
+        half = np.concatenate(
+            [
+                frame.p_error,
+                frame.q_error,
+                tube.half,
+                inputs.now.reading[live] + self.rest[at],
+                frame.q_net_error[of],
+                [min(busbar, NO_VOLTAGE)],
+            ]
+        )
+        half[-1 - v - q : -1] = np.maximum(half[-1 - v - q : -1], _EXACT)
+        r = np.concatenate(
+            [
+                inputs.y[live] - self.v2[at] - gain @ tube.middle,
+                frame.q_net[of] - frame.q[of] - own @ tube.middle,
+            ]
+        )
+        voltage = np.arange(v + q) < v
+        return Relation(r, np.vstack([gain, own]), E, half, np.concatenate([live, told]), voltage)
+
+    def room(self, tube: Tube) -> Floats:
+        """Largest wrong injection of each inverter; (m,).
+
+        Parameters
+        ----------
+        tube
+            Where honest ones are.
+        """
+        return self.design.doubt.reach + np.abs(tube.middle) + tube.half
+
+    def trial(self, meters: Bools, inverters: Bools) -> Trial:
+        """What a pair makes of the tick.
+
+        Parameters
+        ----------
+        meters, inverters : (p,), (m,)
+            Who is suspected.
+        """
+        return try_pair(self.relation(meters), meters, inverters, self.room(self.tube(meters)))
+
+
+# Readings are never more exact than this, pu.
+_EXACT = 1e-9
+
+
+def observe(design: UnknownInputDesign, state: UnknownInputState, frame: Frame) -> Tick:
+    """Clean a frame, and move on what is known of honest inverters.
+
+    Parameters
+    ----------
+    design, state
+        What watches, and where it stands.
+    frame
+        Later than the last one.
+    """
+    inputs = clean(design.setting, Past(state.x, state.v0_squared, state.named), frame)
+    h = 0.0 if state.tubes is None else frame.t - state.t
+    v2, error, rest = _without_inverters(design, state, frame, inputs)
+    seen = _seen(design, inputs, v2, error)
+    tubes = advance(design.setting.errors, design.doubt, state.tubes, seen, h)
+    return Tick(design, frame, inputs, tubes, v2, error, rest)
+
+
+def _without_inverters(
+    design: UnknownInputDesign, state: UnknownInputState, frame: Frame, inputs: Inputs
+) -> tuple[Floats, Floats, Floats]:
+    """Squared voltages if no inverter injected (N,), their error (N,), and its part from the model (N,)."""
+    now, plant = design.setting, design.setting.plant
+    rest = inputs.now.base - now.errors.R2 @ frame.p_error - now.errors.X2 @ frame.q_error
+    moved = np.zeros(rest.shape)
+    if plant.loss_correction and state.x.size:
+        # Losses depend on what inverters inject: all at either end, one beyond.
+        reach, limit = design.doubt.reach, plant.droop.limit
+        ends = np.vstack([limit, -limit, state.x + np.diag(reach), state.x - np.diag(reach)])
+        customers = np.zeros((plant.droop.customer.size, frame.q.size))
+        customers[np.arange(plant.droop.customer.size), plant.droop.customer] = 1.0
+        with np.errstate(all="ignore"):
+            found = loss_correction(
+                plant.feeder,
+                frame.p,
+                frame.q + ends @ customers,
+                inputs.v0_squared,
+                steps=plant.loss_correction,
+            )
+        far = np.nan_to_num(np.abs(found - inputs.correction), nan=NO_VOLTAGE, posinf=NO_VOLTAGE)
+        moved = far[:2].max(axis=0) + max(design.max_inverters, 1) * far[2:].max(axis=0)
+        moved = moved[plant.feeder.bus]
+    # The busbar moves all alike, and has an error of its own.
+    busbar = detect.busbar_error(plant.accuracy, inputs.v0_squared, now.options.sigmas)
+    rest = np.where(inputs.now.base < NO_VOLTAGE, np.maximum(rest - busbar, 0.0), NO_VOLTAGE)
+    error = np.minimum(inputs.now.base + moved, NO_VOLTAGE)
+    return plant.droop.vbar**2 - inputs.w, error, rest + moved
+
+
+def _seen(design: UnknownInputDesign, inputs: Inputs, v2: Floats, error: Floats) -> Seen:
+    now, own = design.setting, design.setting.plant.droop.customer
+    meter = now.errors.meter_of
+    if not inputs.live.size:
+        nothing = np.zeros(own.size)
+        metered = np.zeros(own.size, dtype=np.bool_)
+        return Seen(nothing, nothing, metered, now.plant.droop.vbar**2 - v2[own], error[own])
+    return Seen(
+        z=inputs.z[meter],
+        z_error=inputs.now.reading[meter],
+        metered=(meter >= 0) & inputs.live[meter],
+        rest=now.plant.droop.vbar**2 - v2[own],
+        rest_error=error[own],
+    )

@@ -1,0 +1,232 @@
+"""Pairs of suspected meters and suspected inverters, and whether one explains all other readings.
+
+Everything that a tick says is one linear relation,
+
+    r = C a + E d,      |d_k| <= h_k,
+
+r being the readings (voltages, and net reactive powers where reported) minus what the model explains with
+honest inverters in the middle of their intervals, a the wrong injections, and d everything that honest
+readings may be off by: meters, loads, the busbar, the model, the inverters' intervals. A pair drops the
+rows of its meters and takes the injections of its inverters for unknown inputs, whose columns U of C
+
+    Q = S^-1 - S^-1 U (U^T S^-1 U)^-1 U^T S^-1,       S = E diag(h^2 / 3) E^T,
+
+removes: Q U = 0. Every row f of Q, and of C^T Q, is a test that no honest rest can fail: |f r| <= |f E| h.
+
+References
+----------
+yang2021 (5), (22): consistency of an observer that distrusts (J_u, J_s) with those within it; (35), (36) for
+the decoupling; (42), (43) for the reconstruction. docs/theory-unknown-input.md, section 6.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import chain, combinations
+from math import comb
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats, Ints
+from gridsec.errors import DesignInfeasible
+
+MOST_WORK = 2_000_000
+"""Pairs times squared meters beyond which a tick would take seconds."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pairs:
+    """The candidates; nobody comes first, then in the order of their size. c pairs, p meters, m inverters.
+
+    Attributes
+    ----------
+    meters, inverters : (c, p), (c, m)
+        Who is suspected.
+    """
+
+    meters: Bools
+    inverters: Bools
+
+    def within(self) -> Bools:
+        """Whether the first of two pairs suspects nobody whom the second does not; (c, c)."""
+        both = np.hstack([self.meters, self.inverters]).astype(np.float64)
+        return np.asarray(both @ (1.0 - both.T) == 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class LeftOut:
+    """A pair that has no unknown-input observer.
+
+    Attributes
+    ----------
+    meters, inverters
+        Who would be suspected.
+    rank
+        Rank of `C_Js b_Ju`, less than the number of inverters.
+    """
+
+    meters: tuple[int, ...]
+    inverters: tuple[int, ...]
+    rank: int
+
+
+def pairs(gain: Floats, most_meters: int, most_inverters: int) -> tuple[Pairs, tuple[LeftOut, ...]]:
+    """All pairs that have an unknown-input observer, and those that have none.
+
+    What a pair without one could explain, a smaller pair explains as well: its columns span no more.
+
+    Parameters
+    ----------
+    gain : (p, m)
+        2X from inverters to meters, in units of the meters' errors.
+    most_meters, most_inverters
+        Largest sets.
+
+    Raises
+    ------
+    DesignInfeasible
+        If there are too many to be tried within a tick.
+    """
+    p, m = gain.shape
+    count = sum(comb(p, k) for k in range(most_meters + 1))
+    count *= sum(comb(m, k) for k in range(most_inverters + 1))
+    if count * p**2 > MOST_WORK:
+        raise DesignInfeasible(
+            "bank of unknown-input observers",
+            f"{count} pairs of up to {most_meters} of {p} meters and {most_inverters} of {m} inverters "
+            "cannot be tried within a tick",
+            None,
+        )
+    found, missing = [], []
+    for meters in _subsets(p, most_meters):
+        rest = np.delete(gain, list(meters), axis=0)
+        for inverters in _subsets(m, most_inverters):
+            rank = _rank(rest[:, list(inverters)], float(np.abs(gain).max(initial=0.0)))
+            if rank < len(inverters):
+                missing.append(LeftOut(meters, inverters, rank))
+            else:
+                found.append((meters, inverters))
+    found.sort(key=lambda pair: len(pair[0]) + len(pair[1]))
+    marks = np.zeros((len(found), p + m), dtype=np.bool_)
+    for row, (meters, inverters) in zip(marks, found, strict=True):
+        row[list(meters)] = True
+        row[[p + i for i in inverters]] = True
+    return Pairs(marks[:, :p], marks[:, p:]), tuple(missing)
+
+
+def _subsets(count: int, most: int) -> list[tuple[int, ...]]:
+    return list(chain.from_iterable(combinations(range(count), k) for k in range(most + 1)))
+
+
+# Singular values below this part of the largest entry are rounding.
+_RANK = 1e-9
+
+
+def _rank(columns: Floats, size: float) -> int:
+    if not columns.size:
+        return 0
+    return int(np.count_nonzero(np.linalg.svd(columns, compute_uv=False) > _RANK * size))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Relation:
+    """One tick as `r = C a + E d`. R rows, K errors, m inverters.
+
+    Attributes
+    ----------
+    r : (R,)
+        Residuals, squared pu and pu.
+    C : (R, m)
+        What wrong injections do to them.
+    E : (R, K)
+        What errors do.
+    h : (K,)
+        How large these are at most.
+    meter : (R,)
+        Whose reading each row is.
+    voltage : (R,)
+        Which rows are voltages.
+    """
+
+    r: Floats
+    C: Floats
+    E: Floats
+    h: Floats
+    meter: Ints
+    voltage: Bools
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trial:
+    """What one pair makes of a tick. p meters, m inverters.
+
+    Attributes
+    ----------
+    fits
+        Whether all that it does not suspect may be honest.
+    misfit
+        `r^T Q r`.
+    score, threshold : (p,)
+        How far each voltage is from what all others say, and the most that an honest one can be, squared
+        pu; NaN and infinite for meters without one or suspected.
+    attack, attack_error : (m,)
+        Wrong injection that the rows show for each inverter by itself, with the suspected ones unknown as
+        well, and its error, pu; infinite error where they show nothing.
+    """
+
+    fits: bool
+    misfit: float
+    score: Floats
+    threshold: Floats
+    attack: Floats
+    attack_error: Floats
+
+
+def try_pair(relation: Relation, meters: Bools, inverters: Bools, room: Floats) -> Trial:
+    """Ask whether a pair explains a tick.
+
+    Parameters
+    ----------
+    relation
+        The tick.
+    meters, inverters : (p,), (m,)
+        Who is suspected.
+    room : (m,)
+        Largest wrong injection that there can be, pu.
+    """
+    keep = ~meters[relation.meter]
+    r, C, E, h = relation.r[keep], relation.C[keep], relation.E[keep], relation.h
+    P = np.linalg.inv((E * h) @ (E * h).T / 3.0)
+    left = _left_inverse(P, C[:, inverters])
+    Q = P - P @ C[:, inverters] @ left
+    tests = np.vstack([Q, C.T @ Q])
+    size, most = tests @ r, np.abs(tests @ E) @ h
+    rows, diagonal = r.size, np.diagonal(Q)
+    gain = np.einsum("mr,rm->m", tests[rows:], C)
+    # What the unknown inputs take away entirely is rounding, and no test.
+    sound = diagonal > _ROUNDING * np.diagonal(P)
+    known = gain > _ROUNDING * np.einsum("rm,rm->m", C, P @ C)
+    real = np.concatenate([sound, known & ~inverters])
+    fits = bool(np.all((np.abs(size) <= most)[real]))
+    score, threshold = np.full(meters.size, np.nan), np.full(meters.size, np.inf)
+    own = np.flatnonzero(relation.voltage[keep] & sound)
+    at = relation.meter[keep][own]
+    score[at], threshold[at] = np.abs(size[own] / diagonal[own]), most[own] / diagonal[own]
+    weights = np.where(known[:, None], tests[rows:] / np.where(known, gain, 1.0)[:, None], 0.0)
+    weights[inverters] = left
+    # Meters that are silent now may be those without which an inverter cannot be seen.
+    known[inverters] = np.abs(np.diagonal(left @ C[:, inverters]) - 1.0) < _ROUNDING
+    attack, error = weights @ r, np.where(known, np.abs(weights @ E) @ h, np.inf)
+    beyond = np.any((np.abs(attack) - error > room)[inverters])
+    return Trial(fits and not beyond, float(r @ size[:rows]), score, threshold, attack, error)
+
+
+# What is smaller than this part of what it was computed from.
+_ROUNDING = 1e-6
+
+
+def _left_inverse(P: Floats, U: Floats) -> Floats:
+    """`(U^T P U)^-1 U^T P`: least squares in units of the errors."""
+    if not U.shape[1]:
+        return np.zeros((0, len(P)))
+    return np.asarray(np.linalg.pinv(U.T @ P @ U, hermitian=True) @ U.T @ P)

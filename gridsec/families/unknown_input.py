@@ -1,0 +1,279 @@
+"""Inverters that inject a wrong reactive power and meters that lie, at once: yang2021 on a feeder.
+
+A candidate is a pair (suspected meters, suspected inverters) of bounded size. Its unknown-input observer
+rests on neither: honest inverters follow their curves (`gridsec.families.tubes`), what the suspected ones
+inject is an unknown input that the trusted readings reveal through 2X, and what is left over must be
+possible for honest readings (`gridsec.families.pairs`). Thresholds are worst cases of everything that is
+not known, so that honest readings never contradict the pair that is true. Hence:
+
+1. The pair that is true is never refuted, as long as no more meters and inverters are attacked than assumed.
+2. Who is in every pair that is not refuted is attacked: *named*.
+3. If the named alone are such a pair, the answer is ATTACKED, or CLEAN if they are nobody. Otherwise meters
+   and inverters explain the readings alike: UNDECIDED, with the smallest pairs as explanations.
+4. If all pairs are refuted, more is attacked than assumed: UNDECIDED.
+
+A pair is refuted by its `confirm`-th contradiction and until `release` ticks in a row did not contradict it.
+Active powers are believed, as by all banks. An inverter that moves the readings by less than they may
+honestly be off cannot be judged, and then nothing is CLEAN. Meters of class 0.5 alone judge only the
+largest inverters; where customers' net reactive power is reported, most.
+
+References
+----------
+yang2021 (2), (5) to (7), (17), (22) to (24), (42) to (47); docs/theory-unknown-input.md, section 6.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats, frozen
+from gridsec.errors import NotObservable
+from gridsec.families.pair_tick import Tick, UnknownInputDesign, UnknownInputState, observe
+from gridsec.families.pair_verdict import Found, answer, explain
+from gridsec.families.pairs import Trial, pairs, try_pair
+from gridsec.families.tubes import Doubt, spread
+from gridsec.frames import NO_VOLTAGE, reconstruct
+from gridsec.judge import Tally, count
+from gridsec.online import Cause, Decision, Estimate, Frame, Verdict
+from gridsec.plant import Options, Plant, setting
+
+__all__ = ["UnknownInputDesign", "UnknownInputState", "design", "init", "step"]
+
+REACH = 2.0
+"""Largest injection of an attacked inverter in parts of the largest that its curve asks for."""
+
+
+def design(
+    plant: Plant,
+    *,
+    max_attacked: int,
+    step_s: float,
+    max_inverters: int = 1,
+    options: Options | None = None,
+) -> UnknownInputDesign:
+    """Prepare to watch a feeder.
+
+    Parameters
+    ----------
+    plant
+        What is watched.
+    max_attacked, max_inverters
+        How many meters and inverters may be attacked at the same time, q_2 and q_1.
+    step_s
+        Expected interval between frames, s; it only chooses the options' default, others work as well.
+    options
+        The numbers that decide.
+
+    Raises
+    ------
+    NotObservable
+        Unless there are more than 2 max_attacked meters, yang2021 (4) and (20).
+    DesignInfeasible
+        If there are too many pairs.
+    ValueError
+        If two meters sit at one customer, or a number is not positive.
+    """
+    p, m = plant.meters.size, plant.droop.tau.size
+    if np.unique(plant.meters).size != p:
+        raise ValueError("two meters at one customer; combine them before")
+    if max_attacked < 0 or max_inverters < 0 or not (np.isfinite(step_s) and step_s > 0):
+        raise ValueError(
+            f"cannot watch for {max_attacked} meters, {max_inverters} inverters every {step_s} s"
+        )
+    if p <= 2 * max_attacked:
+        why = f"{p} meters of which {max_attacked} may lie: more than {2 * max_attacked} are needed"
+        raise NotObservable(range(p), p, why + " (yang2021, Assumption 3)")
+    if options is None:
+        options = Options() if step_s <= 30.0 else Options(release=4)
+    made = setting(plant, max_attacked=max_attacked, options=options)
+    own = plant.droop.customer
+    gain = 2.0 * made.model.X[:, own]
+    most = min(max_inverters, m)
+    found, missing = pairs(gain[plant.meters], max_attacked, most)
+    doubt = Doubt(max_attacked, most, frozen(REACH * plant.droop.limit), frozen(gain[own]))
+    return UnknownInputDesign(made, most, found, found.within(), missing, doubt, frozen(gain))
+
+
+def init(design: UnknownInputDesign, t: float) -> UnknownInputState:
+    """Begin to watch.
+
+    Parameters
+    ----------
+    design
+        From `design`.
+    t
+        Unix time, s.
+    """
+    plant, c = design.setting.plant, design.observers
+    none = np.zeros(c, dtype=np.intp)
+    return UnknownInputState(
+        t=t,
+        began=t,
+        tubes=None,
+        contradicted=Tally(none, none, np.zeros(c, dtype=np.bool_)),
+        x=np.zeros(plant.droop.tau.size),
+        v0_squared=plant.droop.vbar**2,
+        named=np.zeros(plant.meters.size, dtype=np.bool_),
+        last=None,
+    )
+
+
+def step(
+    design: UnknownInputDesign, state: UnknownInputState, frame: Frame
+) -> tuple[UnknownInputState, Estimate, Verdict]:
+    """Take one frame in.
+
+    Parameters
+    ----------
+    design, state
+        From `design`, and from `init` or the last step.
+    frame
+        Everything known at one tick. A frame that is not later than the last one changes nothing: it gets
+        the last estimate again, and UNDECIDED.
+    """
+    if not np.isfinite(frame.t) or (state.tubes is not None and not frame.t > state.t):
+        return _unusable(design, state, frame)
+    tick = observe(design, state, frame)
+    after = replace(
+        state,
+        t=frame.t,
+        began=frame.t if state.tubes is None else state.began,
+        tubes=tick.tubes,
+        contradicted=_contradicted(design, state, tick),
+    )
+    return _conclude(design, after, tick)
+
+
+def _contradicted(design: UnknownInputDesign, state: UnknownInputState, tick: Tick) -> Tally:
+    """Try the pairs, as far as there is a need, and count contradictions."""
+    options, both, tally = design.setting.options, design.pairs, state.contradicted
+    over = np.zeros(design.observers, dtype=np.bool_)
+    few = np.count_nonzero(tick.inputs.live) <= 2 * design.setting.max_attacked
+    if few or not tick.inputs.busbar:
+        return tally
+    # Whatever nobody explains by honesty, all others explain as well.
+    nobody = tick.trial(both.meters[0], both.inverters[0])
+    if not nobody.fits:
+        over[0] = True
+        for k in range(1, over.size):
+            if k == 1 or (both.meters[k] != both.meters[k - 1]).any():
+                relation = tick.relation(both.meters[k])
+                room = tick.room(tick.tube(both.meters[k]))
+            over[k] = not try_pair(relation, both.meters[k], both.inverters[k], room).fits
+    # What was found against a pair by a meter that is silent now has not been taken back.
+    hold = np.asarray((state.named & ~tick.inputs.live & ~both.meters).any(axis=1))
+    return count(tally, over, ~hold, confirm=options.confirm, release=options.release)
+
+
+def _conclude(
+    design: UnknownInputDesign, state: UnknownInputState, tick: Tick
+) -> tuple[UnknownInputState, Estimate, Verdict]:
+    both, inputs = design.pairs, tick.inputs
+    possible = ~state.contradicted.named
+    meters = np.asarray(both.meters[possible].all(axis=0) & possible.any())
+    inverters = np.asarray(both.inverters[possible].all(axis=0) & possible.any())
+    smallest = possible & ~(design.within[possible] & ~np.eye(len(possible), dtype=np.bool_)[possible]).any(
+        axis=0
+    )
+    trials = {int(k): tick.trial(both.meters[k], both.inverters[k]) for k in np.flatnonzero(smallest)}
+    order = sorted(trials, key=lambda k: trials[k].misfit)
+    chosen = order[0] if order else 0
+    trial = trials[chosen] if order else tick.trial(both.meters[0], both.inverters[0])
+    x, estimate = _estimate(design, tick, trial, chosen if order else None, certain=len(order) == 1)
+    score, threshold = _scores(tick, both.meters[chosen], both.inverters[chosen], trial)
+    explanations = explain(design.pairs, trials, order) if len(order) > 1 else ()
+    v2 = estimate.v2[design.setting.plant.meters]
+    verdict = Verdict(
+        *answer(design, state, tick, Found(meters, inverters, threshold, trial.attack_error, explanations)),
+        meters,
+        score,
+        threshold,
+        np.where(meters & inputs.live, inputs.y - v2, 0.0),
+        inverters,
+        np.where(inverters, trial.attack, 0.0),
+        (),
+        explanations,
+    )
+    after = replace(state, x=x, v0_squared=inputs.v0_squared, named=meters, last=(estimate, verdict))
+    return after, estimate, verdict
+
+
+def _estimate(
+    design: UnknownInputDesign, tick: Tick, trial: Trial, chosen: int | None, *, certain: bool
+) -> tuple[Floats, Estimate]:
+    """What the chosen pair makes of the feeder, with a bound that holds whichever pair is true."""
+    now, inputs, both = design.setting, tick.inputs, design.pairs
+    plant, doubt = now.plant, design.doubt
+    meters = both.meters[0 if chosen is None else chosen]
+    accused = both.inverters[0 if chosen is None else chosen]
+    tube = tick.tube(meters)
+    wrong = np.where(accused, np.clip(trial.attack, -tick.room(tube), tick.room(tube)), 0.0)
+    x = tube.middle + wrong
+    q = tick.frame.q + np.bincount(plant.droop.customer, weights=x, minlength=tick.frame.q.size)
+    seen = reconstruct(now, tick.frame, inputs, q)
+    gain = np.abs(design.gain)
+    if chosen is None:
+        bound = gain @ (doubt.reach + np.abs(x))
+    else:
+        # Others may be attacked as well, without being seen; then what was found may be theirs.
+        more = Doubt(
+            doubt.meters - (int(meters.sum()) if certain else 0),
+            doubt.inverters - (int(accused.sum()) if certain else 0),
+            doubt.reach,
+            doubt.coupling,
+        )
+        sure = certain and more.meters == 0 and more.inverters == 0
+        known = np.minimum(trial.attack_error if sure else np.inf, doubt.reach + np.abs(x))
+        bound = spread(now.errors, more, tube, tick.tubes.free, gain) + gain @ np.where(accused, known, 0.0)
+    moved = np.abs(seen.correction - inputs.correction)[plant.feeder.bus]
+    estimate = Estimate(
+        t=tick.frame.t,
+        v2=seen.v2,
+        bound=np.minimum(tick.error + moved + bound, NO_VOLTAGE),
+        v2_bus=seen.v2_bus,
+        trusted=inputs.live & ~meters,
+        x=x,
+    )
+    return x, estimate
+
+
+def _scores(tick: Tick, meters: Bools, inverters: Bools, trial: Trial) -> tuple[Floats, Floats]:
+    """Each meter against all others of the chosen pair; suspected ones against those that are not."""
+    score, threshold = trial.score.copy(), trial.threshold.copy()
+    for j in np.flatnonzero(meters & tick.inputs.live).tolist():
+        others = meters.copy()
+        others[j] = False
+        found = tick.trial(others, inverters)
+        score[j], threshold[j] = found.score[j], found.threshold[j]
+    return score, np.minimum(threshold, NO_VOLTAGE)
+
+
+def _unusable(
+    design: UnknownInputDesign, state: UnknownInputState, frame: Frame
+) -> tuple[UnknownInputState, Estimate, Verdict]:
+    """The answer to a frame that is not later than the last one: nothing new, and certainly not CLEAN."""
+    plant = design.setting.plant
+    p, m, b = plant.meters.size, plant.droop.tau.size, len(plant.feeder.buses)
+    reason = f"A frame of time {frame.t} is not later than the last one, {state.t}; it was not used."
+    if state.last is not None:
+        estimate, verdict = state.last
+        changed = replace(verdict, decision=Decision.UNDECIDED, cause=Cause.SETTLING, reason=reason)
+        return state, estimate, changed
+    v2_bus = np.full(b, state.v0_squared)
+    nobody = np.zeros(p, dtype=np.bool_)
+    nothing = np.full(plant.feeder.bus.size, NO_VOLTAGE)
+    estimate = Estimate(state.t, v2_bus[plant.feeder.bus], nothing, v2_bus, nobody, state.x)
+    verdict = Verdict(
+        Decision.UNDECIDED,
+        Cause.SETTLING,
+        reason,
+        nobody,
+        np.full(p, np.nan),
+        np.full(p, NO_VOLTAGE),
+        np.zeros(p),
+        np.zeros(m, dtype=np.bool_),
+        np.zeros(m),
+    )
+    return state, estimate, verdict
