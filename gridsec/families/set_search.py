@@ -382,12 +382,8 @@ def _settled(
 def _search(design: SetSearchDesign, inputs: Inputs, view: _View, state: SetSearchState) -> _Found:
     """Try all sets of at most M dropped meters against what their own readings imply."""
     errors, at, live = design.errors, design.setting.plant.meters, inputs.live
-    reach = errors.inverters[at]
-    column = np.zeros((live.size, live.size))
-    metered = errors.meter_of >= 0
-    np.add.at(column, errors.meter_of[metered], (reach * (errors.span - view.sure)).T[metered])
     sets = design.dropped[~(design.dropped & ~live).any(axis=1)]
-    error = view.base[at] + reach @ view.sure + sets @ column
+    error = (view.base + errors.inverters @ view.sure)[at] + sets @ _lost(errors, view.sure)[at].T
     limit = _threshold(design, view.v2[at], error)
     excess = np.where(live & ~sets, np.nan_to_num(view.score) / limit, 0.0).max(axis=1, initial=0.0)
     fine = np.flatnonzero(excess <= 1.0)
@@ -421,7 +417,9 @@ def _conclude(  # noqa: PLR0917  # the chain's three values, then what this step
     # What a liar did to its own inverter and, through the model, to those without a believed meter.
     driven = _driven(design, live & ~dropped)
     free = np.where(driven, view.bound.free, design.errors.span)
-    estimate = Estimate(frame.t, view.v2, _error(design, view, found), view.v2_bus, live & ~dropped, view.x)
+    estimate = Estimate(
+        frame.t, view.v2, _error(design, view, found.torn), view.v2_bus, live & ~dropped, view.x
+    )
     verdict = _verdict(design, inputs, view, found, tally, dropped, switched)
     after = SetSearchState(
         t=frame.t,
@@ -443,12 +441,21 @@ def _conclude(  # noqa: PLR0917  # the chain's three values, then what this step
     return after, estimate, verdict
 
 
-def _error(design: SetSearchDesign, view: _View, found: _Found) -> Floats:
-    """Half-width of the estimate: of the believed set while its test holds, else what saturation leaves."""
-    if not (view.over & ~found.dropped).any() and not found.accused.any():
-        return view.error
-    far = np.asarray(design.errors.span)
-    return np.asarray(view.base + design.errors.inverters @ far)
+def _lost(errors: ErrorModel, sure: Floats) -> Floats:
+    """What is lost at every customer without the word of one meter, (N, p): its inverter may be anywhere."""
+    column = np.zeros((errors.meters.size, len(errors.inverters)))
+    metered = errors.meter_of >= 0
+    np.add.at(column, errors.meter_of[metered], (errors.inverters * (errors.span - sure)).T[metered])
+    return np.asarray(column.T)
+
+
+def _error(design: SetSearchDesign, view: _View, torn: bool) -> Floats:
+    """Half-width of the estimate that holds whichever M meters lie, found out or not; (N,)."""
+    errors = design.errors
+    if torn:
+        return np.asarray(view.base + errors.inverters @ errors.span)
+    most = detect.largest(_lost(errors, view.sure), design.setting.max_attacked)
+    return np.asarray(view.base + errors.inverters @ view.sure + most)
 
 
 def _verdict(  # noqa: PLR0917  # everything one tick brought
