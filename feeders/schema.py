@@ -107,7 +107,7 @@ class LoadDefaults:
 class MonitorDefaults:
     """How the feeder is watched."""
 
-    estimator: str = "exact-bank"
+    estimator: str = "sequential"
     max_attacked: int = 1
     tick_s: float = 1.0
     on_delay_s: float = 2.0

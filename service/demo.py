@@ -322,7 +322,7 @@ def _introduce(site: Site, service: Service, plan: Plan, console: Console) -> No
     title = site.tables.meta.title or site.feeder.name
     console.print(
         f"[bold]{escape(title)}[/]: {len(site.feeder.customers)} customers, {len(site.meter_ids)} meters, "
-        f"watched for up to {site.tables.meta.monitor.max_attacked} manipulated ones."
+        f"watched by the {site.tables.meta.monitor.estimator} monitor."
     )
     console.print(
         f"Web page: [bold cyan]{service.url}/[/]   REST: {service.url}/api/v1/feeders", highlight=False
