@@ -97,6 +97,7 @@ def conclude(design: SequentialDesign, state: SequentialState, tick: Tick) -> tu
             busbar=True,
         )
     )
+    said = _contradicted(design, trust.trusted & judged & (np.nan_to_num(score) > threshold), said)
     decision, cause, reason = _beside_meters(design, state, tick, amounts, said)
     injected = np.zeros(plant.droop.tau.size)
     for k, amount in amounts.items():
@@ -121,6 +122,15 @@ def conclude(design: SequentialDesign, state: SequentialState, tick: Tick) -> tu
 _Said = tuple[Decision, Cause, str]
 # What a verdict about inverters and loads may add to: nothing more serious was found.
 _MILD = (Cause.AGREEMENT, Cause.AMBIGUOUS)
+
+
+def _contradicted(design: SequentialDesign, against: Bools, said: _Said) -> _Said:
+    """The answer, unless readings that a decoder still believes contradict it: then more than M may lie."""
+    if design.decoder is None or said[1] is not Cause.RESIDUALS or not against.any():
+        return said
+    more, most = int(np.count_nonzero(against)), design.most
+    sentence = f"{said[2][:-1]}; but so are {more} of the others, and at most {most} can be told apart."
+    return Decision.UNDECIDED, Cause.TOO_MANY_SUSPECTS, sentence
 
 
 def _beside_meters(
