@@ -39,8 +39,10 @@ class Fits:
     residual, limit : (S, A)
         ``s - B xi_hat`` and the largest value it can have if all blocks outside the set are honest and, for
         rows of the set, these as well.
+    reach : (A,)
+        The largest value of ``|s|`` that an honest row can have: the limit of the fit that rests on nobody.
     disagree : (S, p)
-        Blocks with a residual above its limit.
+        Blocks with a residual above its limit, or a value out of reach.
     xi : (S, n)
         Fitted unknowns.
     error : (S, F)
@@ -50,6 +52,7 @@ class Fits:
     left_out: Bools
     residual: Floats
     limit: Floats
+    reach: Floats
     disagree: Bools
     xi: Floats
     error: Floats
@@ -112,15 +115,16 @@ def fits(  # noqa: PLR0917  # the terms of s = B xi + v, then what is asked of t
     made = [_without(whole, out[block], functionals) for out in left_out]
     residual, limit, error = (np.array([one[k] for one in made]) for k in range(3))
     disagree = np.zeros((len(made), blocks), dtype=np.bool_)
-    over = np.abs(residual) > limit * (1.0 + _ROUNDING)
+    reach = 1.0 + np.abs(B).sum(axis=1)
+    over = (np.abs(residual) > limit * _ROUNDING) | (np.abs(s) > reach * _ROUNDING)
     for j in present:
         disagree[:, j] = over[:, block == j].any(axis=1)
     # xi_hat = B_Lambda^T W_Lambda s_Lambda, and the residual on Lambda is W_Lambda s_Lambda.
     xi = np.where(left_out[:, block], 0.0, residual) @ B
-    return Fits(left_out, residual, limit, disagree, xi, error)
+    return Fits(left_out, residual, limit, reach, disagree, xi, error)
 
 
-_ROUNDING = 1e-9
+_ROUNDING = 1.0 + 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)

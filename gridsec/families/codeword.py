@@ -184,9 +184,8 @@ def code_word(  # noqa: PLR0917  # as _conclude
     voltage = np.hstack([2.0 * lines.X[:, own], 2.0 * lines.R, 2.0 * lines.X, np.ones((n, 1))])
     at = np.flatnonzero(inputs.live)
     where = plant.meters[at]
-    # An observer that was not driven yet knows what the unheard one knows: no row of its own.
-    driven = (errors.meter_of >= 0) & (parts.bound.driven < parts.bound.free)
-    inverters = np.flatnonzero(driven & inputs.live[errors.meter_of]) if at.size else np.zeros(0, np.intp)
+    driven = inputs.live[errors.meter_of] if at.size else np.zeros(m, dtype=np.bool_)
+    inverters = np.flatnonzero(driven & (errors.meter_of >= 0))
     net = np.flatnonzero(inputs.live & np.isfinite(frame.q_net[plant.meters]))
     of_x = np.eye(m, m + 2 * n + 1)
     total = np.zeros((n, m + 2 * n + 1))

@@ -18,8 +18,8 @@ with the rows of meter j as block j, each in units of its own worst-case bound f
 C(p, M) fits without M meters are made at every frame (`gridsec.decode.boxes`). Shared errors are one
 unknown, not one for every meter: that is where the evidence comes from.
 
-A fit is credible if it explains every meter it rests on, and a meter is named if no credible fit rests on
-it. An honest meter belongs to some set of p - M honest ones, and that set's fit is credible; so, as long as
+A fit is credible if it explains every meter it rests on, as the unheard observer must by itself. A meter is
+named if no credible fit rests on it. An honest meter belongs to some set of p - M honest ones, and that set's fit is credible; so, as long as
 at most M lie, no honest meter is ever named, and the truth is within the union of what the credible fits
 allow. The price is power: the more liars are allowed, the more fits can explain a small lie differently.
 Then the answer is UNDECIDED, with these explanations.
@@ -57,8 +57,8 @@ from gridsec.plant import Options, Plant, Setting, setting
 
 __all__ = ["PartialDesign", "PartialState", "constants", "design", "init", "step"]
 
-MOST_WORK = 5e8
-"""Multiplications per frame that a design may ask for: about a second of one core."""
+MOST_WORK = 3e7
+"""Entries of all fits together that a design may ask for in a second: about half of what one core does."""
 
 _SHOWN = 8
 
@@ -158,8 +158,9 @@ def design(
         raise NotObservable(range(p), p, why)
     sets, rows = comb(p, max_attacked), 3 * p
     unknowns = plant.droop.tau.size + 2 * len(plant.feeder.customers) + 1
-    if sets > MOST_SUBSETS or sets * rows * (rows + unknowns) > MOST_WORK:
-        raise DesignInfeasible(f"fits without every {max_attacked} meters", f"{sets} sets of {rows} rows")
+    if sets > MOST_SUBSETS or sets * rows * (rows + unknowns) > MOST_WORK * step_s:
+        said = f"{sets} sets of up to {rows} rows every {step_s:g} s are too many"
+        raise DesignInfeasible(f"fits without every {max_attacked} of {p} meters", said)
     if options is None:
         options = Options() if step_s <= 30.0 else Options(release=4)
     model = circle.design(close_loop(plant.feeder, plant.droop, meters), np.zeros(p, dtype=np.bool_))
@@ -209,8 +210,8 @@ def step(design: PartialDesign, state: PartialState, frame: Frame) -> tuple[Part
     -------
     PartialState, Estimate, Verdict
         As every estimator's step; see `gridsec.online`. Score and threshold are those of the readings in
-        the fit that the estimate is from. Who is named is decided by all fits and all rows: a small lie
-        may be named below the threshold of this one.
+        the fit that the estimate is from, or of the observer that hears nobody where that says more. Who
+        is named is decided by all fits and all rows: a small lie may be named below this threshold.
     """
     if (state.started and not frame.t > state.t) or not np.isfinite(frame.t):
         return _unusable(design, state, frame)
@@ -339,15 +340,17 @@ def _scores(  # noqa: PLR0917  # as _conclude
     index: int,
     estimate: Estimate,
 ) -> tuple[Floats, Floats]:
-    """Residuals of the readings in one fit, and what honest ones can be at most; (p,)."""
+    """Residuals of the readings in one fit, or without any, and what honest ones can be at most; (p,)."""
     plant, options = design.setting.plant, design.setting.options
     around = estimate.bound[plant.meters]
     top = np.maximum(estimate.v2[plant.meters], 0.0) + around
     threshold = detect.reading_error(plant.accuracy, top, options.sigmas) + around
     score = np.where(inputs.live, 0.0, np.nan)
     at = word.block[word.reading]
-    score[at] = (np.abs(found.residual[index]) * word.unit)[word.reading]
-    threshold[at] = (found.limit[index] * word.unit)[word.reading]
+    fitted, alone = np.abs(found.residual[index]), np.abs(word.s)
+    worse = alone * found.limit[index] > fitted * found.reach
+    score[at] = (np.where(worse, alone, fitted) * word.unit)[word.reading]
+    threshold[at] = (np.where(worse, found.reach, found.limit[index]) * word.unit)[word.reading]
     return score, threshold
 
 
