@@ -9,7 +9,7 @@ so k coincidences in a row with the previous reading (stuck), or with the readin
 (replay), have a probability of at most P^k. That is evidence once it is so small that all meters, ticks
 and, for a replay, lags of a year together see it less often than the false-alarm rate says.
 
-Meters may be calmer than their data sheets promise. Among n runs the data sheet expects one of L with
+Meters may be calmer than their data sheets promise. Among n readings the data sheet expects runs of L with
 ``n P^L`` at most; a meter whose longest run has less than e^-7 of that is judged by that run, as if it
 were the longest of twenty: ``P^L = 1 / 20``, since readings near the edge of a step end many runs and say
 little of those in its middle. A meter is judged after the first minutes, when that is known; one without
@@ -53,6 +53,8 @@ SILENT = np.iinfo(np.int32).min
 _FEWEST = 6
 # Time after which a meter's own longest run says something, s, and fewest readings.
 _KNOWN_S, _KNOWN = 300.0, 16
+# Squared readings above are all alike: codes must fit their integers.
+_HIGHEST = 1e6
 # A run this unlikely by the data sheet shows a calm meter; it then counts as the longest of e^3.
 _UNLIKELY, _FEW_RUNS = 7.0, 3.0
 # Readings without a register step are compared on this grid, pu.
@@ -125,10 +127,8 @@ class Memory:
         Readings heard.
     run : (p,)
         How often the last reading was repeated so far.
-    runs : (p,)
-        How many ended.
     longest : (p,)
-        Longest of them that was no evidence.
+        Longest run that was no evidence.
     stuck : (p,)
         Evidence that the meter is stuck.
     lag : (p,)
@@ -146,7 +146,6 @@ class Memory:
     hash: _Hashes
     count: Ints
     run: Ints
-    runs: Ints
     longest: Ints
     stuck: Bools
     lag: Ints
@@ -199,7 +198,7 @@ def empty(meters: int) -> Memory:
     zero = np.zeros(meters, dtype=np.intp)
     no = np.zeros(meters, dtype=np.bool_)
     return Memory(
-        -1, 0, silent, silent, np.zeros(meters, dtype=np.uint32), zero, zero, zero, zero, no, zero, (), ()
+        -1, 0, silent, silent, np.zeros(meters, dtype=np.uint32), zero, zero, zero, no, zero, (), ()
     )
 
 
@@ -218,12 +217,13 @@ def listen(law: Rules, before: Memory, y: Floats, live: Bools) -> Memory:
         Where there is a reading.
     """
     tick = before.tick + 1
-    code = now = np.rint(np.sqrt(np.maximum(y, 0.0)) / law.step).astype(np.int32)
+    code = now = told = np.rint(np.sqrt(np.minimum(np.maximum(y, 0.0), _HIGHEST)) / law.step).astype(np.int32)
     same = code == before.code
-    run, runs, longest = (before.run + same) * same, before.runs + ~same, before.longest
+    run, longest = (before.run + same) * same, before.longest
     if not live.all():
-        runs = np.where(live, runs, before.runs)
         run = np.where(live, run, before.run)
+        # A silent tick is like no other in the hash.
+        told = np.where(live, code, np.int32(tick % 2**31))
         now, code = np.where(live, code, np.int32(SILENT)), np.where(live, code, before.code)
     # Rare, so only looked at where there is something to see.
     longer = before.run > longest
@@ -231,16 +231,15 @@ def listen(law: Rules, before: Memory, y: Floats, live: Bools) -> Memory:
         longest = np.where(longer & (run == 0) & ~before.stuck, before.run, longest)
     count, stuck = before.count + live, run >= _FEWEST
     if stuck.any():
-        stuck &= (run * _surprise(law, runs, longest) >= law.stuck) & (count >= law.known)
+        stuck &= (run * _surprise(law, count, longest) >= law.stuck) & (count >= law.known)
     after = Memory(
         tick=tick,
         kept=before.kept,
         code=code,
         now=now,
-        hash=_roll(before.hash, now, tick),
+        hash=_roll(before.hash, told),
         count=count,
         run=run,
-        runs=runs,
         longest=longest,
         stuck=stuck,
         lag=_follow(before, now, tick),
@@ -302,16 +301,14 @@ def past(memory: Memory, meter: int, start: int, stop: int) -> tuple[Floats, Flo
     return code, model.astype(np.float64)
 
 
-def _surprise(law: Rules, runs: Ints, longest: Ints) -> Floats:
+def _surprise(law: Rules, count: Ints, longest: Ints) -> Floats:
     """What the data sheet says, or, where the meter is calmer than that, what its longest run does; (p,)."""
-    calm = longest * law.surprise > np.log(np.maximum(runs, 1)) + _UNLIKELY
+    calm = longest * law.surprise > np.log(np.maximum(count, 1)) + _UNLIKELY
     return np.where(calm, np.minimum(_FEW_RUNS / np.maximum(longest, 1), law.surprise), law.surprise)
 
 
-def _roll(before: _Hashes, now: _Codes, tick: int) -> _Hashes:
+def _roll(before: _Hashes, told: _Codes) -> _Hashes:
     """Hash of the last SPAN ticks: older ones have been shifted out (a gear hash)."""
-    silent = now == SILENT
-    told = np.where(silent, np.int32(tick % 2**31), now) if silent.any() else now
     mixed = told.view(np.uint32) * _ODD
     mixed ^= mixed >> _HALF
     return (before << _ONE) + mixed
@@ -344,7 +341,7 @@ def _search(law: Rules, memory: Memory) -> Memory:
     rows, meters = np.nonzero(hit)
     ask = (memory.lag == 0) & (memory.now != SILENT) & (memory.run < SPAN) & (memory.count >= law.known)
     with np.errstate(divide="ignore"):
-        need = np.maximum(np.ceil(law.replay / _surprise(law, memory.runs, memory.longest)), _FEWEST)
+        need = np.maximum(np.ceil(law.replay / _surprise(law, memory.count, memory.longest)), _FEWEST)
     ask &= need <= ROWS * BLOCKS // 2
     wanted = np.flatnonzero(ask[meters])
     begin = memory.first + ROWS * turn

@@ -163,6 +163,14 @@ class TestMemory:
         assert states[-1].lag[0] == 1000
         assert all(memory.lag[0] in {0, 1000} for memory in states)
 
+    def test_absurd_readings_do_no_harm(self) -> None:
+        rule = repeats.rules(np.zeros(3), np.zeros(3), CHANCE, 1.0)
+        memory = repeats.empty(3)
+        for y in (-1.0, 0.0, 1e300, 1.0):
+            memory = repeats.listen(rule, memory, np.full(3, y), np.ones(3, dtype=np.bool_))
+            memory = repeats.keep(memory, np.ones(3))
+        assert not repeats.suspicious(memory).any()
+
 
 class TestHonestMeters:
     def test_at_the_worst_voltage_nothing_repeats_beyond_chance(self) -> None:
