@@ -242,7 +242,7 @@ def _street(seed: int, *, told: bool) -> tuple[Street, Generator]:
 @settings(max_examples=15)
 @given(seed=st.integers(0, 10**6), told=st.booleans(), h=st.sampled_from([1.0, 5.0, 900.0]))
 def test_the_true_pair_is_never_refuted(seed: int, told: bool, h: float) -> None:
-    """Liars of any size, errors at their extremes: honest inverters in their tubes, the true pair possible."""
+    """Liars of any size, errors at their extremes: honest inverters in their tubes, the true pair open."""
     street, rng = _street(seed, told=told)
     design = unknown_input.design(street.plant, max_attacked=1, step_s=h)
     state = unknown_input.init(design, street.t)
