@@ -82,11 +82,12 @@ def test_both_banks_hold_every_set_once(r: int, p: int, q1: int, q2: int) -> Non
     assert {len(s) for _, s in small} == {p - 2 * q2}
 
 
-def test_lemmas_2_and_3_by_brute_force() -> None:
+@pytest.mark.parametrize(("r", "p", "q1", "q2"), [(2, 5, 2, 2), (3, 5, 1, 2), (5, 3, 2, 1)])
+def test_lemmas_1_to_3_by_brute_force(r: int, p: int, q1: int, q2: int) -> None:
     """Whoever is attacked, each large set has a small one within it that is free of attacks."""
-    large, small = members(3, 5, 1, 2)
-    for attacked_inputs in itertools.combinations(range(3), 1):
-        for attacked_sensors in itertools.combinations(range(5), 2):
+    large, small = members(r, p, q1, q2)
+    for attacked_inputs in itertools.combinations(range(r), q1):
+        for attacked_sensors in itertools.combinations(range(p), q2):
             clean = [
                 (u, s)
                 for u, s in small
@@ -156,6 +157,29 @@ def test_theorem_2_whoever_lies(actuator: int, sensor: int) -> None:
     np.testing.assert_allclose(last.x, x[-1], atol=1e-6)
     np.testing.assert_allclose(last.input_attack, a_u[-2], atol=1e-6)
     np.testing.assert_allclose(last.sensor_attack, a_y[-1], atol=1e-6)
+
+
+@pytest.mark.parametrize("example", [1, 2])
+def test_the_printed_selection_errs_at_most_three_times_as_much_as_the_honest_members(example: int) -> None:
+    """Theorems 1 and 2 with the selection of (5) to (7), (22) to (24): (15) and (32) at every step."""
+    made = yang2021.bank(example, corrected=True)
+    plant, r = made.family.plant, 2 if example == 1 else 3
+    assert made.measure == "distance"
+    assert made.guaranteed
+    attacked = [(), (0,), (1,), (0, 1)] if example == 1 else [(0,), (1,), (2,)]
+    for inputs, sensor in itertools.product(attacked, range(4)):
+        rng = np.random.default_rng([example, sensor, *inputs])
+        honest = np.array([set(inputs) <= set(u) and sensor not in s for u, s in made.family.pairs])
+        x, state, worst = rng.standard_normal(r), init(made, 0.0), 0.0
+        for k in range(15):
+            u, lie = rng.uniform(-5, 5, r), rng.uniform(-10, 10) * (np.arange(4) == sensor)
+            state, answer = step(made, state, plant.system.C @ x + lie, u, ALL4)
+            error = np.linalg.norm(state.family.x - x, axis=1)
+            assert np.linalg.norm(answer.x - x) <= 3.0 * error[honest].max() + 1e-9
+            worst = max(worst, float(error.max())) if k > 2 else worst
+            a_u = np.where(np.isin(np.arange(r), inputs), rng.uniform(-10, 10, r), 0.0)
+            x = advance(plant.system, x, u) + plant.inputs @ a_u
+        assert worst > 1.0, "others are deceived, and would be chosen by a wrong rule"
 
 
 @settings(max_examples=15, deadline=None)

@@ -254,6 +254,36 @@ def test_the_error_decays_at_the_certified_rate_whatever_the_inputs_do(
         assert np.all((np.abs(state.x - x) <= state.box)[entitled])
 
 
+def test_the_error_system_is_plant_minus_observer(
+    partial: UnknownInputDesign, noisy: UnknownInputDesign
+) -> None:
+    """e+ of `error_system`, term by term, against a step of every observer beside a step of the plant."""
+    rng = np.random.default_rng(11)
+    for family in (partial, noisy):
+        plant, system = family.plant, family.plant.system
+        n, p, inputs = len(system.A), len(plant.noise), system.B.shape[1]
+        loud, size = bool(np.any(plant.noise > 0.0)), 1.0 if family is partial else 0.03
+        x, u, after = size * rng.standard_normal(n), size * rng.standard_normal(inputs), np.zeros(inputs)
+        state = replace(init(family, 0.0), x=size * rng.standard_normal((len(family.pairs), n)))
+        before, drift = state.x - x, rng.uniform(-1, 1, plant.drift.shape[1])
+        n0, n1 = rng.uniform(-1, 1, (2, p)) if loud else np.zeros((2, p))
+        seen = np.ones(p, dtype=np.bool_)
+        state = step(family, state, system.C @ x + system.D @ u + plant.noise * n0, u, seen)
+        hats = state.x
+        ahead = advance(system, x, u) + plant.drift @ drift
+        state = step(family, state, system.C @ ahead + system.D @ after + plant.noise * n1, after, seen)
+        for i, (pair, gains) in enumerate(zip(family.pairs, family.gains, strict=True)):
+            s, own = error_system(plant, pair), list(pair[1])
+            z, zhat = (system.H @ at + system.F @ u for at in (x, hats[i]))
+            psi = system.phi(zhat) - system.phi(z) - plant.middle * (system.H @ before[i])
+            # b H N acts on the new readings' errors, Gbar E on the drift, with the signs of x_hat - x.
+            w = np.concatenate([n1[own], -drift])
+            expected = (s.M - gains.K @ s.C) @ before[i] + s.S @ psi + s.W @ w + gains.K @ (s.N * n0[own])
+            if not loud:
+                expected = (s.M - gains.K @ s.C) @ before[i] + s.S @ psi
+            np.testing.assert_allclose(state.x[i] - ahead, expected, atol=1e-12)
+
+
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 2**31), extreme=st.booleans())
 def test_noise_and_drift_stay_inside_the_bounds(noisy: UnknownInputDesign, seed: int, extreme: bool) -> None:
