@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 from gridsec import bank as banks
 from gridsec.certificates import reactance
-from gridsec.feeder import lindistflow
+from gridsec.feeder import lindistflow, squared_voltages
 from gridsec.gains import circle_matrix, margin
 from gridsec.lmi import circle
-from gridsec.lure import advance, equilibrium
+from gridsec.lure import advance, close_loop, equilibrium, known_input
 from gridsec.papers import chong2020
 from gridsec.papers.claims import Reproduction
 
@@ -134,10 +136,15 @@ class TestErrata:
         # Printed: v^2 = -H x - psi + v^2, read with v_0 at the end. The correction is 4 X' q_c.
         printed = -H @ qg - phi + v0**2
         np.testing.assert_allclose(printed - v2, 4.0 * Xp * qc, atol=1e-13)
-        # The project's own model agrees with the walk as well.
+        # The project's own loop and known input, on a line with these impedances, give the same voltages.
         of = chong2020.setting(N)
-        model = lindistflow(of.feeder)
-        np.testing.assert_allclose(of.lure.H, -2.0 * model.X, atol=1e-15)
+        line = replace(of.feeder, r=np.concatenate([R, Rp]), x=np.concatenate([X, Xp]))
+        lure, model = close_loop(line, of.droop, np.arange(N)), lindistflow(line)
+        np.testing.assert_allclose(lure.H, H, atol=1e-15)
+        ours = known_input(model, 1.0, rho, -qc, v0**2)
+        np.testing.assert_allclose(ours, w, atol=1e-15)
+        np.testing.assert_allclose(1.0 - (lure.H @ qg + lure.F @ ours), v2, atol=1e-13)
+        np.testing.assert_allclose(squared_voltages(model, rho, qg - qc, v0**2), v2, atol=1e-13)
 
     def test_the_printed_inequality_does_not_fit(self) -> None:
         """(12) prints -P, n columns, where n_J are needed; the corrected column is -P L N."""
