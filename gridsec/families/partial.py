@@ -19,9 +19,10 @@ C(p, M) fits without M meters are made at every frame (`gridsec.decode.boxes`). 
 unknown, not one for every meter: that is where the evidence comes from.
 
 A fit is credible if it explains every meter it rests on, as the unheard observer must by itself. A meter is
-named if no credible fit rests on it. An honest meter belongs to some set of p - M honest ones, and that set's fit is credible; so, as long as
-at most M lie, no honest meter is ever named, and the truth is within the union of what the credible fits
-allow. The price is power: the more liars are allowed, the more fits can explain a small lie differently.
+named if no credible fit rests on it. An honest meter belongs to some set of p - M honest ones, and that
+set's fit is credible; so, as long as at most M lie, no honest meter is ever named, and the truth is within
+the union of what the credible fits allow. The price is power: the more liars are allowed, the more fits can
+explain a small lie differently.
 Then the answer is UNDECIDED, with these explanations.
 
 The paper's own constants (theta, kappa) are available from `constants`; on feeders they promise less than is
