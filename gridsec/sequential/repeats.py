@@ -10,7 +10,7 @@ so k coincidences in a row with the previous reading (stuck), or with the readin
 and, for a replay, lags of a year together see it less often than the false-alarm rate says.
 
 Meters may be calmer than their data sheets promise. Among n readings the data sheet expects runs of L with
-``n P^L`` at most; a meter whose longest run has less than e^-7 of that is judged by that run, as if it
+``n P^L`` at most; a meter whose longest run has less than e^-5 of that is judged by that run, as if it
 were the longest of twenty: ``P^L = 1 / 20``, since readings near the edge of a step end many runs and say
 little of those in its middle. A meter is judged after the first minutes, when that is known; one without
 promised jitter is never judged.
@@ -56,7 +56,7 @@ _KNOWN_S, _KNOWN = 300.0, 16
 # Squared readings above are all alike: codes must fit their integers.
 _HIGHEST = 1e6
 # A run this unlikely by the data sheet shows a calm meter; it then counts as the longest of e^3.
-_UNLIKELY, _FEW_RUNS = 7.0, 3.0
+_UNLIKELY, _FEW_RUNS = 5.0, 3.0
 # Readings without a register step are compared on this grid, pu.
 _FINEST = 1e-6
 # A good multiplier for hashes: 2^32 over the golden ratio.
