@@ -45,8 +45,9 @@ LENGTHS = (50, 100, 200)
 """Readings in a window, as in the paper's example."""
 
 LENGTH = LENGTHS[0]
-"""The shortest: a window answers at its end only, up to two lengths after a lie began. Longer ones collect no
-more evidence here, since worst-case thresholds do not become finer with time."""
+"""The shortest: a window answers at its end only, so that an operator hears of a lie up to two lengths after
+it began, 100 s at one reading a second. Longer windows name the same meters later (`benchmarks.windowed`):
+worst-case thresholds do not become finer with time."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
