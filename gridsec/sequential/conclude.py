@@ -80,6 +80,7 @@ def conclude(design: SequentialDesign, state: SequentialState, tick: Tick) -> tu
         std=std,
     )
     score, threshold, judged = _worst(design, tick.seen, tick.live.size)
+    live = judged & tick.live
     at = plant.feeder.bus[plant.meters]
     attack = np.where(trust.named & tick.live, tick.y - state.learned.bias - v2_bus[at], 0.0)
     amounts = _amounts(design, state, tick.seen)
@@ -87,17 +88,19 @@ def conclude(design: SequentialDesign, state: SequentialState, tick: Tick) -> tu
     said = decide(
         Situation(
             names=design.names,
-            max_attacked=max(1, min(design.most, int(np.count_nonzero(judged)) // 3)),
-            live=judged,
+            max_attacked=max(1, min(design.most, int(np.count_nonzero(live)) // 3)),
+            live=live,
             suspected=~trust.trusted | (judged & (np.nan_to_num(score) > threshold)),
             named=trust.named,
-            wide=judged & (threshold > design.options.widest),
+            wide=live & (threshold > design.options.widest),
             valid=True,
             settled=settled,
             busbar=True,
         )
     )
-    said = _contradicted(design, trust.trusted & judged & (np.nan_to_num(score) > threshold), said)
+    said = _contradicted(
+        design, ~trust.named & judged & (np.nan_to_num(score) > threshold), trust.named, said
+    )
     decision, cause, reason = _beside_meters(design, state, tick, amounts, said)
     injected = np.zeros(plant.droop.tau.size)
     for k, amount in amounts.items():
@@ -124,11 +127,13 @@ _Said = tuple[Decision, Cause, str]
 _MILD = (Cause.AGREEMENT, Cause.AMBIGUOUS)
 
 
-def _contradicted(design: SequentialDesign, against: Bools, said: _Said) -> _Said:
-    """The answer, unless readings that a decoder still believes contradict it: then more than M may lie."""
-    if design.decoder is None or said[1] is not Cause.RESIDUALS or not against.any():
+def _contradicted(design: SequentialDesign, beyond: Bools, named: Bools, said: _Said) -> _Said:
+    """The answer, unless with the meters named more than M are beyond what a decoder calls honest."""
+    more, most = int(np.count_nonzero(beyond)), design.most
+    if design.decoder is None or said[1] is not Cause.RESIDUALS:
         return said
-    more, most = int(np.count_nonzero(against)), design.most
+    if not more or int(np.count_nonzero(named)) + more <= most:
+        return said
     sentence = f"{said[2][:-1]}; but so are {more} of the others, and at most {most} can be told apart."
     return Decision.UNDECIDED, Cause.TOO_MANY_SUSPECTS, sentence
 
