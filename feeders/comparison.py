@@ -10,7 +10,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -20,6 +20,7 @@ from feeders.campaign import NoSuchAttack
 from feeders.estimators import FAMILIES, Watcher, choose, design
 from feeders.lies import Lie, Trick
 from feeders.trials import LoadError, Meters, Outcome, Trial, frames, judge
+from feeders.variation import Variation
 from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible, GridsecError, NotObservable
 
@@ -47,6 +48,10 @@ ONSET_S: Final = 60.0
 
 BEGIN: Final = "<!-- comparison: begin -->"
 END: Final = "<!-- comparison: end -->"
+
+LIVELY: Final = Variation(tap_interval_s=300.0)
+"""Loads and clouds as in every scenario; the transformer upstream may step every five minutes, so that runs
+of minutes see what meters that repeat themselves would miss in hours."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,9 +103,9 @@ CASES: Final = (
     Case("replay", "{count} meters at random repeat what they read 10 minutes earlier", Trick.REPLAY, 600.0),
     Case(
         "inverter",
-        "one inverter at random injects 30 % of its rating beside its droop curve; all meters are honest",
+        "one inverter at random injects its rating beside what its droop curve says; all meters are honest",
         Trick.INVERTER,
-        30.0,
+        100.0,
         one=True,
     ),
 )
@@ -119,7 +124,7 @@ class Plan:
         How many runs of each case.
     duration_s, step_s
         Length of a run and interval of its frames, s.
-    load_error, meters
+    load_error, meters, variation
         As in `feeders.trials.Trial`.
     families, cases
         Names; all by default.
@@ -129,10 +134,11 @@ class Plan:
 
     max_attacked: int = 2
     seeds: int = 3
-    duration_s: float = 240.0
+    duration_s: float = 480.0
     step_s: float = 1.0
     load_error: LoadError = field(default_factory=lambda: LoadError(0.1, 0.05))
     meters: Meters = Meters.SITE
+    variation: Variation = LIVELY
     families: tuple[str, ...] = tuple(FAMILIES)
     cases: tuple[str, ...] = tuple(case.name for case in CASES)
     workers: int = 1
@@ -146,6 +152,7 @@ class Plan:
             step_s=self.step_s,
             load_error=self.load_error,
             meters=self.meters,
+            variation=self.variation,
             lie=case.lie(self.max_attacked),
         )
 
@@ -219,11 +226,11 @@ def compare(site: Site, plan: Plan, *, progress: Callable[[str], None] | None = 
     tell = progress or (lambda _: None)
     cases = [case for case in CASES if case.name in plan.cases]
     # What a trial states does not depend on its seed or lie: one design serves all.
-    stated = replace(plan.trial(site, CASES[0], 0)).stated
+    stated = plan.trial(site, CASES[0], 0).stated
     watchers: dict[str, Watcher | str] = {}
     for name in plan.families:
         tell(f"design of {name}")
-        watchers[name] = _design(stated, name, plan)
+        watchers[name] = _design(stated, name, plan, tell)
     rows: list[Row] = []
     for case in cases:
         tell(f"case {case.name}")
@@ -231,10 +238,14 @@ def compare(site: Site, plan: Plan, *, progress: Callable[[str], None] | None = 
     return rows
 
 
-def _design(site: Site, name: str, plan: Plan) -> Watcher | str:
+def _design(site: Site, name: str, plan: Plan, tell: Callable[[str], None]) -> Watcher | str:
     try:
         chosen = choose(site, estimator=name, max_attacked=plan.max_attacked)
-        return design(chosen, workers=plan.workers)
+        return design(
+            chosen,
+            workers=plan.workers,
+            progress=lambda done, total: tell(f"design of {name}: {done} of {total}"),
+        )
     except (NotObservable, DesignInfeasible) as error:
         return str(error)
 
@@ -348,7 +359,7 @@ def cells(row: Row) -> tuple[str, ...]:
 
 
 def markdown(rows: Sequence[Row], plan: Plan) -> str:
-    """One overview, and one table for each case.
+    """One overview, and one table for each case; every family has a row, also if it did not take part.
 
     Parameters
     ----------
@@ -358,17 +369,21 @@ def markdown(rows: Sequence[Row], plan: Plan) -> str:
         What was compared.
     """
     names = list(dict.fromkeys(row.case for row in rows))
-    families = list(dict.fromkeys(row.family for row in rows))
-    found = {(row.family, row.case): row for row in rows}
+    found = {(family, name): Row(family, name, "not run") for family in FAMILIES for name in names}
+    found |= {(row.family, row.case): row for row in rows}
     meanings = {case.name: case.meaning.format(count=plan.max_attacked) for case in CASES}
-    lines = ["Named of those who lied, and in brackets how many honest ones were ever named:", ""]
+    lines = [
+        "Named of those who lied, and in brackets how many honest ones were ever named; none: there are no",
+        "numbers, the tables below say why.",
+        "",
+    ]
     lines += _head(("family", *names))
-    for family in families:
+    for family in FAMILIES:
         lines.append(_line((family, *(_short(found[family, name]) for name in names))))
     for name in names:
         lines += ["", f"### {name}", "", f"{meanings[name][0].upper()}{meanings[name][1:]}.", ""]
         lines += _head(HEADERS)
-        for family in families:
+        for family in FAMILIES:
             texts = cells(found[family, name])
             lines.append(_line((*texts, *("",) * (len(HEADERS) - len(texts)))))
     return "\n".join(lines)
@@ -397,7 +412,7 @@ def splice(text: str, table: str) -> str:
 
 
 def _short(row: Row) -> str:
-    return "refused" if row.reason else f"{row.named}/{row.liars} ({row.falsely_named})"
+    return "none" if row.reason else f"{row.named}/{row.liars} ({row.falsely_named})"
 
 
 def _head(headers: tuple[str, ...]) -> list[str]:

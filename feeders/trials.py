@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from feeders.estimators import Watcher
 
 __all__ = [
+    "STEADY",
     "Lie",
     "LoadError",
     "Meters",
@@ -41,6 +42,9 @@ __all__ = [
 
 NO_CLASS_PERCENT: Final = 1e-4
 """Accuracy class of meters without a fixed error: the files have no class of zero."""
+
+STEADY: Final = Variation(load_spread=0.0, cloud_spread=0.0, tap_step_pu=0.0)
+"""Loads and generation follow their profiles, the busbar changes slowly."""
 
 SETTLING_S: Final = 10.0
 """How long after the start, and after the onset of a lie, reconstructions do not count yet, s."""
@@ -96,6 +100,8 @@ class Trial:
         Who lies; None: nobody.
     profile_s
         Position within the fourteen days of the profiles, s.
+    variation
+        What changes beside, known to all; `hidden_*` of it are those of `load_error`.
     """
 
     site: Site
@@ -106,6 +112,7 @@ class Trial:
     meters: Meters = Meters.WHITE
     lie: Lie | None = None
     profile_s: float = SUNNY_NOON_S
+    variation: Variation = STEADY
 
     @property
     def stated(self) -> Site:
@@ -149,10 +156,8 @@ class Trial:
             dt_s=self.step_s,
             profile_s=self.profile_s,
             errors=MeterErrors(power=0.0),
-            variation=Variation(
-                load_spread=0.0,
-                cloud_spread=0.0,
-                tap_step_pu=0.0,
+            variation=replace(
+                self.variation,
                 hidden_kw=self.load_error.p_kw,
                 hidden_kvar=self.load_error.q_kvar,
                 hidden_correlation_s=self.load_error.correlation_s,

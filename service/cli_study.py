@@ -38,7 +38,7 @@ def study_compare(
         int, typer.Option(help="How many meters lie, and estimators are to withstand.", min=1)
     ] = 2,
     seeds: Annotated[int, typer.Option(help="Runs of each case.", min=1)] = 3,
-    duration: Annotated[float, typer.Option(help="Length of a run, s.", min=70.0)] = 240.0,
+    duration: Annotated[float, typer.Option(help="Length of a run, s.", min=70.0)] = 480.0,
     meters: Annotated[str, typer.Option(help="Errors of the meters: site, real or white.")] = "site",
     load_error_kw: Annotated[
         float, typer.Option(help="What nobody knows of each customer's active power, 1 sigma.", min=0.0)
