@@ -17,11 +17,18 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field, replace
-from enum import StrEnum
-from typing import Any
+from dataclasses import dataclass, field, replace
 
-from gridsec.errors import GridsecError
+from service.alarm import (
+    Alarm,
+    AlarmState,
+    AlarmUnknown,
+    AlreadyAcknowledged,
+    Change,
+    Transition,
+    from_json,
+    to_json,
+)
 from service.conditions import AlarmKind, Condition, Evidence, Severity, conditions
 
 __all__ = [
@@ -46,95 +53,6 @@ __all__ = [
     "restore",
     "to_json",
 ]
-
-
-class AlarmState(StrEnum):
-    """Where an alarm stands. Clearing keeps who acknowledged it; rising again asks for a new answer."""
-
-    RAISED = "raised"
-    ACKNOWLEDGED = "acknowledged"
-    CLEARED = "cleared"
-
-
-class Change(StrEnum):
-    """What happened to an alarm."""
-
-    RAISED = "raised"
-    ACKNOWLEDGED = "acknowledged"
-    CLEARED = "cleared"
-
-
-class AlarmUnknown(GridsecError):
-    """No alarm has this id (any more)."""
-
-    def __init__(self, alarm_id: str) -> None:
-        self.alarm_id = alarm_id
-        super().__init__(f"no alarm has the id {alarm_id!r}")
-
-
-class AlreadyAcknowledged(GridsecError):
-    """Somebody was faster."""
-
-    def __init__(self, alarm: Alarm) -> None:
-        self.alarm = alarm
-        super().__init__(f"alarm {alarm.id} has already been acknowledged by {alarm.acknowledged_by}")
-
-
-@dataclass(frozen=True, slots=True)
-class Alarm:
-    """An alarm as operators see it. Times are Unix seconds.
-
-    Attributes
-    ----------
-    id
-        26 characters, the first ten of which sort by time; the same data gives the same id.
-    kind, feeder, meter, severity, reason, evidence
-        As in the condition that raised it.
-    state
-        Raised, acknowledged or cleared.
-    count
-        How often it has been raised: above 1 it flaps.
-    t_event
-        When the condition of the present (or last) occurrence was first seen.
-    t_raised
-        When that occurrence had lasted for the on-delay.
-    t_cleared
-        When it was cleared; None while it is active.
-    acknowledged_by, t_acknowledged, comment
-        The answer of an operator to the present (or last) occurrence.
-    """
-
-    id: str
-    kind: AlarmKind
-    feeder: str
-    meter: str | None
-    severity: Severity
-    state: AlarmState
-    count: int
-    t_event: float
-    t_raised: float
-    t_cleared: float | None
-    reason: str
-    evidence: Evidence
-    acknowledged_by: str | None = None
-    t_acknowledged: float | None = None
-    comment: str | None = None
-
-    @property
-    def active(self) -> bool:
-        """Whether the alarm still stands."""
-        return self.state is not AlarmState.CLEARED
-
-
-@dataclass(frozen=True, slots=True)
-class Transition:
-    """One change of one alarm: the alarm as it is afterwards, what happened, when, and by whom."""
-
-    alarm: Alarm
-    change: Change
-    t: float
-    who: str | None = None
-    comment: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,7 +137,7 @@ class AlarmBook:
     t
         Time of the last tick, s; None before the first one.
     entries
-        By kind and meter.
+        By kind and subject.
     """
 
     feeder: str
@@ -268,7 +186,7 @@ def advance(
     for condition in conditions:
         if condition.feeder != book.feeder:
             raise ValueError(f"a condition of {condition.feeder!r} in the book of {book.feeder!r}")
-        seen[condition.kind, condition.meter] = condition
+        seen[condition.kind, condition.subject] = condition
     backwards = book.t is not None and t < book.t
     entries: dict[Key, Entry] = {}
     transitions: list[Transition] = []
@@ -338,6 +256,7 @@ def _raise(old: Alarm | None, condition: Condition, rules: AlarmRules, onset: fl
         t_cleared=None,
         reason=condition.reason,
         evidence=condition.evidence,
+        customer=condition.customer,
     )
 
 
@@ -353,11 +272,11 @@ def alarm_id(condition: Condition, onset: float) -> str:
     Parameters
     ----------
     condition
-        Kind, feeder and meter enter the hash.
+        Kind, feeder and subject enter the hash.
     onset
         Unix time, s.
     """
-    what = "\0".join((condition.kind, condition.feeder, condition.meter or "", repr(onset)))
+    what = "\0".join((condition.kind, condition.feeder, condition.subject or "", repr(onset)))
     tail = int.from_bytes(hashlib.sha256(what.encode()).digest()[:10], "big")
     number = (max(0, int(onset * 1000.0)) % (1 << 48)) << 80 | tail
     return "".join(_CROCKFORD[number >> shift & 31] for shift in range(125, -1, -5))
@@ -451,44 +370,12 @@ def restore(feeder: str, alarms: Iterable[Alarm]) -> AlarmBook:
         Name.
     alarms
         Its active alarms and those that cleared within the memory of the rules, in any order. Of several
-        with the same kind and meter the latest counts.
+        with the same kind and subject the latest counts.
     """
     entries: dict[Key, Entry] = {}
     for alarm in sorted(alarms, key=lambda alarm: alarm.id):
         if alarm.feeder != feeder:
             raise ValueError(f"an alarm of {alarm.feeder!r} in the book of {feeder!r}")
         t = alarm.t_raised if alarm.t_cleared is None else alarm.t_cleared
-        entries[alarm.kind, alarm.meter] = Entry(alarm.active, t, t, t, held=True, alarm=alarm)
+        entries[alarm.kind, alarm.subject] = Entry(alarm.active, t, t, t, held=True, alarm=alarm)
     return AlarmBook(feeder, None, entries)
-
-
-def to_json(alarm: Alarm) -> dict[str, Any]:
-    """Return the alarm as the JSON object that REST and zenoh show.
-
-    Parameters
-    ----------
-    alarm
-        The alarm.
-    """
-    return {
-        **asdict(alarm),
-        "kind": str(alarm.kind),
-        "severity": str(alarm.severity),
-        "state": str(alarm.state),
-    }
-
-
-def from_json(data: Mapping[str, Any]) -> Alarm:
-    """Return the alarm that `to_json` wrote.
-
-    Parameters
-    ----------
-    data
-        The object; it may carry more fields.
-    """
-    fields = {name: data[name] for name in Alarm.__dataclass_fields__}
-    fields["kind"] = AlarmKind(data["kind"])
-    fields["severity"] = Severity(data["severity"])
-    fields["state"] = AlarmState(data["state"])
-    fields["evidence"] = Evidence(**data["evidence"])
-    return Alarm(**fields)

@@ -8,13 +8,14 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from gridsec.online import Cause, Decision
-from service.report import BUSBAR, FeederReport, MeterReport, finite
+from service.report import BUSBAR, ExplanationReport, FeederReport, MeterReport, finite
 
 
 class AlarmKind(StrEnum):
     """What can be wrong."""
 
     METER_MANIPULATED = "meter-manipulated"
+    INVERTER_MANIPULATED = "inverter-manipulated"
     VOLTAGE_LIMIT = "voltage-limit"
     DATA_LOSS = "data-loss"
     UNDECIDED = "undecided"
@@ -38,6 +39,12 @@ class Evidence:
         Residual of the meter and the largest one that an honest meter can reach, squared pu.
     v_volt_reported, v_volt_estimated, attack_volt_estimated
         Reported and reconstructed voltage and their difference for suspects, V.
+    kind
+        What a meter's manipulation looks like, see `gridsec.online.Kind`.
+    attack_kvar_estimated
+        Reactive power that an inverter injects beside its droop curve, kvar.
+    explanations
+        What could all explain the readings, where nobody can be named.
     """
 
     score: float | None = None
@@ -45,6 +52,9 @@ class Evidence:
     v_volt_reported: float | None = None
     v_volt_estimated: float | None = None
     attack_volt_estimated: float | None = None
+    kind: str | None = None
+    attack_kvar_estimated: float | None = None
+    explanations: tuple[ExplanationReport, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +65,8 @@ class Condition:
     ----------
     kind, feeder, meter
         What and where; the meter is None if it is about the whole feeder.
+    customer
+        Whose inverter it is about; None if it is about none. The meter is that customer's, if there is one.
     severity, evidence, reason
         How bad, the numbers, and a sentence for the operator.
     known
@@ -68,6 +80,12 @@ class Condition:
     evidence: Evidence = Evidence()
     reason: str = ""
     known: bool = True
+    customer: str | None = None
+
+    @property
+    def subject(self) -> str | None:
+        """What it is about: a customer's inverter, a meter, or (None) the whole feeder."""
+        return self.customer or self.meter
 
 
 def conditions(report: FeederReport) -> list[Condition]:
@@ -75,6 +93,8 @@ def conditions(report: FeederReport) -> list[Condition]:
 
     - `meter-manipulated`: the verdict names the meter. Unknown while the verdict is UNDECIDED or the meter
       is silent, whatever the list of suspects says.
+    - `inverter-manipulated`: the verdict names the inverter. Unknown while the verdict is UNDECIDED, or from
+      an estimator that does not judge inverters.
     - `voltage-limit`: the whole interval around the *reconstructed* voltage is outside the limits, so a
       lying meter raises none. Unknown while the interval straddles a limit with its middle outside, or
       while the reconstruction itself carries no guarantee.
@@ -92,21 +112,24 @@ def conditions(report: FeederReport) -> list[Condition]:
     list of Condition
         What is not in it is known to be absent.
     """
-    found = [*_manipulated(report), *_data_loss(report), *_undecided(report)]
+    found = [*_manipulated(report), *_inverters(report), *_data_loss(report), *_undecided(report)]
     for meter in report.meters:
         found.extend(_voltage_limit(report, meter))
     return found
 
 
 def _evidence(meter: MeterReport) -> Evidence:
-    values = (
-        meter.score,
-        meter.threshold,
-        meter.v_volt_reported,
-        meter.v_volt_estimated,
-        meter.attack_volt_estimated,
+    def number(value: float | None) -> float | None:
+        return None if value is None else finite(value)
+
+    return Evidence(
+        number(meter.score),
+        number(meter.threshold),
+        number(meter.v_volt_reported),
+        number(meter.v_volt_estimated),
+        number(meter.attack_volt_estimated),
+        meter.kind,
     )
-    return Evidence(*(None if value is None else finite(value) for value in values))
 
 
 def _volt(value: float | None) -> str:
@@ -129,6 +152,26 @@ def _manipulated(report: FeederReport) -> Iterable[Condition]:
             evidence,
             f"reports {reported}, but the rest of the feeder says {estimated}",
             known,
+        )
+
+
+def _inverters(report: FeederReport) -> Iterable[Condition]:
+    decided = report.verdict is not Decision.UNDECIDED
+    for inverter in report.inverters:
+        known = decided and inverter.judged
+        if known and not inverter.suspect:
+            continue
+        kvar = inverter.attack_kvar_estimated
+        much = "reactive power" if kvar is None else f"{kvar:+.1f} kvar"
+        yield Condition(
+            AlarmKind.INVERTER_MANIPULATED,
+            report.feeder,
+            inverter.meter,
+            Severity.CRITICAL,
+            Evidence(attack_kvar_estimated=kvar),
+            f"the inverter of {inverter.customer} injects {much} that its droop curve does not ask for",
+            known,
+            inverter.customer,
         )
 
 
@@ -189,6 +232,7 @@ def _undecided(report: FeederReport) -> Iterable[Condition]:
             report.feeder,
             None,
             Severity.MAJOR,
+            Evidence(explanations=report.explanations),
             reason=report.reason,
             known=report.cause not in _COVERED,
         )

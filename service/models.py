@@ -51,9 +51,38 @@ class MeterState(BaseModel):
     threshold: Number = Field(description="The largest score that an honest meter can reach, squared pu.")
     v_volt_reported: Number = Field(description="Voltage the meter claims, phase to neutral, V.")
     v_volt_estimated: Number = Field(description="Reconstructed voltage, V.")
-    v_volt_std: Number = Field(description="A third of the half-width of the hard interval around it, V.")
+    v_volt_std: Number = Field(description="Its standard deviation, or a third of its hard bound, V.")
     v2_pu_estimated: Number = Field(description="Reconstructed squared voltage, pu.")
     attack_volt_estimated: Number = Field(description="Reported minus reconstructed, V; 0 if no suspect.")
+    kind: str | None = Field(default=None, description="What the manipulation looks like, if known.")
+
+
+class CustomerState(BaseModel):
+    """One customer at the latest tick, metered or not."""
+
+    customer: str
+    v_volt_estimated: Number = Field(description="Reconstructed voltage, V.")
+    v_volt_std: Number = Field(description="Its standard deviation, or a third of its hard bound, V.")
+
+
+class InverterState(BaseModel):
+    """One droop inverter at the latest tick."""
+
+    customer: str
+    bus: str
+    meter: str | None = Field(description="The customer's meter, if there is one.")
+    judged: bool = Field(description="The estimator says something about inverters.")
+    suspect: bool = Field(description="The verdict names this inverter as manipulated.")
+    q_kvar_estimated: Number = Field(description="Reactive power that it injects, kvar.")
+    attack_kvar_estimated: Number = Field(description="What its curve does not ask for of it, kvar.")
+
+
+class ExplanationModel(BaseModel):
+    """One way to explain the readings, where several do about equally well."""
+
+    meters: list[str] = Field(description="Which meters would lie.")
+    inverters: list[str] = Field(description="Whose inverters would inject a wrong reactive power.")
+    probability: float = Field(description="Its share among the explanations given.")
 
 
 class BusState(BaseModel):
@@ -84,6 +113,9 @@ class State(BaseModel):
     silent: list[Silence]
     v_min_volt: Number
     v_max_volt: Number
+    customers: list[CustomerState] = []
+    inverters: list[InverterState] = []
+    explanations: list[ExplanationModel] = []
 
 
 class MeterNow(MeterState):
@@ -151,6 +183,11 @@ class AlarmEvidence(BaseModel):
     v_volt_reported: Number
     v_volt_estimated: Number
     attack_volt_estimated: Number
+    kind: str | None = Field(default=None, description="What a meter's manipulation looks like.")
+    attack_kvar_estimated: Number = Field(
+        default=None, description="Wrong part of an inverter's injection, kvar."
+    )
+    explanations: list[ExplanationModel] = []
 
 
 class AlarmModel(BaseModel):
@@ -171,6 +208,7 @@ class AlarmModel(BaseModel):
     acknowledged_by: str | None
     t_acknowledged: float | None
     comment: str | None
+    customer: str | None = Field(default=None, description="Whose inverter it is about.")
 
 
 class Alarms(BaseModel):

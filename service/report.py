@@ -46,12 +46,15 @@ class MeterReport:
     v_volt_estimated
         Reconstructed voltage at the meter's connection point, V; None if there is no estimate.
     v_volt_std
-        A third of the half-width of the interval that holds the true voltage, V: the interval is hard, so
-        this is the standard deviation of the normal law whose three-sigma interval it is.
+        Standard deviation of the reconstructed voltage, V. From estimators that only bound it: a third of
+        the half-width of the interval that holds the true voltage, the standard deviation of the normal law
+        whose three-sigma interval it is.
     v2_pu_estimated
         Reconstructed squared voltage, pu.
     attack_volt_estimated
         Reconstructed manipulation: reported minus reconstructed voltage, V, for suspects; 0 for others.
+    kind
+        What the manipulation looks like, see `gridsec.online.Kind`; None where nobody can tell.
     """
 
     meter: str
@@ -65,6 +68,72 @@ class MeterReport:
     v_volt_std: float | None
     v2_pu_estimated: float | None
     attack_volt_estimated: float | None
+    kind: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class CustomerReport:
+    """The reconstructed voltage of one customer, metered or not.
+
+    Attributes
+    ----------
+    customer
+        Id as in the feeder's files.
+    v_volt_estimated, v_volt_std
+        As in `MeterReport`.
+    """
+
+    customer: str
+    v_volt_estimated: float | None
+    v_volt_std: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class InverterReport:
+    """One droop inverter at one tick.
+
+    Attributes
+    ----------
+    customer, bus
+        Whose it is and where, ids as in the feeder's files.
+    meter
+        The customer's meter; None without one.
+    judged
+        Whether the estimator says anything about inverters.
+    suspect
+        Whether the verdict names it as manipulated.
+    q_kvar_estimated
+        Reactive power that it injects, kvar.
+    attack_kvar_estimated
+        The part of it that its droop curve does not ask for, kvar; 0 if it is no suspect, None if not judged.
+    """
+
+    customer: str
+    bus: str
+    meter: str | None
+    judged: bool
+    suspect: bool
+    q_kvar_estimated: float | None
+    attack_kvar_estimated: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class ExplanationReport:
+    """One way to explain the readings, where several do about equally well.
+
+    Attributes
+    ----------
+    meters
+        Who would lie, by meter.
+    inverters
+        Whose inverters would inject a wrong reactive power, by customer.
+    probability
+        Its share among the explanations given, from 0 to 1.
+    """
+
+    meters: tuple[str, ...]
+    inverters: tuple[str, ...]
+    probability: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +160,10 @@ class FeederReport:
         `BUSBAR`.
     v_min_volt, v_max_volt
         The feeder's voltage limits, V.
+    customers, inverters
+        One entry per customer, and per droop inverter, in the order of the feeder's file.
+    explanations
+        Where several explanations fit the readings, those, the likeliest first.
     """
 
     feeder: str
@@ -104,6 +177,9 @@ class FeederReport:
     silent: tuple[tuple[str, float], ...]
     v_min_volt: float
     v_max_volt: float
+    customers: tuple[CustomerReport, ...] = ()
+    inverters: tuple[InverterReport, ...] = ()
+    explanations: tuple[ExplanationReport, ...] = ()
 
 
 def finite(value: float) -> float | None:
@@ -145,11 +221,11 @@ def build(site: Site, tick: Tick, max_attacked: int, estimate: Estimate, verdict
     estimate, verdict
         What the monitor made of it.
     """
-    v2 = estimate.v2[site.meters]
-    bound = estimate.bound[site.meters]
-    half_width = 0.5 * (volts(site, v2 + bound) - volts(site, v2 - bound))
-    numbers = np.column_stack((verdict.score, verdict.threshold, volts(site, v2), half_width / 3.0, v2))
+    v, std = volts(site, estimate.v2), _std_volts(site, estimate)
+    at = site.meters
+    numbers = np.column_stack((verdict.score, verdict.threshold, v[at], std[at], estimate.v2[at]))
     attack = _attack_volts(site, tick, verdict)
+    kinds = verdict.kinds or (None,) * len(site.meter_ids)
     meters = []
     for k, (meter, reading) in enumerate(zip(site.meter_ids, tick.readings, strict=True)):
         score, threshold, v_volt, v_std, v2_pu = (finite(value) for value in numbers[k])
@@ -166,6 +242,7 @@ def build(site: Site, tick: Tick, max_attacked: int, estimate: Estimate, verdict
                 v_volt_std=v_std,
                 v2_pu_estimated=v2_pu,
                 attack_volt_estimated=finite(attack[k]),
+                kind=None if kinds[k] is None else str(kinds[k]),
             )
         )
     buses = zip(site.feeder.buses, volts(site, estimate.v2_bus), strict=True)
@@ -176,6 +253,9 @@ def build(site: Site, tick: Tick, max_attacked: int, estimate: Estimate, verdict
         verdict=(verdict.decision, verdict.cause, _reason(site, tick, max_attacked, verdict)),
         meters=tuple(meters),
         buses=tuple((bus, finite(v)) for bus, v in buses),
+        customers=tuple(map(CustomerReport, site.feeder.customers, map(finite, v), map(finite, std))),
+        inverters=_inverters(site, estimate, verdict),
+        explanations=_explanations(site, verdict),
     )
 
 
@@ -212,6 +292,42 @@ def blind(site: Site, tick: Tick, max_attacked: int, cause: Cause, reason: str) 
         verdict=(Decision.UNDECIDED, cause, reason),
         meters=meters,
         buses=tuple((bus, None) for bus in site.feeder.buses),
+        customers=tuple(CustomerReport(customer, None, None) for customer in site.feeder.customers),
+        inverters=_inverters(site, None, None),
+        explanations=(),
+    )
+
+
+def _std_volts(site: Site, estimate: Estimate) -> Floats:
+    """Standard deviation of every customer's voltage, V, (N,): the estimator's own, or from its bound."""
+    half, share = (estimate.std, 1.0) if estimate.std.size else (estimate.bound, 1.0 / 3.0)
+    return np.asarray(0.5 * share * (volts(site, estimate.v2 + half) - volts(site, estimate.v2 - half)))
+
+
+def _inverters(site: Site, estimate: Estimate | None, verdict: Verdict | None) -> tuple[InverterReport, ...]:
+    """Every inverter; without a verdict, or one that does not judge inverters, nobody knows."""
+    base = site.feeder.base_kva
+    judged = verdict is not None and verdict.inverters.size > 0
+    out = []
+    for i, row in enumerate(site.tables.customers[int(c)] for c in site.droop.customer):
+        named = verdict is not None and judged and bool(verdict.inverters[i])
+        wrong = base * verdict.inverter_attack[i] if verdict is not None and judged else math.nan
+        x = math.nan if estimate is None else base * estimate.x[i]
+        out.append(
+            InverterReport(row.customer, row.bus, row.meter or None, judged, named, finite(x), finite(wrong))
+        )
+    return tuple(out)
+
+
+def _explanations(site: Site, verdict: Verdict) -> tuple[ExplanationReport, ...]:
+    owners = [site.feeder.customers[int(c)] for c in site.droop.customer]
+    return tuple(
+        ExplanationReport(
+            tuple(site.meter_ids[k] for k in np.flatnonzero(e.meters)),
+            tuple(owners[i] for i in np.flatnonzero(e.inverters)),
+            float(e.probability),
+        )
+        for e in verdict.explanations
     )
 
 
@@ -220,16 +336,16 @@ def _reason(site: Site, tick: Tick, max_attacked: int, verdict: Verdict) -> str:
     suspects = np.flatnonzero(verdict.suspects).tolist()
     unseen = [k for k, reading in enumerate(tick.readings) if reading is None]
     named = _meters(site, suspects)
-    if verdict.cause is Cause.RESIDUALS:
+    if verdict.cause is Cause.RESIDUALS and not verdict.inverters.any():
         return f"Manipulated: {named}; further off than meter accuracy and load uncertainty allow."
-    if verdict.cause is Cause.TOO_MANY_SUSPECTS:
+    if verdict.cause is Cause.TOO_MANY_SUSPECTS and suspects:
         return (
             f"{len(suspects)} meters disagree with the feeder ({named}), and at most {max_attacked} can be "
             "told apart. A wrong busbar reading, switch or line in the model looks the same."
         )
     if verdict.cause is Cause.SILENT_METERS and unseen:
         return f"No reading from {_meters(site, unseen)}."
-    if verdict.cause in {Cause.AMBIGUOUS, Cause.SILENT_METERS}:
+    if verdict.cause in {Cause.AMBIGUOUS, Cause.SILENT_METERS, Cause.RESIDUALS}:
         return _in_ids(site, verdict.reason)
     return verdict.reason
 
@@ -241,13 +357,16 @@ def _meters(site: Site, which: Sequence[int]) -> str:
 
 
 def _in_ids(site: Site, text: str) -> str:
-    """Call customers in a sentence by their meters' ids; longer names first, one may begin another."""
+    """Call customers in a sentence by their meters' ids; longer names first, one may begin another.
+
+    Inverters keep their customer's name, as in alarms.
+    """
     meter_of = {
         site.feeder.customers[int(customer)]: meter
         for customer, meter in zip(site.meters, site.meter_ids, strict=True)
     }
     names = "|".join(re.escape(name) for name in sorted(meter_of, key=len, reverse=True))
-    return re.sub(rf"(?<!\w)(?:{names})(?!\w)", lambda found: meter_of[found[0]], text)
+    return re.sub(rf"(?<!\w)(?<!the inverter of )(?:{names})(?!\w)", lambda found: meter_of[found[0]], text)
 
 
 def _attack_volts(site: Site, tick: Tick, verdict: Verdict) -> Floats:
@@ -266,6 +385,9 @@ def _whole(
     verdict: tuple[Decision, Cause, str],
     meters: tuple[MeterReport, ...],
     buses: tuple[tuple[str, float | None], ...],
+    customers: tuple[CustomerReport, ...],
+    inverters: tuple[InverterReport, ...],
+    explanations: tuple[ExplanationReport, ...],
 ) -> FeederReport:
     limits, nominal = site.tables.meta.limits, site.tables.meta.voltage_volt
     decision, cause, reason = verdict
@@ -281,6 +403,9 @@ def _whole(
         silent=tuple((BUSBAR if meter is None else meter, seconds) for meter, seconds in tick.silent),
         v_min_volt=limits.v_min_pu * nominal,
         v_max_volt=limits.v_max_pu * nominal,
+        customers=customers,
+        inverters=inverters,
+        explanations=explanations,
     )
 
 
@@ -317,8 +442,29 @@ def to_json(report: FeederReport) -> dict[str, Any]:
                 "v_volt_std": m.v_volt_std,
                 "v2_pu_estimated": m.v2_pu_estimated,
                 "attack_volt_estimated": m.attack_volt_estimated,
+                "kind": m.kind,
             }
             for m in report.meters
+        ],
+        "customers": [
+            {"customer": c.customer, "v_volt_estimated": c.v_volt_estimated, "v_volt_std": c.v_volt_std}
+            for c in report.customers
+        ],
+        "inverters": [
+            {
+                "customer": i.customer,
+                "bus": i.bus,
+                "meter": i.meter,
+                "judged": i.judged,
+                "suspect": i.suspect,
+                "q_kvar_estimated": i.q_kvar_estimated,
+                "attack_kvar_estimated": i.attack_kvar_estimated,
+            }
+            for i in report.inverters
+        ],
+        "explanations": [
+            {"meters": list(e.meters), "inverters": list(e.inverters), "probability": e.probability}
+            for e in report.explanations
         ],
         "buses": [{"bus": bus, "v_volt": v} for bus, v in report.bus_v_volt],
         "silent": [{"meter": meter, "seconds": finite(seconds)} for meter, seconds in report.silent],
