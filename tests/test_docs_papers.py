@@ -174,3 +174,78 @@ def test_the_index_has_every_page() -> None:
     index = (DOCS / "papers.md").read_text()
     pages = [page for page in PAGES if page.name not in {"papers.md", "README.md"}]
     assert [page for page in pages if f"]({page.relative_to(DOCS)})" not in index] == []
+
+
+# What the papers number. Figures 1.1, 1.2 and 6.1 of lee2018 belong to chapters that state nothing.
+NUMBERED = {
+    "chong2020": """
+        Assumption 1, 2; Definition 1; Theorem 1, 2; Proposition 1; Corollary 1; Figure 1, 2; (1) to (20)
+        """,
+    "kim2018": """
+        Assumption 1 to 3; Definition 1; Lemma 1; Proposition 1; Theorem 1, 2; Corollary 1; Remark 1 to 3;
+        Table I; Figure 1; (1) to (25)
+        """,
+    "lee2018": """
+        Algorithm 2.1 to 2.3, 4.1, 4.2; Assumption 3.1.1, 4.1.1, 4.3.1 to 4.3.3, 5.1.1, 5.2.1; Definition
+        2.1.1, 2.2.1 to 2.2.3, 3.1.1 to 3.1.4, 3.2.1 to 3.2.4, 3.3.1, 3.3.2, 5.1.1, 5.1.2, 5.3.1; Theorem
+        2.1.1, 2.1.2, 2.2.7, 2.2.9, 2.2.11, 2.2.12, 2.2.18, 2.2.19, 4.3.2, 5.4.1, 5.4.3; Lemma 2.2.1,
+        2.2.4, 2.2.6, 2.2.8, 2.2.16, 2.2.17, 5.1.1, 5.2.1; Corollary 2.2.5, 2.2.13 to 2.2.15, 3.1.5,
+        3.1.12, 5.4.2; Proposition 2.2.2, 2.2.3, 2.2.10, 3.1.1 to 3.1.4, 3.1.6 to 3.1.11, 3.1.13, 3.2.1 to
+        3.2.4, 3.3.1, 3.3.2, 4.3.1, 5.1.2 to 5.1.7; Remark 2.2.1 to 2.2.3, 3.2.1, 4.4.1, 4.4.2, 5.2.1 to
+        5.2.3, 5.3.1, 5.4.1; Table 5.1; Figure 4.1 to 4.12, 5.1 to 5.4; (2.1.1) to (2.1.4), (2.2.1) to
+        (2.2.21), (3.1.1) to (3.1.6), (3.2.1) to (3.2.6), (4.1.1), (4.1.2), (4.2.1) to (4.2.10), (4.3.1)
+        to (4.3.16), (4.5.1), (4.5.2), (5.1.1) to (5.1.5), (5.2.1) to (5.2.8), (5.3.1) to (5.3.5), (5.4.1)
+        to (5.4.5)
+        """,
+    "yang2019": """
+        Assumption 1 to 3; Algorithm 1, 2; Proposition 1 to 4; Remark 1, 2; Example 1; Figure 1 to 4; (1)
+        to (26)
+        """,
+    "yang2021": """
+        Assumption 1 to 3; Lemma 1 to 3; Theorem 1, 2; Example 1 to 4; Figure 1 to 12; (1) to (48)
+        """,
+}
+
+
+def expanded(text: str) -> set[str]:
+    """Return the numbers of a list such as "1, 2 and 4 to 6" or "(2.1) to (2.3), (2.5)", as written."""
+    found = set(re.findall(r"\(?(?:\d+(?:\.\d+)*|\bI\b)\)?", text))
+    for first, last in re.findall(r"(\(?[\d.]+\)?)\s*(?:to|–)\s*(\(?[\d.]+\)?)", text):
+        head, _, start = first.strip("()").rpartition(".")
+        stop = int(last.strip("()").rpartition(".")[2])
+        shape = "({})" if first.startswith("(") else "{}"
+        found |= {shape.format(f"{head}.{k}" if head else k) for k in range(int(start), stop + 1)}
+    return found
+
+
+def numbered(pages: list[Path]) -> dict[str, set[str]]:
+    """Return what the rows of some pages are about: numbers by kind, those of equations under no kind."""
+    kinds = "Assumption|Definition|Theorem|Lemma|Proposition|Corollary|Algorithm|Remark|Example|Figure|Table"
+    out: dict[str, set[str]] = {"": set()}
+    for page in pages:
+        for _, _, *rows in tables(page):
+            for first, *_ in rows:
+                subject = re.sub(r"[′″]+|(?<=\d)[a-z](?=\))", "", first).replace("Corollaries", "Corollary")
+                out[""] |= {n for n in expanded(subject) if n.startswith("(")}
+                pieces = re.split(rf"\b({kinds})s?\b", subject)
+                for kind, rest in zip(pieces[1::2], pieces[2::2], strict=True):
+                    upto = re.match(r"[\s\d.,I–]*(?:(?:to|and)[\s\d.,I–]*)*", rest)
+                    out.setdefault(kind, set()).update(expanded(upto[0] if upto else ""))
+    return out
+
+
+@pytest.mark.parametrize("paper", NUMBERED)
+def test_everything_that_a_paper_numbers_has_a_row(paper: str) -> None:
+    have = numbered([page for page in TABLES if page.stem.split("-")[0] == paper])
+    for part in NUMBERED[paper].split(";"):
+        kind, _, rest = part.strip().partition(" ")
+        if kind.startswith("("):
+            kind, rest = "", part
+        assert sorted(expanded(rest) - have.get(kind, set())) == [], kind
+
+
+def test_numbers_are_told_from_each_other() -> None:
+    assert expanded("2.2.1, 2.2.3 to 2.2.5") == {"2.2.1", "2.2.3", "2.2.4", "2.2.5"}
+    assert expanded("(5) to (7), (9)") == {"(5)", "(6)", "(7)", "(9)"}
+    assert "2.2.2" not in numbered(TABLES)["Theorem"]
+    assert "(49)" not in numbered(TABLES)[""]
