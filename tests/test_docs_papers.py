@@ -238,7 +238,7 @@ def numbered(pages: list[Path]) -> dict[str, set[str]]:
 def test_everything_that_a_paper_numbers_has_a_row(paper: str) -> None:
     have = numbered([page for page in TABLES if page.stem.split("-")[0] == paper])
     for part in NUMBERED[paper].split(";"):
-        kind, _, rest = part.strip().partition(" ")
+        kind, rest = part.split(maxsplit=1)
         if kind.startswith("("):
             kind, rest = "", part
         assert sorted(expanded(rest) - have.get(kind, set())) == [], kind
