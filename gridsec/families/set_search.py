@@ -443,10 +443,9 @@ def _conclude(  # noqa: PLR0917  # the chain's three values, then what this step
 
 def _lost(errors: ErrorModel, sure: Floats) -> Floats:
     """What is lost at every customer without the word of one meter, (N, p): its inverter may be anywhere."""
-    column = np.zeros((errors.meters.size, len(errors.inverters)))
-    metered = errors.meter_of >= 0
-    np.add.at(column, errors.meter_of[metered], (errors.inverters * (errors.span - sure)).T[metered])
-    return np.asarray(column.T)
+    metered, p = errors.meter_of >= 0, errors.meters.size
+    more = np.bincount(errors.meter_of[metered], weights=(errors.span - sure)[metered], minlength=p)
+    return np.asarray(errors.reach * more)
 
 
 def _error(design: SetSearchDesign, view: _View, torn: bool) -> Floats:
