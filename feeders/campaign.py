@@ -131,7 +131,7 @@ def random_attacks(
         raise NoSuchAttack(f"{site.feeder.name} has {site.meters.size} meters; cannot attack {count}")
     random = generator(seed, Stream.ATTACK)
     if kind in (Kind.COORDINATED, Kind.COORDINATED_POWER):
-        loads = _typical(site) if scenario is None else _present(site, scenario, t_on)
+        loads = _typical(site) if scenario is None else present_loads(site, scenario, t_on)
         meters, fake = _somewhere(site, random, count, size, loads)
         power = kind is Kind.COORDINATED_POWER
         return (coordinated(site, meters, fake, t_on=t_on, t_off=t_off, power=power),)
@@ -295,7 +295,8 @@ def _typical(site: Site) -> Loads:
     return Loads(p_kw, q_kvar, site.tables.meta.voltage_volt)
 
 
-def _present(site: Site, scenario: Scenario, t: float) -> Loads:
+def present_loads(site: Site, scenario: Scenario, t: float) -> Loads:
+    """What customers draw at time t, Unix s, without what readings do not show."""
     customers = Customers(site, scenario.variation, scenario.seed, scenario.start, scenario.profile_s)
     demand = customers.at(np.array([t]))
     return Loads(demand.p_kw[0], demand.q_kvar[0], float(demand.v0_volt[0]))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from feeders.campaign import NoSuchAttack, random_attacks
+from feeders.campaign import NoSuchAttack, coordinated, fake_load, present_loads
 from feeders.variation import Stream, generator
 from gridsec.arrays import Floats, Ints
 from gridsec.attack import Attack, Bias, Drift, InverterAttack, Replay, Scaling, Stuck
@@ -46,7 +46,8 @@ class Lie:
     size
         How much. Bias (random signs), together (the sign of `size` for all) and scaling: % of nominal.
         Drift: % of nominal per minute, random signs. Coordinated: % of nominal by which the trace of a load
-        that does not exist moves the least affected liar. Replay and clock shift: how old the reports are,
+        that does not exist moves the least affected liar; it is at a customer whose meter would be believed
+        to read it, if there is one. Replay and clock shift: how old the reports are,
         s. Inverter: % of its rating, random signs. Stuck: nothing.
     onset_s, end_s
         Seconds after the start of the run.
@@ -82,10 +83,7 @@ def manipulations(
         return (), ()
     t_on, t_off = scenario.start + lie.onset_s, scenario.start + min(lie.end_s, scenario.duration_s)
     if lie.trick in (Trick.COORDINATED, Trick.COORDINATED_POWER):
-        size, kind = lie.size / 100.0, str(lie.trick)
-        return random_attacks(
-            site, scenario.seed, kind, lie.count, size, t_on=t_on, t_off=t_off, scenario=scenario
-        ), ()
+        return (_coordinated(site, lie, scenario, t_on, t_off),), ()
     random = generator(scenario.seed, Stream.ATTACK)
     there = site.droop.tau.size if lie.trick is Trick.INVERTER else site.meters.size
     if not 0 < lie.count <= there:
@@ -97,6 +95,28 @@ def manipulations(
         q = lie.size / 100.0 * signs * rating[liars] / site.feeder.base_kva
         return (), (InverterAttack(liars, q, t_on, t_off),)
     return (_plain(lie, liars, signs, t_on, t_off),), ()
+
+
+def _coordinated(site: Site, lie: Lie, scenario: Scenario, t_on: float, t_off: float) -> Attack:
+    """All liars tell one story, the trace of a load at a random customer."""
+    if not 0 < lie.count <= site.meters.size:
+        raise NoSuchAttack(f"{site.feeder.name} has {site.meters.size} meters; {lie.count} cannot lie")
+    loads = present_loads(site, scenario, t_on)
+    told: list[Attack] = []
+    for customer in generator(scenario.seed, Stream.ATTACK).permutation(site.meters):
+        try:
+            meters, fake = fake_load(site, int(customer), lie.count, lie.size / 100.0, loads=loads)
+        except NoSuchAttack:
+            continue
+        power = lie.trick is Trick.COORDINATED_POWER
+        attack = coordinated(site, meters, fake, t_on=t_on, t_off=t_off, power=power)
+        read_kw = loads.p_kw[customer] + fake.p_kw
+        if abs(read_kw) <= site.loads.credible[customer] * site.feeder.base_kva:
+            return attack
+        told.append(attack)
+    if not told:
+        raise NoSuchAttack(f"{site.feeder.name} has no place for the trace of a load of {lie.size:g} %")
+    return told[0]
 
 
 def _plain(lie: Lie, liars: Ints, signs: Floats, t_on: float, t_off: float) -> Attack:

@@ -208,26 +208,40 @@ def frames(trial: Trial) -> Iterator[tuple[Frame, Truth]]:
     NoSuchAttack, PowerFlowDiverged, NoEquilibrium
         When the lie cannot be told on this feeder, or the feeder not be solved.
     """
-    site, scenario, error = trial.stated, trial.scenario, trial.load_error
-    base, count = site.feeder.base_kva, len(site.tables.customers)
-    p_error = np.full(count, error.half_width * error.p_kw / base)
-    q_error = np.full(count, error.half_width * error.q_kvar / base)
+    site, scenario = trial.stated, trial.scenario
     known = Customers(site, scenario.variation, scenario.seed, scenario.start, scenario.profile_s)
     samples = list(simulate(site, scenario))
     t = np.array([sample.t for sample in samples])
-    q_kvar = known.at(t).q_kvar + _fake_reactive(site, scenario, t)
-    for sample, snapshot, q in zip(samples, snapshots(samples), q_kvar, strict=True):
-        frame = to_frame(site, snapshot)
-        yield replace(frame, p_error=p_error, q=-q / base, q_error=q_error), _truth(site, scenario, sample)
+    demand = known.at(t)
+    fake_kw, fake_kvar = _fake_load(site, scenario, t)
+    told = zip(demand.p_kw + fake_kw, demand.q_kvar + fake_kvar, strict=True)
+    for sample, snapshot, (p_kw, q_kvar) in zip(samples, snapshots(samples), told, strict=True):
+        frame = _powers(trial, site, to_frame(site, snapshot), p_kw, q_kvar)
+        yield frame, _truth(site, scenario, sample)
 
 
-def _fake_reactive(site: Site, scenario: Scenario, t: Floats) -> Floats:
-    """The reactive power of loads that do not exist, where it is reported, kvar, (T, N)."""
-    out = np.zeros((t.size, len(site.tables.customers)))
+def _powers(trial: Trial, site: Site, frame: Frame, p_kw: Floats, q_kvar: Floats) -> Frame:
+    """The frame with powers as told; those that nobody would believe stay what they are in any frame."""
+    base, error = site.feeder.base_kva, trial.load_error
+    believed = np.abs(p_kw) <= site.loads.credible * base
+    return replace(
+        frame,
+        p=np.where(believed, -p_kw / base, frame.p),
+        p_error=np.where(believed, error.half_width * error.p_kw / base, frame.p_error),
+        q=np.where(believed, -q_kvar / base, frame.q),
+        q_error=np.where(believed, error.half_width * error.q_kvar / base, frame.q_error),
+    )
+
+
+def _fake_load(site: Site, scenario: Scenario, t: Floats) -> tuple[Floats, Floats]:
+    """Loads that do not exist, where their powers are reported, kW and kvar, (T, N) each."""
+    p_kw, q_kvar = np.zeros((2, t.size, len(site.tables.customers)))
     for attack in scenario.attacks:
         if isinstance(attack, Coordinated):
-            out[np.ix_(active(attack, t), site.meters[attack.meters])] += attack.q_shift
-    return out
+            cells = np.ix_(active(attack, t), site.meters[attack.meters])
+            p_kw[cells] += attack.p_shift
+            q_kvar[cells] += attack.q_shift
+    return p_kw, q_kvar
 
 
 def _truth(site: Site, scenario: Scenario, sample: Sample) -> Truth:
