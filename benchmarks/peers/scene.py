@@ -14,13 +14,14 @@ pseudo-measurements. Loads and generation are random. Three attacks of size 3 %:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from feeders.load import Site, load
-from feeders.powerflow import PowerFlow
+from feeders.load import load
+from feeders.powerflow import Grid, PowerFlow
 from gridsec.arrays import Bools, Floats
+from gridsec.feeder import Feeder
 
 SIZE = 0.03
 """Size of every attack, of the voltage."""
@@ -53,30 +54,43 @@ class Cell:
     liars: int = 0
 
 
+@dataclass(frozen=True, slots=True)
+class Transformer:
+    """The one that feeds the feeder: rated power, kVA, and short-circuit voltages, %."""
+
+    kva: float
+    vk_percent: float
+    vkr_percent: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """A feeder, ready to make snapshots and to be estimated.
+    """A feeder, ready to make snapshots and to be estimated. N customers.
 
     Attributes
     ----------
-    site
-        The feeder.
+    feeder
+        The feeder, behind its transformer if it has one.
     flow
         Its AC power flow.
+    load, sun : (N,)
+        Connected load and generation, pu.
     """
 
-    site: Site
+    feeder: Feeder
     flow: PowerFlow
+    load: Floats
+    sun: Floats
 
     @property
     def kw(self) -> float:
         """1 pu of power, kW."""
-        return self.site.feeder.base_kva
+        return self.feeder.base_kva
 
     @property
     def volt(self) -> float:
         """1 pu of voltage, V."""
-        return self.site.feeder.base_volt
+        return self.feeder.base_volt
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,10 +126,47 @@ class Snapshot:
     true_v: Floats
 
 
+TRANSFORMERS = {"rural1": Transformer(160.0, 4.0, 1.46875), "rural3": Transformer(400.0, 6.0, 1.2)}
+
+
 def scene(feeder: str) -> Scene:
-    """Prepare a feeder of `FEEDERS`."""
-    site = load(FEEDERS[feeder])
-    return Scene(site, PowerFlow(site))
+    """Prepare a feeder of `FEEDERS`; one that ends in `-behind` is fed through its transformer."""
+    name, _, behind = feeder.partition("-")
+    site = load(FEEDERS[name])
+    load_kw, sun_kw = np.array([(c.load_kw, c.pv_kw) for c in site.tables.customers]).T
+    kva = site.feeder.base_kva
+    flow, tree = PowerFlow(site), site.feeder
+    if behind:
+        tree, grid = _behind(tree, flow.grid, TRANSFORMERS[name])
+        flow = PowerFlow.of(grid)
+    return Scene(tree, flow, load_kw / kva, sun_kw / kva)
+
+
+def _behind(tree: Feeder, grid: Grid, of: Transformer) -> tuple[Feeder, Grid]:
+    """The same feeder with one more branch at its root; what was its busbar is a plain bus then."""
+    z, r = of.vk_percent / 100.0, of.vkr_percent / 100.0
+    x = float(np.sqrt(z * z - r * r))
+    pu = tree.base_kva / of.kva
+    ohm = 3.0 * tree.base_volt**2 / (of.kva * 1e3)
+    feeder = replace(
+        tree,
+        parent=np.concatenate([[0], tree.parent + 1]),
+        r=np.concatenate([[r * pu], tree.r]),
+        x=np.concatenate([[x * pu], tree.x]),
+        charging=np.concatenate([[0.0], tree.charging]),
+        bus=tree.bus + 1,
+        buses=("source", *tree.buses),
+    )
+    source = grid.bus_count
+    return feeder, replace(
+        grid,
+        ends=np.vstack([grid.ends, [source, grid.busbar]]),
+        r_ohm=np.append(grid.r_ohm, r * ohm),
+        x_ohm=np.append(grid.x_ohm, x * ohm),
+        b_siemens=np.append(grid.b_siemens, 0.0),
+        busbar=source,
+        bus_count=source + 1,
+    )
 
 
 def snapshot(here: Scene, cell: Cell, rng: np.random.Generator, seconds: int = 1) -> Snapshot:
@@ -123,17 +174,15 @@ def snapshot(here: Scene, cell: Cell, rng: np.random.Generator, seconds: int = 1
 
     Noise of voltages is new in every reading. The powers' error is that of profiles and stays.
     """
-    peak = np.array([c.load_kw for c in here.site.tables.customers]) / here.kw
-    sun = np.array([c.pv_kw for c in here.site.tables.customers]) / here.kw
-    n = peak.size
-    use = peak * rng.uniform(0.1, 1.0, n)
-    p = use - sun * rng.uniform(0.0, 0.6)
+    n = here.load.size
+    use = here.load * rng.uniform(0.1, 1.0, n)
+    p = use - here.sun * rng.uniform(0.0, 0.6)
     q = POWER_FACTOR_TAN * use
     v0 = rng.uniform(0.98, 1.03)
     true_v = _voltages(here, p, q, v0)
     says_v, says_p, says_q, liars = _attacked(here, cell, rng, (p, q, v0, true_v))
     std_p, std_q = (
-        cell.std_pq * np.maximum(np.abs(x), FLOOR * peak.mean() * s)
+        cell.std_pq * np.maximum(np.abs(x), FLOOR * here.load.mean() * s)
         for x, s in ((says_p, 1.0), (says_q, POWER_FACTOR_TAN))
     )
     says_p = says_p + std_p * rng.normal(size=n)

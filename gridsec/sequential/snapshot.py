@@ -1,0 +1,341 @@
+"""Who lies, from one set of readings alone: the likeliest explanation, and those about as likely.
+
+No time, nothing that was believed before. The error of a liar's reading has the standard deviation A, far
+beyond an honest meter's. A customer whose meter lies may report false powers too, which moves the squared
+voltages along the columns of ``B_c = std_c [2 R_:c, 2 X_:c]``. With the liars L and, of those, F whose
+powers are false too,
+
+    K = S + diag(d) + A^2 sum_{j in L} e_j e_j^T + sum_{c in F} B_c B_c^T
+    J = m^T K^-1 m + ln det K + 2 ln binom(p, |L|) + false |F| + anybody [L not empty]
+
+is minus twice the logarithm of an explanation's probability. ``ln det K`` charges an accusation for the
+freedom that it gives: what one meter costs follows from A and from how well the others know its voltage.
+Accusing changes K by a matrix of rank one, false powers by one of rank two; the gains of *all* single
+accusations come from ``Q = K^-1`` and ``g = Q m`` without solving anything.
+
+`anybody` is what makes a false alarm as rare as asked for: with it a single meter is accused beyond the
+``1 - rate / (2 p)`` quantile of the normal distribution. Once one is, others lie more probably.
+
+References
+----------
+George and McCulloch 1993 (spike and slab); Chen and Chen 2008 (the prior over sets).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import norm
+
+from gridsec.arrays import Bools, Floats
+from gridsec.sequential.conditional import Prior, inverted
+from gridsec.sequential.search import price
+
+
+@dataclass(frozen=True, slots=True)
+class Lies:
+    """What lies are expected to be like.
+
+    Attributes
+    ----------
+    size
+        Standard deviation A of a lie, squared pu: 0.2 is 10 % of the voltage.
+    each
+        What every accusation costs beside its freedom and the number of such sets.
+    false
+        What false powers cost beside their freedom, as minus twice a logarithm.
+    rate
+        Clean snapshots of which one may name somebody.
+    like
+        Explanations no more than this factor less likely than the best are reported.
+    """
+
+    size: float = 0.2
+    each: float = 1.4
+    false: float = 2.0
+    rate: float = 0.005
+    like: float = 1e3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Explained:
+    """One explanation. p meters.
+
+    Attributes
+    ----------
+    liars : (p,)
+        Whose readings are manipulated.
+    powers : (p,)
+        Whose powers are false as well.
+    probability
+        Among all that are reported.
+    cost
+        J.
+    weights : (p,)
+        ``K^-1 m``; what the readings say about any voltage is its covariance with them times this.
+    """
+
+    liars: Bools
+    powers: Bools
+    probability: float
+    cost: float
+    weights: Floats
+
+
+@dataclass(slots=True, eq=False)
+class _State:
+    """An explanation under way: L, F and what follows from them."""
+
+    liars: Bools
+    powers: Bools
+    Q: Floats
+    g: Floats
+    logdet: float
+    fit: float
+
+    def copy(self) -> _State:
+        return _State(self.liars.copy(), self.powers.copy(), self.Q.copy(), self.g, self.logdet, self.fit)
+
+    @property
+    def key(self) -> bytes:
+        return self.liars.tobytes() + self.powers.tobytes()
+
+
+class _Problem:
+    """Readings, and what may be wrong with them."""
+
+    def __init__(self, lies: Lies, noise: Floats, m: Floats, false: Floats) -> None:
+        self.lies, self.m, self.false = lies, m, false
+        p = m.size
+        self.a2 = lies.size**2
+        # The most likely single accusation at the wanted rate costs nothing net.
+        least = norm.isf(lies.rate / (2.0 * p)) ** 2
+        self.anybody = max(0.0, float(least - np.log1p(self.a2 / np.median(noise)) - price(p, 1) - lies.each))
+
+    def charge(self, count: int, false: int) -> float:
+        return (
+            price(self.m.size, count)
+            + self.lies.each * count
+            + self.lies.false * false
+            + self.anybody * (count > 0)
+        )
+
+    def cost(self, at: _State) -> float:
+        return at.fit + at.logdet + self.charge(int(at.liars.sum()), int(at.powers.sum()))
+
+    def meters(self, at: _State) -> Floats:
+        """Rise of J by accusing each meter, or by trusting it again, (p,)."""
+        on = at.liars
+        delta = np.where(on, -self.a2, self.a2)
+        pivot = np.maximum(1.0 + delta * at.Q.diagonal(), np.finfo(np.float64).tiny)
+        k, f = int(on.sum()), int(at.powers.sum())
+        now = self.charge(k, f)
+        more, less = self.charge(k + 1, f) - now, self.charge(max(k - 1, 0), f) - now
+        rise = np.log(pivot) - delta * at.g**2 / pivot + np.where(on, less, more)
+        # Powers are false only where the meter lies.
+        return np.where(at.powers, np.inf, rise)
+
+    def pairs(self, at: _State) -> Floats:
+        """Rise of J by false powers of each customer, its meter included where it is trusted, (p,)."""
+        p = self.m.size
+        k, f = int(at.liars.sum()), int(at.powers.sum())
+        b = self.false.reshape(p, 2 * p)
+        Qb, hb = (at.Q @ b).reshape(p, p, 2), (at.g @ b).reshape(p, 2)
+        M = np.empty((p, 3, 3))
+        own = np.where(at.liars, 0.0, self.lies.size)
+        M[:, 0, 0] = 1.0 + own**2 * at.Q.diagonal()
+        M[:, 0, 1:] = M[:, 1:, 0] = own[:, None] * Qb[np.arange(p), np.arange(p)]
+        M[:, 1:, 1:] = np.eye(2) + np.einsum("jci,jck->cik", self.false, Qb)
+        h = np.column_stack([own * at.g, hb])
+        gain = np.einsum("ci,ci->c", h, np.linalg.solve(M, h[:, :, None])[:, :, 0])
+        sign, logdet = np.linalg.slogdet(M)
+        rise = logdet - gain + np.where(at.liars, self.charge(k, f + 1), self.charge(k + 1, f + 1))
+        return np.where(at.powers | (sign <= 0), np.inf, rise - self.charge(k, f))
+
+    def toggle(self, at: _State, j: int) -> None:
+        """Accuse a meter, or trust it again."""
+        delta = -self.a2 if at.liars[j] else self.a2
+        q = at.Q[:, j].copy()
+        pivot = 1.0 + delta * q[j]
+        at.fit -= delta * at.g[j] ** 2 / pivot
+        at.logdet += float(np.log(pivot))
+        at.g = at.g - q * (delta * at.g[j] / pivot)
+        at.Q -= np.multiply.outer(q, q * (delta / pivot))
+        at.liars[j] = not at.liars[j]
+
+    def powers(self, at: _State, c: int, sign: float = 1.0) -> None:
+        """Doubt a customer's powers, or with `sign` -1 believe them again."""
+        u = self.false[:, c]
+        Qu, h = at.Q @ u, u.T @ at.g
+        M = sign * np.eye(2) + u.T @ Qu
+        solved = np.linalg.solve(M, np.column_stack([Qu.T, h]))
+        at.fit -= float(h @ solved[:, -1])
+        at.logdet += float(np.linalg.slogdet(M)[1])
+        at.g = at.g - Qu @ solved[:, -1]
+        at.Q -= Qu @ solved[:, :-1]
+        at.powers[c] = sign > 0
+
+
+# Rises of J below this are rounding.
+_LEAST = 1e-9
+_MOVES = 4
+# So many customers, those that explain most, are where a search with false powers begins.
+_STARTS = 12
+
+
+def identify(
+    prior: Prior,
+    noise: Floats,
+    m: Floats,
+    live: Bools,
+    *,
+    lies: Lies | None = None,
+    false: Floats | None = None,
+) -> tuple[Explained, ...]:
+    """The likeliest explanations of one set of readings.
+
+    Parameters
+    ----------
+    prior
+        What is known without meters.
+    noise : (p,)
+        Variance of each meter's reading, > 0.
+    m : (p,)
+        Readings minus what the model explains, squared pu; any finite value where there is none.
+    live : (p,)
+        Which meters have a reading.
+    lies
+        What lies are expected to be like; the defaults of `Lies` by default.
+    false : (p, p, 2)
+        `false[:, c]` is what false active and reactive powers of the customer of meter c do to the squared
+        voltages of all meters' buses, times how false they may be; none by default.
+
+    Returns
+    -------
+    tuple of Explained
+        The likeliest first; there is always one.
+    """
+    at = np.flatnonzero(live)
+    lies = Lies() if lies is None else lies
+    doubts = np.zeros((at.size, at.size, 0 if false is None else 2))
+    doubts = doubts if false is None else false[np.ix_(at, at)]
+    problem = _Problem(lies, noise[at], m[at], doubts)
+    K = prior.of_meters[np.ix_(prior.meters[at], at)] + np.diag(noise[at])
+    Q = inverted(K)
+    none = np.zeros(at.size, dtype=np.bool_)
+    g = Q @ m[at]
+    start = _State(none, none.copy(), Q, g, 0.0, float(m[at] @ g))
+    found = _explanations(problem, start, false is not None)
+    return _reported(problem, found, live, lies)
+
+
+def _explanations(problem: _Problem, start: _State, false: bool) -> list[_State]:
+    """Local minima of J from several starts, and their neighbours."""
+    if problem.m.size == 0:
+        return [start]
+    known: dict[bytes, _State] = {start.key: start}
+    first = _descend(problem, start, known, false)
+    if first is start:
+        return [start]
+    if false:
+        rise = problem.pairs(start)
+        for c in np.argsort(rise)[:_STARTS].tolist():
+            if np.isfinite(rise[c]):
+                _descend(problem, _doubted(problem, start, c), known, false)
+    best = min(known.values(), key=problem.cost)
+    _exchange(problem, best, known, false)
+    return list(known.values())
+
+
+def _doubted(problem: _Problem, at: _State, c: int) -> _State:
+    after = at.copy()
+    if not after.liars[c]:
+        problem.toggle(after, c)
+    problem.powers(after, c)
+    return after
+
+
+def _descend(problem: _Problem, at: _State, known: dict[bytes, _State], false: bool) -> _State:
+    """Steepest descent; remembers every explanation that it passes."""
+    known.setdefault(at.key, at)
+    for _ in range(_MOVES * at.g.size):
+        after = _best(problem, at, false)
+        if after is None:
+            return at
+        if after.key in known:
+            return known[after.key]
+        known[after.key] = at = after
+    return at
+
+
+def _best(problem: _Problem, at: _State, false: bool) -> _State | None:
+    """The state after the move that lowers J most, or None where none does."""
+    rise = problem.meters(at)
+    j = int(np.argmin(rise))
+    least, move = float(rise[j]), "meter"
+    if false and at.liars.any():
+        for c in np.flatnonzero(at.powers).tolist():
+            after = at.copy()
+            problem.powers(after, c, -1.0)
+            change = problem.cost(after) - problem.cost(at)
+            if change < min(least, -_LEAST):
+                return after
+        doubts = problem.pairs(at)
+        c = int(np.argmin(doubts))
+        if doubts[c] < least:
+            j, least, move = c, float(doubts[c]), "powers"
+    if least >= -_LEAST:
+        return None
+    if move == "powers":
+        return _doubted(problem, at, j)
+    after = at.copy()
+    problem.toggle(after, j)
+    return after
+
+
+def _exchange(problem: _Problem, at: _State, known: dict[bytes, _State], false: bool) -> None:
+    """Trust each liar again, and see what explains the readings instead."""
+    for j in np.flatnonzero(at.liars).tolist():
+        after = at.copy()
+        if after.powers[j]:
+            problem.powers(after, j, -1.0)
+        problem.toggle(after, j)
+        rise = problem.meters(after)
+        rise[j] = np.inf
+        k = int(np.argmin(rise))
+        problem.toggle(after, k)
+        if after.key not in known:
+            _descend(problem, after, known, false)
+
+
+def _reported(problem: _Problem, found: list[_State], live: Bools, lies: Lies) -> tuple[Explained, ...]:
+    """The likeliest of them as explanations of all meters, one for each set of liars."""
+    costs = sorted(((problem.cost(each), each) for each in found), key=lambda pair: pair[0])
+    best: dict[bytes, tuple[float, _State]] = {}
+    for cost, each in costs:
+        if cost - costs[0][0] <= 2.0 * np.log(lies.like):
+            best.setdefault(each.liars.tobytes(), (cost, each))
+    total = sum(float(np.exp(-0.5 * (cost - costs[0][0]))) for cost, _ in best.values())
+    return tuple(
+        Explained(
+            _spread(each.liars, live),
+            _spread(each.powers, live),
+            float(np.exp(-0.5 * (cost - costs[0][0]))) / total,
+            cost,
+            _weights(each.g, live),
+        )
+        for cost, each in best.values()
+    )
+
+
+def _spread(some: Bools, live: Bools) -> Bools:
+    out = np.zeros(live.size, dtype=np.bool_)
+    out[live] = some
+    return out
+
+
+def _weights(g: Floats, live: Bools) -> Floats:
+    out = np.zeros(live.size)
+    out[live] = g
+    return out
