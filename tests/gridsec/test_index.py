@@ -226,6 +226,18 @@ def test_attacks_on_the_asymptotic_index_last_and_others_die_away() -> None:
     assert min(lasting, fading) > 20
 
 
+def test_erratum_the_limits_of_definition_3_2_3_need_not_exist() -> None:
+    """The states alternate for ever, but what the attack makes them differ by dies away."""
+    A, C = np.diag([-1.0, 0.5]), np.array([[1.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
+    x, other = np.array([1.0, 0.0]), np.array([1.0, 1.0])
+    steps = [np.linalg.matrix_power(A, k) for k in range(60, 64)]
+    assert np.ptp([P @ x for P in steps], axis=0)[0] == np.ptp([P @ other for P in steps], axis=0)[0] == 2.0
+    assert all(np.linalg.norm(P @ (other - x)) < 1e-15 for P in steps)
+    # One sensor can tell this story, and by the difference it is no lasting one: that takes all three.
+    assert dynamic_index(A, C, tol=TOL).count == 1
+    assert asymptotic_index(A, C, discrete=True, tol=TOL).count == 3
+
+
 def test_one_eigenvector_per_eigenvalue_is_not_enough() -> None:
     """What a search over `numpy.linalg.eig`'s vectors says where an eigenvalue repeats: too much."""
     A = np.eye(3)

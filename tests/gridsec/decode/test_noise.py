@@ -191,6 +191,20 @@ def test_constants_equal_their_definitions(seed: int) -> None:
                 assert getattr(got_c, name) == pytest.approx(getattr(want_c, name), rel=1e-10), (name, q, r)
 
 
+def test_erratum_the_step_of_the_proof_of_theorem_2_2_9() -> None:
+    """`Phi_i d = Phi_i Phi_Lambda^+ Phi_Lambda d`; without the last factor, as printed, it does not fit."""
+    rng = np.random.default_rng(3)
+    stack = Stack.of(rng.standard_normal((5, 2, 3)))
+    rows, d = stack.rows([0, 1, 3, 4]), rng.standard_normal(3)
+    part = stack.matrix[rows]
+    own = stack.matrix[stack.rows([2])]
+    assert np.allclose(own @ np.linalg.pinv(part) @ (part @ d), own @ d)
+    assert (own @ np.linalg.pinv(part)).shape[1] != d.size
+    # Hence |Phi_i (x - x_hat)| <= eta |Phi_Lambda (x - x_hat)|, which kappa^e rests on.
+    eta = detection_constants(stack, 1, tol=TOL).eta
+    assert np.linalg.norm(own @ d) <= eta * np.linalg.norm(part @ d)
+
+
 def test_a_bound_of_the_noise_for_every_measurement() -> None:
     """v_max may differ between the members of a batch, as with observers that settle over time."""
     rng = np.random.default_rng(0)
