@@ -21,6 +21,7 @@ them are given as explanations, and nobody is named whom one of them acquits.
 
 The papers' sets come with their own partial observers, whose estimates can be compared at once. Here a
 candidate is judged by what its members' readings alone imply for their inverters, which costs no observer.
+Metered net reactive power is not used: a dropped meter's would have to be forgotten, too.
 
 References
 ----------

@@ -199,6 +199,18 @@ def test_silence_and_missing_busbar_are_undecided() -> None:
     assert (np.abs(estimate.v2 - street.truth()) <= estimate.bound).all()
 
 
+def test_reported_reactive_power_changes_nothing() -> None:
+    """It is not used, whether true or absurd."""
+    answers = []
+    for reported in (None, np.arange(9)):
+        rng = np.random.default_rng(12)
+        plant = make_plant(rng)
+        made = set_search.design(plant, max_attacked=2, step_s=1.0)
+        answers.append(watch(Street(plant, rng, metered_q=reported), made, 20)[1])
+    for (one, _), (other, _) in zip(*answers, strict=True):
+        np.testing.assert_array_equal(one.v2, other.v2)
+
+
 def test_readings_that_are_no_numbers_and_late_frames() -> None:
     rng = np.random.default_rng(7)
     plant = make_plant(rng)

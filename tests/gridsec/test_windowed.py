@@ -225,6 +225,17 @@ def test_readings_that_are_no_numbers_and_late_frames() -> None:
     assert np.isfinite(verdict.attack).all()
 
 
+def test_with_reported_reactive_power_the_liar_is_named_as_well() -> None:
+    rng = np.random.default_rng(1)
+    plant = make_plant(rng, drop=0.03, presets=(STEEP,))
+    made = windowed.design(plant, max_attacked=1, step_s=1.0, length=10)
+    street = Street(plant, rng, metered_q=np.arange(9))
+    state, answers = watch(street, made, 30)
+    assert answers[-1][1].decision is Decision.CLEAN
+    _, answers = watch(street, made, 20, state=state, lies=LIES)
+    assert np.flatnonzero(answers[-1][1].suspects).tolist() == [4]
+
+
 def test_irregular_intervals_name_the_liar_as_well() -> None:
     _, made, street = make(1)
     state, _ = watch(street, made, 20)
