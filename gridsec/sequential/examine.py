@@ -136,6 +136,38 @@ def examine(
     return Examined(trust, tuple(after), tuple(views), found)
 
 
+def ended(design: SequentialDesign, trust: Trust, seen: Examined, window: Window) -> Bools:
+    """Distrusted meters whose manipulation is over, though long means still contain it.
+
+    What a short scale sees of them is honest, and further from what a longer one sees than the short one's
+    noise and the loads' wandering explain.
+
+    Parameters
+    ----------
+    design
+        The design.
+    trust
+        From the last tick.
+    seen, window
+        What this tick brought.
+    """
+    out = np.zeros_like(trust.trusted)
+    suspected = ~trust.trusted & ~seen.trust.trusted
+    if not suspected.any():
+        return out
+    means = window.sums / np.maximum(window.counts, 1)
+    wander = 2.0 * design.prior.variance[design.prior.meters] * design.step_s / design.doubt.time_s
+    for s, short in enumerate(seen.views[:-1]):
+        if short is None:
+            continue
+        quiet = suspected & short.enough & ~short.still
+        for later in range(s + 1, len(design.lengths)):
+            variance = design.white / np.maximum(window.counts[s], 1) + wander * design.lengths[later]
+            far = np.abs(means[later] - means[s]) > design.sigmas[s] * np.sqrt(variance)
+            out |= quiet & seen.trust.still[later] & far
+    return out
+
+
 def _due(design: SequentialDesign, trust: Trust, view: View, s: int, tick: int) -> bool:
     """Whether what is believed is looked into again, though nothing new speaks against it.
 

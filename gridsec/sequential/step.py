@@ -15,12 +15,12 @@ from gridsec.sequential.commission import gather
 from gridsec.sequential.conclude import Tick, conclude, unusable
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.drive import drive
-from gridsec.sequential.examine import Examined, examine
+from gridsec.sequential.examine import Examined, ended, examine
 from gridsec.sequential.kinds import Kinds, describe, listen, suspicious
 from gridsec.sequential.loads import prior
 from gridsec.sequential.naming import name
 from gridsec.sequential.state import Doubts, SequentialState, Trust
-from gridsec.sequential.windows import Window, push, shift
+from gridsec.sequential.windows import Window, forget, push, shift
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,9 +72,7 @@ def step(
     if state.ticks % _STALE == 0:
         model = _model_error(design, frame.p, q, heard.v0_squared)
     since = frame.t if state.x is None else state.since
-    # Without inverters the rate is infinite, and times no time at all it would be no number.
-    left = np.exp(-design.certificate.rate * (frame.t - since)) if frame.t > since else 1.0
-    transient = design.reach * left
+    transient = _transient(design, frame.t - since)
     seen = examine(
         design,
         begun,
@@ -85,7 +83,9 @@ def step(
         tick=state.ticks,
         model=model + transient,
     )
-    trust, rivals = name(design, begun, seen)
+    over = ended(design, begun, seen, window)
+    window = forget(window, over)
+    trust, rivals = name(design, begun, _acquit(seen, over))
     trust = _distrust(trust, copies)
     seen = replace(seen, trust=trust)
     after = replace(
@@ -106,6 +106,20 @@ def step(
     tick = Tick(heard.y, heard.live, heard.v0_squared, heard.busbar, v2_bus, transient, seen, rivals)
     estimate, verdict = conclude(design, after, tick)
     return replace(after, last=(estimate, verdict)), estimate, verdict
+
+
+def _transient(design: SequentialDesign, age: float) -> Floats:
+    """What is left of the unknown initial state at each meter, (p,)."""
+    # Without inverters the rate is infinite, and times no time at all it would be no number.
+    return np.asarray(design.reach * (np.exp(-design.certificate.rate * age) if age > 0 else 1.0))
+
+
+def _acquit(seen: Examined, over: Bools) -> Examined:
+    """Evidence against meters whose manipulation is over counts no more."""
+    trust = seen.trust
+    if not over.any():
+        return seen
+    return replace(seen, trust=replace(trust, bad=trust.bad & ~over, still=trust.still & ~over))
 
 
 def _voltages(design: SequentialDesign, frame: Frame, heard: _Heard, x: Floats) -> tuple[Floats, Floats]:

@@ -97,6 +97,8 @@ def forget(window: Window, meters: Bools) -> Window:
     meters : (p,)
         Which.
     """
+    if not meters.any():
+        return window
     ring, marks = window.residual.copy(), window.heard.copy()
     ring[:, meters], marks[:, meters] = 0.0, False
     sums = np.where(meters, 0.0, window.sums)
