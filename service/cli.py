@@ -262,6 +262,16 @@ Attacks = Annotated[
 ]
 
 
+InverterAttacks = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--inverter-attack",
+        help="customer:kvar:from:to, e.g. 'load-6:-4:20:55': the customer's inverter injects so many kvar "
+        "beside its droop curve (times in s after the start); may be repeated.",
+    ),
+]
+
+
 @app.command()
 def simulate(
     feeder: Feeder,
@@ -276,6 +286,7 @@ def simulate(
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Chooses everything random.")] = 0,
     attack: Attacks = None,
+    inverter_attack: InverterAttacks = None,
     start: Annotated[
         float | None, typer.Option(help="Unix time of the first tick, s. [default: now]")
     ] = None,
@@ -308,6 +319,7 @@ def simulate(
         channel=Channel(loss=loss),
     )
     scenario = _with_attacks(site, scenario, attack or [])
+    scenario = _with_inverter_attacks(site, scenario, inverter_attack or [])
     if out is not None:
         from feeders.recording import record
 
@@ -345,6 +357,31 @@ def _with_attacks(site: Site, scenario: Scenario, texts: list[str]) -> Scenario:
             scenario=scenario,
         )
     return replace(scenario, attacks=tuple(attacks))
+
+
+def _with_inverter_attacks(site: Site, scenario: Scenario, texts: list[str]) -> Scenario:
+    from dataclasses import replace
+
+    import numpy as np
+
+    from gridsec.attack import InverterAttack
+
+    owners = [site.feeder.customers[int(c)] for c in site.droop.customer]
+    attacks = []
+    for text in texts:
+        try:
+            customer, *numbers = text.rsplit(":", 3)
+            kvar, begin, end = map(float, numbers)
+            which = np.array([owners.index(customer)], dtype=np.intp)
+            q = np.array([kvar / site.feeder.base_kva])
+            attacks.append(InverterAttack(which, q, scenario.start + begin, scenario.start + end))
+        except ValueError:
+            raise typer.BadParameter(
+                f"{text!r}: expected customer:kvar:from:to with a customer who has an inverter: "
+                f"{', '.join(owners)}",
+                param_hint="--inverter-attack",
+            ) from None
+    return replace(scenario, inverter_attacks=tuple(attacks))
 
 
 def _publish(

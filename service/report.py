@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from feeders.load import Site, Snapshot, volts
-from gridsec.arrays import Floats
+from gridsec.arrays import Bools, Floats
 from gridsec.online import Cause, Decision, Estimate, Verdict
 from service.align import Tick
 
@@ -336,8 +336,13 @@ def _reason(site: Site, tick: Tick, max_attacked: int, verdict: Verdict) -> str:
     suspects = np.flatnonzero(verdict.suspects).tolist()
     unseen = [k for k, reading in enumerate(tick.readings) if reading is None]
     named = _meters(site, suspects)
-    if verdict.cause is Cause.RESIDUALS and not verdict.inverters.any():
-        return f"Manipulated: {named}; further off than meter accuracy and load uncertainty allow."
+    if verdict.cause is Cause.RESIDUALS:
+        who = _who(site, verdict.suspects, verdict.inverters)
+        return f"Manipulated: {who}; further off than meter accuracy and load uncertainty allow."
+    if verdict.cause is Cause.AMBIGUOUS and verdict.explanations:
+        ways = [f"{_who(site, e.meters, e.inverters)} ({e.probability:.0%})" for e in verdict.explanations]
+        more = f" or {len(ways) - _SHOWN} more" if len(ways) > _SHOWN else ""
+        return f"Several explanations fit: {' or else '.join(ways[:_SHOWN])}{more}."
     if verdict.cause is Cause.TOO_MANY_SUSPECTS and suspects:
         return (
             f"{len(suspects)} meters disagree with the feeder ({named}), and at most {max_attacked} can be "
@@ -345,7 +350,7 @@ def _reason(site: Site, tick: Tick, max_attacked: int, verdict: Verdict) -> str:
         )
     if verdict.cause is Cause.SILENT_METERS and unseen:
         return f"No reading from {_meters(site, unseen)}."
-    if verdict.cause in {Cause.AMBIGUOUS, Cause.SILENT_METERS, Cause.RESIDUALS}:
+    if verdict.cause in {Cause.AMBIGUOUS, Cause.SILENT_METERS}:
         return _in_ids(site, verdict.reason)
     return verdict.reason
 
@@ -354,6 +359,17 @@ def _meters(site: Site, which: Sequence[int]) -> str:
     """The ids of some meters, the first few of many."""
     rest = f" and {len(which) - _SHOWN} more" if len(which) > _SHOWN else ""
     return ", ".join(site.meter_ids[k] for k in which[:_SHOWN]) + rest
+
+
+def _who(site: Site, meters: Bools, inverters: Bools) -> str:
+    """Meters by their ids and inverters by their customers, as in alarms; the first few of many."""
+    found = np.flatnonzero(meters).tolist()
+    parts = [_meters(site, found)] if found else []
+    owners = [site.feeder.customers[int(site.droop.customer[i])] for i in np.flatnonzero(inverters)]
+    rest = f" and {len(owners) - _SHOWN} more" if len(owners) > _SHOWN else ""
+    if owners:
+        parts.append(f"the inverter{'s' if len(owners) > 1 else ''} of {', '.join(owners[:_SHOWN])}{rest}")
+    return " and ".join(parts) or "nobody"
 
 
 def _in_ids(site: Site, text: str) -> str:
@@ -366,7 +382,7 @@ def _in_ids(site: Site, text: str) -> str:
         for customer, meter in zip(site.meters, site.meter_ids, strict=True)
     }
     names = "|".join(re.escape(name) for name in sorted(meter_of, key=len, reverse=True))
-    return re.sub(rf"(?<!\w)(?<!the inverter of )(?:{names})(?!\w)", lambda found: meter_of[found[0]], text)
+    return re.sub(rf"(?<!\w)(?<!nverter of )(?:{names})(?!\w)", lambda found: meter_of[found[0]], text)
 
 
 def _attack_volts(site: Site, tick: Tick, verdict: Verdict) -> Floats:

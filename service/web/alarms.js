@@ -5,6 +5,7 @@ import { byId, clock, duration, el, getJson, isKnown, signed, volt } from "./dom
 const API = "/api/v1/alarms";
 const KIND = {
   "meter-manipulated": "Meter manipulated",
+  "inverter-manipulated": "Inverter manipulated",
   "voltage-limit": "Voltage limit",
   "data-loss": "Data loss",
   undecided: "Undecided",
@@ -107,9 +108,10 @@ export class Alarms {
   item(alarm) {
     const e = alarm.evidence;
     const numbers = isKnown(e.v_volt_reported) && alarm.kind === "meter-manipulated"
-      ? `${volt(e.v_volt_reported)} reported, ${volt(e.v_volt_estimated)} reconstructed (${signed(e.v_volt_reported - e.v_volt_estimated)} V)`
+      ? `${volt(e.v_volt_reported)} reported, ${volt(e.v_volt_estimated)} reconstructed (${signed(e.v_volt_reported - e.v_volt_estimated)} V${e.kind ? `, ${e.kind}` : ""})`
       : alarm.reason;
-    const where = alarm.meter ? `${alarm.meter} · ${alarm.feeder}` : alarm.feeder;
+    const subject = alarm.customer ?? alarm.meter;
+    const where = subject ? `${subject} · ${alarm.feeder}` : alarm.feeder;
     const since = alarm.state === "cleared"
       ? `${clock(alarm.t_raised)}, cleared after ${duration(alarm.t_cleared - alarm.t_raised)}`
       : `since ${clock(alarm.t_raised)}`;
@@ -124,7 +126,7 @@ export class Alarms {
           alarm.count > 1 ? el("span", { class: "times", title: "raised so many times", text: `× ${alarm.count}` }) : null),
         el("p", {}, el("a", { href: `#${encodeURIComponent(alarm.feeder)}`, class: "where", text: where, on: { click: (event) => {
           event.preventDefault();
-          this.onPick(alarm.feeder, alarm.meter);
+          this.onPick(alarm.feeder, alarm.meter, alarm.customer);
         } } })),
         el("p", { class: "numbers", text: numbers }),
         el("p", { class: "quiet since", text: since }), answered),
@@ -135,7 +137,7 @@ export class Alarms {
 
   ask(alarm) {
     this.asking = alarm.id;
-    byId("ack-what").textContent = `${KIND[alarm.kind] ?? alarm.kind}: ${alarm.meter ?? alarm.feeder}. ${alarm.reason}`;
+    byId("ack-what").textContent = `${KIND[alarm.kind] ?? alarm.kind}: ${alarm.customer ?? alarm.meter ?? alarm.feeder}. ${alarm.reason}`;
     byId("ack-who").value = localStorage.getItem("gridsec.who") ?? "";
     byId("ack-comment").value = "";
     byId("ack-error").hidden = true;

@@ -17,9 +17,9 @@ const SIGNS = {
 const page = { feeder: null, report: null, selected: null, source: null, retry: null, heard: 0, linked: true, past: new Map() };
 const diagram = new Diagram({ onSelect: (id) => select(id === page.selected ? null : id) });
 const alarms = new Alarms({
-  onPick: async (feeder, meter) => {
+  onPick: async (feeder, meter, owner) => {
     if (feeder !== page.feeder?.name) await show(feeder);
-    const customer = page.feeder?.layout.customers.find((c) => c.meter === meter);
+    const customer = page.feeder?.layout.customers.find((c) => (owner ? c.customer === owner : c.meter === meter));
     if (customer) select(customer.customer);
   },
   onLink: (up) => { page.linked = up; },
@@ -124,15 +124,20 @@ function verdict() {
     type: "button", class: "chip", "data-status": kind, text, on: { click: () => select(customer.get(meter) ?? null) },
   });
   const suspects = report.meters.filter((m) => m.suspect);
+  const inverters = (report.inverters ?? []).filter((i) => i.suspect);
   byId("chips").replaceChildren(
     ...suspects.map((m) => chip(m.meter, "suspect", `${m.meter} ${signed(m.attack_volt_estimated)} V`)),
+    ...inverters.map((i) => el("button", {
+      type: "button", class: "chip", "data-status": "suspect",
+      text: `inverter of ${i.customer} ${signed(i.attack_kvar_estimated)} kvar`, on: { click: () => select(i.customer) },
+    })),
     ...report.silent.map((s) => chip(s.meter, "silent", `${s.meter} silent ${isKnown(s.seconds) ? duration(s.seconds) : ""}`)));
   const volts = report.meters.map((m) => m.v_volt_estimated).filter(isKnown);
   const range = volts.length ? `${bare(Math.min(...volts))} – ${volt(Math.max(...volts))}` : "–";
   const fact = (name, value) => el("div", {}, el("dt", { text: name }), el("dd", { text: value }));
   byId("facts").replaceChildren(
     fact("Meters heard", `${report.meters.filter((m) => m.seen).length} of ${report.meters.length}`),
-    fact("Suspects", String(suspects.length)),
+    fact("Suspects", String(suspects.length + inverters.length)),
     fact("Guaranteed up to", `${report.max_attacked} manipulated`),
     fact("Real voltages", range),
     fact("Tick", clock(report.t)));
@@ -197,7 +202,11 @@ function detail() {
   byId("detail-card").hidden = false;
   const customer = page.feeder.layout.customers.find((c) => c.customer === page.selected);
   const meter = page.report.meters.find((m) => m.meter === customer.meter);
-  showDetail(page.feeder, customer, meter, diagram.voltAt(customer), page.past.get(customer.meter) ?? []);
+  const mine = (item) => item.customer === customer.customer;
+  const known = page.report.customers?.find(mine);
+  const inverter = page.report.inverters?.find(mine);
+  const now = { meter, inverter, v: diagram.voltAt(customer), std: known?.v_volt_std ?? meter?.v_volt_std };
+  showDetail(page.feeder, customer, now, page.past.get(customer.meter) ?? []);
 }
 
 // ------------------------------------------------------------- all of them

@@ -62,7 +62,7 @@ function row(label, value, extra) {
   return [el("dt", { text: label }), el("dd", {}, el("b", { text: value }), extra ? el("span", { class: "quiet", text: ` ${extra}` }) : null)];
 }
 
-export function showDetail(feeder, customer, meter, v, points) {
+export function showDetail(feeder, customer, { meter, inverter, v, std }, points) {
   const limits = { low: feeder.v_min_volt, high: feeder.v_max_volt };
   const nominal = feeder.v_nominal_volt;
   const pu = (value) => (isKnown(value) ? `${(value / nominal).toFixed(4)} pu` : "");
@@ -71,11 +71,16 @@ export function showDetail(feeder, customer, meter, v, points) {
   const head = el("p", { class: "where" },
     el("span", { class: "state", "data-status": now.key, text: now.text }),
     el("span", { class: "quiet", text: ` ${customer.meter ? `meter ${customer.meter}, ` : ""}bus ${customer.bus}` }));
-  const half = isKnown(meter?.v_volt_std) ? 3 * meter.v_volt_std : null;
+  const half = isKnown(std) ? 3 * std : null;
   const list = el("dl", { class: "numbers" });
   if (meter) list.append(...row("Meter says", volt(meter.v_volt_reported, 2), pu(meter.v_volt_reported)));
   list.append(...row("Reconstructed", volt(v, 2), `${half === null ? "" : `± ${half.toFixed(2)} V, `}${pu(v)}`));
-  if (meter?.suspect) list.append(...row("Manipulation", `${signed(meter.attack_volt_estimated, 2)} V`));
+  if (half !== null) list.append(...row("Standard deviation", volt(std, 2)));
+  if (meter?.suspect) list.append(...row("Manipulation", `${signed(meter.attack_volt_estimated, 2)} V`, meter.kind ?? ""));
+  if (inverter && isKnown(inverter.q_kvar_estimated)) {
+    list.append(...row("Inverter injects", `${signed(inverter.q_kvar_estimated, 1)} kvar`, inverter.judged ? "" : "by its droop curve"));
+  }
+  if (inverter?.suspect) list.append(...row("Manipulated by", `${signed(inverter.attack_kvar_estimated, 1)} kvar`));
   byId("detail").replaceChildren(head, list, ...(meter ? [gauge(meter)] : []),
     el("div", { class: "trend-box" }, trend(points, limits, nominal)),
     el("p", { class: "key" },

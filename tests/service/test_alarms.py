@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -31,7 +32,7 @@ from service.alarms import (
     restore,
     to_json,
 )
-from service.report import BUSBAR, FeederReport, MeterReport
+from service.report import BUSBAR, ExplanationReport, FeederReport, InverterReport, MeterReport
 
 T0 = 1_795_212_000.0
 FEEDER = "village"
@@ -74,6 +75,68 @@ def test_a_suspect_is_a_condition_with_its_numbers() -> None:
     assert found.evidence == Evidence(9e-3, 2e-3, 240.0, 230.0, 10.0)
     assert "240.0 V" in found.reason
     assert "230.0 V" in found.reason
+
+
+def test_evidence_says_what_a_manipulation_looks_like() -> None:
+    liar = meter("m2", suspect=True, kind="drift")
+    (found,) = conditions(report(liar, cause=Cause.RESIDUALS))
+    assert found.evidence.kind == "drift"
+
+
+def inverter(customer: str = "Miller", **changes: object) -> InverterReport:
+    made = InverterReport(customer, "b1", "m1", True, False, 2.0, 0.0)
+    return replace(made, **changes)  # type: ignore[arg-type]
+
+
+def with_inverters(now: FeederReport, *inverters: InverterReport) -> FeederReport:
+    return replace(now, inverters=inverters)
+
+
+def test_a_manipulated_inverter_is_a_condition_of_its_customer() -> None:
+    wrong = inverter(suspect=True, attack_kvar_estimated=-6.25)
+    other = inverter("Lovelace", meter=None)
+    (found,) = conditions(with_inverters(report(meter("m1"), cause=Cause.RESIDUALS), wrong, other))
+    assert (found.kind, found.subject, found.meter) == (AlarmKind.INVERTER_MANIPULATED, "Miller", "m1")
+    assert (found.severity, found.known) == (Severity.CRITICAL, True)
+    assert found.evidence == Evidence(attack_kvar_estimated=-6.25)
+    assert "the inverter of Miller injects -6.2 kvar" in found.reason
+
+
+@pytest.mark.parametrize("cause", [*UNDECIDED_CAUSES, Cause.AGREEMENT])
+def test_who_does_not_judge_inverters_says_nothing_about_them(cause: Cause) -> None:
+    """Neither an estimator that only knows meters nor an undecided one clears an inverter's alarm."""
+    judged = cause is not Cause.AGREEMENT
+    found = conditions(with_inverters(report(meter("m1"), cause=cause), inverter(judged=judged)))
+    assert [(c.subject, c.known) for c in found if c.kind is AlarmKind.INVERTER_MANIPULATED] == [
+        ("Miller", False)
+    ]
+
+
+def test_an_inverter_s_alarm_lives_like_any_other() -> None:
+    """Raised after its delay, held while undecided, acknowledged, cleared; two inverters are two alarms."""
+    wrong = [inverter(c, meter=None, suspect=True, attack_kvar_estimated=3.0) for c in ("Miller", "Lovelace")]
+    clean = [inverter(c, meter=None) for c in ("Miller", "Lovelace")]
+    book, seen = AlarmBook(FEEDER), []
+    for k, (cause, inverters) in enumerate(
+        [(Cause.RESIDUALS, wrong)] * 4 + [(Cause.AMBIGUOUS, clean)] * 20 + [(Cause.AGREEMENT, clean)] * 8
+    ):
+        now = with_inverters(report(meter("m1"), cause=cause, t=T0 + k), *inverters)
+        book, transitions = advance(book, AlarmRules(), conditions(now), now.t)
+        seen += [(k, t.alarm.customer, t.change) for t in transitions if t.alarm.customer]
+        if k == 5:
+            (mine,) = [a for a in book.active if a.customer == "Miller"]
+            book, _ = acknowledge(book, mine.id, "Ada", "", now.t)
+    assert seen == [
+        (2, "Lovelace", Change.RAISED),
+        (2, "Miller", Change.RAISED),
+        (29, "Lovelace", Change.CLEARED),
+        (29, "Miller", Change.CLEARED),
+    ]
+    assert {a.customer: a.acknowledged_by for a in book.alarms if a.customer} == {
+        "Lovelace": None,
+        "Miller": "Ada",
+    }
+    assert restore(FEEDER, book.alarms).alarms == book.alarms
 
 
 @pytest.mark.parametrize("cause", UNDECIDED_CAUSES)
@@ -494,3 +557,15 @@ def test_json_and_back() -> None:
     assert data["kind"] == "meter-manipulated"
     assert type(data["state"]) is str
     assert from_json({**data, "unknown": 1}) == alarm
+    shown = (ExplanationReport(("m1", "m2"), ("Miller",), 0.5),)
+    rich = replace(alarm, customer="Miller", evidence=Evidence(kind="stuck", explanations=shown))
+    assert from_json(json.loads(json.dumps(to_json(rich)))) == rich
+
+
+def test_json_from_before_inverters_had_alarms() -> None:
+    _, alarm = raised()
+    data = to_json(alarm)
+    del data["customer"]
+    old = ("score", "threshold", "v_volt_reported", "v_volt_estimated", "attack_volt_estimated")
+    data["evidence"] = {name: data["evidence"][name] for name in old}
+    assert from_json(data) == alarm

@@ -16,6 +16,7 @@ import pytest
 from gridsec.online import Cause
 from service import api, models
 from service.alarms import Change, Transition
+from service.report import CustomerReport, ExplanationReport, InverterReport
 from service.report import to_json as report_json
 from service.store import Rejected, connect
 
@@ -93,9 +94,9 @@ def test_state_is_the_report(setup: Setup) -> None:
     contract = {"feeder", "t", "verdict", "reason", "max_attacked", "meters"}
     meter = {
         *("meter", "bus", "seen", "suspect", "score", "threshold", "v_volt_reported", "v_volt_estimated"),
-        *("v_volt_std", "v2_pu_estimated", "attack_volt_estimated"),
+        *("v_volt_std", "v2_pu_estimated", "attack_volt_estimated", "kind"),
     }
-    assert contract <= set(response.json())
+    assert contract | {"customers", "inverters", "explanations"} <= set(response.json())
     assert all(set(item) == meter for item in response.json()["meters"])
 
 
@@ -197,7 +198,9 @@ def test_an_alarm_and_its_fields(setup: Setup) -> None:
     assert contract <= set(alarm)
     assert set(alarm["evidence"]) == {
         *("score", "threshold", "v_volt_reported", "v_volt_estimated", "attack_volt_estimated"),
+        *("kind", "attack_kvar_estimated", "explanations"),
     }
+    assert alarm["customer"] is None
     assert (alarm["kind"], alarm["meter"], alarm["state"]) == ("meter-manipulated", "H3", "raised")
     assert (alarm["t_event"], alarm["t_raised"], alarm["t_cleared"]) == (T0, T0 + 2, None)
     assert setup.get(f"/alarms/{alarm['id']}").json() == alarm
@@ -206,6 +209,38 @@ def test_an_alarm_and_its_fields(setup: Setup) -> None:
     events = models.AlarmEvents.model_validate(setup.get(f"/alarms/{alarm['id']}/events").json()).events
     assert [(e.seq, e.change, e.t - T0) for e in events] == [(1, "raised", 2.0), (2, "cleared", 9.0)]
     assert events[0].alarm.state == "raised"
+
+
+def test_an_inverter_and_an_ambiguity_are_shown(setup: Setup) -> None:
+    inverter = InverterReport("H7", "drop-7", None, True, True, 4.5, -6.0)
+    explanations = (
+        ExplanationReport(("H3",), (), 0.75),
+        ExplanationReport((), ("H7",), 0.25),
+    )
+    for k in range(4):
+        report = setup.village.report(T0 + k, cause=Cause.RESIDUALS)
+        customers = (CustomerReport("H7", 229.0, 0.2), CustomerReport("H8", None, None))
+        setup.service.tick(replace(report, inverters=(inverter,), customers=customers))
+    state = models.State.model_validate(setup.get("/feeders/village/state").json())
+    assert [(i.customer, i.suspect, i.attack_kvar_estimated) for i in state.inverters] == [("H7", True, -6.0)]
+    assert [(c.customer, c.v_volt_std) for c in state.customers] == [("H7", 0.2), ("H8", None)]
+    alarm = models.AlarmModel.model_validate(setup.one())
+    assert (alarm.kind, alarm.customer, alarm.meter) == ("inverter-manipulated", "H7", None)
+    assert alarm.evidence.attack_kvar_estimated == -6.0
+    assert setup.get("/alarms", params={"kind": "inverter-manipulated"}).json()["alarms"][0]["id"] == alarm.id
+    answered = setup.http.post(
+        f"/api/v1/alarms/{alarm.id}/ack", json={"who": "Ada", "comment": "switched off"}
+    )
+    assert answered.json()["state"] == "acknowledged"
+    for k in range(4, 8):
+        report = setup.village.report(T0 + k, cause=Cause.AMBIGUOUS)
+        setup.service.tick(replace(report, explanations=explanations))
+    undecided, held = setup.get("/alarms").json()["alarms"]
+    assert (undecided["kind"], held["state"]) == ("undecided", "acknowledged")
+    assert undecided["evidence"]["explanations"] == [
+        {"meters": ["H3"], "inverters": [], "probability": 0.75},
+        {"meters": [], "inverters": ["H7"], "probability": 0.25},
+    ]
 
 
 def test_filters_and_pages(setup: Setup) -> None:

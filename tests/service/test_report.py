@@ -10,12 +10,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from feeders.estimators import choose
 from feeders.load import Site, load, to_frame
+from feeders.meters import MeterErrors
 from feeders.scenario import Scenario, random_attacks, simulate
-from gridsec.online import Cause, Decision, Estimate, Verdict
+from gridsec.attack import InverterAttack
+from gridsec.online import Cause, Decision, Estimate, Explanation, Kind, Verdict
 from service.align import Tick
+from service.conditions import AlarmKind, conditions
 from service.reading import Reading
-from service.report import BUSBAR, blind, build, snapshot, to_json
+from service.report import BUSBAR, ExplanationReport, FeederReport, blind, build, snapshot, to_json
 from service.watch import design
 
 T = 1_795_212_000.0
@@ -102,6 +106,7 @@ def test_the_monitor_s_own_sentences_name_no_customer(site: Site) -> None:
     """Whatever the monitor says over a real attack with a gap in it, the operator reads meters' ids."""
     attacks = random_attacks(site, 5, "bias", 3, 0.03, t_on=T + 5, t_off=T + 30)
     names = re.compile("|".join(re.escape(name) for name in site.feeder.customers))
+    site = choose(site, estimator="exact-bank")
     finished, said = design(site), set()
     state = finished.init(T)
     for sample in simulate(site, Scenario(seed=4, start=T, duration_s=40.0, attacks=attacks)):
@@ -125,7 +130,20 @@ def test_json_is_plain_and_has_no_nan(site: Site) -> None:
     assert found["verdict"] == "attacked"
     assert found["meters"][5]["v_volt_estimated"] is None
     assert found["silent"][0] == {"meter": site.meter_ids[0], "seconds": None}
-    wanted = {"meter", "bus", "seen", "suspect", "score", "threshold", "v_volt_reported", "v_volt_estimated"}
+    assert [c["customer"] for c in found["customers"]] == list(site.feeder.customers)
+    assert {i["judged"] for i in found["inverters"]} == {False}
+    assert found["explanations"] == []
+    wanted = {
+        "kind",
+        "meter",
+        "bus",
+        "seen",
+        "suspect",
+        "score",
+        "threshold",
+        "v_volt_reported",
+        "v_volt_estimated",
+    }
     assert wanted | {"v_volt_std", "v2_pu_estimated", "attack_volt_estimated"} == set(found["meters"][0])
 
 
@@ -148,3 +166,83 @@ def test_snapshots_keep_the_order_of_the_meters(site: Site) -> None:
     frame = to_frame(site, found)
     assert frame.seen.tolist() == [k not in (0, 2) for k in range(13)]
     assert frame.v0_squared == pytest.approx(1.01**2)
+
+
+def test_kinds_inverters_and_a_standard_deviation_of_its_own(site: Site) -> None:
+    estimate, verdict = judged(site, 6.0, 3)
+    m, base = site.droop.tau.size, site.feeder.base_volt
+    named = np.arange(m) == 2
+    estimate = replace(estimate, std=np.full(estimate.v2.size, 0.002), x=np.linspace(0.0, 0.08, m))
+    verdict = replace(
+        verdict,
+        kinds=tuple(Kind.DRIFT if k == 3 else None for k in range(13)),
+        inverters=named,
+        inverter_attack=np.where(named, -0.1, 0.0),
+    )
+    report = build(site, tick(site, {3: 6.0}), 2, estimate, verdict)
+    assert [meter.kind for meter in report.meters] == ["drift" if k == 3 else None for k in range(13)]
+    wide = base * (math.sqrt(1.002) - math.sqrt(0.998)) / 2
+    assert [c.v_volt_std for c in report.customers] == pytest.approx([wide] * len(report.customers))
+    assert report.meters[0].v_volt_std == pytest.approx(wide)
+    (wrong,) = [i for i in report.inverters if i.suspect]
+    owner = site.feeder.customers[site.droop.customer[2]]
+    assert (wrong.customer, wrong.judged, wrong.meter) == (owner, True, "m04")
+    assert wrong.attack_kvar_estimated == pytest.approx(-0.1 * site.feeder.base_kva)
+    assert wrong.q_kvar_estimated == pytest.approx(0.02 * site.feeder.base_kva)
+    assert report.reason.startswith(f"Manipulated: m04 and the inverter of {owner}; further off")
+
+
+def test_ambiguity_is_one_sentence_and_a_list(site: Site) -> None:
+    estimate, verdict = judged(site, 6.0, 3)
+    p, m = len(site.meter_ids), site.droop.tau.size
+    nobody, none = np.zeros(p, dtype=bool), np.zeros(m, dtype=bool)
+    verdict = replace(
+        verdict,
+        decision=Decision.UNDECIDED,
+        cause=Cause.AMBIGUOUS,
+        suspects=nobody,
+        explanations=(
+            Explanation(np.arange(p) == 1, none, 0.7),
+            Explanation(nobody, np.arange(m) == 1, 0.3),
+        ),
+    )
+    report = build(site, tick(site), 2, estimate, verdict)
+    owner = site.feeder.customers[site.droop.customer[1]]
+    assert report.reason == f"Several explanations fit: m02 (70%) or else the inverter of {owner} (30%)."
+    assert report.explanations == (
+        ExplanationReport(("m02",), (), 0.7),
+        ExplanationReport((), (owner,), 0.3),
+    )
+    (found,) = [c for c in conditions(report) if c.kind is AlarmKind.UNDECIDED]
+    assert found.evidence.explanations == report.explanations
+
+
+def test_a_wrong_inverter_and_a_lying_meter_of_a_real_feeder(site: Site) -> None:
+    """AC truth, the real estimator, and what the operator is told in the end."""
+    site = choose(site, estimator="unknown-input", max_attacked=1)
+    wrong = InverterAttack(np.array([1]), np.array([-0.1]), T + 10, T + 99)
+    lies = random_attacks(site, 5, "bias", 1, 0.05, t_on=T + 10, t_off=T + 99)
+    scenario = Scenario(
+        seed=4,
+        start=T,
+        duration_s=16.0,
+        attacks=lies,
+        inverter_attacks=(wrong,),
+        errors=MeterErrors(report_q=True),
+    )
+    finished = design(site)
+    state, report = finished.init(T), None
+    for sample in simulate(site, scenario):
+        heard = {r.meter: r for r in sample.readings}
+        now = Tick(sample.t, tuple(heard[m] for m in site.meter_ids), heard[""], ())  # type: ignore[arg-type]
+        state, estimate, verdict = finished.step(state, to_frame(site, snapshot(now)))
+        report = build(site, now, 1, estimate, verdict)
+    assert isinstance(report, FeederReport)
+    found = {c.kind: c for c in conditions(report) if c.known}
+    assert set(found) == {AlarmKind.METER_MANIPULATED, AlarmKind.INVERTER_MANIPULATED}
+    assert found[AlarmKind.METER_MANIPULATED].meter == site.meter_ids[int(lies[0].meters[0])]
+    inverter = found[AlarmKind.INVERTER_MANIPULATED]
+    assert (inverter.customer, inverter.meter) == ("LV1.101 Load 2", "m02")
+    assert inverter.evidence.attack_kvar_estimated == pytest.approx(-10.0, abs=1.9)
+    assert inverter.reason.startswith("the inverter of LV1.101 Load 2 injects -9.")
+    json.dumps(to_json(report), allow_nan=False)
