@@ -16,6 +16,8 @@ from feeders.scenario import START, Scenario, random_attacks, simulate, snapshot
 from gridsec.errors import DesignInfeasible, NotObservable
 from gridsec.families import set_search
 from gridsec.families.set_search import SetSearchDesign, SetSearchState
+from gridsec.families.switched import advance
+from gridsec.frames import Past, clean
 from gridsec.online import Cause, Decision, Estimate, Verdict
 from tests.gridsec.street import Street, make_plant
 
@@ -132,10 +134,8 @@ def test_the_search_finds_what_brute_force_finds() -> None:
     lies = {2: 0.05, 6: -0.04}
     street.advance(1.0)
     frame = street.frame(lies)
-    inputs = set_search.clean(
-        made.setting, set_search.Past(state.x, state.v0_squared, state.tally.named), frame
-    )
-    view = set_search._advance(made, state, frame, inputs)
+    inputs = clean(made.setting, Past(state.x, state.v0_squared, state.tally.named), frame)
+    view = advance(made, state, frame, inputs)
     found = set_search._search(made, inputs, view, state)
     X = made.setting.model.X
     passing = []
