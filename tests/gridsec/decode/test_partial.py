@@ -301,6 +301,8 @@ def test_attack_is_noticed_left_out_and_readmitted_afterwards(rule: str) -> None
         error = out.x - x
         assert error @ np.linalg.solve(out.covariance, error) < chi2.isf(1e-7, 3)
         assert out.credible
+        assert out.threshold == pytest.approx(chi2.isf(1e-6, out.freedom))
+        assert out.alarm == (out.g > out.threshold)
         if k < 40:
             # While the test passes nothing else is computed (Remark 4.4.1).
             assert all(other is None for other in state.tables.fused[1:])

@@ -155,6 +155,18 @@ def test_dedicated_observers_decide_by_majority_and_two_of_them_cannot() -> None
         deadbeat(2, 1)
 
 
+def test_algorithm_4_1_compares_with_theta_v_max() -> None:
+    """Five sensors of one constant, theta = 2, noise at most 1: a residual of 1.92 passes, 2.08 does not."""
+    made = deadbeat(5, 2)
+    for last, faults in ((2.4, 0), (2.6, 1)):
+        state, _ = bounded.init(made, 0.0, np.zeros(1), 0.0)
+        _, out = bounded.step(made, state, np.array([0.0, 0.0, 0.0, 0.0, last]), np.zeros(1))
+        assert np.allclose(out.limits, 2.0)
+        assert np.isclose(out.residuals[4], 0.8 * last)
+        assert out.faults == faults
+        assert not out.searched
+
+
 class Printed:
     """Algorithm 4.1 to the letter: the estimate of the step before is tested, another one is given out."""
 
