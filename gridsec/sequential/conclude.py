@@ -65,24 +65,11 @@ def conclude(design: SequentialDesign, state: SequentialState, tick: Tick) -> tu
         What it brought.
     """
     plant, trust = design.plant, state.trust
-    w, variance = _reconstructed(design, state, tick.seen)
-    v2_bus = tick.v2_bus + w
-    v2_bus[0] = tick.v0_squared if tick.busbar else v2_bus[0]
-    v2, std = v2_bus[plant.feeder.bus], np.sqrt(variance[plant.feeder.bus])
-    far = float(np.max(state.model_error + tick.transient, initial=0.0))
-    estimate = Estimate(
-        t=state.t,
-        v2=v2,
-        bound=design.sigmas[0] * std + far,
-        v2_bus=v2_bus,
-        trusted=trust.trusted & tick.live,
-        x=np.zeros(0) if state.x is None else state.x,
-        std=std,
-    )
+    estimate = _estimate(design, state, tick)
     score, threshold, judged = _worst(design, tick.seen, tick.live.size)
     live = judged & tick.live
     at = plant.feeder.bus[plant.meters]
-    attack = np.where(trust.named & tick.live, tick.y - state.learned.bias - v2_bus[at], 0.0)
+    attack = np.where(trust.named & tick.live, tick.y - state.learned.bias - estimate.v2_bus[at], 0.0)
     amounts = _amounts(design, state, tick.seen)
     settled = bool(np.all(tick.transient <= design.options.settled * threshold))
     said = decide(
@@ -120,6 +107,24 @@ def conclude(design: SequentialDesign, state: SequentialState, tick: Tick) -> tu
         explanations=tick.rivals,
     )
     return estimate, verdict
+
+
+def _estimate(design: SequentialDesign, state: SequentialState, tick: Tick) -> Estimate:
+    plant = design.plant
+    w, variance = _reconstructed(design, state, tick.seen)
+    v2_bus = tick.v2_bus + w
+    v2_bus[0] = tick.v0_squared if tick.busbar else v2_bus[0]
+    v2, std = v2_bus[plant.feeder.bus], np.sqrt(variance[plant.feeder.bus])
+    far = float(np.max(state.model_error + tick.transient, initial=0.0))
+    return Estimate(
+        t=state.t,
+        v2=v2,
+        bound=design.sigmas[0] * std + far,
+        v2_bus=v2_bus,
+        trusted=state.trust.trusted & tick.live,
+        x=np.zeros(0) if state.x is None else state.x,
+        std=std,
+    )
 
 
 _Said = tuple[Decision, Cause, str]

@@ -212,13 +212,8 @@ def design(
     options = SequentialOptions() if options is None else options
     meters = plant.meters
     _check(plant, doubt, step_s)
-    most = meters.size // 3 if max_attacked is None else max_attacked
     model = lindistflow(plant.feeder)
     lure = close_loop(plant.feeder, plant.droop, meters)
-    certificate = _proof(lure)
-    margin = verify(certificate, lure)
-    if not margin > 0:
-        raise DesignInfeasible(f"{certificate.kind} certificate", "it fails its verification", margin)
     injections = injection_doubt(plant.droop, plant.accuracy, meters, plant.feeder.bus.size)
     busbar = busbar_error(plant.accuracy, plant.droop.vbar**2, 2.0) / 2.0
     lengths = _lengths(options.scales_s, step_s)
@@ -228,7 +223,7 @@ def design(
         names=tuple(plant.feeder.customers[c] for c in meters),
         model=model,
         lure=lure,
-        certificate=certificate,
+        certificate=_proof(lure),
         doubt=doubt,
         prior=prior(model, plant.feeder.bus[meters], doubt, busbar=busbar, inverters=injections),
         injections=injections,
@@ -243,7 +238,7 @@ def design(
         meter_of=_meter_of(plant),
         book=_suspicions(plant, model, options),
         shapes=_shapes(plant, model, options.alarms_per_year, step_s, lengths),
-        most=most,
+        most=meters.size // 3 if max_attacked is None else max_attacked,
         step_s=step_s,
         options=options,
     )
@@ -276,11 +271,15 @@ _RATE = 0.1
 
 
 def _proof(lure: Lure) -> Certificate:
-    """The best closed form, or the solver's certificate where none applies."""
+    """The best closed form, or the solver's certificate where none applies; verified."""
     try:
-        return certify(lure)
+        found = certify(lure)
     except DesignInfeasible:
-        return contraction(lure, rate=_RATE * float(np.min(-np.diagonal(lure.A))))
+        found = contraction(lure, rate=_RATE * float(np.min(-np.diagonal(lure.A))))
+    margin = verify(found, lure)
+    if not margin > 0:
+        raise DesignInfeasible(f"{found.kind} certificate", "it fails its verification", margin)
+    return found
 
 
 def _lengths(scales_s: tuple[float, ...], step_s: float) -> tuple[int, ...]:

@@ -18,7 +18,7 @@ from gridsec.sequential.conditional import Fit, Judged, Prior, admit, drop, fit,
 from gridsec.sequential.decoder import Accused, Evidence
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.search import Dictionary, Explanation, Limits
-from gridsec.sequential.state import Trust
+from gridsec.sequential.state import SequentialState, Trust
 from gridsec.sequential.windows import Window
 
 
@@ -74,40 +74,23 @@ _ANEW = 6
 _MOST_CHANGES = 400
 
 
-def examine(
-    design: SequentialDesign,
-    trust: Trust,
-    fits: tuple[Fit | None, ...],
-    window: Window,
-    *,
-    prior: Prior,
-    learned: Learned,
-    tick: int,
-    model: Floats,
-) -> Examined:
+def examine(design: SequentialDesign, state: SequentialState, model: Floats) -> Examined:
     """Judge every meter on every scale that is due, shortest first.
 
     Parameters
     ----------
     design
         The design.
-    trust, fits
-        From the last tick.
-    window
-        The residuals.
-    prior
-        What is known without meters.
-    learned
-        What is known of the meters.
-    tick
-        Number of this tick.
+    state
+        With this tick's window and doubts, and all else from the last tick.
     model : (p,)
         What the model may be off, squared pu.
     """
+    trust, fits, window, prior, tick = state.trust, state.fits, state.window, state.doubts.prior, state.ticks
     views: list[View | None] = []
     after: list[Fit | None] = []
     found: dict[int, tuple[Explanation, ...]] = {}
-    scales = _Scales(design, prior, window, learned, model)
+    scales = _Scales(design, prior, window, state.learned, model)
     for s, length in enumerate(design.lengths):
         before = fits[s]
         stale = before is None or bool((before.trusted & ~trust.trusted).any())

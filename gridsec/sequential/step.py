@@ -55,8 +55,7 @@ def step(
     """
     if not np.isfinite(frame.t) or (state.x is not None and not frame.t > state.t):
         return unusable(design, state, frame)
-    plant = design.plant
-    at = plant.feeder.bus[plant.meters]
+    at = design.plant.feeder.bus[design.plant.meters]
     heard = _clean(design, state, frame)
     doubts = _doubts(design, state.doubts, frame, heard.busbar)
     if doubts is not state.doubts and doubts.prior is not state.doubts.prior:
@@ -68,21 +67,12 @@ def step(
     q, v2_bus = _voltages(design, frame, heard, x)
     residual = heard.y - v2_bus[at] - state.learned.bias
     window = push(state.window, design.lengths, residual, heard.live)
-    model = state.model_error
     if state.ticks % _STALE == 0:
-        model = _model_error(design, frame.p, q, heard.v0_squared)
+        state = replace(state, model_error=_model_error(design, frame.p, q, heard.v0_squared))
     since = frame.t if state.x is None else state.since
     transient = _transient(design, frame.t - since)
-    seen = examine(
-        design,
-        begun,
-        state.fits,
-        window,
-        prior=doubts.prior,
-        learned=state.learned,
-        tick=state.ticks,
-        model=model + transient,
-    )
+    model = state.model_error + transient
+    seen = examine(design, replace(state, trust=begun, window=window, doubts=doubts), model)
     over = ended(design, begun, seen, window)
     window = forget(window, over)
     trust, rivals = name(design, begun, _acquit(seen, over))
@@ -99,7 +89,6 @@ def step(
         trust=trust,
         fits=seen.fits,
         doubts=doubts,
-        model_error=model,
         kinds=_kinds(design, state, kinds, seen, window, v2_bus[at]),
     )
     after = _learn(design, after, residual, heard.live & trust.trusted, frame.t - state.t)
