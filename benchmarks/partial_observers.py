@@ -43,20 +43,22 @@ def frames(site: Site, size: float, seed: int) -> tuple[int, list[Frame]]:
     return liar, [to_frame(site, snapshot) for snapshot in seen]
 
 
-def last_word(made: partial.PartialDesign, seen: list[Frame]) -> tuple[CodeWord, Parts, np.ndarray]:
-    """The code word of the last frame, the observers, and what honest readings may be off; (p,)."""
+def last_word(made: partial.PartialDesign, seen: list[Frame]) -> tuple[CodeWord, Parts, np.ndarray, float]:
+    """Code word and observers at the last frame, what readings may be off (p,), and the largest bound."""
     state = partial.init(made, START)
     for frame in seen[:-1]:
         state, _, _ = partial.step(made, state, frame)
     inputs = clean(made.setting, Past(state.parts.x, state.v0_squared, state.tally.named), seen[-1])
     h = seen[-1].t - state.t
     alone, model, parts, _ = codeword.observe(made.setting, made.model, state.parts, seen[-1], inputs, h)
-    return codeword.code_word(made.setting, parts, seen[-1], inputs, alone, model), parts, alone.reading
+    word = codeword.code_word(made.setting, parts, seen[-1], inputs, alone, model)
+    _, estimate, _ = partial.step(made, state, seen[-1])
+    return word, parts, alone.reading, float(estimate.bound.max())
 
 
 def knowledge(site: Site, made: partial.PartialDesign) -> None:
     """What one meter knows of its inverter, and what the constants promise."""
-    word, parts, reading = last_word(made, frames(site, 0.0, 0)[1])
+    word, parts, reading, bound = last_word(made, frames(site, 0.0, 0)[1])
     errors, p, n = made.setting.errors, reading.size, word.scale.size
     of = errors.meter_of >= 0
     better = np.count_nonzero(parts.bound.driven[of] < parts.bound.free[of])
@@ -83,7 +85,8 @@ def knowledge(site: Site, made: partial.PartialDesign) -> None:
     )
     volts = np.linalg.norm(word.voltage, axis=1).max()
     known = (np.abs(word.voltage).sum(axis=1) + word.rest).max()
-    print(f"  v^2, squared pu: promised {promise * volts:.3g}, known without any meter {known:.3g}")
+    said = f"promised {promise * volts:.3g}, known without any meter {known:.3g}, given {bound:.3g}"
+    print(f"  v^2, squared pu: {said}")
 
 
 def named(

@@ -321,12 +321,16 @@ def _estimate(  # noqa: PLR0917  # as _conclude
     dq = dq + np.bincount(own, weights=dx, minlength=n)
     v2_bus = model.v2_bus + 2.0 * (lines.R_bus @ dp + lines.X_bus @ dq) + step_[-1]
     v2 = v2_bus[plant.feeder.bus]
-    # Whoever lies, the unheard observer's own bound holds around it.
-    bound = detect.gap(design.setting.errors, alone, after.parts.bound) + np.abs(v2 - model.v2)
+    # Whoever lies, the unheard observer's own bound holds; and so does one of the credible fits'.
+    gap = detect.gap(design.setting.errors, alone, after.parts.bound)
+    low, high = model.v2 - gap, model.v2 + gap
     fine = found.credible
     if fine.any():
-        apart = np.abs((found.xi[fine] - found.xi[index]) @ word.voltage.T)
-        bound = np.minimum(bound, (apart + found.error[fine]).max(axis=0) + word.rest)
+        fitted, error = model.v2 + found.xi[fine] @ word.voltage.T, found.error[fine] + word.rest
+        low = np.maximum(low, (fitted - error).min(axis=0))
+        high = np.minimum(high, (fitted + error).max(axis=0))
+    # Nothing between them: more lie than assumed, and only the unheard observer is left.
+    bound = np.where(low <= high, np.maximum(high - v2, v2 - low), gap + np.abs(v2 - model.v2))
     trusted = np.zeros(plant.meters.size, dtype=np.bool_)
     trusted[word.block] = True
     trusted &= ~found.left_out[index] & ~found.disagree[index]
