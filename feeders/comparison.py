@@ -404,9 +404,9 @@ def splice(text: str, table: str) -> str:
     GridsecError
         When the document does not have both markers, once each and in this order.
     """
-    before, begin, rest = text.partition(BEGIN)
+    before, _, rest = text.partition(BEGIN)
     _, end, after = rest.partition(END)
-    if not (begin and end) or BEGIN in after or END in before + after:
+    if not end or text.count(BEGIN) != 1 or text.count(END) != 1:
         raise GridsecError(f"the document must hold {BEGIN} and, after it, {END}, once each")
     return f"{before}{BEGIN}\n\n{table.strip()}\n\n{END}{after}"
 
