@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -194,6 +195,10 @@ def test_wrong_usage(gridsec: Run) -> None:
     done = gridsec("simulate", FEEDER, "--attack", "bias:2", "--out", "x")
     assert done.returncode == 2
     assert "kind:count:size:from:to" in done.stderr
+    for text in ("load-6:-4:20", "nobody:-4:20:55", "LV1.101 Load 2:-4:55:20"):
+        done = gridsec("simulate", FEEDER, "--inverter-attack", text, "--out", "x")
+        assert done.returncode == 2
+        assert "customer:kvar:from:to" in done.stderr
     assert gridsec("demo", "--duration", "1").returncode == 2
 
 
@@ -240,6 +245,30 @@ def test_a_recording_replayed_names_the_liars(gridsec: Run, tmp_path: Path) -> N
     summary = gridsec("replay", str(file)).stdout
     assert "never arrived" in summary
     assert "attacked" in summary
+
+
+def test_a_wrong_inverter_is_recorded_and_raises_its_alarm(gridsec: Run, tmp_path: Path) -> None:
+    """Both named through files alone: a feeder's file that chooses the estimator, and a recording."""
+    folder, file = tmp_path / FEEDER, tmp_path / "day.parquet"
+    shutil.copytree(CASES.parents[1] / "data/feeders" / FEEDER, folder)
+    meta = folder / "feeder.toml"
+    text = meta.read_text().replace('estimator = "sequential"', 'estimator = "unknown-input"')
+    meta.write_text(text.replace("max_attacked = 2", "max_attacked = 1"))
+    made = gridsec(
+        "simulate", str(folder), "--out", str(file), "--duration", "40", "--seed", "3", "--report-q",
+        "--attack", "bias:1:0.05:15:30", "--inverter-attack", "LV1.101 Load 2:-10:15:30",
+        "--start", "1795212000",
+    )  # fmt: skip
+    assert made.returncode == 0, made.stderr
+    told = gridsec("replay", str(file), "--feeder", str(folder), "--json")
+    assert told.returncode == 0, told.stderr
+    alarms = [t["alarm"] for t in map(json.loads, told.stdout.splitlines()) if t["change"] == "raised"]
+    (inverter,) = [a for a in alarms if a["kind"] == "inverter-manipulated"]
+    assert (inverter["customer"], inverter["meter"]) == ("LV1.101 Load 2", "m02")
+    assert inverter["evidence"]["attack_kvar_estimated"] == pytest.approx(-10.0, abs=1.9)
+    truth = read_recording(file).truth()
+    lying = {load(FEEDER).meter_ids[k] for k in truth.manipulated.any(axis=0).nonzero()[0]}
+    assert {a["meter"] for a in alarms if a["kind"] == "meter-manipulated"} == lying
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

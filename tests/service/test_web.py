@@ -4,6 +4,7 @@ import random
 import re
 import shutil
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from playwright.sync_api import Browser, Page, expect, sync_playwright
 from feeders.load import load, names
 from gridsec.online import Cause
 from service.describe import detail
+from service.report import CustomerReport, InverterReport
 
 pytestmark = pytest.mark.browser
 
@@ -250,6 +252,30 @@ def test_all_meters_as_a_table_with_the_worst_first(site: Site) -> None:
 
 
 # ------------------------------------------------------------------------- alarms
+
+
+def test_a_manipulated_inverter_and_its_alarm(site: Site) -> None:
+    wrong = InverterReport("H7", "drop-7", "H7", True, True, 4.5, -6.0)
+    customers = tuple(CustomerReport(f"H{k}", 230.0, 0.25) for k in range(13))
+    for k in range(4):
+        report = site.village.report(T0 + k, cause=Cause.RESIDUALS)
+        liar = replace(report.meters[2], suspect=True, attack_volt_estimated=9.0, kind="drift")
+        meters = (*report.meters[:2], liar, *report.meters[3:])
+        site.service.tick(replace(report, meters=meters, inverters=(wrong,), customers=customers))
+    page = site.open()
+    expect(page.locator("#chips")).to_contain_text("inverter of H7 −6.0 kvar")
+    alarm = page.locator('.alarm:has-text("Inverter manipulated")')
+    expect(alarm).to_contain_text("injects -6.0 kvar")
+    alarm.locator("a.where").click()
+    panel = page.locator("#detail-card")
+    expect(page.locator("#detail-title")).to_have_text("H7")
+    expect(panel).to_contain_text("+4.5 kvar")
+    expect(panel).to_contain_text("−6.0 kvar")
+    expect(panel).to_contain_text("Standard deviation")
+    expect(panel).to_contain_text("0.25 V")
+    expect(page.locator('.alarm:has-text("Meter manipulated")')).to_contain_text("drift")
+    page.select_option("#alarm-kind", "inverter-manipulated")
+    expect(page.locator(".alarm")).to_have_count(1)
 
 
 def test_an_alarm_is_acknowledged_with_a_name(site: Site) -> None:
