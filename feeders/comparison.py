@@ -63,7 +63,7 @@ class Case:
     name
         Short name.
     meaning
-        What happens, for people; `{count}` stands for how many lie.
+        What happens, for people; `{meters}` stands for how many lie.
     trick, size
         As in `feeders.lies.Lie`; no trick: nobody lies.
     one
@@ -76,6 +76,10 @@ class Case:
     size: float = 0.0
     one: bool = False
 
+    def told(self, count: int) -> str:
+        """What happens when `count` may lie, as a phrase."""
+        return self.meaning.format(meters=f"{count} meter" if count == 1 else f"{count} meters")
+
     def lie(self, count: int) -> Lie | None:
         """Who lies when `count` may."""
         if self.trick is None:
@@ -85,10 +89,10 @@ class Case:
 
 CASES: Final = (
     Case("clean", "nobody lies"),
-    Case("bias", "{count} meters at random read 3 % too high or too low", Trick.BIAS, 3.0),
+    Case("bias", "readings of {meters} at random are 3 % too high or too low", Trick.BIAS, 3.0),
     Case(
         "coordinated",
-        "{count} meters show the trace of a load that is not there, at least 3 % deep",
+        "readings of {meters} show the trace of a load that is not there, at least 3 % deep",
         Trick.COORDINATED,
         3.0,
     ),
@@ -98,9 +102,9 @@ CASES: Final = (
         Trick.COORDINATED_POWER,
         3.0,
     ),
-    Case("drift", "{count} meters at random leave the truth by 1 % per minute", Trick.DRIFT, 1.0),
-    Case("stuck", "{count} meters at random repeat their reading of the onset", Trick.STUCK),
-    Case("replay", "{count} meters at random repeat what they read 10 minutes earlier", Trick.REPLAY, 600.0),
+    Case("drift", "readings of {meters} at random leave the truth by 1 % per minute", Trick.DRIFT, 1.0),
+    Case("stuck", "readings of {meters} at random stay as at the onset", Trick.STUCK),
+    Case("replay", "readings of {meters} at random are those of 10 minutes earlier", Trick.REPLAY, 600.0),
     Case(
         "inverter",
         "one inverter at random injects its rating beside what its droop curve says; all meters are honest",
@@ -371,7 +375,7 @@ def markdown(rows: Sequence[Row], plan: Plan) -> str:
     names = list(dict.fromkeys(row.case for row in rows))
     found = {(family, name): Row(family, name, "not run") for family in FAMILIES for name in names}
     found |= {(row.family, row.case): row for row in rows}
-    meanings = {case.name: case.meaning.format(count=plan.max_attacked) for case in CASES}
+    meanings = {case.name: case.told(plan.max_attacked) for case in CASES}
     lines = [
         "Named of those who lied, and in brackets how many honest ones were ever named; none: there are no",
         "numbers, the tables below say why.",

@@ -105,11 +105,11 @@ def _known(chosen: list[str] | None, known: tuple[str, ...], option: str) -> tup
 
 def _told(site: Site, plan: Plan) -> str:
     """What the tables hold for, in one sentence."""
-    error = plan.load_error
+    error, runs = plan.load_error, "one run" if plan.seeds == 1 else f"{plan.seeds} runs"
     return (
         f"{site.tables.meta.title or site.feeder.name}: {len(site.meter_ids)} meters "
         f"(errors: {plan.meters}), {site.droop.tau.size} inverters, M = {plan.max_attacked}, "
-        f"{plan.seeds} runs of {plan.duration_s:g} s at {plan.step_s:g} s per case, powers known within "
+        f"{runs} of {plan.duration_s:g} s at {plan.step_s:g} s per case, powers known within "
         f"{error.p_kw:g} kW and {error.q_kvar:g} kvar (1 sigma, correlated over {error.correlation_s:g} s)."
     )
 
@@ -118,7 +118,7 @@ def _show(rows: list[Row], plan: Plan) -> None:
     """Print one table for each case; reasons stand below it."""
     from feeders.comparison import CASES, HEADERS, cells
 
-    meanings = {case.name: case.meaning.format(count=plan.max_attacked) for case in CASES}
+    meanings = {case.name: case.told(plan.max_attacked) for case in CASES}
     for name in dict.fromkeys(row.case for row in rows):
         table = Table(*HEADERS, title_justify="left", title=f"[bold]{name}[/]: {meanings[name]}")
         reasons: list[str] = []

@@ -42,7 +42,7 @@ def test_numbers_go_to_the_screen_to_a_file_and_into_a_document(
         monkeypatch, capsys, "compare", *QUICK, *names, "--csv", str(numbers), "--write", str(page)
     )
     assert code == 0
-    assert "bias: 1 meters" in told
+    assert "bias: readings of 1 meter at random" in told
     assert row(told, "sequential")[1:4] == ["1 of 1", "0", "0"]
     with numbers.open(newline="", encoding="utf-8") as file:
         read = {line["family"]: line for line in csv.DictReader(file)}
@@ -52,7 +52,7 @@ def test_numbers_go_to_the_screen_to_a_file_and_into_a_document(
     assert text.startswith("# Mine\n")
     assert text.endswith(f"{END}\nkept\n")
     assert "old" not in text
-    assert "13 meters (errors: site), 9 inverters, M = 1, 1 runs of 80 s at 1 s per case" in text
+    assert "13 meters (errors: site), 9 inverters, M = 1, one run of 80 s at 1 s per case" in text
     assert text.count("| exact-bank |") == 2
     assert text.count("not run") == len(FAMILIES) - 2
 
