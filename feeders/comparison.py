@@ -128,7 +128,7 @@ class Plan:
         How many runs of each case.
     duration_s, step_s
         Length of a run and interval of its frames, s.
-    load_error, meters, variation
+    load_error, meters, variation, report_q
         As in `feeders.trials.Trial`.
     families, cases
         Names; all by default.
@@ -143,6 +143,7 @@ class Plan:
     load_error: LoadError = field(default_factory=lambda: LoadError(0.1, 0.05))
     meters: Meters = Meters.SITE
     variation: Variation = LIVELY
+    report_q: bool = False
     families: tuple[str, ...] = tuple(FAMILIES)
     cases: tuple[str, ...] = tuple(case.name for case in CASES)
     workers: int = 1
@@ -157,6 +158,7 @@ class Plan:
             load_error=self.load_error,
             meters=self.meters,
             variation=self.variation,
+            report_q=self.report_q,
             lie=case.lie(self.max_attacked),
         )
 

@@ -102,6 +102,8 @@ class Trial:
         Position within the fourteen days of the profiles, s.
     variation
         What changes beside, known to all; `hidden_*` of it are those of `load_error`.
+    report_q
+        Whether meters report the net reactive power.
     """
 
     site: Site
@@ -113,6 +115,7 @@ class Trial:
     lie: Lie | None = None
     profile_s: float = SUNNY_NOON_S
     variation: Variation = STEADY
+    report_q: bool = False
 
     @property
     def stated(self) -> Site:
@@ -155,7 +158,7 @@ class Trial:
             duration_s=self.duration_s,
             dt_s=self.step_s,
             profile_s=self.profile_s,
-            errors=MeterErrors(power=0.0),
+            errors=MeterErrors(power=0.0, report_q=self.report_q),
             variation=replace(
                 self.variation,
                 hidden_kw=self.load_error.p_kw,

@@ -46,6 +46,7 @@ def study_compare(
     load_error_kvar: Annotated[
         float, typer.Option(help="The same of its reactive power, 1 sigma.", min=0.0)
     ] = 0.05,
+    report_q: Annotated[bool, typer.Option(help="Meters report the net reactive power.")] = False,
     csv: Annotated[Path | None, typer.Option(help="Write all numbers into this file.")] = None,
     write: Annotated[
         Path | None, typer.Option(help="Replace the tables between the markers of this Markdown file.")
@@ -70,6 +71,7 @@ def study_compare(
         duration_s=duration,
         load_error=LoadError(load_error_kw, load_error_kvar),
         meters=Meters(_known([meters], tuple(Meters), "--meters")[0]),
+        report_q=report_q,
         families=_known(family, tuple(FAMILIES), "--family"),
         cases=_known(case, tuple(each.name for each in CASES), "--case"),
         workers=workers or os.cpu_count() or 1,
@@ -108,7 +110,8 @@ def _told(site: Site, plan: Plan) -> str:
     error, runs = plan.load_error, "one run" if plan.seeds == 1 else f"{plan.seeds} runs"
     return (
         f"{site.tables.meta.title or site.feeder.name}: {len(site.meter_ids)} meters "
-        f"(errors: {plan.meters}), {site.droop.tau.size} inverters, M = {plan.max_attacked}, "
+        f"(errors: {plan.meters}{', with q' * plan.report_q}), {site.droop.tau.size} inverters, "
+        f"M = {plan.max_attacked}, "
         f"{runs} of {plan.duration_s:g} s at {plan.step_s:g} s per case, powers known within "
         f"{error.p_kw:g} kW and {error.q_kvar:g} kvar (1 sigma, correlated over {error.correlation_s:g} s)."
     )

@@ -150,6 +150,15 @@ def test_the_site_may_speak_for_its_meters() -> None:
     np.testing.assert_array_equal(stated.accuracy.jitter, small().accuracy.jitter)
 
 
+def test_meters_may_report_what_inverters_do() -> None:
+    made = trial(report_q=True)
+    base = small().feeder.base_kva
+    assert np.isnan(played()[5][0].q_net).all()
+    for sample, (frame, _) in zip(simulate(made.stated, made.scenario), frames(made), strict=True):
+        np.testing.assert_allclose(-frame.q_net * base, sample.q_kvar, atol=1e-9)
+        assert (frame.q_net_error > 0.0).all()
+
+
 def test_a_trial_is_the_same_every_time_and_another_one_is_not() -> None:
     np.testing.assert_array_equal(reported(Trick.BIAS), reported(Trick.BIAS))
     assert np.abs(reported() - reported(seed=4)).min() > 0.0
