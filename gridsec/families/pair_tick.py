@@ -212,7 +212,7 @@ def observe(design: UnknownInputDesign, state: UnknownInputState, frame: Frame) 
     inputs = clean(design.setting, Past(state.x, state.v0_squared, state.named), frame)
     h = 0.0 if state.tubes is None else frame.t - state.t
     v2, error, rest = _without_inverters(design, state, frame, inputs)
-    seen = _seen(design, inputs, v2, error)
+    seen = _seen(design, inputs, inputs.live & ~state.named, v2, error)
     tubes = advance(design.setting.errors, design.doubt, state.tubes, seen, h)
     return Tick(design, frame, inputs, tubes, v2, error, rest)
 
@@ -248,7 +248,8 @@ def _without_inverters(
     return plant.droop.vbar**2 - inputs.w, error, rest + moved
 
 
-def _seen(design: UnknownInputDesign, inputs: Inputs, v2: Floats, error: Floats) -> Seen:
+def _seen(design: UnknownInputDesign, inputs: Inputs, believed: Bools, v2: Floats, error: Floats) -> Seen:
+    """The inverters' places. A named meter's word would go on to mislead after it was cleared."""
     now, own = design.setting, design.setting.plant.droop.customer
     meter = now.errors.meter_of
     if not inputs.live.size:
@@ -258,7 +259,7 @@ def _seen(design: UnknownInputDesign, inputs: Inputs, v2: Floats, error: Floats)
     return Seen(
         z=inputs.z[meter],
         z_error=inputs.now.reading[meter],
-        metered=(meter >= 0) & inputs.live[meter],
+        metered=(meter >= 0) & believed[meter],
         rest=now.plant.droop.vbar**2 - v2[own],
         rest_error=error[own],
     )

@@ -255,7 +255,7 @@ def test_a_wrong_inverter_is_recorded_and_raises_its_alarm(gridsec: Run, tmp_pat
     text = meta.read_text().replace('estimator = "sequential"', 'estimator = "unknown-input"')
     meta.write_text(text.replace("max_attacked = 2", "max_attacked = 1"))
     made = gridsec(
-        "simulate", str(folder), "--out", str(file), "--duration", "40", "--seed", "3", "--report-q",
+        "simulate", str(folder), "--out", str(file), "--duration", "40", "--seed", "4", "--report-q",
         "--attack", "bias:1:0.05:15:30", "--inverter-attack", "LV1.101 Load 2:-10:15:30",
         "--start", "1795212000",
     )  # fmt: skip
