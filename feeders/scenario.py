@@ -147,7 +147,7 @@ class Sample:
     v_bus_volt : (b + 1,)
         True voltage of each bus, the busbar first, V.
     x_kvar : (m,)
-        True reactive injection of each inverter, kvar.
+        Reactive injection of each inverter as its droop curve has it, kvar; attacks come on top.
     p_kw, q_kvar : (N,)
         True net import of each customer, inverter included, kW and kvar.
     manipulated : (p,)
