@@ -91,4 +91,4 @@ def test_kept_designs_are_used_again(tmp_path: Path) -> None:
 
 def test_too_many_liars_are_refused() -> None:
     with pytest.raises(NotObservable, match="6 meters"):
-        design(choose(load(SMALL), max_attacked=3))
+        design(choose(load(SMALL), estimator=DIRECT, max_attacked=3))

@@ -287,7 +287,7 @@ def test_feeders_over_rest_have_an_end_and_stay_deleted(tmp_path: Path) -> None:
 def impossible(site: Site, tmp_path: Path) -> Iterator[Path]:
     """A feeder that asks for more than 13 meters can give: N > 2 M does not hold."""
     meta = replace(site.tables.meta, name="impossible")
-    meta = replace(meta, monitor=replace(meta.monitor, max_attacked=7))
+    meta = replace(meta, monitor=replace(meta.monitor, estimator="exact-bank", max_attacked=7))
     write(replace(site.tables, meta=meta), tmp_path / "impossible")
     yield tmp_path / "impossible"
     shutil.rmtree(tmp_path / "impossible")

@@ -50,6 +50,7 @@ def test_what_cannot_be_watched_is_said(
     assert "2 problems" in error
     assert "'oracle'" in error
     assert "-1" in error
-    code, _, error = run(monkeypatch, capsys, "design", "cigre-lv", "--max-attacked", "3")
+    bank = ("--estimator", "exact-bank", "--max-attacked", "3")
+    code, _, error = run(monkeypatch, capsys, "design", "cigre-lv", *bank)
     assert code == 3
     assert "more than 6 meters are needed" in error
