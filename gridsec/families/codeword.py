@@ -28,6 +28,9 @@ from gridsec.plant import Setting
 _LONG_S = 3600.0
 # Bound of a row at least, pu: below rounding, for meters without any error.
 _SMALLEST = 1e-9
+# What is not known at most, pu, and how far off anything said can be: more than any feeder carries, and few
+# enough digits for squares and sums to remain numbers.
+_LARGEST, _FARTHEST = 1e4, 1e8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -181,12 +184,13 @@ def code_word(  # noqa: PLR0917  # as _conclude
     own, n, m = plant.droop.customer, frame.p.size, parts.x.size
     shared, rest_ = _split(setting, frame, inputs, alone)
     scale = np.concatenate([parts.bound.free, frame.p_error, frame.q_error, [shared]])
+    scale = np.minimum(scale, _LARGEST)
     voltage = np.hstack([2.0 * lines.X[:, own], 2.0 * lines.R, 2.0 * lines.X, np.ones((n, 1))])
     at = np.flatnonzero(inputs.live)
     where = plant.meters[at]
     driven = inputs.live[errors.meter_of] if at.size else np.zeros(m, dtype=np.bool_)
     inverters = np.flatnonzero(driven & (errors.meter_of >= 0))
-    net = np.flatnonzero(inputs.live & np.isfinite(frame.q_net[plant.meters]))
+    net = np.flatnonzero(inputs.live & np.isfinite(frame.q_net + frame.q_net_error)[plant.meters])
     of_x = np.eye(m, m + 2 * n + 1)
     total = np.zeros((n, m + 2 * n + 1))
     total[own, np.arange(m)] = 1.0
@@ -207,7 +211,7 @@ def code_word(  # noqa: PLR0917  # as _conclude
             frame.q_net_error[plant.meters[net]],
         ]
     )
-    unit = np.maximum(np.nan_to_num(unit, nan=NO_VOLTAGE, posinf=NO_VOLTAGE), _SMALLEST)
+    unit, value = np.clip(unit, _SMALLEST, _FARTHEST), np.clip(value, -_FARTHEST, _FARTHEST)
     block = np.concatenate([at, errors.meter_of[inverters], net]).astype(np.intp)
     reading = np.arange(block.size) < at.size
     B = rows * scale / unit[:, None]
@@ -217,7 +221,8 @@ def code_word(  # noqa: PLR0917  # as _conclude
 def _split(setting: Setting, frame: Frame, inputs: Inputs, alone: Uncertainty) -> tuple[float, Floats]:
     """Error of the busbar voltage, which all share, and what neither it nor the loads explain; (N,)."""
     errors = setting.errors
-    rest_ = np.maximum(alone.base - errors.R2 @ frame.p_error - errors.X2 @ frame.q_error, 0.0)
+    p_error, q_error = np.minimum(frame.p_error, _LARGEST), np.minimum(frame.q_error, _LARGEST)
+    rest_ = np.maximum(alone.base - errors.R2 @ p_error - errors.X2 @ q_error, 0.0)
     rest_ = np.where(alone.base >= NO_VOLTAGE, NO_VOLTAGE, rest_)
     if not inputs.busbar:
         # What the meters imply of it is not told apart from the rest: count it in both.

@@ -213,6 +213,56 @@ class TestBadFrames:
         _, answers = watch(street, made, 2, state=state, change=spoil)
         assert {verdict.cause for _, verdict in answers} == {Cause.SILENT_METERS}
 
+    @pytest.mark.parametrize(
+        ("field", "value"),
+        [
+            ("y", 1e300),
+            ("y", -1e300),
+            ("y", 0.0),
+            ("p", 1e6),
+            ("p_error", 1e6),
+            ("p_error", np.inf),
+            ("q_error", 1e200),
+            ("q_net", 1e300),
+            ("v0_squared", 0.0),
+            ("v0_squared", 1e300),
+        ],
+    )
+    def test_a_step_never_raises_and_nonsense_is_never_clean(self, field: str, value: float) -> None:
+        street, made, state = self.settled()
+        street.advance(1.0)
+        frame = street.frame()
+        whole = value if field == "v0_squared" else np.full(9, value)
+        _, estimate, verdict = partial.step(made, state, replace(frame, **{field: whole}))
+        for numbers in (estimate.v2, estimate.bound, verdict.threshold, verdict.score):
+            assert np.isfinite(numbers).all()
+        assert verdict.decision is Decision.UNDECIDED
+
+    @pytest.mark.parametrize("error", [np.nan, np.inf])
+    def test_reactive_powers_without_a_known_error_are_not_used(self, error: float) -> None:
+        street, made, state = self.settled()
+        street.advance(1.0)
+        frame = street.frame()
+        told = replace(frame, q_net=np.full(9, 7.0), q_net_error=np.full(9, error))
+        _, base, _ = partial.step(made, state, frame)
+        _, other, verdict = partial.step(made, state, told)
+        np.testing.assert_array_equal(base.v2, other.v2)
+        assert verdict.decision is Decision.CLEAN
+
+    def test_a_wrong_reactive_power_names_its_meter(self) -> None:
+        """Everything that a meter says belongs to its block."""
+        rng = np.random.default_rng(14)
+        street_plant = make_plant(rng)
+        street = Street(street_plant, rng, metered_q=np.arange(9))
+        made = made_for(street_plant)
+        state, _ = watch(street, made, 10)
+
+        def lie(frame: Frame) -> Frame:
+            return replace(frame, q_net=frame.q_net + np.where(np.arange(9) == 6, 0.3, 0.0))
+
+        _, answers = watch(street, made, 3, state=state, lies={6: 0.0}, change=lie)
+        assert np.flatnonzero(answers[-1][1].suspects).tolist() == [6]
+
     def test_a_silent_meter_has_exactly_no_influence(self) -> None:
         street, made, state = self.settled()
         street.advance(1.0)
