@@ -56,6 +56,17 @@ def test_honest_sensors_are_never_suspected_and_bounds_hold(decay: Any) -> None:
     assert made.proven
 
 
+@pytest.mark.parametrize("decay", ["componentwise", "kim2018", "lee2018"])
+def test_bounds_are_those_of_12_and_14(decay: Any) -> None:
+    """`max(2 M_z eta e^(-rate age), eps)`: an estimate and a state within M_z are at most 2 M_z apart."""
+    made = estimator(decay=decay)
+    ages = np.array([0.0, 0.3, 1e3])
+    got = high_gain.error_bounds(made, ages)
+    for d, size, age, bound in zip(made.decays, made.system.z_bound, ages, got, strict=True):
+        assert bound == pytest.approx(max(2.0 * size * d.eta * np.exp(-d.rate * age), d.epsilon))
+    assert got[0] == pytest.approx(2.0 * made.decays[0].eta)
+
+
 @pytest.mark.parametrize("size", [0.02, -0.3, 1e4, 1e300])
 def test_attacks_are_seen_named_and_left_out(size: float) -> None:
     made = estimator()

@@ -234,6 +234,18 @@ def test_limit_is_reached_by_a_scalar_observer() -> None:
         geometric(part, np.array([0.5]), 0.2, 0.1, np.eye(1), beta=0.1)
 
 
+def test_a_step_without_a_reading_costs_what_the_model_says() -> None:
+    """A scalar: the bound is |S| times the last one plus d_max, and that is reached."""
+    bounds = Bounds(0.2, np.array([0.1]), np.eye(1))
+    made = luenberger.design(np.array([[0.9]]), np.zeros((1, 1)), np.eye(1), bounds, slowest=0.0, tol=TOL)
+    state, error = luenberger.init(made, 0.0, np.zeros(1), 0.5), 0.5
+    before = luenberger.bound(made, state)
+    after = luenberger.step(made, state, np.full(1, np.nan), np.zeros(1), np.zeros(1, dtype=bool))
+    assert after.origin == pytest.approx(0.9 * before + 0.2)
+    assert np.all(after.origin >= 0.9 * error + 0.2)
+    assert luenberger.bound(made, after) == pytest.approx(after.origin + made.envelopes[0].limit)
+
+
 def test_masked_sensor_has_no_influence_and_batch_equals_single() -> None:
     made = designed(11)
     rng = np.random.default_rng(1)
