@@ -69,8 +69,8 @@ class UnknownInputState:
         Estimated injections, wrong parts included, pu.
     v0_squared
         Last squared busbar voltage, pu.
-    named : (p,)
-        Meters named as manipulated.
+    named, inverters : (p,), (m,)
+        Meters and inverters named as manipulated.
     last
         The last estimate and verdict, for frames that cannot be used.
     """
@@ -82,6 +82,7 @@ class UnknownInputState:
     x: Floats
     v0_squared: float
     named: Bools
+    inverters: Bools
     last: tuple[Estimate, Verdict] | None
 
 

@@ -25,8 +25,8 @@ class Found:
         Who is in every pair that is possible.
     threshold : (p,)
         Largest honest score of each meter, squared pu.
-    attack_error : (m,)
-        Error of each inverter's wrong injection, pu.
+    trial
+        What the likeliest pair makes of the tick.
     explanations
         The smallest possible pairs where there are several.
     """
@@ -34,7 +34,7 @@ class Found:
     meters: Bools
     inverters: Bools
     threshold: Floats
-    attack_error: Floats
+    trial: Trial
     explanations: tuple[Explanation, ...]
 
 
@@ -60,6 +60,18 @@ def explain(pairs: Pairs, trials: dict[int, Trial], order: list[int]) -> tuple[E
         Explanation(pairs.meters[k].copy(), pairs.inverters[k].copy(), float(share))
         for k, share in list(zip(order, shares, strict=True))[:_SHOWN]
     )
+
+
+def deaf_inverters(design: UnknownInputDesign, trial: Trial) -> Bools:
+    """Inverters whose wrong injections may be as large as their curves reach without being seen; (m,).
+
+    Parameters
+    ----------
+    design, trial
+        What watches, and what a pair makes of the tick.
+    """
+    q = design.setting.plant.droop.q
+    return np.asarray(trial.attack_error > q[:, 0] - q[:, 3])
 
 
 def answer(
@@ -118,8 +130,7 @@ def answer(
     elif base[0] is Decision.CLEAN and pending.any():
         base = *ambiguous, "Readings were further off than allowed lately, but not often enough."
     elif base[0] is Decision.CLEAN:
-        span = plant.droop.q[:, 0] - plant.droop.q[:, 3]
-        deaf = np.asarray(found.attack_error > span)
+        deaf = deaf_inverters(design, found.trial)
         who = _who(np.zeros_like(live), deaf, names, owners)
         base = (
             (*ambiguous, f"No meter disagrees, but readings are too coarse to judge {who}.")

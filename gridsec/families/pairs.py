@@ -196,7 +196,7 @@ def try_pair(relation: Relation, meters: Bools, inverters: Bools, room: Floats) 
     """
     keep = ~meters[relation.meter]
     r, C, E, h = relation.r[keep], relation.C[keep], relation.E[keep], relation.h
-    P = np.linalg.inv((E * h) @ (E * h).T / 3.0)
+    P = np.asarray(np.linalg.inv((E * h) @ (E * h).T / 3.0), dtype=np.float64)
     left = _left_inverse(P, C[:, inverters])
     Q = P - P @ C[:, inverters] @ left
     tests = np.vstack([Q, C.T @ Q])

@@ -31,7 +31,7 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, frozen
 from gridsec.errors import NotObservable
 from gridsec.families.pair_tick import Tick, UnknownInputDesign, UnknownInputState, observe
-from gridsec.families.pair_verdict import Found, answer, explain
+from gridsec.families.pair_verdict import Found, answer, deaf_inverters, explain
 from gridsec.families.pairs import Trial, pairs, try_pair
 from gridsec.families.tubes import Doubt, spread
 from gridsec.frames import NO_VOLTAGE, reconstruct
@@ -116,6 +116,7 @@ def init(design: UnknownInputDesign, t: float) -> UnknownInputState:
         x=np.zeros(plant.droop.tau.size),
         v0_squared=plant.droop.vbar**2,
         named=np.zeros(plant.meters.size, dtype=np.bool_),
+        inverters=np.zeros(plant.droop.tau.size, dtype=np.bool_),
         last=None,
     )
 
@@ -162,9 +163,11 @@ def _contradicted(design: UnknownInputDesign, state: UnknownInputState, tick: Ti
                 relation = tick.relation(both.meters[k])
                 room = tick.room(tick.tube(both.meters[k]))
             over[k] = not try_pair(relation, both.meters[k], both.inverters[k], room).fits
-    # What was found against a pair by a meter that is silent now has not been taken back.
-    hold = np.asarray((state.named & ~tick.inputs.live & ~both.meters).any(axis=1))
-    return count(tally, over, ~hold, confirm=options.confirm, release=options.release)
+    # What was found against a pair is not taken back while those whom it spares cannot be judged.
+    deaf = deaf_inverters(design, nobody)
+    silent = state.named & ~tick.inputs.live
+    hold = (silent & ~both.meters).any(axis=1) | (state.inverters & deaf & ~both.inverters).any(axis=1)
+    return count(tally, over, np.asarray(~hold), confirm=options.confirm, release=options.release)
 
 
 def _conclude(
@@ -186,7 +189,7 @@ def _conclude(
     explanations = explain(design.pairs, trials, order) if len(order) > 1 else ()
     v2 = estimate.v2[design.setting.plant.meters]
     verdict = Verdict(
-        *answer(design, state, tick, Found(meters, inverters, threshold, trial.attack_error, explanations)),
+        *answer(design, state, tick, Found(meters, inverters, threshold, trial, explanations)),
         meters,
         score,
         threshold,
@@ -196,7 +199,9 @@ def _conclude(
         (),
         explanations,
     )
-    after = replace(state, x=x, v0_squared=inputs.v0_squared, named=meters, last=(estimate, verdict))
+    after = replace(
+        state, x=x, v0_squared=inputs.v0_squared, named=meters, inverters=inverters, last=(estimate, verdict)
+    )
     return after, estimate, verdict
 
 

@@ -6,6 +6,7 @@ can explain, and real feeders' scenarios for who is named.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -25,7 +26,7 @@ from gridsec.errors import DesignInfeasible, NotObservable
 from gridsec.families import unknown_input
 from gridsec.families.pair_tick import observe
 from gridsec.families.pairs import Relation, pairs, try_pair
-from gridsec.online import Cause, Decision, Estimate, Frame, Verdict
+from gridsec.online import Cause, Decision, Estimate, Verdict
 from tests.gridsec.street import Street, make_plant
 
 ON, END = 15.0, 40.0
@@ -165,6 +166,25 @@ def test_a_silent_meter_is_undecided_and_a_silent_liar_stays_named() -> None:
     assert named(watch(site, meter=(4, 0.05), channel=silence)[-1][1]) == ([4], [])
 
 
+def test_an_inverter_that_cannot_be_judged_any_more_stays_named() -> None:
+    site = village()
+    made = watcher(site)
+    scenario = Scenario(
+        seed=5,
+        duration_s=END,
+        errors=REPORTING,
+        attacks=(Bias(np.array([4]), START + ON, START + 99.0, np.array([0.05])),),
+        inverter_attacks=(InverterAttack(np.array([1]), np.array([-0.1]), START + ON, START + 99.0),),
+    )
+    state = made.init(START)
+    for k, snapshot in enumerate(snapshots(simulate(site, scenario))):
+        frame = to_frame(site, snapshot)
+        if k >= 20:
+            frame = replace(frame, q_net=np.full_like(frame.q_net, np.nan))
+        state, _, verdict = made.step(state, frame)
+        assert named(verdict) == (([4], [1]) if k > ON else ([], []))
+
+
 def test_too_few_meters_and_no_busbar_are_undecided() -> None:
     site = village()
     rest = tuple(Silence(meter, START, START + 99.0) for meter in site.meter_ids[2:])
@@ -192,14 +212,9 @@ def test_a_late_frame_changes_nothing() -> None:
         np.testing.assert_array_equal(again.v2, estimate.v2)
         assert verdict.decision is Decision.UNDECIDED
     first = unknown_input.init(made.design, START)
-    _, estimate, verdict = made.step(first, _at(frames[0], np.nan))
+    _, estimate, verdict = made.step(first, replace(frames[0], t=np.nan))
     assert verdict.decision is Decision.UNDECIDED
     assert estimate.bound.min() > 1.0
-
-
-def _at(frame: Frame, t: float) -> Frame:
-    fields = {name: getattr(frame, name) for name in Frame.__slots__} | {"t": t}
-    return Frame(**fields)
 
 
 def test_a_quarter_of_an_hour_is_an_interval_like_any_other() -> None:
