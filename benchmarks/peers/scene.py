@@ -7,7 +7,7 @@ pseudo-measurements. Loads and generation are random. Three attacks of size 3 %:
     k random meters read 3 % high.
 `coord`
     A fake load that would drop one customer's voltage by 3 %; the k most affected meters report just the
-    voltages that it would cause.
+    voltages that it would cause, the customer's own first.
 `coord+pq`
     The same, and that customer's active and reactive power are reported as if the load were there.
 """
@@ -208,7 +208,7 @@ def _attacked(
     here: Scene, cell: Cell, rng: np.random.Generator, truth: tuple[Floats, Floats, float, Floats]
 ) -> tuple[Floats, Floats, Floats, Bools]:
     """What is reported before noise: voltages, powers, and who lies."""
-    p, q, v0, v = truth
+    p, q, _, v = truth
     liars = np.zeros(v.size, dtype=np.bool_)
     if cell.attack == "clean":
         return v, p, q, liars
@@ -217,7 +217,9 @@ def _attacked(
         return v * np.where(liars, 1.0 + SIZE, 1.0), p, q, liars
     customer = int(rng.integers(v.size))
     fake_p, fake_q, fake_v = _fake_load(here, customer, truth)
-    liars[np.argsort(fake_v - v)[: cell.liars]] = True
+    drop = v - fake_v
+    drop[customer] = np.inf  # those behind it feel the same
+    liars[np.argsort(-drop)[: cell.liars]] = True
     says = np.where(liars, fake_v, v)
     return (says, fake_p, fake_q, liars) if cell.attack == "coord+pq" else (says, p, q, liars)
 

@@ -23,7 +23,8 @@ George and McCulloch 1993 (spike and slab); Chen and Chen 2008 (the prior over s
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import norm
@@ -31,6 +32,9 @@ from scipy.stats import norm
 from gridsec.arrays import Bools, Floats
 from gridsec.sequential.conditional import Prior, inverted
 from gridsec.sequential.search import price
+
+
+Curved = Callable[[Floats, Bools], Floats]
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +57,7 @@ class Lies:
 
     size: float = 0.2
     each: float = 1.4
-    false: float = 2.0
+    false: float = 3.0
     rate: float = 0.005
     like: float = 1e3
 
@@ -89,13 +93,14 @@ class _State:
 
     liars: Bools
     powers: Bools
+    m: Floats
     Q: Floats
     g: Floats
     logdet: float
     fit: float
 
     def copy(self) -> _State:
-        return _State(self.liars.copy(), self.powers.copy(), self.Q.copy(), self.g, self.logdet, self.fit)
+        return replace(self, liars=self.liars.copy(), powers=self.powers.copy(), Q=self.Q.copy())
 
     @property
     def key(self) -> bytes:
@@ -105,9 +110,9 @@ class _State:
 class _Problem:
     """Readings, and what may be wrong with them."""
 
-    def __init__(self, lies: Lies, noise: Floats, m: Floats, false: Floats) -> None:
-        self.lies, self.m, self.false = lies, m, false
-        p = m.size
+    def __init__(self, lies: Lies, noise: Floats, false: Floats, curved: Curved | None) -> None:
+        self.lies, self.false, self.curved = lies, false, curved
+        self.size = p = noise.size
         self.a2 = lies.size**2
         # The most likely single accusation at the wanted rate costs nothing net.
         least = norm.isf(lies.rate / (2.0 * p)) ** 2
@@ -115,7 +120,7 @@ class _Problem:
 
     def charge(self, count: int, false: int) -> float:
         return (
-            price(self.m.size, count)
+            price(self.size, count)
             + self.lies.each * count
             + self.lies.false * false
             + self.anybody * (count > 0)
@@ -138,7 +143,7 @@ class _Problem:
 
     def pairs(self, at: _State) -> Floats:
         """Rise of J by false powers of each customer, its meter included where it is trusted, (p,)."""
-        p = self.m.size
+        p = self.size
         k, f = int(at.liars.sum()), int(at.powers.sum())
         b = self.false.reshape(p, 2 * p)
         Qb, hb = (at.Q @ b).reshape(p, p, 2), (at.g @ b).reshape(p, 2)
@@ -152,6 +157,15 @@ class _Problem:
         sign, logdet = np.linalg.slogdet(M)
         rise = logdet - gain + np.where(at.liars, self.charge(k, f + 1), self.charge(k + 1, f + 1))
         return np.where(at.powers | (sign <= 0), np.inf, rise - self.charge(k, f))
+
+    def settle(self, at: _State) -> None:
+        """Linearise about what this explanation says of the powers."""
+        if self.curved is None:
+            return
+        for _ in range(_PASSES):
+            at.m = self.curved(at.g, at.powers)
+            at.g = at.Q @ at.m
+        at.fit = float(at.m @ at.g)
 
     def toggle(self, at: _State, j: int) -> None:
         """Accuse a meter, or trust it again."""
@@ -177,6 +191,7 @@ class _Problem:
         at.powers[c] = sign > 0
 
 
+_PASSES = 2
 # Rises of J below this are rounding.
 _LEAST = 1e-9
 _MOVES = 4
@@ -192,6 +207,7 @@ def identify(
     *,
     lies: Lies | None = None,
     false: Floats | None = None,
+    curved: Curved | None = None,
 ) -> tuple[Explained, ...]:
     """The likeliest explanations of one set of readings.
 
@@ -210,6 +226,10 @@ def identify(
     false : (p, p, 2)
         `false[:, c]` is what false active and reactive powers of the customer of meter c do to the squared
         voltages of all meters' buses, times how false they may be; none by default.
+    curved
+        The power flow is not linear, and false powers may be large: `curved(weights, powers)` is `m` for the
+        live meters linearised about the powers of an explanation, by its weights and who reports false ones,
+        (p_live,) each. Without it, `m` is good for all.
 
     Returns
     -------
@@ -220,19 +240,19 @@ def identify(
     lies = Lies() if lies is None else lies
     doubts = np.zeros((at.size, at.size, 0 if false is None else 2))
     doubts = doubts if false is None else false[np.ix_(at, at)]
-    problem = _Problem(lies, noise[at], m[at], doubts)
+    problem = _Problem(lies, noise[at], doubts, curved)
     K = prior.of_meters[np.ix_(prior.meters[at], at)] + np.diag(noise[at])
     Q = inverted(K)
     none = np.zeros(at.size, dtype=np.bool_)
     g = Q @ m[at]
-    start = _State(none, none.copy(), Q, g, 0.0, float(m[at] @ g))
+    start = _State(none, none.copy(), m[at], Q, g, 0.0, float(m[at] @ g))
     found = _explanations(problem, start, false is not None)
     return _reported(problem, found, live, lies)
 
 
 def _explanations(problem: _Problem, start: _State, false: bool) -> list[_State]:
     """Local minima of J from several starts, and their neighbours."""
-    if problem.m.size == 0:
+    if problem.size == 0:
         return [start]
     known: dict[bytes, _State] = {start.key: start}
     first = _descend(problem, start, known, false)
@@ -245,7 +265,10 @@ def _explanations(problem: _Problem, start: _State, false: bool) -> list[_State]
                 _descend(problem, _doubted(problem, start, c), known, false)
     best = min(known.values(), key=problem.cost)
     _exchange(problem, best, known, false)
-    return list(known.values())
+    ranked = sorted(known.values(), key=problem.cost)
+    for each in ranked[:_STARTS]:
+        problem.settle(each)
+    return ranked
 
 
 def _doubted(problem: _Problem, at: _State, c: int) -> _State:
@@ -253,6 +276,7 @@ def _doubted(problem: _Problem, at: _State, c: int) -> _State:
     if not after.liars[c]:
         problem.toggle(after, c)
     problem.powers(after, c)
+    problem.settle(after)
     return after
 
 
