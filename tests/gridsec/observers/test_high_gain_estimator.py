@@ -75,6 +75,12 @@ def test_attacks_are_seen_named_and_left_out(size: float) -> None:
     assert all(outcome.decision is Decision.ATTACKED for outcome in after)
     assert all(outcome.suspects.tolist() == [False, True, False] for outcome in after)
     assert after[-1].trusted.tolist() == [True, False, True]
+    for state, outcome in zip(states, outcomes, strict=True):
+        # Theorem 2 of kim2018 for the set in use: (Lip^ + 1) / min Lip_ times delta.
+        chosen = made.inverses[outcome.sigma]
+        delta = high_gain.error_bounds(made, state.age)[list(chosen.sensors)].max()
+        assert outcome.threshold == pytest.approx(chosen.factor * delta)
+        assert outcome.bound == pytest.approx((chosen.factor + 1.0) / made.lowest * delta)
     error = np.array([np.abs(o.x - truth_x).max() for o, truth_x in zip(outcomes, x, strict=True)])
     assert np.all(error <= np.array([outcome.bound for outcome in outcomes]))
     assert np.all(np.abs(np.array([state.z for state in states])) <= made.limit[:, None] + 1e-9)

@@ -265,6 +265,11 @@ def test_saturated_inverses_are_left_inverses_with_the_stated_constant() -> None
 
         assert upper_sampled(rest, -3.0 * np.ones(n), 3.0 * np.ones(n)).lower <= psi.factor
         assert np.all(np.abs(psi(rng.normal(scale=50.0, size=(100, n)))) <= 0.5)
+        z = rng.uniform(-6.0, 6.0, (50, n))
+        raw = example.table()[groups(4, 1).index(psi.sensors)]
+        by_hand = np.clip(raw(np.clip(z, -2.0, 2.0)), -0.5, 0.5)  # (10), (11)
+        assert np.allclose(psi(z), by_hand)
+        assert not np.allclose(np.clip(raw(z), -0.5, 0.5), by_hand), "the inner saturation matters"
     own = given_inverse(model, (1, 2, 3), example.table()[0], factor=1.0)
     assert np.allclose(own(model.phi(np.zeros(3), (1, 2, 3))), 0.0)
 
