@@ -185,7 +185,7 @@ class Row:
         95th percentile of the voltage's reconstruction error at lying meters and at all customers, % of
         nominal.
     step_ms, step_ms_95
-        Median and 95th percentile of the time per step, ms.
+        Median and 95th percentile of the processor time per step, ms.
     observers
         How many observers, or candidate sets, ran.
     false_clean
