@@ -8,7 +8,7 @@ import numpy as np
 
 from gridsec import detect
 from gridsec.arrays import Bools, Floats
-from gridsec.families.pairs import LeftOut, Pairs, Relation, Trial, try_pair
+from gridsec.families.pairs import Believed, LeftOut, Pairs, Relation, Trial, believe, try_pair
 from gridsec.families.tubes import Doubt, Seen, Tube, Tubes, advance
 from gridsec.feeder import loss_correction
 from gridsec.frames import NO_VOLTAGE, Inputs, Past, clean
@@ -175,6 +175,16 @@ class Tick:
         voltage = np.arange(v + q) < v
         return Relation(r, np.vstack([gain, own]), E, half, np.concatenate([live, told]), voltage)
 
+    def believe(self, meters: Bools) -> Believed:
+        """The readings of all but these meters.
+
+        Parameters
+        ----------
+        meters : (p,)
+            Who.
+        """
+        return believe(self.relation(meters), meters)
+
     def room(self, tube: Tube) -> Floats:
         """Largest wrong injection of each inverter; (m,).
 
@@ -193,7 +203,7 @@ class Tick:
         meters, inverters : (p,), (m,)
             Who is suspected.
         """
-        return try_pair(self.relation(meters), meters, inverters, self.room(self.tube(meters)))
+        return try_pair(self.believe(meters), inverters, self.room(self.tube(meters)))
 
 
 # Readings are never more exact than this, pu.

@@ -182,51 +182,113 @@ class Trial:
     attack_error: Floats
 
 
-def try_pair(relation: Relation, meters: Bools, inverters: Bools, room: Floats) -> Trial:
-    """Ask whether a pair explains a tick.
+@dataclass(frozen=True, slots=True, eq=False)
+class Believed:
+    """A relation without the rows of suspected meters, ready for any set of inverters. k rows, m inverters.
+
+    Attributes
+    ----------
+    size
+        p, how many meters there are.
+    meter, voltage : (k,)
+        Of the rows that are left.
+    C : (k, m)
+        Of the rows that are left.
+    tests : (k + m, k)
+        P = S^-1 and C^T P: the tests if nobody but these meters is suspected.
+    r, E, C_ : (k + m,), (k + m, K), (k + m, m)
+        Those tests of r, E and C.
+    plain : (k,)
+        r itself.
+    h : (K,)
+        As in `Relation`.
+    """
+
+    size: int
+    meter: Ints
+    voltage: Bools
+    C: Floats
+    tests: Floats
+    r: Floats
+    E: Floats
+    C_: Floats
+    plain: Floats
+    h: Floats
+
+
+def believe(relation: Relation, meters: Bools) -> Believed:
+    """Drop the rows of suspected meters.
 
     Parameters
     ----------
     relation
         The tick.
-    meters, inverters : (p,), (m,)
+    meters : (p,)
         Who is suspected.
-    room : (m,)
-        Largest wrong injection that there can be, pu.
     """
     keep = ~meters[relation.meter]
     r, C, E, h = relation.r[keep], relation.C[keep], relation.E[keep], relation.h
-    P = np.asarray(np.linalg.inv((E * h) @ (E * h).T / 3.0), dtype=np.float64)
-    left = _left_inverse(P, C[:, inverters])
-    Q = P - P @ C[:, inverters] @ left
-    tests = np.vstack([Q, C.T @ Q])
-    size, most = tests @ r, np.abs(tests @ E) @ h
-    rows, diagonal = r.size, np.diagonal(Q)
-    gain = np.einsum("mr,rm->m", tests[rows:], C)
+    P = np.linalg.inv((E * h) @ (E * h).T / 3.0)
+    tests = np.asarray(np.vstack([P, C.T @ P]), dtype=np.float64)
+    return Believed(
+        size=meters.size,
+        meter=relation.meter[keep],
+        voltage=relation.voltage[keep],
+        C=C,
+        tests=tests,
+        r=tests @ r,
+        E=tests @ E,
+        C_=tests @ C,
+        plain=r,
+        h=h,
+    )
+
+
+def try_pair(believed: Believed, inverters: Bools, room: Floats) -> Trial:
+    """Ask whether a pair explains a tick.
+
+    With `G = U^T P U` its tests are those of its meters alone minus `T U G^-1 U^T P`, a matrix of rank |J_u|.
+
+    Parameters
+    ----------
+    believed
+        The tick, without the rows of the pair's meters.
+    inverters : (m,)
+        The pair's inverters.
+    room : (m,)
+        Largest wrong injection that there can be, pu.
+    """
+    k, h = believed.plain.size, believed.h
+    chosen = np.flatnonzero(inverters)
+    own = k + chosen  # the rows U^T P
+    TU = believed.C_[:, chosen]
+    G = believed.C_[np.ix_(own, chosen)]
+    inverse = np.linalg.pinv(G, hermitian=True) if chosen.size else G
+    left_r, left_E = inverse @ believed.r[own], inverse @ believed.E[own]
+    left_C = inverse @ believed.C_[own]
+    size, error = believed.r - TU @ left_r, np.abs(believed.E - TU @ left_E) @ h
+    before = np.concatenate([np.diagonal(believed.tests), np.diagonal(believed.C_[k:])])
+    taken = np.vstack([(inverse @ believed.tests[own]).T, left_C.T])
+    norm = before - np.einsum("tw,tw->t", TU, taken)
     # What the unknown inputs take away entirely is rounding, and no test.
-    sound = diagonal > _ROUNDING * np.diagonal(P)
-    known = gain > _ROUNDING * np.einsum("rm,rm->m", C, P @ C)
-    real = np.concatenate([sound, known & ~inverters])
-    fits = bool(np.all((np.abs(size) <= most)[real]))
-    score, threshold = np.full(meters.size, np.nan), np.full(meters.size, np.inf)
-    own = np.flatnonzero(relation.voltage[keep] & sound)
-    at = relation.meter[keep][own]
-    score[at], threshold[at] = np.abs(size[own] / diagonal[own]), most[own] / diagonal[own]
-    weights = np.where(known[:, None], tests[rows:] / np.where(known, gain, 1.0)[:, None], 0.0)
-    weights[inverters] = left
+    known = norm > _ROUNDING * before
+    real = known.copy()
+    real[own] = False
+    fits = bool(np.all((np.abs(size) <= error)[real]))
+    safe = np.where(known, norm, 1.0)
+    offset, most = size / safe, np.where(known, error / safe, np.inf)
+    score, threshold = np.full(believed.size, np.nan), np.full(believed.size, np.inf)
+    rows = np.flatnonzero(believed.voltage & known[:k])
+    at = believed.meter[rows]
+    score[at], threshold[at] = np.abs(offset[rows]), most[rows]
+    attack, attack_error = np.where(known[k:], offset[k:], 0.0), most[k:]
     # Meters that are silent now may be those without which an inverter cannot be seen.
-    known[inverters] = np.abs(np.diagonal(left @ C[:, inverters]) - 1.0) < _ROUNDING
-    attack, error = weights @ r, np.where(known, np.abs(weights @ E) @ h, np.inf)
-    beyond = np.any((np.abs(attack) - error > room)[inverters])
-    return Trial(fits and not beyond, float(r @ size[:rows]), score, threshold, attack, error)
+    seen = np.abs(np.diagonal(left_C[:, chosen]) - 1.0) < _ROUNDING
+    attack[chosen], attack_error[chosen] = left_r, np.where(seen, np.abs(left_E) @ h, np.inf)
+    beyond = np.any((np.abs(attack) - attack_error > room)[chosen])
+    misfit = float(believed.plain @ size[:k])
+    return Trial(fits and not beyond, misfit, score, threshold, attack, attack_error)
 
 
 # What is smaller than this part of what it was computed from.
 _ROUNDING = 1e-6
-
-
-def _left_inverse(P: Floats, U: Floats) -> Floats:
-    """`(U^T P U)^-1 U^T P`: least squares in units of the errors."""
-    if not U.shape[1]:
-        return np.zeros((0, len(P)))
-    return np.asarray(np.linalg.pinv(U.T @ P @ U, hermitian=True) @ U.T @ P)

@@ -158,11 +158,14 @@ def _contradicted(design: UnknownInputDesign, state: UnknownInputState, tick: Ti
     nobody = tick.trial(both.meters[0], both.inverters[0])
     if not nobody.fits:
         over[0] = True
+        # Pairs with the same meters share nearly all of the work.
+        groups: dict[bytes, list[int]] = {}
         for k in range(1, over.size):
-            if k == 1 or (both.meters[k] != both.meters[k - 1]).any():
-                relation = tick.relation(both.meters[k])
-                room = tick.room(tick.tube(both.meters[k]))
-            over[k] = not try_pair(relation, both.meters[k], both.inverters[k], room).fits
+            groups.setdefault(both.meters[k].tobytes(), []).append(k)
+        for group in groups.values():
+            meters = both.meters[group[0]]
+            believed, room = tick.believe(meters), tick.room(tick.tube(meters))
+            over[group] = [not try_pair(believed, both.inverters[k], room).fits for k in group]
     # What was found against a pair is not taken back while those whom it spares cannot be judged.
     deaf = deaf_inverters(design, nobody)
     silent = state.named & ~tick.inputs.live

@@ -25,7 +25,7 @@ from gridsec.attack import Bias, InverterAttack
 from gridsec.errors import DesignInfeasible, NotObservable
 from gridsec.families import unknown_input
 from gridsec.families.pair_tick import observe
-from gridsec.families.pairs import Relation, pairs, try_pair
+from gridsec.families.pairs import Relation, believe, pairs, try_pair
 from gridsec.online import Cause, Decision, Estimate, Verdict
 from tests.gridsec.street import Street, make_plant
 
@@ -303,7 +303,7 @@ def test_no_test_refutes_what_a_linear_program_can_explain(seed: int) -> None:
             possible = linprog(
                 np.zeros(m + h.size), A_eq=np.hstack([C, E * h])[keep], b_eq=r[keep], bounds=box
             ).success
-            trial = try_pair(relation, meters, inverters, room)
+            trial = try_pair(believe(relation, meters), inverters, room)
             assert trial.fits or not possible
             if inverter == 0 and suspect == 2:
                 assert abs(trial.attack[0] - wrong[0]) <= trial.attack_error[0] * (1.0 + 1e-9)
