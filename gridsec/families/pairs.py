@@ -263,7 +263,7 @@ def try_pair(believed: Believed, inverters: Bools, room: Floats) -> Trial:
     own = k + chosen  # the rows U^T P
     TU = believed.C_[:, chosen]
     G = believed.C_[np.ix_(own, chosen)]
-    inverse = np.linalg.pinv(G, hermitian=True) if chosen.size else G
+    inverse = _pseudo_inverse(G)
     left_r, left_E = inverse @ believed.r[own], inverse @ believed.E[own]
     left_C = inverse @ believed.C_[own]
     size, error = believed.r - TU @ left_r, np.abs(believed.E - TU @ left_E) @ h
@@ -292,3 +292,10 @@ def try_pair(believed: Believed, inverters: Bools, room: Floats) -> Trial:
 
 # What is smaller than this part of what it was computed from.
 _ROUNDING = 1e-6
+
+
+def _pseudo_inverse(G: Floats) -> Floats:
+    """Of a symmetric positive semidefinite matrix, most often of one entry."""
+    if G.size <= 1:
+        return np.divide(1.0, G, out=np.zeros_like(G), where=G > 0.0)
+    return np.asarray(np.linalg.pinv(G, hermitian=True))
