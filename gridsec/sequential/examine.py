@@ -69,6 +69,8 @@ class Examined:
 
 # A long scale hardly changes from tick to tick: it is looked at this many times per length.
 _LOOKS = 8
+# With more meters than this beyond their limits at once, moving one after the other is no good start.
+_FEW = 32
 # A fit is made anew when that part of its meters changed, or after so many changes (rounding).
 _ANEW = 6
 _MOST_CHANGES = 400
@@ -108,7 +110,7 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats) -> 
             now = found[s][0].fit
             view = _view(design, here, now)
         elif (view.over & trust.trusted).any() or _due(design, trust, view, s, tick):
-            found[s], trust = _Search(design, scales, fits, trust, s)(now)
+            found[s], trust = _Search(design, scales, fits, trust, s)(now, view)
             now = found[s][0].fit
             view = _view(design, here, now)
         bad, still = trust.bad.copy(), trust.still.copy()
@@ -272,13 +274,13 @@ class _Search:
         self.keep = _held(trust, s)
         self.accused = tuple(suspicion for suspicion in trust.accused if suspicion[1] > s)
 
-    def __call__(self, now: Fit) -> tuple[tuple[Explanation, ...], Trust]:
+    def __call__(self, now: Fit, view: View) -> tuple[tuple[Explanation, ...], Trust]:
         """The explanations, the likeliest first, and whom that leaves trusted."""
-        here, design = self.here, self.design
         start = now if len(self.accused) == len(self.trust.accused) else self._fit(now.trusted)
-        found = [self._descend(start, self.keep)]
+        few = np.count_nonzero(view.over & now.trusted) <= _FEW
+        found = [self._descend(start, self.keep)] if few else []
         free = None
-        if _suspected(here, found[0]) > design.options.several:
+        if not few or self._suspected(found[0]) > self.design.options.several:
             starts = [self._descend(self._fit(chosen), np.zeros_like(chosen)) for chosen in self._starts()]
             free = min(starts, key=lambda each: each.cost)
             if (free.fit.trusted & self.keep).any():
@@ -286,12 +288,15 @@ class _Search:
             else:
                 found += starts
                 free = None
-        if min(_suspected(here, each) for each in found) > 0:
-            found.append(self._descend(start, self.keep, design.book))
+        if few and min(self._suspected(each) for each in found) > 0:
+            found.append(self._descend(start, self.keep, self.design.book))
         found.sort(key=lambda each: each.cost)
         if free is not None and free.cost < found[0].cost and self._total(free) < self._total(found[0]):
             found.insert(0, free)
         return tuple(found), self._believe(found[0])
+
+    def _suspected(self, found: Explanation) -> int:
+        return int(np.count_nonzero(self.here.enough & ~found.fit.trusted))
 
     def _starts(self) -> tuple[Bools, Bools]:
         """Sets that owe nothing to what was believed: a robust fit, and the meters close to the model."""
@@ -378,10 +383,6 @@ def _explanation(design: SequentialDesign, here: _Scale, whole: Fit, answer: Acc
     for k in answer.others:
         loosen(now, design.book.column(k), float(design.book.std[k]))
     return Explanation(now, judge(now, here.m), list(answer.others), 0.0, answer.worse)
-
-
-def _suspected(here: _Scale, found: Explanation) -> int:
-    return int(np.count_nonzero(here.enough & ~found.fit.trusted))
 
 
 def _held(trust: Trust, s: int) -> Bools:

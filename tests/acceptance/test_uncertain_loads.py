@@ -11,7 +11,6 @@ import pytest
 from benchmarks.uncertain_loads import CELLS, LARGEST_ERROR_PERCENT, LIARS, Cell, run
 from feeders.trials import Meters
 
-
 # Learning takes six simulated hours: one seed of that has to do here.
 RUNS = [(cell, seed) for cell in CELLS for seed in range(1 if cell.learned else 3)]
 
