@@ -6,7 +6,7 @@ nobody attacks); e are the meters' honest errors; a is the attack, in as few ent
 
 References
 ----------
-lee2018, chapters 2, 4 and 5; kim2018; yang2021; docs/estimators.md.
+lee2018, chapters 2, 4 and 5; kim2018; yang2021; docs/theory-snapshot.md.
 """
 
 from __future__ import annotations
