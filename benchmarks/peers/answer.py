@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from benchmarks.peers.scene import Snapshot
+from benchmarks.peers.scene import Reading
 from gridsec.arrays import Bools, Floats
 
 
@@ -31,5 +31,5 @@ class Answer:
     failed: bool = False
 
 
-Method = Callable[[Snapshot, Floats, float, Floats, Floats, float], Answer]
-"""`method(told, v, v0, p, q, std_v)`: `told` gives the standard deviations of the powers."""
+Method = Callable[[Reading], Answer]
+"""One reading in, one answer out."""

@@ -18,11 +18,15 @@ from power_grid_model import (
     initialize_array,
 )
 from power_grid_model.errors import PowerGridError  # type: ignore[attr-defined]  # documented, but not re-exported
+from scipy.special import chdtri
 
 from benchmarks.peers.answer import Answer
-from benchmarks.peers.scene import Scene, Snapshot
+from benchmarks.peers.scene import Reading, Scene
 from feeders import powerflow
-from gridsec.arrays import Floats
+from gridsec.arrays import Bools, Floats
+from gridsec.feeder import lindistflow
+from gridsec.sequential.conditional import drop, fit
+from gridsec.sequential.loads import LoadDoubt, prior
 
 _SQRT3 = np.sqrt(3.0)
 
@@ -53,13 +57,16 @@ class GridModel:
         self.power = initialize_array(DatasetType.update, ComponentType.sym_power_sensor, n)
         self.volt["id"], self.power["id"] = volt["id"], power["id"]
         self.volt_pu, self.watt = here.volt * _SQRT3, here.kw * 1e3
-        self.customer_bus = grid.customer_bus
+        self.customer_bus, self.busbar = grid.customer_bus, grid.busbar
 
-    def tell(self, v: Floats, v0: float, p: Floats, q: Floats, told: Snapshot, std_v: float) -> None:
+    def tell(self, told: Reading) -> None:
         """Hand over the readings with their standard deviations."""
-        self.volt["u_measured"][:-1], self.volt["u_measured"][-1] = v * self.volt_pu, v0 * self.volt_pu
-        self.volt["u_sigma"] = std_v * self.volt_pu
-        self.power["p_measured"], self.power["q_measured"] = p * self.watt, q * self.watt
+        self.volt["u_measured"][:-1], self.volt["u_measured"][-1] = (
+            told.v * self.volt_pu,
+            told.v0 * self.volt_pu,
+        )
+        self.volt["u_sigma"] = told.std_v * self.volt_pu
+        self.power["p_measured"], self.power["q_measured"] = told.p * self.watt, told.q * self.watt
         self.power["p_sigma"], self.power["q_sigma"] = told.std_p * self.watt, told.std_q * self.watt
         self._update(
             {ComponentType.sym_voltage_sensor: self.volt, ComponentType.sym_power_sensor: self.power}
@@ -84,6 +91,23 @@ class GridModel:
         )
         return np.asarray(out[ComponentType.node]["u"][self.customer_bus]) / self.volt_pu
 
+    def judged(self, told: Reading, live: Bools) -> tuple[Floats, float]:
+        """The same, and the sum of all squared residuals over their variances."""
+        sensor = ComponentType.sym_power_sensor
+        out = self.model.calculate_state_estimation(
+            symmetric=True,
+            error_tolerance=1e-6,
+            calculation_method=self.solver,
+            output_component_types={ComponentType.node: ["u"], sensor: ["p_residual", "q_residual"]},
+        )
+        u = np.asarray(out[ComponentType.node]["u"]) / self.volt_pu
+        estimate = u[self.customer_bus]
+        volts = np.where(live, (told.v - estimate) / told.std_v, 0.0)
+        p = out[sensor]["p_residual"] / (told.std_p * self.watt)
+        q = out[sensor]["q_residual"] / (told.std_q * self.watt)
+        busbar = (told.v0 - u[self.busbar]) / told.std_v
+        return estimate, float(volts @ volts + p @ p + q @ q + busbar**2)
+
 
 class Greedy:
     """Removes the sensor with the largest residual over sigma until all are below a threshold."""
@@ -93,14 +117,15 @@ class Greedy:
     ) -> None:
         self.grid, self.threshold = GridModel(here, solver), threshold
 
-    def __call__(self, told: Snapshot, v: Floats, v0: float, p: Floats, q: Floats, std_v: float) -> Answer:
+    def __call__(self, told: Reading) -> Answer:
         """One snapshot."""
-        self.grid.tell(v, v0, p, q, told, std_v)
+        self.grid.tell(told)
+        v = told.v
         named = np.zeros(v.size, dtype=np.bool_)
         try:
             for _ in range(v.size):
                 estimate = self.grid.estimate()
-                residual = np.where(named, 0.0, np.abs(v - estimate)) / std_v
+                residual = np.where(named, 0.0, np.abs(v - estimate)) / told.std_v
                 worst = int(np.argmax(residual))
                 if residual[worst] <= self.threshold:
                     return Answer(named, v=estimate)
@@ -109,3 +134,38 @@ class Greedy:
         except PowerGridError:
             return Answer(named, failed=True)
         return Answer(named, v=estimate)
+
+
+class GreedyChi:
+    """Removes the sensor with the largest normalised residual until the chi-square test passes.
+
+    The residuals' covariance is that of the linear model, whose inverse shrinks with every removal; the
+    library does not give it.
+    """
+
+    def __init__(self, here: Scene, passes: float = 0.99) -> None:
+        self.grid, self.passes = GridModel(here, CalculationMethod.newton_raphson), passes
+        self.model, self.bus = lindistflow(here.feeder), here.feeder.bus
+
+    def __call__(self, told: Reading) -> Answer:
+        """One snapshot."""
+        self.grid.tell(told)
+        v = told.v
+        noise = (2.0 * v * told.std_v) ** 2
+        known = prior(
+            self.model, self.bus, LoadDoubt(told.std_p, told.std_q, 1.0), busbar=2.0 * told.v0 * told.std_v
+        )
+        left = fit(known, noise, np.ones(v.size, dtype=np.bool_))
+        try:
+            while True:
+                estimate, misfit = self.grid.judged(told, left.trusted)
+                count = int(np.count_nonzero(left.trusted))
+                if misfit <= chdtri(count, 1.0 - self.passes) or count == 1:
+                    return Answer(~left.trusted, v=estimate)
+                open_ = np.sqrt(np.maximum(left.Q.diagonal(), np.finfo(np.float64).tiny))
+                size = np.where(left.trusted, np.abs(v - estimate) * 2.0 * v / noise / open_, -1.0)
+                worst = int(np.argmax(size))
+                drop(left, worst)
+                self.grid.mute(worst)
+        except PowerGridError:
+            return Answer(~left.trusted, failed=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.peers.answer import Answer
-from benchmarks.peers.scene import Scene, Snapshot
+from benchmarks.peers.scene import Reading, Scene
 from gridsec.arrays import Bools, Floats
 from gridsec.feeder import bus_voltages, lindistflow
 from gridsec.sequential.loads import LoadDoubt, prior
@@ -23,8 +23,9 @@ class Ours:
         self.R, self.X = 2.0 * self.model.R, 2.0 * self.model.X
         self.false_powers = false_powers
 
-    def __call__(self, told: Snapshot, v: Floats, v0: float, p: Floats, q: Floats, std_v: float) -> Answer:
+    def __call__(self, told: Reading) -> Answer:
         """One snapshot."""
+        v, v0, p, q, std_v = told.v, told.v0, told.p, told.q, told.std_v
         feeder = self.feeder
         doubt = LoadDoubt(told.std_p, told.std_q, time_s=1.0)
         known = prior(self.model, feeder.bus, doubt, busbar=2.0 * v0 * std_v)
@@ -42,8 +43,8 @@ class Ours:
             w = bus_voltages(feeder, dp - p, dq - q, v0**2, steps=_STEPS)[feeder.bus]
             return np.asarray(v2 - w + R @ dp + X @ dq)
 
-        live, nobody = np.ones(v.size, dtype=np.bool_), np.zeros(v.size, dtype=np.bool_)
-        m = curved(np.zeros(v.size), nobody)
+        live = np.ones(v.size, dtype=np.bool_)
+        m = v2 - bus_voltages(feeder, -p, -q, v0**2, steps=_STEPS)[feeder.bus]
         found = identify(known, noise, m, live, lies=self.lies, false=false, curved=curved)
         best = found[0]
         error = np.where(best.liars, self.lies.size**2, 0.0) + noise

@@ -13,8 +13,7 @@ import pandapower as pp
 from pandapower import estimation
 
 from benchmarks.peers.answer import Answer
-from benchmarks.peers.scene import Scene, Snapshot
-from gridsec.arrays import Floats
+from benchmarks.peers.scene import Reading, Scene
 
 # A bus without customers injects nothing, to 0.1 kW; an exact zero makes its matrices singular.
 _NOTHING_MW = 1e-4
@@ -53,13 +52,13 @@ class Panda:
         self.threshold, self.mw = threshold, here.kw / 1e3
         self.customer_bus = grid.customer_bus
 
-    def _tell(self, told: Snapshot, v: Floats, v0: float, p: Floats, q: Floats, std_v: float) -> None:
+    def _tell(self, told: Reading) -> None:
         table = self.table.copy()
         nothing = np.zeros(2 * self.idle)
-        table["value"] = np.concatenate([v, [v0], p * self.mw, q * self.mw, nothing])
+        table["value"] = np.concatenate([told.v, [told.v0], told.p * self.mw, told.q * self.mw, nothing])
         table["std_dev"] = np.concatenate(
             [
-                np.full(self.n + 1, std_v),
+                np.full(self.n + 1, told.std_v),
                 told.std_p * self.mw,
                 told.std_q * self.mw,
                 np.full(2 * self.idle, _NOTHING_MW),
@@ -67,9 +66,9 @@ class Panda:
         )
         self.net.measurement = table
 
-    def __call__(self, told: Snapshot, v: Floats, v0: float, p: Floats, q: Floats, std_v: float) -> Answer:
+    def __call__(self, told: Reading) -> Answer:
         """`remove_bad_data` of one snapshot."""
-        self._tell(told, v, v0, p, q, std_v)
+        self._tell(told)
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
@@ -84,9 +83,9 @@ class Panda:
         estimate = self.net.res_bus_est["vm_pu"].to_numpy()[self.customer_bus]
         return Answer(named, v=estimate, failed=not done)
 
-    def chi2(self, told: Snapshot, v: Floats, v0: float, p: Floats, q: Floats, std_v: float) -> bool | None:
+    def chi2(self, told: Reading) -> bool | None:
         """Whether `chi2_analysis` sees bad data; None where it fails."""
-        self._tell(told, v, v0, p, q, std_v)
+        self._tell(told)
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")

@@ -129,6 +129,30 @@ class Snapshot:
 TRANSFORMERS = {"rural1": Transformer(160.0, 4.0, 1.46875), "rural3": Transformer(400.0, 6.0, 1.2)}
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Reading:
+    """What every method is told: one reading, or the mean of several. Fields as in `Snapshot`."""
+
+    v: Floats
+    v0: float
+    p: Floats
+    q: Floats
+    std_v: float
+    std_p: Floats
+    std_q: Floats
+
+
+def reading(told: Snapshot, t: int) -> Reading:
+    """One of a snapshot's readings."""
+    return Reading(told.v[t], float(told.v0[t]), told.p[t], told.q[t], told.std_v, told.std_p, told.std_q)
+
+
+def mean(told: Snapshot) -> Reading:
+    """The mean of a snapshot's readings; its noise is smaller, the powers' error is not."""
+    means = (told.v.mean(axis=0), float(told.v0.mean()), told.p.mean(axis=0), told.q.mean(axis=0))
+    return Reading(*means, told.std_v / float(np.sqrt(len(told.v))), told.std_p, told.std_q)
+
+
 def scene(feeder: str) -> Scene:
     """Prepare a feeder of `FEEDERS`; one that ends in `-behind` is fed through its transformer."""
     name, _, behind = feeder.partition("-")

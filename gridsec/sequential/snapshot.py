@@ -27,12 +27,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtri
 
-from gridsec.arrays import Bools, Floats
+from gridsec.arrays import Bools, Floats, Ints
 from gridsec.sequential.conditional import Prior, inverted
 from gridsec.sequential.search import price
-
 
 Curved = Callable[[Floats, Bools], Floats]
 
@@ -115,7 +114,7 @@ class _Problem:
         self.size = p = noise.size
         self.a2 = lies.size**2
         # The most likely single accusation at the wanted rate costs nothing net.
-        least = norm.isf(lies.rate / (2.0 * p)) ** 2
+        least = ndtri(lies.rate / (2.0 * p)) ** 2
         self.anybody = max(0.0, float(least - np.log1p(self.a2 / np.median(noise)) - price(p, 1) - lies.each))
 
     def charge(self, count: int, false: int) -> float:
@@ -141,22 +140,22 @@ class _Problem:
         # Powers are false only where the meter lies.
         return np.where(at.powers, np.inf, rise)
 
-    def pairs(self, at: _State) -> Floats:
-        """Rise of J by false powers of each customer, its meter included where it is trusted, (p,)."""
-        p = self.size
+    def pairs(self, at: _State, who: Ints) -> Floats:
+        """Rise of J by false powers of some customers, their meters included where trusted, (k,)."""
         k, f = int(at.liars.sum()), int(at.powers.sum())
-        b = self.false.reshape(p, 2 * p)
-        Qb, hb = (at.Q @ b).reshape(p, p, 2), (at.g @ b).reshape(p, 2)
-        M = np.empty((p, 3, 3))
-        own = np.where(at.liars, 0.0, self.lies.size)
-        M[:, 0, 0] = 1.0 + own**2 * at.Q.diagonal()
-        M[:, 0, 1:] = M[:, 1:, 0] = own[:, None] * Qb[np.arange(p), np.arange(p)]
-        M[:, 1:, 1:] = np.eye(2) + np.einsum("jci,jck->cik", self.false, Qb)
-        h = np.column_stack([own * at.g, hb])
+        false = self.false[:, who]
+        Qb = (at.Q @ false.reshape(self.size, -1)).reshape(false.shape)
+        own = np.where(at.liars[who], 0.0, self.lies.size)
+        M = np.empty((who.size, 3, 3))
+        M[:, 0, 0] = 1.0 + own**2 * at.Q[who, who]
+        M[:, 0, 1:] = M[:, 1:, 0] = own[:, None] * Qb[who, np.arange(who.size)]
+        M[:, 1:, 1:] = np.eye(2) + np.einsum("jci,jck->cik", false, Qb)
+        h = np.column_stack([own * at.g[who], np.einsum("j,jci->ci", at.g, false)])
         gain = np.einsum("ci,ci->c", h, np.linalg.solve(M, h[:, :, None])[:, :, 0])
         sign, logdet = np.linalg.slogdet(M)
-        rise = logdet - gain + np.where(at.liars, self.charge(k, f + 1), self.charge(k + 1, f + 1))
-        return np.where(at.powers | (sign <= 0), np.inf, rise - self.charge(k, f))
+        charges = np.where(at.liars[who], self.charge(k, f + 1), self.charge(k + 1, f + 1))
+        rise = logdet - gain + charges - self.charge(k, f)
+        return np.where(at.powers[who] | (sign <= 0), np.inf, rise)
 
     def settle(self, at: _State) -> None:
         """Linearise about what this explanation says of the powers."""
@@ -194,9 +193,11 @@ class _Problem:
 _PASSES = 2
 # Rises of J below this are rounding.
 _LEAST = 1e-9
+# A fit this many standard deviations above its expectation leaves something unexplained.
+_MISFIT = 2.0
 _MOVES = 4
 # So many customers, those that explain most, are where a search with false powers begins.
-_STARTS = 12
+_STARTS = 6
 
 
 def identify(
@@ -258,17 +259,18 @@ def _explanations(problem: _Problem, start: _State, false: bool) -> list[_State]
     first = _descend(problem, start, known, false)
     if first is start:
         return [start]
-    if false:
-        rise = problem.pairs(start)
-        for c in np.argsort(rise)[:_STARTS].tolist():
-            if np.isfinite(rise[c]):
-                _descend(problem, _doubted(problem, start, c), known, false)
-    best = min(known.values(), key=problem.cost)
-    _exchange(problem, best, known, false)
-    ranked = sorted(known.values(), key=problem.cost)
-    for each in ranked[:_STARTS]:
-        problem.settle(each)
-    return ranked
+    if false and first.fit > problem.size + _MISFIT * np.sqrt(2.0 * problem.size):
+        for c in _doubtful(problem, start):
+            _descend(problem, _doubted(problem, start, c), known, false)
+    _exchange(problem, min(known.values(), key=problem.cost), known, false)
+    return list(known.values())
+
+
+def _doubtful(problem: _Problem, at: _State) -> list[int]:
+    """Customers whose false powers explain more than their lying meter alone, the best first."""
+    rise = problem.pairs(at, np.arange(problem.size))
+    order = np.argsort(rise)[:_STARTS]
+    return [int(c) for c in order[(rise < problem.meters(at))[order]]]
 
 
 def _doubted(problem: _Problem, at: _State, c: int) -> _State:
@@ -302,13 +304,13 @@ def _best(problem: _Problem, at: _State, false: bool) -> _State | None:
         for c in np.flatnonzero(at.powers).tolist():
             after = at.copy()
             problem.powers(after, c, -1.0)
-            change = problem.cost(after) - problem.cost(at)
-            if change < min(least, -_LEAST):
+            if problem.cost(after) - problem.cost(at) < min(least, -_LEAST):
                 return after
-        doubts = problem.pairs(at)
+        who = np.flatnonzero(at.liars)
+        doubts = problem.pairs(at, who)
         c = int(np.argmin(doubts))
         if doubts[c] < least:
-            j, least, move = c, float(doubts[c]), "powers"
+            j, least, move = int(who[c]), float(doubts[c]), "powers"
     if least >= -_LEAST:
         return None
     if move == "powers":
@@ -320,6 +322,7 @@ def _best(problem: _Problem, at: _State, false: bool) -> _State | None:
 
 def _exchange(problem: _Problem, at: _State, known: dict[bytes, _State], false: bool) -> None:
     """Trust each liar again, and see what explains the readings instead."""
+    least, within = problem.cost(at), 2.0 * np.log(problem.lies.like)
     for j in np.flatnonzero(at.liars).tolist():
         after = at.copy()
         if after.powers[j]:
@@ -329,7 +332,7 @@ def _exchange(problem: _Problem, at: _State, known: dict[bytes, _State], false: 
         rise[j] = np.inf
         k = int(np.argmin(rise))
         problem.toggle(after, k)
-        if after.key not in known:
+        if after.key not in known and problem.cost(after) - least <= within:
             _descend(problem, after, known, false)
 
 

@@ -1,0 +1,65 @@
+"""Who finds manipulated meters, side by side: `python -m benchmarks.peers [--trials N] [--write docs]`.
+
+Without `--write` a short run that prints its tables. With it, docs/peers.md and its figures are written.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+from pathlib import Path
+
+from benchmarks.peers import report
+from benchmarks.peers.grid_model import Greedy
+from benchmarks.peers.measure import OURS, cells, measure, prepared, votes
+
+FEEDERS = ("rural1-behind", "rural3-behind")
+
+
+def main() -> int:
+    """Measure, print, and write if asked for. Exits 1 if ours names too many in clean snapshots."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.peers", description=__doc__)
+    parser.add_argument("--trials", type=int, default=20)
+    parser.add_argument("--panda", type=int, default=3, help="trials of pandapower, the slowest")
+    parser.add_argument("--clean", type=int, default=100, help="trials of clean snapshots")
+    parser.add_argument("--minute", type=int, default=4, help="trials with 60 s of data")
+    parser.add_argument("--feeders", nargs="*", default=list(FEEDERS))
+    parser.add_argument("--save", type=Path, help="keep the numbers in a file")
+    parser.add_argument("--load", type=Path, nargs="*", help="take the numbers from files instead")
+    parser.add_argument("--write", type=Path, help="folder for peers.md and its figure")
+    wanted = parser.parse_args()
+    single, minute = report.load(wanted.load) if wanted.load else _run(wanted)
+    if wanted.save:
+        report.save(wanted.save, single, minute)
+    print(report.tables(single, minute))
+    if wanted.write:
+        report.write(wanted.write, single, minute)
+    clean_scores = [scores[OURS] for cell, scores in single.items() if cell.attack == "clean"]
+    return int(
+        sum(score.false for score in clean_scores) > 0.01 * sum(score.trials for score in clean_scores)
+    )
+
+
+def _run(wanted: argparse.Namespace) -> tuple[report.Scores, report.Scores]:
+    logging.disable(logging.CRITICAL)
+    single: report.Scores = {}
+    minute: report.Scores = {}
+    for feeder in wanted.feeders:
+        here, everybody = prepared(feeder)
+        voter = Greedy(here, 3.5)
+        for cell in cells((feeder,)):
+            clean = cell.attack == "clean"
+            trials = wanted.clean if clean else wanted.trials
+            single[cell] = measure(cell, here, everybody, trials=trials, panda=min(trials, wanted.panda))
+            print(report.line(cell, single[cell]), flush=True)
+            if wanted.minute and (clean or cell.liars == 3):
+                few = min(wanted.minute, wanted.panda)
+                minute[cell] = measure(cell, here, everybody, trials=wanted.minute, panda=few, seconds=60)
+                minute[cell]["pgm votes"] = votes(cell, here, voter, trials=wanted.minute, seconds=60)
+                print("60 s", report.line(cell, minute[cell]), flush=True)
+    return single, minute
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,129 @@
+"""Run every method on the same snapshots and count."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from benchmarks.peers.answer import Answer, Method
+from benchmarks.peers.grid_model import Greedy, GreedyChi
+from benchmarks.peers.ours import Ours
+from benchmarks.peers.panda import Panda
+from benchmarks.peers.scene import ATTACKS, Cell, Scene, Snapshot, mean, reading, scene, snapshot
+
+NOISES = ((0.001, 0.1), (0.005, 0.3))
+OURS, PANDA = "ours", "pandapower"
+PEERS = (PANDA, "pgm 3.0", "pgm 3.5", "pgm chi2")
+
+
+@dataclass(slots=True)
+class Score:
+    """What one method did in one cell, in numbers of snapshots.
+
+    Attributes
+    ----------
+    trials, exact, missed, false, failed
+        Snapshots; those where the named meters are exactly the liars; where a liar was not named; where
+        somebody else was; where the method had no result.
+    among
+        Those where the liars are exactly one of the explanations.
+    ms
+        Median time of a snapshot.
+    seen
+        Snapshots in which a chi-square test alone says that something is wrong; -1 where there is none.
+    """
+
+    trials: int = 0
+    exact: int = 0
+    among: int = 0
+    missed: int = 0
+    false: int = 0
+    failed: int = 0
+    ms: float = 0.0
+    seen: int = -1
+
+
+def cells(feeders: tuple[str, ...]) -> Iterator[Cell]:
+    """All cells of the table."""
+    for feeder in feeders:
+        for std_v, std_pq in NOISES:
+            yield Cell(feeder, std_v, std_pq)
+            for attack in ATTACKS:
+                for liars in (1, 2, 3):
+                    yield Cell(feeder, std_v, std_pq, attack, liars)
+
+
+def methods(here: Scene) -> dict[str, Method]:
+    """Everybody, prepared for a feeder."""
+    return {
+        PANDA: Panda(here),
+        "pgm 3.0": Greedy(here, 3.0),
+        "pgm 3.5": Greedy(here, 3.5),
+        "pgm chi2": GreedyChi(here),
+        OURS: Ours(here),
+    }
+
+
+def measure(
+    cell: Cell, here: Scene, everybody: dict[str, Method], *, trials: int, panda: int, seconds: int = 1
+) -> dict[str, Score]:
+    """One cell: every method sees the same snapshots, one after the other.
+
+    With `seconds`, everybody gets the mean of the readings, with its smaller standard deviation.
+    """
+    scores = {name: Score() for name in everybody}
+    if PANDA in scores and seconds == 1:
+        scores[PANDA].seen = 0
+    times: dict[str, list[float]] = {name: [] for name in everybody}
+    for trial in range(trials):
+        told = snapshot(here, cell, np.random.default_rng([trial, cell.liars]), seconds)
+        given = mean(told)
+        for name, method in everybody.items():
+            if name == PANDA and trial >= panda:
+                continue
+            start = time.perf_counter()
+            answer = method(given)
+            times[name].append(time.perf_counter() - start)
+            _count(scores[name], answer, told)
+            if isinstance(method, Panda) and seconds == 1:
+                scores[name].seen += method.chi2(given) is True
+    for name, score in scores.items():
+        score.ms = float(np.median(times[name])) * 1e3 if times[name] else float("nan")
+    return scores
+
+
+def votes(cell: Cell, here: Scene, method: Method, *, trials: int, seconds: int) -> Score:
+    """Another way to use time: judge every second alone; who is named in most of them is named."""
+    score, times = Score(), []
+    for trial in range(trials):
+        told = snapshot(here, cell, np.random.default_rng([trial, cell.liars]), seconds)
+        start = time.perf_counter()
+        each = [method(reading(told, t)) for t in range(seconds)]
+        times.append(time.perf_counter() - start)
+        named = np.mean([answer.named for answer in each], axis=0) > 0.5
+        _count(score, Answer(named), told)
+    score.ms = float(np.median(times)) * 1e3
+    return score
+
+
+def _count(score: Score, answer: Answer, told: Snapshot) -> None:
+    exact = bool(np.array_equal(answer.named, told.liars)) and not answer.failed
+    score.trials += 1
+    score.exact += exact
+    score.among += exact or any(np.array_equal(other, told.liars) for other, _ in answer.others)
+    score.missed += bool((told.liars & ~answer.named).any())
+    score.false += bool((answer.named & ~told.liars).any())
+    score.failed += answer.failed
+
+
+def prepared(feeder: str) -> tuple[Scene, dict[str, Method]]:
+    """A feeder with all methods, each run once on a clean snapshot, so that caches are warm."""
+    here = scene(feeder)
+    everybody = methods(here)
+    told = snapshot(here, Cell(feeder, *NOISES[0]), np.random.default_rng(0))
+    for method in everybody.values():
+        method(mean(told))
+    return here, everybody

@@ -1,0 +1,178 @@
+"""Tables and figures of a run."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.peers.measure import OURS, Score
+from benchmarks.peers.scene import Cell
+
+Scores = dict[Cell, dict[str, Score]]
+
+_NAMES = {"rural1-behind": "rural1, 13 customers", "rural3-behind": "rural3, 118 customers"}
+
+
+def line(cell: Cell, scores: dict[str, Score]) -> str:
+    """One cell in one line: exact / false in per cent, and the time."""
+    parts = [
+        f"{name} {_percent(s.exact, s)}/{_percent(s.false, s)} {s.ms:.2f} ms" for name, s in scores.items()
+    ]
+    return f"{cell.feeder} {cell.std_v:g} {cell.attack} {cell.liars}: " + " | ".join(parts)
+
+
+def _percent(count: int, score: Score) -> str:
+    return f"{100.0 * count / score.trials:.0f}" if score.trials else "-"
+
+
+def tables(single: Scores, minute: Scores) -> str:
+    """Everything as Markdown."""
+    parts = ["## Single snapshots", _exact(single), _clean(single), _details(single)]
+    if minute:
+        parts += ["## With 60 s of data", _exact(minute), _clean(minute)]
+    return "\n\n".join(parts) + "\n"
+
+
+def _rows(head: list[str], rows: list[list[str]]) -> str:
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
+
+
+def _place(cell: Cell) -> list[str]:
+    return [
+        _NAMES.get(cell.feeder, cell.feeder),
+        f"{100 * cell.std_v:g} % V, {100 * cell.std_pq:g} % PQ",
+        f"{cell.attack} {cell.liars}" if cell.liars else cell.attack,
+    ]
+
+
+def _exact(scores: Scores) -> str:
+    names = list(next(iter(scores.values())))
+    rows = []
+    for cell, here in scores.items():
+        if cell.attack == "clean":
+            continue
+        best = max(
+            (100.0 * s.exact / s.trials for n, s in here.items() if n != OURS and s.trials), default=0.0
+        )
+        ours = here[OURS]
+        row = [_percent(here[name].exact, here[name]) for name in names if name != OURS]
+        own = f"**{_percent(ours.exact, ours)}**"
+        rows.append(
+            [
+                *_place(cell),
+                *row,
+                own,
+                _percent(ours.among, ours),
+                f"{100.0 * ours.exact / ours.trials - best:+.0f}",
+            ]
+        )
+    head = [
+        "feeder",
+        "noise",
+        "attack",
+        *(n for n in names if n != OURS),
+        "ours",
+        "ours, among explanations",
+        "ours - best peer",
+    ]
+    return "Named exactly the liars, % of snapshots:\n\n" + _rows(head, rows)
+
+
+def _clean(scores: Scores) -> str:
+    names = list(next(iter(scores.values())))
+    rows = [
+        [
+            *_place(cell)[:2],
+            *(f"{100.0 * s.false / s.trials:.1f}" if s.trials else "-" for s in here.values()),
+        ]
+        for cell, here in scores.items()
+        if cell.attack == "clean"
+    ]
+    return "Somebody is named although nobody lies, % of clean snapshots:\n\n" + _rows(
+        ["feeder", "noise", *names], rows
+    )
+
+
+def _details(scores: Scores) -> str:
+    names = list(next(iter(scores.values())))
+    rows = []
+    for cell, here in scores.items():
+        for name in names:
+            s = here[name]
+            if not s.trials:
+                continue
+            seen = _percent(s.seen, s) if s.seen >= 0 else ""
+            numbers = [_percent(count, s) for count in (s.exact, s.missed, s.false, s.failed)]
+            rows.append([*_place(cell), name, str(s.trials), *numbers, seen, f"{s.ms:.2f}"])
+    head = [
+        "feeder",
+        "noise",
+        "attack",
+        "method",
+        "snapshots",
+        "exact",
+        "a liar missed",
+        "somebody else named",
+        "no result",
+        "chi-square test sees it",
+        "ms",
+    ]
+    return "All numbers, % of snapshots, and the median time of one:\n\n" + _rows(head, rows)
+
+
+def save(path: Path, single: Scores, minute: Scores) -> None:
+    """Keep the numbers of a run."""
+    kept = [
+        [[asdict(cell), {name: asdict(s) for name, s in here.items()}] for cell, here in scores.items()]
+        for scores in (single, minute)
+    ]
+    path.write_text(json.dumps(kept), encoding="utf-8")
+
+
+def load(paths: list[Path]) -> tuple[Scores, Scores]:
+    """The numbers of several runs together."""
+    single: Scores = {}
+    minute: Scores = {}
+    for path in paths:
+        for scores, kept in zip((single, minute), json.loads(path.read_text(encoding="utf-8")), strict=True):
+            for cell, here in kept:
+                scores[Cell(**cell)] = {name: Score(**numbers) for name, numbers in here.items()}
+    return single, minute
+
+
+def write(folder: Path, single: Scores, minute: Scores) -> None:
+    """Write peers.md and the figures."""
+    text = (Path(__file__).parent / "text.md").read_text(encoding="utf-8")
+    text = text.replace("{tables}", tables(single, minute))
+    (folder / "peers.md").write_text(text, encoding="utf-8")
+    _draw(folder / "peers.png", single)
+
+
+def _draw(path: Path, scores: Scores) -> None:
+    import matplotlib as mpl  # only where figures are wanted
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    attacked = [cell for cell in scores if cell.attack != "clean"]
+    places = list(dict.fromkeys((cell.feeder, cell.std_v) for cell in attacked))
+    names = list(next(iter(scores.values())))
+    figure, axes = plt.subplots(len(places), 1, figsize=(9, 2.3 * len(places)), sharex=True, squeeze=False)
+    for axis, place in zip(axes[:, 0], places, strict=True):
+        here = [cell for cell in attacked if (cell.feeder, cell.std_v) == place]
+        x, width = np.arange(len(here)), 0.8 / len(names)
+        for k, name in enumerate(names):
+            exact = [100.0 * scores[cell][name].exact / max(scores[cell][name].trials, 1) for cell in here]
+            axis.bar(x + (k - (len(names) - 1) / 2) * width, exact, width, label=name)
+        axis.set_ylabel("exact, %")
+        axis.set_ylim(0, 100)
+        axis.set_title(", ".join(_place(here[0])[:2]), fontsize=9)
+        axis.set_xticks(x, [f"{cell.attack} {cell.liars}" for cell in here], fontsize=8)
+    axes[0, 0].legend(ncols=len(names), fontsize=7, loc="lower center")
+    figure.tight_layout()
+    figure.savefig(path, dpi=80)
+    plt.close(figure)
