@@ -87,6 +87,24 @@ def test_attacks_are_seen_named_and_left_out(size: float) -> None:
     assert any(outcome.reset[1] for outcome in after) == (abs(size) > made.limit[1])
 
 
+def test_a_sensor_is_named_only_beyond_what_the_error_of_the_estimate_explains() -> None:
+    """`|zhat_i - Phi_i(xhat)| > delta_i + Lip^(Phi_i) bound`: an honest sensor cannot be further off."""
+    made = estimator()
+    state = high_gain.init(made, 0.0, np.full(3, 0.2), np.zeros(1))
+    state = replace(state, age=np.full(3, 100.0))
+    y, seen = np.full(3, 0.2), np.ones(3, dtype=bool)
+    _, calm = high_gain.step(made, state, y, np.zeros(1), seen, 0.02)
+    reach = made.decays[1].epsilon + made.steep[1] * calm.bound
+    assert made.steep[1] * calm.bound > made.decays[1].epsilon
+    for share, named in ((0.8, [False] * 3), (1.3, [False, True, False])):
+        # The second observer stands apart: within what two honest errors can do, and beyond.
+        apart = np.array(state.z)
+        apart[:, 0] = 0.2
+        apart[1, 0] += share * reach
+        _, out = high_gain.step(made, replace(state, z=apart), y, np.zeros(1), seen, 1e-9)
+        assert out.suspects.tolist() == named
+
+
 def test_search_walks_through_the_sets_at_once_or_one_by_one() -> None:
     # Sensor 2 is in the first two sets, {1, 2} and {0, 2}.
     added = lambda t: 0.5 * (t[:, None] >= 4.0) * np.array([0.0, 0.0, 1.0])  # noqa: E731
