@@ -8,7 +8,7 @@ from benchmarks.peers.answer import Answer
 from benchmarks.peers.scene import Reading, Scene
 from gridsec.arrays import Bools, Floats
 from gridsec.feeder import bus_voltages, lindistflow
-from gridsec.sequential.loads import LoadDoubt, prior
+from gridsec.sequential.conditional import Prior
 from gridsec.sequential.snapshot import Lies, identify
 
 _STEPS = 2
@@ -18,17 +18,18 @@ class Ours:
     """One feeder, prepared once."""
 
     def __init__(self, here: Scene, lies: Lies | None = None, *, false_powers: bool = True) -> None:
-        self.feeder, self.model = here.feeder, lindistflow(here.feeder)
+        self.feeder, model = here.feeder, lindistflow(here.feeder)
         self.lies = Lies() if lies is None else lies
-        self.R, self.X = 2.0 * self.model.R, 2.0 * self.model.X
+        self.R, self.X = 2.0 * model.R, 2.0 * model.X
         self.false_powers = false_powers
 
     def __call__(self, told: Reading) -> Answer:
         """One snapshot."""
         v, v0, p, q, std_v = told.v, told.v0, told.p, told.q, told.std_v
         feeder = self.feeder
-        doubt = LoadDoubt(told.std_p, told.std_q, time_s=1.0)
-        known = prior(self.model, feeder.bus, doubt, busbar=2.0 * v0 * std_v)
+        spread = np.hstack([self.R * told.std_p, self.X * told.std_q])
+        K = spread @ spread.T + (2.0 * v0 * std_v) ** 2
+        known = Prior(K, np.arange(v.size), K.diagonal())
         noise, v2 = (2.0 * v * std_v) ** 2, v**2
         R, X = self.R, self.X
         var_p, var_q = told.std_p**2, told.std_q**2

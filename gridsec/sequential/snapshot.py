@@ -194,7 +194,7 @@ _PASSES = 2
 # Rises of J below this are rounding.
 _LEAST = 1e-9
 # A fit this many standard deviations above its expectation leaves something unexplained.
-_MISFIT = 2.0
+_MISFIT = 3.0
 _MOVES = 4
 # So many customers, those that explain most, are where a search with false powers begins.
 _STARTS = 6
@@ -237,16 +237,17 @@ def identify(
     tuple of Explained
         The likeliest first; there is always one.
     """
-    at = np.flatnonzero(live)
     lies = Lies() if lies is None else lies
-    doubts = np.zeros((at.size, at.size, 0 if false is None else 2))
-    doubts = doubts if false is None else false[np.ix_(at, at)]
-    problem = _Problem(lies, noise[at], doubts, curved)
-    K = prior.of_meters[np.ix_(prior.meters[at], at)] + np.diag(noise[at])
+    at: Ints | slice = slice(None) if live.all() else np.flatnonzero(live)
+    d, y, bus = noise[at], m[at], prior.meters[at]
+    doubts = np.zeros((d.size, d.size, 0)) if false is None else false[at][:, at]
+    problem = _Problem(lies, d, doubts, curved)
+    K = prior.of_meters[bus][:, at]
+    K[np.diag_indices(d.size)] += d
     Q = inverted(K)
-    none = np.zeros(at.size, dtype=np.bool_)
-    g = Q @ m[at]
-    start = _State(none, none.copy(), m[at], Q, g, 0.0, float(m[at] @ g))
+    none = np.zeros(d.size, dtype=np.bool_)
+    g = Q @ y
+    start = _State(none, none.copy(), y, Q, g, 0.0, float(y @ g))
     found = _explanations(problem, start, false is not None)
     return _reported(problem, found, live, lies)
 
