@@ -113,8 +113,33 @@ def _told(site: Site, plan: Plan) -> str:
         f"(errors: {plan.meters}{', with q' * plan.report_q}), {site.droop.tau.size} inverters, "
         f"M = {plan.max_attacked}, "
         f"{runs} of {plan.duration_s:g} s at {plan.step_s:g} s per case, powers known within "
-        f"{error.p_kw:g} kW and {error.q_kvar:g} kvar (1 sigma, correlated over {error.correlation_s:g} s)."
+        f"{error.p_kw:g} kW and {error.q_kvar:g} kvar (1 sigma, correlated over {error.correlation_s:g} s).\n"
+        f"Measured by:\n\n    {_command(site, plan)}"
     )
+
+
+def _command(site: Site, plan: Plan) -> str:
+    """The command line that measures all this again."""
+    from feeders.comparison import Plan
+
+    usual = Plan()
+    options = {
+        "--max-attacked": (plan.max_attacked, usual.max_attacked),
+        "--seeds": (plan.seeds, usual.seeds),
+        "--duration": (plan.duration_s, usual.duration_s),
+        "--meters": (str(plan.meters), str(usual.meters)),
+        "--load-error-kw": (plan.load_error.p_kw, usual.load_error.p_kw),
+        "--load-error-kvar": (plan.load_error.q_kvar, usual.load_error.q_kvar),
+    }
+    words = ["gridsec study compare", site.feeder.name]
+    words += [f"{name} {value}" for name, (value, default) in options.items() if value != default]
+    words += ["--report-q"] * plan.report_q
+    for name, chosen, every in (
+        ("--family", plan.families, usual.families),
+        ("--case", plan.cases, usual.cases),
+    ):
+        words += [f"{name} {each}" for each in chosen if chosen != every]
+    return " ".join(words)
 
 
 def _show(rows: list[Row], plan: Plan) -> None:
