@@ -135,13 +135,23 @@ def answer(
         base = (
             (*ambiguous, f"No meter disagrees, but readings are too coarse to judge {who}.")
             if deaf.any()
-            else (*base[:2], "All meters and inverters agree with the feeder.")
+            else (*base[:2], _agreement(design, found.trial, owners))
         )
     return base
 
 
 _SHORT = 1e-3
 _NAMED = 4
+
+
+def _agreement(design: UnknownInputDesign, trial: Trial, owners: list[str]) -> str:
+    """What CLEAN says, and how much it leaves open: an injection of twice its error is seen for certain."""
+    said = "All meters and inverters agree with the feeder"
+    if not owners:
+        return f"{said}."
+    unseen = 2.0 * trial.attack_error * design.setting.plant.feeder.base_kva
+    most = int(np.argmax(unseen))
+    return f"{said}; up to {unseen[most]:.0f} kvar of the inverter of {owners[most]} could go unseen."
 
 
 def _who(meters: Bools, inverters: Bools, names: list[str], owners: list[str]) -> str:

@@ -6,6 +6,7 @@ can explain, and real feeders' scenarios for who is named.
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import lru_cache
 
@@ -98,6 +99,9 @@ def test_a_clean_hour_names_nobody() -> None:
     answers = watch(village(), seconds=3600.0, dt_s=10.0)
     assert all(named(verdict) == ([], []) for _, verdict in answers)
     assert {v.decision for _, v in answers[3:]} == {Decision.CLEAN}
+    assert re.search(
+        r"up to \d+ kvar of the inverter of LV1.101 Load \d+ could go unseen", answers[-1][1].reason
+    )
 
 
 def test_without_reported_reactive_power_nothing_is_called_clean() -> None:
