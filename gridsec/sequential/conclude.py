@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gridsec.arrays import Bools, Floats
+from gridsec.frames import NO_VOLTAGE
 from gridsec.judge import Situation, decide
 from gridsec.online import Cause, Decision, Estimate, Explanation, Frame, Verdict
 from gridsec.sequential.conditional import judge
@@ -266,11 +267,11 @@ def unusable(
     estimate = Estimate(
         t=state.t,
         v2=v2_bus[plant.feeder.bus],
-        bound=np.full(plant.feeder.bus.size, _NO_VOLTAGE),
+        bound=np.full(plant.feeder.bus.size, NO_VOLTAGE),
         v2_bus=v2_bus,
         trusted=np.zeros(p, dtype=np.bool_),
         x=np.zeros(m),
-        std=np.full(plant.feeder.bus.size, _NO_VOLTAGE),
+        std=np.full(plant.feeder.bus.size, NO_VOLTAGE),
     )
     verdict = Verdict(
         Decision.UNDECIDED,
@@ -278,11 +279,7 @@ def unusable(
         reason,
         np.zeros(p, dtype=np.bool_),
         np.full(p, np.nan),
-        np.full(p, _NO_VOLTAGE),
+        np.full(p, NO_VOLTAGE),
         np.zeros(p),
     )
     return state, estimate, verdict
-
-
-# Errors of squared voltages end here: no voltage is above 2 pu.
-_NO_VOLTAGE = 4.0

@@ -131,6 +131,9 @@ class SequentialDesign:
         What manipulations are compared with, and when repetition is evidence.
     most
         How many liars it claims to tell apart: a third of the meters.
+    most_p, most_q : (N,)
+        Largest power of each customer that is believed, pu: more would alone move the voltage beyond all
+        limits.
     step_s
         Expected interval between frames, s.
     options
@@ -161,6 +164,8 @@ class SequentialDesign:
     book: Dictionary = field(repr=False)
     shapes: Shapes = field(repr=False)
     most: int
+    most_p: Floats
+    most_q: Floats
     step_s: float
     options: SequentialOptions = field(repr=False)
     decoder: Decoder | None = None
@@ -239,9 +244,19 @@ def design(
         book=_suspicions(plant, model, options),
         shapes=_shapes(plant, model, options.alarms_per_year, step_s, lengths),
         most=meters.size // 3 if max_attacked is None else max_attacked,
+        most_p=_most_power(model.R_bus),
+        most_q=_most_power(model.X_bus),
         step_s=step_s,
         options=options,
     )
+
+
+# Powers that alone would move a squared voltage by this, pu, are none; nor are any beyond so many pu.
+_COLLAPSE, _NO_POWER = 1.0, 1e4
+
+
+def _most_power(matrix: Floats) -> Floats:
+    return np.asarray(_COLLAPSE / np.maximum(2.0 * np.abs(matrix).max(axis=0), _COLLAPSE / _NO_POWER))
 
 
 # Voltage at which a meter's relative errors are turned into squared ones, in parts of the nominal.

@@ -8,6 +8,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats
 from gridsec.feeder import bus_voltages, model_error_bound
+from gridsec.frames import NO_VOLTAGE
 from gridsec.lure import known_input
 from gridsec.online import Estimate, Frame, Verdict
 from gridsec.sequential.commission import conclude as learn
@@ -56,6 +57,7 @@ def step(
     if not np.isfinite(frame.t) or (state.x is not None and not frame.t > state.t):
         return unusable(design, state, frame)
     at = design.plant.feeder.bus[design.plant.meters]
+    frame = _powers(design, frame)
     heard = _clean(design, state, frame)
     doubts = _doubts(design, state.doubts, frame, heard.busbar)
     if doubts is not state.doubts and doubts.prior is not state.doubts.prior:
@@ -119,7 +121,8 @@ def _voltages(design: SequentialDesign, frame: Frame, heard: _Heard, x: Floats) 
     )
     with np.errstate(all="ignore"):
         v2_bus = bus_voltages(plant.feeder, frame.p, q, heard.v0_squared, steps=plant.loss_correction)
-    return q, np.where(np.isfinite(v2_bus), v2_bus, heard.v0_squared)
+        v2_bus = np.clip(v2_bus, 0.0, NO_VOLTAGE)
+    return q, np.where(np.isnan(v2_bus), heard.v0_squared, v2_bus)
 
 
 def _distrust(trust: Trust, copies: Bools) -> Trust:
@@ -167,25 +170,46 @@ def _learn(
 _STALE = 16
 
 
+def _powers(design: SequentialDesign, frame: Frame) -> Frame:
+    """The frame with powers that can be: all others are not known."""
+    p, p_error = _possible(frame.p, frame.p_error, design.most_p)
+    q, q_error = _possible(frame.q, frame.q_error, design.most_q)
+    if p is frame.p and q is frame.q and p_error is frame.p_error and q_error is frame.q_error:
+        return frame
+    return replace(frame, p=p, p_error=p_error, q=q, q_error=q_error)
+
+
+def _possible(power: Floats, error: Floats, most: Floats) -> tuple[Floats, Floats]:
+    good = np.abs(power) <= most
+    known = good & (np.abs(error) <= most)
+    if known.all():
+        return power, error
+    return np.where(good, power, 0.0), np.where(known, error, most)
+
+
 def _clean(design: SequentialDesign, state: SequentialState, frame: Frame) -> _Heard:
     plant = design.plant
     live = frame.seen & np.isfinite(frame.y)
     low, high = design.options.v2_limits
     busbar = bool(np.isfinite(frame.v0_squared) and low <= frame.v0_squared <= high)
     told = np.zeros(frame.q.size, dtype=np.bool_)
-    reported = np.isfinite(frame.q_net)
+    # As `_possible` has it: who is sure of nothing tells nothing.
+    reported = (np.abs(frame.q_net) <= design.most_q) & (np.abs(frame.q_net_error) <= design.most_q)
     if reported.any():
         trusted = np.zeros(frame.q.size, dtype=np.bool_)
         trusted[plant.meters] = live & state.trust.trusted
         count = frame.q.size
         most = np.bincount(plant.droop.customer, weights=plant.droop.q[:, 0], minlength=count)
         least = np.bincount(plant.droop.customer, weights=plant.droop.q[:, 3], minlength=count)
-        rest, room = np.nan_to_num(frame.q_net) - frame.q, frame.q_error + np.nan_to_num(frame.q_net_error)
+        rest, room = (
+            np.where(reported, frame.q_net, 0.0) - frame.q,
+            frame.q_error + np.where(reported, frame.q_net_error, 0.0),
+        )
         told = trusted & reported & (least - room <= rest) & (rest <= most + room)
     return _Heard(
         live=live,
-        y=np.where(live, frame.y, 0.0),
-        q=np.where(told, np.nan_to_num(frame.q_net), frame.q),
+        y=np.clip(np.where(live, frame.y, 0.0), 0.0, NO_VOLTAGE),
+        q=np.where(told, frame.q_net, frame.q),
         told=told,
         v0_squared=frame.v0_squared if busbar else state.v0_squared,
         busbar=busbar,
@@ -209,7 +233,11 @@ def _doubts(design: SequentialDesign, before: Doubts, frame: Frame, busbar: bool
     )
     if busbar == before.busbar and np.array_equal(p, before.p) and np.array_equal(q, before.q):
         return before
-    doubt = replace(design.doubt, p=design.doubt.p * p, q=design.doubt.q * q)
+    doubt = replace(
+        design.doubt,
+        p=np.where(p > 1.0, np.maximum(design.doubt.p, _EXACT) * p, design.doubt.p),
+        q=np.where(q > 1.0, np.maximum(design.doubt.q, _EXACT) * q, design.doubt.q),
+    )
     plain = busbar and bool((p == 1.0).all() and (q == 1.0).all())
     found = (
         design.prior
@@ -225,9 +253,13 @@ def _doubts(design: SequentialDesign, before: Doubts, frame: Frame, busbar: bool
     return Doubts(p, q, busbar, found)
 
 
+# Powers are known no better than this, pu.
+_EXACT = 1e-6
+
+
 def _factor(error: Floats, std: Floats, old: Floats) -> Floats:
     """Power of two by which a frame knows a power less well than the design assumes, with hysteresis."""
-    ratio = error / np.sqrt(3.0) / np.maximum(std, np.finfo(np.float64).tiny)
+    ratio = error / np.sqrt(3.0) / np.maximum(std, _EXACT)
     keep = (ratio <= old * _MUCH_LESS) & (ratio * _MUCH_LESS >= old) & (old > 1.0)
     raised = np.exp2(np.ceil(np.log2(np.maximum(ratio, 1.0))))
     return np.where(keep, old, np.where(ratio > _MUCH_LESS, raised, 1.0))

@@ -1,0 +1,99 @@
+"""The sequential monitor against data that nobody promised, and against liars who know how it works."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gridsec import sequential
+from gridsec.online import Decision, Frame, Verdict
+from gridsec.sequential import SequentialState
+from tests.gridsec.sequential.test_monitor import prepare, watch
+from tests.gridsec.street import Street, make_plant
+
+Change = Callable[[Frame], Frame]
+
+
+def run(
+    change: Change, *, frames: int, before: int = 30, after: int = 0, seed: int = 0, inverters: int = 12
+) -> tuple[list[Verdict], SequentialState]:
+    """Verdicts from the first changed frame on, of a street that was calm before."""
+    rng = np.random.default_rng(seed)
+    plant = make_plant(rng, customers=12, drop=0.03, inverters=np.arange(inverters))
+    design, street = prepare(plant), Street(plant, rng)
+    state, _ = watch(street, design, before)
+    state, answers = watch(street, design, frames, state=state, change=change)
+    if after:
+        state, more = watch(street, design, after, state=state)
+        answers += more
+    return [verdict for _, verdict in answers], state
+
+
+def put(name: str, value: float) -> Change:
+    """One number of every frame replaced."""
+
+    def change(frame: Frame) -> Frame:
+        old = getattr(frame, name)
+        if np.ndim(old) == 0:
+            return replace(frame, **{name: value})
+        new = old.copy()
+        new[2] = value
+        return replace(frame, **{name: new})
+
+    return change
+
+
+class TestNumbersThatAreNone:
+    @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e20, -1e200, 1e308])
+    @pytest.mark.parametrize("name", ["p", "q", "p_error", "q_error"])
+    def test_a_power_that_is_none_is_not_known(self, name: str, value: float) -> None:
+        """Nobody is named for it, and nothing of it is left afterwards."""
+        verdicts, state = run(put(name, value), frames=6, after=70)
+        assert not any(verdict.suspects.any() for verdict in verdicts)
+        assert verdicts[-1].decision is Decision.CLEAN
+        assert (state.doubts.p == 1.0).all()
+
+    @pytest.mark.parametrize("value", [-1e308, 0.0, 1e8, 1e15, 1e200, 1e308])
+    def test_a_reading_that_is_none_is_a_lie_of_one_meter(self, value: float) -> None:
+        verdicts, _ = run(put("y", value), frames=4, after=70)
+        assert list(np.flatnonzero(verdicts[3].suspects)) == [2]
+        assert not any(np.delete(verdict.suspects, 2).any() for verdict in verdicts)
+        assert verdicts[-1].decision is Decision.CLEAN
+
+    @pytest.mark.parametrize("inverters", [0, 5])
+    def test_everything_at_once(self, inverters: int) -> None:
+        """Half of the meters silent, another half at every tick; powers and the busbar come and go."""
+        rng = np.random.default_rng(1)
+
+        def change(frame: Frame) -> Frame:
+            seen = rng.random(12) < 0.5
+            wild = rng.random() < 0.2
+            return replace(
+                frame,
+                seen=seen,
+                y=np.where(seen, frame.y, np.nan),
+                v0_squared=np.nan if rng.random() < 0.5 else frame.v0_squared,
+                p=np.full(12, 1e3) if wild else frame.p,
+                q_net=np.where(rng.random(12) < 0.2, 1e300, np.nan),
+                q_net_error=np.full(12, np.inf),
+            )
+
+        verdicts, _ = run(change, frames=80, after=90, inverters=inverters)
+        assert all(verdict.decision is Decision.UNDECIDED for verdict in verdicts[:80])
+        assert not any(verdict.suspects.any() for verdict in verdicts)
+        assert verdicts[-1].decision is Decision.CLEAN
+
+    def test_errors_are_believed_where_the_design_knows_of_none(self) -> None:
+        rng = np.random.default_rng(2)
+        plant = make_plant(rng, customers=12, drop=0.03)
+        design = prepare(plant)
+        exact = replace(design.doubt, p=np.zeros(12), q=design.doubt.q)
+        made = sequential.design(plant, doubt=exact, step_s=1.0)
+        frame = Street(plant, rng).frame()
+        for error in (0.05, 50.0, np.inf):
+            given = replace(frame, p_error=np.full(12, error))
+            state, _, _ = sequential.step(made, sequential.init(made, frame.t - 1.0), given)
+            assert (state.doubts.prior.variance[1:] > made.prior.variance[1:]).all()
