@@ -2,8 +2,8 @@
 
 SimBench LV rural 1: 13 customers, watched by the sequential monitor or by the exact bank of 78 + 715
 observers (M = 2), six seeds each in turn. Customers' meters of class 0.5 with 0.1 V resolution and 0.05 %
-jitter, a busbar meter of class 0.1, p metered within 1 %, q not reported. The truth is full AC power flow with
-the droop inverters in closed loop, at 1 Hz for ten minutes.
+jitter, a busbar meter of class 0.1, p metered within 1 %, q not reported. The truth is full AC power flow
+with the droop inverters in closed loop, at 1 Hz for ten minutes.
 """
 
 from __future__ import annotations
