@@ -13,8 +13,10 @@ freedom that it gives: what one meter costs follows from A and from how well the
 Accusing changes K by a matrix of rank one, false powers by one of rank two; the gains of *all* single
 accusations come from ``Q = K^-1`` and ``g = Q m`` without solving anything.
 
-`anybody` is what makes a false alarm as rare as asked for: with it a single meter is accused beyond the
-``1 - rate / (2 p)`` quantile of the normal distribution. Once one is, others lie more probably.
+`anybody` is what makes a false alarm as rare as asked for: nobody is named unless accusing one meter lowers
+J, and with it that takes a leave-one-out residual beyond the ``1 - rate / (2 p)`` quantile of the normal
+distribution. `rate` is an upper bound: where the freedom and the prior alone cost more, `anybody` is zero and
+fewer are named. Once one is accused, others lie more probably.
 
 References
 ----------
@@ -49,7 +51,7 @@ class Lies:
     false
         What false powers cost beside their freedom, as minus twice a logarithm.
     rate
-        Clean snapshots of which one may name somebody.
+        At most this part of clean snapshots names somebody, where errors are what the model says.
     like
         Explanations no more than this factor less likely than the best are reported.
     """
@@ -109,13 +111,15 @@ class _State:
 class _Problem:
     """Readings, and what may be wrong with them."""
 
-    def __init__(self, lies: Lies, noise: Floats, false: Floats, curved: Curved | None) -> None:
+    def __init__(self, lies: Lies, Q: Floats, false: Floats, curved: Curved | None) -> None:
         self.lies, self.false, self.curved = lies, false, curved
-        self.size = p = noise.size
+        self.size = p = len(Q)
         self.a2 = lies.size**2
-        # The most likely single accusation at the wanted rate costs nothing net.
-        least = ndtri(lies.rate / (2.0 * p)) ** 2
-        self.anybody = max(0.0, float(least - np.log1p(self.a2 / np.median(noise)) - price(p, 1) - lies.each))
+        self.anybody = 0.0
+        if p:
+            # The meter that the others know least well is accused for the least freedom.
+            least = ndtri(lies.rate / (2.0 * p)) ** 2 - price(p, 1) - lies.each
+            self.anybody = max(0.0, float(least - np.log1p(self.a2 * Q.diagonal().min())))
 
     def charge(self, count: int, false: int) -> float:
         return (
@@ -241,10 +245,10 @@ def identify(
     at: Ints | slice = slice(None) if live.all() else np.flatnonzero(live)
     d, y, bus = noise[at], m[at], prior.meters[at]
     doubts = np.zeros((d.size, d.size, 0)) if false is None else false[at][:, at]
-    problem = _Problem(lies, d, doubts, curved)
     K = prior.of_meters[bus][:, at]
     K[np.diag_indices(d.size)] += d
     Q = inverted(K)
+    problem = _Problem(lies, Q, doubts, curved)
     none = np.zeros(d.size, dtype=np.bool_)
     g = Q @ y
     start = _State(none, none.copy(), y, Q, g, 0.0, float(y @ g))

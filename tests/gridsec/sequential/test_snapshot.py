@@ -1,0 +1,156 @@
+"""The likeliest explanation of one snapshot, against all explanations and dense linear algebra."""
+
+from __future__ import annotations
+
+from itertools import chain, combinations
+from math import comb
+
+import numpy as np
+import pytest
+
+from gridsec.arrays import Bools, Floats
+from gridsec.sequential.conditional import Prior
+from gridsec.sequential.snapshot import Explained, Lies, identify
+
+P = 7
+LIES = Lies()
+
+
+Known = tuple[Prior, Floats, Floats]
+
+
+def street(rng: np.random.Generator) -> Known:
+    """A line of customers: prior, noise, and what false powers do to voltages, (p, p, 2)."""
+    r = np.cumsum(rng.uniform(0.01, 0.05, P))
+    R = 2.0 * np.minimum.outer(r, r)
+    K = R @ np.diag(rng.uniform(0.005, 0.02, P) ** 2) @ R.T
+    return Prior(K, np.arange(P), K.diagonal()), np.full(P, 0.004**2), np.stack([R, 0.3 * R], axis=2)
+
+
+def dense(known: Known, m: Floats, liars: tuple[int, ...], powers: tuple[int, ...] = ()) -> float:
+    """Minus twice the log evidence, from its definition, relative to K of nobody."""
+    prior, noise, false = known
+    honest = prior.between + np.diag(noise)
+    K = honest.copy()
+    for j in liars:
+        K[j, j] += LIES.size**2
+    for c in powers:
+        K += false[:, c] @ false[:, c].T
+    logs = np.linalg.slogdet(K)[1] - np.linalg.slogdet(honest)[1]
+    sets = 2.0 * np.log(comb(P, len(liars)))
+    return float(m @ np.linalg.solve(K, m) + logs + sets + LIES.each * len(liars) + LIES.false * len(powers))
+
+
+def subsets(most: int) -> list[tuple[int, ...]]:
+    return list(chain.from_iterable(combinations(range(P), k) for k in range(1, most + 1)))
+
+
+def who(found: Explained) -> tuple[int, ...]:
+    return tuple(np.flatnonzero(found.liars).tolist())
+
+
+LIVE: Bools = np.ones(P, dtype=np.bool_)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_finds_the_best_of_all_sets_of_up_to_three(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    prior, noise, false = street(rng)
+    m = rng.multivariate_normal(np.zeros(P), prior.between + np.diag(noise))
+    lying = rng.choice(P, 1 + seed % 3, replace=False)
+    m[lying] += rng.choice([-1.0, 1.0], lying.size) * rng.uniform(0.05, 0.2, lying.size)
+    found = identify(prior, noise, m, LIVE)
+    best = min(subsets(3), key=lambda each: dense((prior, noise, false), m, each))
+    assert who(found[0]) == best == tuple(sorted(lying.tolist()))
+    rivals = {who(each): each.probability for each in found}
+    for other, probability in rivals.items():
+        if other:
+            gap = dense((prior, noise, false), m, other) - dense((prior, noise, false), m, best)
+            assert np.log(rivals[best] / probability) == pytest.approx(gap / 2.0, abs=1e-6)
+    assert sum(rivals.values()) == pytest.approx(1.0)
+
+
+def test_false_powers_are_found_with_their_meter() -> None:
+    exact = 0
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        prior, noise, false = street(rng)
+        c = int(rng.integers(2, P - 1))
+        # The model follows the false powers, all meters but the customer's own tell the truth.
+        honest = rng.multivariate_normal(np.zeros(P), prior.between + np.diag(noise))
+        m = honest - 0.7 * false[:, c, 0]
+        m[c] = honest[c]
+        found = identify(prior, noise, m, LIVE, false=false)
+        best = min(
+            ((each, powers) for each in subsets(2) for k in (0, 1) for powers in combinations(each, k)),
+            key=lambda pair: dense((prior, noise, false), m, *pair),
+        )
+        assert who(found[0]) == best[0]
+        assert tuple(np.flatnonzero(found[0].powers).tolist()) == best[1]
+        exact += best == ((c,), (c,))
+    assert exact >= 18
+
+
+def clean_and_named(rate: float, noise: Floats, trials: int) -> int:
+    """In how many of so many clean snapshots somebody is named."""
+    rng = np.random.default_rng(5)
+    prior, _, false = street(rng)
+    root = np.linalg.cholesky(prior.between + np.diag(noise))
+    lies = Lies(rate=rate)
+    told = rng.normal(size=(trials, P)) @ root.T
+    found = [identify(prior, noise, m, LIVE, lies=lies, false=false)[0] for m in told]
+    return sum(bool(each.liars.any()) for each in found)
+
+
+SAME = np.full(P, 0.004**2)
+MIXED = np.array([1.0, 1.0, 30.0, 1.0, 1.0, 5.0, 1.0]) ** 2 * SAME
+
+
+@pytest.mark.parametrize("noise", [SAME, MIXED])
+def test_no_more_clean_snapshots_name_somebody_than_allowed(noise: Floats) -> None:
+    for rate in (0.05, 0.005):
+        # Three standard deviations of the count.
+        assert clean_and_named(rate, noise, 4000) <= 4000 * rate + 3.0 * np.sqrt(4000 * rate)
+
+
+def test_as_many_clean_snapshots_name_somebody_as_allowed_where_the_rate_decides() -> None:
+    # At 0.05 the freedom and the prior alone allow less; at 0.001 `anybody` is what they lack.
+    assert clean_and_named(0.05, SAME, 4000) < 0.01 * 4000
+    assert 8 <= clean_and_named(0.001, SAME, 15000) <= 27
+
+
+def test_the_voltage_follows_from_the_weights() -> None:
+    rng = np.random.default_rng(9)
+    prior, noise, _ = street(rng)
+    truth = rng.multivariate_normal(np.zeros(P), prior.between)
+    m = truth + np.sqrt(noise) * rng.normal(size=P)
+    m[4] += 0.3
+    best = identify(prior, noise, m, LIVE)[0]
+    honest = np.flatnonzero(~best.liars)
+    K = prior.between[np.ix_(honest, honest)] + np.diag(noise[honest])
+    expected = prior.between[:, honest] @ np.linalg.solve(K, m[honest])
+    # A liar's reading counts with the tiny weight of its slab.
+    np.testing.assert_allclose(prior.between @ best.weights, expected, atol=3e-4)
+
+
+def test_a_silent_meter_has_no_influence() -> None:
+    rng = np.random.default_rng(2)
+    prior, noise, false = street(rng)
+    m = rng.multivariate_normal(np.zeros(P), prior.between + np.diag(noise))
+    m[1] += 0.1
+    live = LIVE.copy()
+    live[5] = False
+    first = identify(prior, noise, m, live, false=false)
+    m[5] = np.nan
+    second = identify(prior, noise, m, live, false=false)
+    assert who(first[0]) == who(second[0]) == (1,)
+    assert not first[0].weights[5]
+    np.testing.assert_array_equal(first[0].weights, second[0].weights)
+
+
+def test_without_readings_nobody_is_named() -> None:
+    prior, noise, _ = street(np.random.default_rng(1))
+    found = identify(prior, noise, np.full(P, np.nan), ~LIVE)
+    assert len(found) == 1
+    assert not found[0].liars.any()
+    assert found[0].probability == pytest.approx(1.0)
