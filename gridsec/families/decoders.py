@@ -16,14 +16,7 @@ from scipy.stats import chi2, norm
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.decode.sparse import basis_pursuit, matching_pursuit
-from gridsec.families.sets import (
-    Atoms,
-    Outcome,
-    meters_and_inverters,
-    meters_only,
-    meters_with_their_inverters,
-    outcomes,
-)
+from gridsec.families.sets import Outcome, outcomes
 from gridsec.sequential.conditional import drop, judge
 from gridsec.sequential.decoder import Accused, Evidence
 
@@ -71,61 +64,25 @@ def fewest(evidence: Evidence) -> tuple[Accused, ...]:
     Returns
     -------
     tuple of Accused
-        The set with the smallest misfit of all those of the smallest size, and its rivals.
+        The set with the smallest misfit of all those of the smallest size, and its rivals; the best of the
+        largest size, where none leaves everybody within the limits.
 
     References
     ----------
     lee2018 (2.2.8'): l0 decoding with bounded noise, the sets tried in the order of their size.
     """
-    return _smallest(evidence, meters_only(evidence.live))
-
-
-def search_on_failure(evidence: Evidence) -> tuple[Accused, ...]:
-    """Go on believing the same meters as long as these agree; search only when they do not.
-
-    Parameters
-    ----------
-    evidence
-        One tick.
-
-    References
-    ----------
-    kim2018 and lee2018, chapter 5: monitor one estimate, switch to another set when its own test fails.
-    """
-    if not (evidence.over & evidence.believed).any():
-        return (Accused(evidence.live & ~evidence.believed),)
-    return fewest(evidence)
-
-
-def meter_and_its_observer(evidence: Evidence) -> tuple[Accused, ...]:
-    """As `fewest`, but each meter is the only input of its own observer, which a lie spoils as well.
-
-    Parameters
-    ----------
-    evidence
-        One tick, its inverters driven by their own meters whoever is believed.
-
-    References
-    ----------
-    lee2018, Algorithm 4.1: block j of the stack is what sensor j alone says, its observer's state and its
-    own reading.
-    """
-    return _smallest(evidence, meters_with_their_inverters(evidence))
-
-
-def meters_or_inverters(evidence: Evidence) -> tuple[Accused, ...]:
-    """The smallest set of meters and inverters: an accused inverter's injection is an unknown input.
-
-    Parameters
-    ----------
-    evidence
-        One tick.
-
-    References
-    ----------
-    yang2021 (22) to (24): the pair of sensors and inputs whose estimate is consistent.
-    """
-    return _smallest(evidence, meters_and_inverters(evidence))
+    within = 2.0 * float(np.log(evidence.like))
+    found: Outcome | None = None
+    for size in range(min(evidence.most, int(np.count_nonzero(evidence.live))) + 1):
+        found = outcomes(evidence, size)
+        fine = np.flatnonzero(found.excess <= 1.0)
+        if fine.size:
+            order = fine[np.argsort(found.misfit[fine], kind="stable")]
+            near = order[found.misfit[order] - found.misfit[order[0]] <= within]
+            return tuple(_answer(evidence.live, found, int(c), int(order[0])) for c in near)
+    assert found is not None  # noqa: S101  # size 0 is always tried
+    best = int(np.argmin(found.misfit))
+    return (_answer(evidence.live, found, best, best),)
 
 
 def pursue(evidence: Evidence) -> tuple[Accused, ...]:
@@ -187,26 +144,7 @@ def _beyond(evidence: Evidence, at: Ints, attack: Floats) -> Accused:
     return Accused(accused)
 
 
-def _smallest(evidence: Evidence, atoms: Atoms) -> tuple[Accused, ...]:
-    """The smallest set that leaves everybody within the limits; else the best of the largest size."""
-    within = 2.0 * float(np.log(evidence.like))
-    found: Outcome | None = None
-    for size in range(min(evidence.most, len(atoms.of)) + 1):
-        found = outcomes(evidence, atoms, size)
-        fine = np.flatnonzero(found.excess <= 1.0)
-        if fine.size:
-            order = fine[np.argsort(found.misfit[fine], kind="stable")]
-            near = order[found.misfit[order] - found.misfit[order[0]] <= within]
-            return tuple(_answer(evidence.live, atoms, found, int(c), int(order[0])) for c in near)
-    assert found is not None  # noqa: S101  # size 0 is always tried
-    best = int(np.argmin(found.misfit))
-    return (_answer(evidence.live, atoms, found, best, best),)
-
-
-def _answer(live: Bools, atoms: Atoms, found: Outcome, which: int, best: int) -> Accused:
-    members = found.members[which]
+def _answer(live: Bools, found: Outcome, which: int, best: int) -> Accused:
     accused = np.zeros(live.size, dtype=np.bool_)
-    meters, others = atoms.meter[members], atoms.other[members]
-    accused[meters[meters >= 0]] = True
-    worse = float(found.misfit[which] - found.misfit[best])
-    return Accused(accused, tuple(others[others >= 0].tolist()), worse)
+    accused[found.members[which]] = True
+    return Accused(accused, float(found.misfit[which] - found.misfit[best]))

@@ -4,19 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from gridsec.families.decoders import (
-    fewest,
-    meter_and_its_observer,
-    meters_or_inverters,
-    search_on_failure,
-)
+from gridsec.families.decoders import fewest
 from gridsec.families.sets import check
 from gridsec.plant import Plant
 from gridsec.sequential import LoadDoubt, SequentialDesign, SequentialOptions
 from gridsec.sequential import design as sequential_design
 from gridsec.sequential.decoder import Decoder
-
-_TRY_ALL_SETS = (fewest, search_on_failure, meter_and_its_observer, meters_or_inverters)
 
 
 def design(
@@ -54,7 +47,6 @@ def design(
     """
     options = SequentialOptions(alarms_per_year=alarms_per_year, scales_s=(0.0,), commission_s=0.0)
     made = sequential_design(plant, doubt=doubt, step_s=step_s, options=options, max_attacked=max_attacked)
-    if decoder in _TRY_ALL_SETS:
-        inverters = plant.droop.tau.size if decoder is meters_or_inverters else 0
-        check(plant.meters.size + inverters, max_attacked)
-    return replace(made, decoder=decoder, own=decoder is meter_and_its_observer)
+    if decoder is fewest:
+        check(plant.meters.size, max_attacked)
+    return replace(made, decoder=decoder)

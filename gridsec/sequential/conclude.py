@@ -164,7 +164,7 @@ def _beside_meters(
     if tick.rivals:
         ways = " or ".join(_way(design, each) for each in tick.rivals)
         sentence = f"Manipulated is either {ways}; both explain the readings."
-    elif amounts and not design.own:
+    elif amounts:
         sentence = _doubt(design, *next(iter(amounts.items())))
     return (Decision.UNDECIDED, Cause.AMBIGUOUS, sentence) if sentence else said
 

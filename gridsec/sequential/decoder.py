@@ -10,14 +10,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from gridsec.arrays import Bools, Floats, Ints
+from gridsec.arrays import Bools, Floats
 from gridsec.sequential.conditional import Fit
-from gridsec.sequential.search import Dictionary, Limits
+from gridsec.sequential.search import Limits
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
-    """What a decoder decides from. p meters, m inverters, N customers.
+    """What a decoder decides from. p meters.
 
     Attributes
     ----------
@@ -32,10 +32,6 @@ class Evidence:
         What is evidence.
     believed, over : (p,)
         Who was trusted before; whose offset is too large as judged by these.
-    book
-        Customers' active powers, then inverters: what they would do to the meters if they were wrong.
-    meter_of : (m,)
-        Meter that drives each inverter; -1 for none.
     most
         How many accusations are allowed.
     like
@@ -48,8 +44,6 @@ class Evidence:
     limits: Limits
     believed: Bools
     over: Bools
-    book: Dictionary
-    meter_of: Ints
     most: int
     like: float
 
@@ -62,14 +56,11 @@ class Accused:
     ----------
     meters : (p,)
         Who lies.
-    others
-        What else is wrong, indices into the book.
     worse
         By how much its cost exceeds that of the best answer.
     """
 
     meters: Bools
-    others: tuple[int, ...] = ()
     worse: float = 0.0
 
 

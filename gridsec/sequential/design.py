@@ -140,8 +140,6 @@ class SequentialDesign:
         The numbers that decide.
     decoder
         What decides in place of the search; None: the search.
-    own
-        Whether every inverter follows its own meter, also one that is not trusted.
     """
 
     plant: Plant
@@ -169,7 +167,6 @@ class SequentialDesign:
     step_s: float
     options: SequentialOptions = field(repr=False)
     decoder: Decoder | None = None
-    own: bool = False
 
     @property
     def customers(self) -> int:

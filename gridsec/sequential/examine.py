@@ -14,7 +14,7 @@ import numpy as np
 from gridsec.arrays import Bools, Floats
 from gridsec.sequential import search
 from gridsec.sequential.commission import Learned
-from gridsec.sequential.conditional import Fit, Judged, Prior, admit, drop, fit, judge, loosen
+from gridsec.sequential.conditional import Fit, Judged, Prior, admit, drop, fit, judge
 from gridsec.sequential.decoder import Accused, Evidence
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.search import Dictionary, Explanation, Limits
@@ -355,14 +355,12 @@ def _decoded(
         limits=here.limits,
         believed=trust.trusted,
         over=over,
-        book=design.book,
-        meter_of=design.meter_of,
         most=design.most,
         like=design.options.like,
     )
     assert design.decoder is not None  # noqa: S101  # the caller has looked
     answers = design.decoder(evidence)
-    found = tuple(_explanation(design, here, whole, answer) for answer in answers)
+    found = tuple(_explanation(here, whole, answer) for answer in answers)
     best = answers[0]
     trusted = np.where(here.enough, ~best.meters, trust.trusted)
     fallen = trust.trusted & ~trusted
@@ -372,17 +370,15 @@ def _decoded(
         scale=np.where(fallen, s, trust.scale),
         age=np.where(fallen, 0, trust.age),
         quiet=np.where(fallen, 0, trust.quiet),
-        accused=tuple((k, s) for k in best.others),
+        accused=(),
     )
 
 
-def _explanation(design: SequentialDesign, here: _Scale, whole: Fit, answer: Accused) -> Explanation:
+def _explanation(here: _Scale, whole: Fit, answer: Accused) -> Explanation:
     now = whole.copy()
     for j in np.flatnonzero(answer.meters & here.enough).tolist():
         drop(now, j)
-    for k in answer.others:
-        loosen(now, design.book.column(k), float(design.book.std[k]))
-    return Explanation(now, judge(now, here.m), list(answer.others), 0.0, answer.worse)
+    return Explanation(now, judge(now, here.m), [], 0.0, answer.worse)
 
 
 def _held(trust: Trust, s: int) -> Bools:

@@ -54,7 +54,7 @@ def name(design: SequentialDesign, before: Trust, seen: Examined) -> tuple[Trust
 
 def _inverters(design: SequentialDesign, before: Trust, trust: Trust) -> tuple[Ints, Bools]:
     """How long every inverter has been accused, and which are named, (m,) each."""
-    accused = [] if design.own else [k for k, _ in trust.accused]
+    accused = [k for k, _ in trust.accused]
     if not accused and not before.counted.any():
         return before.counted, before.inverters
     now = inverters_of(design, accused)
@@ -93,7 +93,7 @@ def _rivals(design: SequentialDesign, seen: Examined, fresh: Bools, new: Bools) 
             other[swap.accused], other[swap.innocent] = False, True
             near.append((other, best, swap.worse))
         for meters, each, worse in near:
-            inverters = inverters_of(design, [] if design.own else each.loosened)
+            inverters = inverters_of(design, each.loosened)
             differs = (fresh & ~meters).any() or (new & ~inverters).any()
             if (each is best and worse == 0.0) or (worse <= within and differs):
                 out.append((meters, inverters, float(np.exp(-0.5 * worse))))

@@ -268,7 +268,7 @@ def _factor(error: Floats, std: Floats, old: Floats) -> Floats:
 def _inverters(design: SequentialDesign, state: SequentialState, frame: Frame, heard: _Heard) -> Floats:
     """The injections at this frame: at rest at the first one, a step later at every other."""
     droop, meter = design.plant.droop, design.meter_of
-    believed = heard.live if design.own else state.trust.trusted & heard.live
+    believed = state.trust.trusted & heard.live
     driven = (meter >= 0) & believed[meter]
     y = np.where(driven, heard.y[meter], heard.v0_squared) if meter.size else np.zeros(0)
     if state.x is None:

@@ -31,7 +31,7 @@ from gridsec.sequential import LoadDoubt, SequentialDesign, SequentialState
 from gridsec.sequential.conditional import fit, judge
 from gridsec.sequential.decoder import Decoder, Evidence
 from gridsec.sequential.loads import prior
-from gridsec.sequential.search import Dictionary, Limits
+from gridsec.sequential.search import Limits
 from tests.gridsec.street import BASE_KVA, Street, make_plant, random_tree
 
 ALL = pytest.mark.parametrize("decoder", [least_squares, fewest, pursue, match])
@@ -80,8 +80,6 @@ def bench(rng: np.random.Generator, p: int = 8, sigmas: float = 3.5, most: int =
             limits=Limits(sigmas, zeros, zeros, zeros),
             believed=seen,
             over=none,
-            book=Dictionary(np.zeros((p, 0)), np.zeros(0), np.zeros(0), lambda _: np.zeros(p + 1)),
-            meter_of=np.zeros(0, dtype=np.intp),
             most=most,
             like=100.0,
         )
