@@ -233,7 +233,9 @@ def to_frame(site: Site, snapshot: Snapshot) -> Frame:
     Voltages: ``y = v |v|`` in pu, so that a negative reading stays a bad one.
 
     Active power: a register of f = `p_error_percent` and steps of 2 h shows r; the truth is within
-    ``(f |r| + h) / (1 - f)`` of it. Where there is no reading, or one that is not finite or beyond anything
+    ``(f |r| + h) / (1 - f)`` of it. What a register shows beyond the customer's largest load, or generation,
+    may be missing from the truth: a load that is not there is the cover of colluding voltage meters, and a
+    connection limits what it can hide. Where there is no reading, or one that is not finite or beyond anything
     the customer could draw, all that is known is the interval from full generation without load to full
     load without generation.
 
@@ -259,8 +261,9 @@ def to_frame(site: Site, snapshot: Snapshot) -> Frame:
     metered[site.meters] = snapshot.p_kw / base_kva
     known = np.abs(metered) <= model.credible  # False for NaN
     p = np.where(known, metered, 0.5 * (model.load_peak - model.pv_peak))
+    beyond = np.maximum(p - model.load_peak, 0.0) + np.maximum(-p - model.pv_peak, 0.0)
     p_error = np.where(
-        known, model.p_fraction * np.abs(p) + model.p_floor, 0.5 * (model.load_peak + model.pv_peak)
+        known, model.p_fraction * np.abs(p) + model.p_floor + beyond, 0.5 * (model.load_peak + model.pv_peak)
     )
     low = np.maximum(p - p_error, 0.0)
     most = np.minimum(p + p_error + model.pv_peak, model.load_peak)
