@@ -9,9 +9,22 @@ switching between them. What the readings then deviate from it is explained by l
 way that neighbours share, by meters' errors, and, where these do not suffice, by as few liars as possible.
 """
 
+from gridsec.sequential.commission import Commission, from_arrays, to_arrays
 from gridsec.sequential.design import SequentialDesign, SequentialOptions, design
 from gridsec.sequential.loads import LoadDoubt
-from gridsec.sequential.state import SequentialState, init
+from gridsec.sequential.state import SequentialState, init, renew
 from gridsec.sequential.step import step
 
-__all__ = ["LoadDoubt", "SequentialDesign", "SequentialOptions", "SequentialState", "design", "init", "step"]
+__all__ = [
+    "Commission",
+    "LoadDoubt",
+    "SequentialDesign",
+    "SequentialOptions",
+    "SequentialState",
+    "design",
+    "from_arrays",
+    "init",
+    "renew",
+    "step",
+    "to_arrays",
+]

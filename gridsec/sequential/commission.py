@@ -4,11 +4,15 @@ A meter of class 0.5 may be off by 0.5 %, always by the same amount; a lie of th
 the amount can be learned: over a long time the load errors cancel, and what is left of a meter's residual
 is its own. With B the prior variance of the fixed errors and M the long-run means,
 
-    cov M = B + S / n_eff + D / n,      b_hat = B (cov M)^-1 M,      P = B - B (cov M)^-1 B
+    cov M = B + c * S + D / n,      b_hat = B (cov M)^-1 M,      P = B - B (cov M)^-1 B
 
-where S / n_eff is what the loads' errors still contribute: their mean over a time T has the variance
-``2 rho (1 - rho (1 - exp(-1 / rho)))`` times that at one instant, ``rho = time_s / T``.
-After that a meter counts as manipulated when it *changes*, even inside its class.
+where ``c_ij`` says what the loads' errors, of correlation time tau, still contribute to two means over the
+last a and b >= a seconds (in units of tau):
+
+    c = (2 a + e^-a + e^-b - e^-(b - a) - 1) / (a b).
+
+After that a meter counts as manipulated when it *changes*, even inside its class. A meter that is replaced
+is learned anew while the others stay; they then say what the loads did meanwhile, with B their P.
 
 References
 ----------
@@ -17,7 +21,8 @@ docs/theory-sequential.md, section 6.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -38,11 +43,14 @@ class Learned:
         Its variance.
     allowed : (p,)
         Largest honest change from it, squared pu.
+    at : (p,)
+        When it was learned, Unix s; NaN where only the class is known.
     """
 
     bias: Floats
     variance: Floats
     allowed: Floats
+    at: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,13 +63,37 @@ class Learning:
         Sum of each meter's residuals while it was trusted, squared pu.
     count : (p,)
         How many they are.
-    time_s
+    time_s : (p,)
         Time over which they were gathered, s.
+    since : (p,)
+        Since when the meter is learned, Unix s; NaN for those that only say what the loads do.
     """
 
     total: Floats
     count: Ints
-    time_s: float
+    time_s: Floats
+    since: Floats
+
+    @property
+    def open(self) -> Bools:
+        """Which meters are being learned, (p,)."""
+        return np.isfinite(self.since)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Commission:
+    """All that commissioning has brought so far.
+
+    Attributes
+    ----------
+    learned
+        What is known.
+    learning
+        What was gathered; None where there is nothing left to learn.
+    """
+
+    learned: Learned
+    learning: Learning | None
 
 
 def nothing(design: SequentialDesign) -> Learned:
@@ -72,18 +104,67 @@ def nothing(design: SequentialDesign) -> Learned:
     design
         The design.
     """
-    return Learned(np.zeros(design.allowed.size), design.fixed, design.allowed)
+    p = design.allowed.size
+    return Learned(np.zeros(p), design.fixed, design.allowed, np.full(p, np.nan))
 
 
-def begin(meters: int) -> Learning:
+def begin(which: Bools, t: float) -> Learning:
     """Nothing gathered yet.
 
     Parameters
     ----------
-    meters
-        p.
+    which : (p,)
+        Meters to learn.
+    t
+        Unix time, s.
     """
-    return Learning(np.zeros(meters), np.zeros(meters, dtype=np.intp), 0.0)
+    p = which.size
+    return Learning(np.zeros(p), np.zeros(p, dtype=np.intp), np.zeros(p), np.where(which, t, np.nan))
+
+
+def fresh(design: SequentialDesign, t: float) -> Commission:
+    """A feeder that has just been built: only the classes are known, and all meters are to be learned.
+
+    Parameters
+    ----------
+    design
+        The design; with ``commission_s = 0`` nothing is ever learned.
+    t
+        Unix time, s.
+    """
+    learns = design.options.commission_s > 0
+    every = np.ones(design.allowed.size, dtype=np.bool_)
+    return Commission(nothing(design), begin(every, t) if learns else None)
+
+
+def renew(design: SequentialDesign, before: Commission, which: Bools, t: float) -> Commission:
+    """Forget what is known of some meters and learn them anew; all others stay.
+
+    Parameters
+    ----------
+    design
+        The design.
+    before
+        What is known.
+    which : (p,)
+        The meters.
+    t
+        Unix time, s.
+    """
+    if not which.any() or not design.options.commission_s > 0:
+        return before
+    known, blank = before.learned, nothing(design)
+    learned = Learned(
+        *(np.where(which, getattr(blank, f.name), getattr(known, f.name)) for f in fields(Learned))
+    )
+    start = begin(which, t)
+    if before.learning is None:
+        return Commission(learned, start)
+    so_far = before.learning
+    learning = Learning(
+        *(np.where(which, getattr(start, f.name), getattr(so_far, f.name)) for f in fields(Learning))
+    )
+    return Commission(learned, learning)
 
 
 def gather(before: Learning, residual: Floats, use: Bools, h: float) -> Learning:
@@ -94,7 +175,7 @@ def gather(before: Learning, residual: Floats, use: Bools, h: float) -> Learning
     before
         So far.
     residual : (p,)
-        Readings minus what the model explains.
+        Readings minus what the model and the errors learned before explain.
     use : (p,)
         Meters that are trusted and have a reading.
     h
@@ -104,34 +185,163 @@ def gather(before: Learning, residual: Floats, use: Bools, h: float) -> Learning
         before,
         total=before.total + np.where(use, residual, 0.0),
         count=before.count + use,
-        time_s=before.time_s + h,
+        time_s=before.time_s + np.where(use, h, 0.0),
     )
 
 
-def conclude(design: SequentialDesign, gathered: Learning) -> Learned:
-    """The meters' fixed errors; meters with no reading at all keep their class.
+def ripe(design: SequentialDesign, gathered: Learning) -> Bools:
+    """Which meters have been heard for long enough, (p,).
+
+    Once one of those being learned was heard for `commission_s`, so are all that have `enough` of it: they
+    are learned together, since together they tell errors of loads from their own.
+
+    Parameters
+    ----------
+    design, gathered
+        The design, and what was gathered.
+    """
+    needed, heard = design.options.commission_s, np.where(gathered.open, gathered.time_s, 0.0)
+    if not heard.max(initial=0.0) >= needed > 0:
+        return np.zeros_like(gathered.open)
+    return np.asarray(heard >= design.options.enough * needed)
+
+
+def conclude(
+    design: SequentialDesign, known: Learned, gathered: Learning, which: Bools, t: float
+) -> Commission:
+    """The fixed errors of some meters; meters with no reading at all keep their class.
 
     Parameters
     ----------
     design
         The design.
+    known
+        What is known of all meters.
     gathered
-        From `gather`.
+        What was gathered relative to that.
+    which : (p,)
+        Meters to conclude about.
+    t
+        Unix time, s.
     """
-    heard = np.flatnonzero(gathered.count)
-    known = nothing(design)
-    if not heard.size or not gathered.time_s > 0:
-        return known
-    B, n = design.fixed[heard], gathered.count[heard]
-    rho = design.doubt.time_s / gathered.time_s
-    share = 2.0 * rho * (1.0 + rho * np.expm1(-1.0 / rho))
+    heard = np.flatnonzero(gathered.count * gathered.time_s > 0)
+    done = which & (gathered.count > 0) & (gathered.time_s > 0)
+    if not done.any():
+        return Commission(known, gathered)
+    B, n = known.variance[heard], gathered.count[heard]
+    share = _share(gathered.time_s[heard] / design.doubt.time_s)
     K = share * design.prior.between[np.ix_(heard, heard)] + np.diag(B + design.white[heard] / n)
     factor = cho_factor(K, lower=True, check_finite=False)
     bias, variance, allowed = known.bias.copy(), known.variance.copy(), known.allowed.copy()
-    bias[heard] = B * cho_solve(factor, gathered.total[heard] / n)
-    left = B - B * B * cho_solve(factor, np.eye(heard.size)).diagonal()
+    bias[heard] += B * cho_solve(factor, gathered.total[heard] / n)
+    left = np.maximum(B - B * B * cho_solve(factor, np.eye(heard.size)).diagonal(), 0.0)
     aging = design.options.stability * design.allowed[heard]
     # A uniform error of half-width a has the variance a^2 / 3.
-    variance[heard] = np.minimum(np.maximum(left, 0.0) + aging**2 / 3.0, B)
-    allowed[heard] = np.minimum(aging + 3.0 * np.sqrt(np.maximum(left, 0.0)), known.allowed[heard])
-    return Learned(bias, variance, allowed)
+    variance[heard] = np.minimum(left + aging**2 / 3.0, B)
+    allowed[heard] = np.minimum(aging + 3.0 * np.sqrt(left), design.allowed[heard])
+    learned = Learned(
+        # No honest meter leaves its class, so nothing beyond it is learned as an error.
+        bias=np.where(done, np.clip(bias, -design.allowed, design.allowed), known.bias),
+        variance=np.where(done, variance, known.variance),
+        allowed=np.where(done, allowed, known.allowed),
+        at=np.where(done, t, known.at),
+    )
+    rest = gathered.open & ~done
+    if not rest.any():
+        return Commission(learned, None)
+    # What the others gathered is in what is known now; they begin anew as witnesses of the loads.
+    start = begin(rest, t)
+    left_open = Learning(
+        *(np.where(rest, getattr(gathered, f.name), getattr(start, f.name)) for f in fields(Learning))
+    )
+    return Commission(learned, left_open)
+
+
+def _share(time: Floats) -> Floats:
+    """Covariance of two means of an Ornstein-Uhlenbeck process of variance 1 that end together, (k, k).
+
+    The times are in units of its correlation time.
+    """
+    a, b = np.minimum.outer(time, time), np.maximum.outer(time, time)
+    total = 2.0 * a + np.expm1(-a) + np.expm1(-b) - np.expm1(a - b)
+    return np.asarray(np.clip(total / (a * b), 0.0, 1.0))
+
+
+_KNOWN, _GATHERED = (tuple(f.name for f in fields(kind)) for kind in (Learned, Learning))
+
+
+def to_arrays(commission: Commission) -> dict[str, Floats]:
+    """What has to be kept to go on later, as arrays of p numbers by name.
+
+    Parameters
+    ----------
+    commission
+        What is known.
+    """
+    learned = commission.learned
+    none = np.zeros(learned.at.size, dtype=np.bool_)
+    learning = commission.learning or begin(none, 0.0)
+    known = {name: getattr(learned, name) for name in _KNOWN}
+    return known | {name: np.asarray(getattr(learning, name), dtype=np.float64) for name in _GATHERED}
+
+
+def from_arrays(design: SequentialDesign, arrays: Mapping[str, Floats]) -> Commission:
+    """What `to_arrays` gave, for a design that it fits.
+
+    Parameters
+    ----------
+    design
+        The design.
+    arrays
+        By name.
+
+    Raises
+    ------
+    ValueError
+        If it does not fit; the message names every problem.
+    """
+    problems = _problems(design, arrays)
+    if problems:
+        raise ValueError("; ".join(problems))
+    learned = Learned(*(arrays[name] for name in _KNOWN))
+    if not np.isfinite(arrays["since"]).any():
+        return Commission(learned, None)
+    count = arrays["count"].astype(np.intp)
+    return Commission(learned, Learning(arrays["total"], count, arrays["time_s"], arrays["since"]))
+
+
+# Numbers may have been rounded on their way.
+_ROUNDED = 1.0 + 1e-9
+
+
+def _problems(design: SequentialDesign, arrays: Mapping[str, Floats]) -> list[str]:
+    """Everything that is wrong with arrays."""
+    p, names = design.allowed.size, {*_KNOWN, *_GATHERED}
+    problems = [f"{name} is missing" for name in sorted(names - arrays.keys())]
+    problems += [f"{name} is not known" for name in sorted(arrays.keys() - names)]
+    shapes = {name: arrays[name].shape for name in sorted(names & arrays.keys())}
+    problems += [
+        f"{name} has the shape {shape}, not ({p},)" for name, shape in shapes.items() if shape != (p,)
+    ]
+    if problems:
+        return problems
+    widest, at, since = design.allowed * _ROUNDED, arrays["at"], arrays["since"]
+    count, time_s = arrays["count"], arrays["time_s"]
+    # Comparisons with NaN are false: whatever is no number breaks its rule.
+    rules = {
+        "bias is beyond the class": np.abs(arrays["bias"]) <= widest,
+        "variance is not within that of the class": (arrays["variance"] >= 0)
+        & (arrays["variance"] <= design.fixed * _ROUNDED),
+        "allowed is not within the class": (arrays["allowed"] >= 0) & (arrays["allowed"] <= widest),
+        "at is no time": np.isnan(at) | np.isfinite(at),
+        "since is no time": np.isnan(since) | np.isfinite(since),
+        "neither learned nor being learned": np.isfinite(at) ^ np.isfinite(since),
+        "total is no number": np.isfinite(arrays["total"]),
+        "count is no number of readings": np.isfinite(count) & (count >= 0) & (count == np.floor(count)),
+        "time_s is no time": np.isfinite(time_s) & (time_s >= 0),
+    }
+    return [
+        f"{what} (meters {', '.join(map(str, np.flatnonzero(~good)))})"
+        for what, good in rules.items()
+        if not good.all()
+    ]

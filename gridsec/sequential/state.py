@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.online import Estimate, Verdict
-from gridsec.sequential.commission import Learned, Learning, begin, nothing
+from gridsec.sequential.commission import Commission, Learned, Learning, fresh
+from gridsec.sequential.commission import renew as learn_anew
 from gridsec.sequential.conditional import Fit, Prior
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.kinds import Kinds
 from gridsec.sequential.kinds import empty as no_kinds
-from gridsec.sequential.windows import Window, empty
+from gridsec.sequential.windows import Window, empty, forget
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,8 +126,15 @@ class SequentialState:
     kinds: Kinds
     last: tuple[Estimate, Verdict] | None
 
+    @property
+    def commission(self) -> Commission:
+        """All that is known of the meters' fixed errors."""
+        return Commission(self.learned, self.learning)
 
-def init(design: SequentialDesign, t: float, learned: Learned | None = None) -> SequentialState:
+
+def init(
+    design: SequentialDesign, t: float, learned: Learned | None = None, learning: Learning | None = None
+) -> SequentialState:
     """Begin to watch; the observer starts with the first frame.
 
     Parameters
@@ -135,9 +143,10 @@ def init(design: SequentialDesign, t: float, learned: Learned | None = None) -> 
         From `design`.
     t
         Unix time, s.
-    learned
-        The meters' fixed errors, if they were learned before.
+    learned, learning
+        What is known of the meters' fixed errors and what was gathered, if there is anything from before.
     """
+    known = fresh(design, t) if learned is None else Commission(learned, learning)
     p, s, customers = design.plant.meters.size, len(design.lengths), design.plant.feeder.bus.size
     m = design.plant.droop.tau.size
     zeros = np.zeros(p, dtype=np.intp)
@@ -165,9 +174,25 @@ def init(design: SequentialDesign, t: float, learned: Learned | None = None) -> 
         ),
         fits=(None,) * s,
         doubts=Doubts(one, one, True, design.prior),
-        learning=begin(p) if learned is None and design.options.commission_s > 0 else None,
-        learned=nothing(design) if learned is None else learned,
+        learning=known.learning,
+        learned=known.learned,
         model_error=np.zeros(p),
         kinds=no_kinds(p),
         last=None,
     )
+
+
+def renew(design: SequentialDesign, state: SequentialState, which: Bools) -> SequentialState:
+    """Learn some meters anew, because they were replaced: nothing of the old ones counts any more.
+
+    Parameters
+    ----------
+    design, state
+        The design, and the state.
+    which : (p,)
+        The meters. One that is not trusted stays so until six ticks of it were without evidence.
+    """
+    known = learn_anew(design, state.commission, which, state.t)
+    window = forget(state.window, which)
+    fits = (None,) * len(state.fits)
+    return replace(state, learned=known.learned, learning=known.learning, window=window, fits=fits)

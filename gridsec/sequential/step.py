@@ -12,7 +12,7 @@ from gridsec.frames import NO_VOLTAGE
 from gridsec.lure import known_input
 from gridsec.online import Estimate, Frame, Verdict
 from gridsec.sequential.commission import conclude as learn
-from gridsec.sequential.commission import gather
+from gridsec.sequential.commission import gather, ripe
 from gridsec.sequential.conclude import Tick, conclude, unusable
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.drive import drive
@@ -158,14 +158,20 @@ def _learn(
     """Gather what the meters' fixed errors are, and from some time on rely on it."""
     if state.learning is None or state.ticks == 1:
         return state
-    learning = gather(state.learning, residual, use, h)
-    if learning.time_s < design.options.commission_s or not state.trust.trusted.all():
+    # A pause of the frames is no time in which anything was heard.
+    step_s = design.step_s
+    learning = gather(state.learning, residual, use, h if h <= _PAUSE * step_s else step_s)
+    ready = ripe(design, learning)
+    if not ready.any() or not state.trust.trusted.all():
         return replace(state, learning=learning)
-    learned = learn(design, learning)
-    window = shift(state.window, state.learned.bias - learned.bias)
-    return replace(state, learning=None, learned=learned, window=window, fits=(None,) * len(state.fits))
+    known = learn(design, state.learned, learning, ready, state.t)
+    window = shift(state.window, state.learned.bias - known.learned.bias)
+    fits = (None,) * len(state.fits)
+    return replace(state, learning=known.learning, learned=known.learned, window=window, fits=fits)
 
 
+# Ticks without a frame after which there was a pause.
+_PAUSE = 60.0
 # The model's error is bounded anew every so many ticks.
 _STALE = 16
 

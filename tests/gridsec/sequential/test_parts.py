@@ -91,20 +91,26 @@ class TestCommissioning:
         made = design(plant, doubt=doubt, step_s=1.0, options=SequentialOptions(stability=0.0))
         count = np.array([900, 900, 900, 0, 450, 900, 900, 900])
         mean = rng.normal(size=8) * 0.004
-        found = conclude(made, Learning(mean * count, count, 3600.0))
         heard = count > 0
+        gathered = Learning(mean * count, count, np.where(heard, 3600.0, 0.0), np.full(8, 100.0))
+        known = conclude(made, nothing(made), gathered, np.ones(8, dtype=bool), 4000.0)
+        found = known.learned
         rho = 600.0 / 3600.0
         share = 2 * rho * (1 - rho * (1 - np.exp(-1 / rho)))
         S = made.prior.between[np.ix_(heard, heard)] * share
         B = np.diag(made.fixed[heard])
         K = S + B + np.diag(made.white[heard] / count[heard])
         gain = B @ np.linalg.inv(K)
-        np.testing.assert_allclose(found.bias[heard], gain @ mean[heard], rtol=1e-9)
+        expected = np.clip(gain @ mean[heard], -made.allowed[heard], made.allowed[heard])
+        np.testing.assert_allclose(found.bias[heard], expected, rtol=1e-9)
         np.testing.assert_allclose(found.variance[heard], np.diagonal(B - gain @ B), rtol=1e-6)
         assert found.bias[3] == 0.0
         assert found.variance[3] == made.fixed[3]
         assert found.allowed[3] == made.allowed[3]
         assert (found.allowed[heard] < made.allowed[heard]).all()
+        np.testing.assert_array_equal(found.at, np.where(heard, 4000.0, np.nan))
+        assert known.learning is not None
+        np.testing.assert_array_equal(known.learning.open, ~heard)
 
     def test_mean_of_a_correlated_process_varies_as_is_said(self) -> None:
         """The factor on S, against an Ornstein-Uhlenbeck process."""
@@ -123,11 +129,14 @@ class TestCommissioning:
         rng = np.random.default_rng(4)
         plant = make_plant(rng, customers=5)
         made = design(plant, doubt=LoadDoubt(np.full(5, 0.01), np.full(5, 0.01), 600.0), step_s=1.0)
-        start = begin(5)
-        assert np.array_equal(conclude(made, start).variance, nothing(made).variance)
+        every = np.ones(5, dtype=bool)
+        start = begin(every, 7.0)
+        known = conclude(made, nothing(made), start, every, 9.0)
+        assert np.array_equal(known.learned.variance, nothing(made).variance)
+        assert known.learning is start
         some = gather(
             start, np.array([1.0, 2.0, np.nan, 4.0, 5.0]), np.array([1, 1, 0, 1, 0], dtype=bool), 2.0
         )
         np.testing.assert_array_equal(some.total, [1.0, 2.0, 0.0, 4.0, 0.0])
         np.testing.assert_array_equal(some.count, [1, 1, 0, 1, 0])
-        assert some.time_s == 2.0
+        np.testing.assert_array_equal(some.time_s, [2.0, 2.0, 0.0, 2.0, 0.0])
