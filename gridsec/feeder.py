@@ -187,15 +187,65 @@ def lindistflow(feeder: Feeder) -> LinDistFlow:
     ----------
     chong2020, equation (15), for any tree instead of a line.
     """
-    # Branch k - 1 feeds bus j exactly if j lies in the depth-first interval of bus k.
-    at = feeder.start[:, None]
-    fed = ((feeder.start[1:] <= at) & (at < feeder.stop[1:])).astype(np.float64)
-    of_customers = fed[feeder.bus].T
-    R_bus = (fed * feeder.r) @ of_customers
-    X_bus = (fed * feeder.x) @ of_customers
+    R_bus = common_paths(feeder, feeder.r, feeder.bus)
+    X_bus = common_paths(feeder, feeder.x, feeder.bus)
     return LinDistFlow(
         R=frozen(R_bus[feeder.bus]), X=frozen(X_bus[feeder.bus]), R_bus=frozen(R_bus), X_bus=frozen(X_bus)
     )
+
+
+def common_paths(feeder: Feeder, branch: Floats, buses: Ints) -> Floats:
+    """Sum of a branch quantity over what the paths of two buses to the busbar have in common; O(n k).
+
+    In depth-first order that is the least of what consecutive buses between the two have in common: the sum
+    up to the parent of the later one.
+
+    Parameters
+    ----------
+    feeder
+        The feeder.
+    branch : (b,)
+        Of each branch, not negative; for example `feeder.r`.
+    buses : (k,)
+        The second bus of each pair.
+
+    Returns
+    -------
+    (b + 1, k)
+        For every bus and each of `buses`.
+    """
+    start, whole = feeder.start, path_sums(feeder, branch)
+    between = np.zeros(start.size)
+    between[start[1:]] = whole[feeder.parent]
+    out, common = np.empty((buses.size, start.size)), np.empty(start.size)
+    for row, bus in zip(out, buses.tolist(), strict=True):
+        at = int(start[bus])
+        common[at] = whole[bus]
+        np.minimum.accumulate(between[at + 1 :], out=common[at + 1 :])
+        common[:at] = np.minimum.accumulate(between[at:0:-1])[::-1]
+        np.take(common, start, out=row)
+    return out.T
+
+
+def path_sums(feeder: Feeder, branch: Floats) -> Floats:
+    """Sum of a branch quantity over the path from the busbar to each bus, without rounding it twice.
+
+    Parameters
+    ----------
+    feeder
+        The feeder.
+    branch : (b,)
+        Of each branch.
+
+    Returns
+    -------
+    (b + 1,)
+        0 at the busbar.
+    """
+    out = [0.0]
+    for above, more in zip(feeder.parent.tolist(), branch.tolist(), strict=True):
+        out.append(out[above] + more)
+    return np.array(out)
 
 
 def squared_voltages(model: LinDistFlow, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:

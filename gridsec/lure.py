@@ -22,7 +22,7 @@ from scipy.linalg import expm
 from gridsec.arrays import Floats, Ints, exponential_integrals, frozen, perron_bound
 from gridsec.droop import Droop
 from gridsec.errors import FeederInvalid
-from gridsec.feeder import Feeder, LinDistFlow, lindistflow
+from gridsec.feeder import Feeder, LinDistFlow, common_paths
 from gridsec.newton import Nonlinearity, settle
 
 
@@ -118,17 +118,16 @@ def close_loop(feeder: Feeder, droop: Droop, meters: Ints) -> Lure:
     ]
     if problems:
         raise FeederInvalid(problems)
-    model = lindistflow(feeder)
-    pick = np.eye(count)
-    own = droop.customer
+    own, at = droop.customer, np.arange(count)
+    X = common_paths(feeder, feeder.x, feeder.bus[own])
     return Lure(
         A=-np.diag(1.0 / droop.tau),
         G=np.diag(1.0 / droop.tau),
-        H=-2.0 * model.X[np.ix_(own, own)],
-        F=pick[own],
+        H=-2.0 * X[feeder.bus[own]],
+        F=np.equal.outer(own, at).astype(np.float64),
         B=np.zeros((own.size, count)),
-        C=-2.0 * model.X[np.ix_(meters, own)],
-        D=pick[meters],
+        C=-2.0 * X[feeder.bus[meters]],
+        D=np.equal.outer(meters, at).astype(np.float64),
         slope=droop.slope,
         phi=droop,
     )

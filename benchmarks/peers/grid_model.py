@@ -24,7 +24,6 @@ from benchmarks.peers.answer import Answer
 from benchmarks.peers.scene import Reading, Scene
 from feeders import powerflow
 from gridsec.arrays import Bools, Floats
-from gridsec.feeder import lindistflow
 from gridsec.sequential.conditional import drop, fit
 from gridsec.sequential.loads import LoadDoubt, prior
 
@@ -145,7 +144,7 @@ class GreedyChi:
 
     def __init__(self, here: Scene, passes: float = 0.99) -> None:
         self.grid, self.passes = GridModel(here, CalculationMethod.newton_raphson), passes
-        self.model, self.bus = lindistflow(here.feeder), here.feeder.bus
+        self.feeder = here.feeder
 
     def __call__(self, told: Reading) -> Answer:
         """One snapshot."""
@@ -153,7 +152,10 @@ class GreedyChi:
         v = told.v
         noise = (2.0 * v * told.std_v) ** 2
         known = prior(
-            self.model, self.bus, LoadDoubt(told.std_p, told.std_q, 1.0), busbar=2.0 * told.v0 * told.std_v
+            self.feeder,
+            self.feeder.bus,
+            LoadDoubt(told.std_p, told.std_q, 1.0),
+            busbar=2.0 * told.v0 * told.std_v,
         )
         left = fit(known, noise, np.ones(v.size, dtype=np.bool_))
         try:

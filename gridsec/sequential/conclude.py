@@ -204,7 +204,7 @@ def _amounts(design: SequentialDesign, state: SequentialState, seen: Examined) -
             weights = now.Q @ (state.window.sums[s] / np.maximum(state.window.counts[s], 1))
         else:
             continue
-        out[k] = float(design.book.std[k] ** 2 * (design.book.at_meters[:, k] @ weights))
+        out[k] = float(design.book.std[k] ** 2 * design.book.along(weights)[k])
     return out
 
 

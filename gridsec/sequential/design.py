@@ -16,14 +16,14 @@ from gridsec.arrays import Floats, Ints
 from gridsec.certificates import Certificate, certify, verify
 from gridsec.detect import busbar_error
 from gridsec.errors import DesignInfeasible, NotObservable
-from gridsec.feeder import LinDistFlow, lindistflow
+from gridsec.feeder import Feeder, bus_voltages, common_paths, path_sums
 from gridsec.lmi import contraction
 from gridsec.lure import Lure, close_loop
 from gridsec.plant import Plant
 from gridsec.sequential.conditional import Prior
 from gridsec.sequential.decoder import Decoder
-from gridsec.sequential.kinds import Shapes
-from gridsec.sequential.loads import LoadDoubt, injection_doubt, prior
+from gridsec.sequential.kinds import Shapes, Traces
+from gridsec.sequential.loads import LoadDoubt, injection_doubt, prior, squares
 from gridsec.sequential.repeats import rules
 from gridsec.sequential.search import Dictionary
 
@@ -97,10 +97,8 @@ class SequentialDesign:
         What is watched.
     names : (p,)
         The meters' customers, for sentences.
-    model
-        Its linear power flow.
-    lure
-        The closed loop.
+    loop : (m, m)
+        What the injections do to the voltages that the inverters see: H of the closed loop.
     certificate
         Why the observer converges, for every trusted set and every switching between them.
     doubt
@@ -144,8 +142,7 @@ class SequentialDesign:
 
     plant: Plant
     names: tuple[str, ...]
-    model: LinDistFlow
-    lure: Lure
+    loop: Floats
     certificate: Certificate
     doubt: LoadDoubt
     prior: Prior
@@ -214,7 +211,6 @@ def design(
     options = SequentialOptions() if options is None else options
     meters = plant.meters
     _check(plant, doubt, step_s)
-    model = lindistflow(plant.feeder)
     lure = close_loop(plant.feeder, plant.droop, meters)
     injections = injection_doubt(plant.droop, plant.accuracy, meters, plant.feeder.bus.size)
     busbar = busbar_error(plant.accuracy, plant.droop.vbar**2, 2.0) / 2.0
@@ -223,11 +219,10 @@ def design(
     return SequentialDesign(
         plant=plant,
         names=tuple(plant.feeder.customers[c] for c in meters),
-        model=model,
-        lure=lure,
+        loop=lure.H,
         certificate=_proof(lure),
         doubt=doubt,
-        prior=prior(model, plant.feeder.bus[meters], doubt, busbar=busbar, inverters=injections),
+        prior=prior(plant.feeder, plant.feeder.bus[meters], doubt, busbar=busbar, inverters=injections),
         injections=injections,
         busbar=busbar,
         lengths=lengths,
@@ -238,11 +233,11 @@ def design(
         allowed=slope * accuracy.class_fraction,
         reach=np.abs(lure.C) @ (2.0 * plant.droop.limit),
         meter_of=_meter_of(plant),
-        book=_suspicions(plant, model, options),
-        shapes=_shapes(plant, model, options.alarms_per_year, step_s, lengths),
+        book=_suspicions(plant, options),
+        shapes=_shapes(plant, options.alarms_per_year, step_s, lengths),
         most=meters.size // 3 if max_attacked is None else max_attacked,
-        most_p=_most_power(model.R_bus),
-        most_q=_most_power(model.X_bus),
+        most_p=_most_power(plant.feeder, plant.feeder.r),
+        most_q=_most_power(plant.feeder, plant.feeder.x),
         step_s=step_s,
         options=options,
     )
@@ -252,8 +247,9 @@ def design(
 _COLLAPSE, _NO_POWER = 1.0, 1e4
 
 
-def _most_power(matrix: Floats) -> Floats:
-    return np.asarray(_COLLAPSE / np.maximum(2.0 * np.abs(matrix).max(axis=0), _COLLAPSE / _NO_POWER))
+def _most_power(feeder: Feeder, branch: Floats) -> Floats:
+    own = path_sums(feeder, branch)[feeder.bus]
+    return np.asarray(_COLLAPSE / np.maximum(2.0 * own, _COLLAPSE / _NO_POWER))
 
 
 # Voltage at which a meter's relative errors are turned into squared ones, in parts of the nominal.
@@ -312,31 +308,44 @@ def _sigmas(rate: float, meters: int, length: int, step_s: float, lengths: tuple
     return float(norm.isf(min(rate / tests, 0.5) / 2.0))
 
 
-def _shapes(plant: Plant, model: LinDistFlow, rate: float, step_s: float, lengths: tuple[int, ...]) -> Shapes:
+def _shapes(plant: Plant, rate: float, step_s: float, lengths: tuple[int, ...]) -> Shapes:
     """What manipulations look like at this feeder's meters."""
     accuracy, slope = plant.accuracy, 2.0 * _HIGH * plant.droop.vbar
     tests = plant.meters.size * (len(lengths) + _REPEATS) * YEAR_S / step_s
-    at = plant.feeder.bus[plant.meters]
     return Shapes(
         rules=rules(accuracy.resolution, accuracy.jitter, min(rate / tests, 0.5), step_s),
-        traces=2.0 * np.hstack([model.R_bus[at], model.X_bus[at]]),
+        traces=Traces(plant.feeder, plant.feeder.bus[plant.meters]),
         noise=slope**2 * (accuracy.jitter**2 + accuracy.resolution**2 / 12.0),
     )
 
 
-def _suspicions(plant: Plant, model: LinDistFlow, options: SequentialOptions) -> Dictionary:
-    """Columns of 2R for the customers' active powers, and of 2X for the inverters."""
-    own, at = plant.droop.customer, plant.feeder.bus[plant.meters]
-    customers = plant.feeder.bus.size
+def _suspicions(plant: Plant, options: SequentialOptions) -> Dictionary:
+    """Columns of 2R for the customers' active powers, and of 2X for the inverters; made when asked for."""
+    feeder, own = plant.feeder, plant.droop.customer
+    customers = feeder.bus.size
+    of, metered = np.concatenate([np.arange(customers), own]), np.zeros(customers)
+    metered[plant.meters] = 1.0
 
-    def column(k: int) -> Floats:
-        return np.asarray(2.0 * (model.R_bus[:, k] if k < customers else model.X_bus[:, own[k - customers]]))
+    def columns(which: Ints) -> Floats:
+        out = np.empty((len(feeder.buses), which.size))
+        for branch, some in ((feeder.r, which < customers), (feeder.x, which >= customers)):
+            out[:, some] = 2.0 * common_paths(feeder, branch, feeder.bus[of[which[some]]])
+        return out
 
+    def along(weights: Floats) -> Floats:
+        # What a power here does there it does here if it is there.
+        power = np.zeros((2, 2, customers))
+        power[0, 0, plant.meters] = power[1, 1, plant.meters] = weights
+        volts = bus_voltages(feeder, power[0], power[1], 0.0, steps=0)[:, feeder.bus]
+        return np.concatenate([volts[0], volts[1][own]])
+
+    load, injection = (squares(feeder, branch, metered)[feeder.bus] for branch in (feeder.r, feeder.x))
     return Dictionary(
-        at_meters=2.0 * np.hstack([model.R_bus[at], model.X_bus[at][:, own]]),
         std=np.concatenate([np.full(customers, options.hidden_power), 2.0 * plant.droop.limit]),
         charge=np.repeat([options.hidden_charge, 1.0], [customers, own.size]),
-        column=column,
+        size=np.concatenate([load, injection[own]]),
+        columns=columns,
+        along=along,
     )
 
 

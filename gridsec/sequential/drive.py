@@ -51,11 +51,11 @@ def drive(  # noqa: PLR0917  # state, what drives it, and for how long
         return np.asarray(target + decay * (x - target))
     out = np.where(driven, target + decay * (x - target), x)
     free = np.flatnonzero(~driven)
-    H = design.lure.H[np.ix_(free, free)]
+    H = design.loop[np.ix_(free, free)]
     own = droop.customer[free]
     # The driven ones take the mean of their way from x to out.
     held = np.where(driven, 0.5 * (x + out), 0.0)
-    at = w[own] + design.lure.H[free] @ held
+    at = w[own] + design.loop[free] @ held
     rate = 1.0 / droop.tau[free]
     size = free.size
     loop = Lure(

@@ -220,7 +220,8 @@ def _directions(design: SequentialDesign, accused: tuple[tuple[int, int], ...]) 
     """Loosened directions, (n, k)."""
     if not accused:
         return None
-    return np.column_stack([design.book.std[k] * design.book.column(k) for k, _ in accused])
+    which = np.array([k for k, _ in accused])
+    return np.asarray(design.book.columns(which) * design.book.std[which])
 
 
 def adapt(before: Fit | None, prior: Prior, noise: Floats, wanted: Bools, loose: Floats | None) -> Fit:

@@ -18,6 +18,7 @@ docs/theory-sequential.md, "What a manipulation looks like".
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 
@@ -25,6 +26,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from gridsec.arrays import Bools, Floats, Ints
+from gridsec.feeder import Feeder, common_paths
 from gridsec.online import Kind
 from gridsec.sequential import repeats
 from gridsec.sequential.repeats import Memory, Rules
@@ -47,6 +49,39 @@ _ALIKE, _SURE = 4.0, 5.0
 _TRACE = 0.05
 # Entries of two columns this close, as a part, are equal.
 _SAME = 1e-9
+# Traces that are looked at together.
+_PART = 256
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Traces:
+    """Change of the meters' squared voltages per customer's power: columns of 2R, then of 2X. p meters.
+
+    Attributes
+    ----------
+    feeder
+        The feeder.
+    at : (p,)
+        Bus of each meter.
+    """
+
+    feeder: Feeder
+    at: Ints
+
+    def of(self, meters: Ints) -> Iterator[Floats]:
+        """All traces at some meters, (k, …) each, in parts that are small."""
+        feeder = self.feeder
+        for branch in (feeder.r, feeder.x):
+            for first in range(0, feeder.bus.size, _PART):
+                there = common_paths(feeder, branch, feeder.bus[first : first + _PART])
+                yield 2.0 * there[self.at[meters]]
+
+    def trace(self, which: int) -> Floats:
+        """One of them, (p,)."""
+        feeder, customers = self.feeder, self.feeder.bus.size
+        branch = feeder.r if which < customers else feeder.x
+        there = common_paths(feeder, branch, feeder.bus[which % customers, None])
+        return np.asarray(2.0 * there[self.at, 0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,14 +92,14 @@ class Shapes:
     ----------
     rules
         When repetition is evidence.
-    traces : (p, K)
-        Squared voltage at each meter per customer's power: columns of 2R and 2X.
+    traces
+        What each customer's power would do to the meters.
     noise : (p,)
         Variance of a squared reading from tick to tick, squared pu^2.
     """
 
     rules: Rules
-    traces: Floats
+    traces: Traces
     noise: Floats
 
 
@@ -356,7 +391,7 @@ def _together(shapes: Shapes, memory: Memory, since: Ints, variance: Floats) -> 
     return np.where(traced(shapes.traces, who, lies, spread), named, np.zeros_like(named))
 
 
-def traced(traces: Floats, who: Ints, lies: Floats, variance: Floats) -> bool:
+def traced(traces: Traces, who: Ints, lies: Floats, variance: Floats) -> bool:
     """Whether several meters' lies are the trace of one customer's load, rather than anything else.
 
     The lies must be proportional to a column of 2R or 2X within their errors; the meters must be among
@@ -365,7 +400,7 @@ def traced(traces: Floats, who: Ints, lies: Floats, variance: Floats) -> bool:
 
     Parameters
     ----------
-    traces : (p, K)
+    traces
         Columns of 2R and 2X.
     who : (k,)
         The meters.
@@ -375,18 +410,25 @@ def traced(traces: Floats, who: Ints, lies: Floats, variance: Floats) -> bool:
         Of them.
     """
     weight = 1.0 / (variance + (_TRACE * lies) ** 2)
-    columns = traces[who]
 
     def misfit(of: Floats) -> Floats:
         power = (weight * lies) @ of / np.maximum(weight @ of**2, np.finfo(np.float64).tiny)
         return np.asarray(weight @ (lies[:, None] - power * of) ** 2)
 
     same = misfit(np.ones((who.size, 1)))[0]
-    weakest = columns.min(axis=0)
-    # Meters beyond the same branch feel it alike: only those that feel more are counted.
-    affected = (traces > weakest * (1.0 + _SAME)).sum(axis=0) <= 2 * who.size
-    fits = misfit(columns)
-    fits = np.where(affected & (weakest > 0.0), fits, np.inf)
-    best = float(fits.min())
-    enough = float(chi2.isf(0.01, who.size - 1))
-    return bool(best <= enough and same - best > 2.0 * np.log(traces.shape[1]))
+    most = min(_quantile(who.size - 1), same - 2.0 * np.log(2 * traces.feeder.bus.size))
+    if most < 0.0:
+        return False
+    parts = [(misfit(part), part.min(axis=0)) for part in traces.of(who)]
+    fits, weakest = (np.concatenate(values) for values in zip(*parts, strict=True))
+    for k in np.flatnonzero((fits <= most) & (weakest > 0.0)).tolist():
+        # Meters beyond the same branch feel it alike: only those that feel more are counted.
+        if np.count_nonzero(traces.trace(k) > weakest[k] * (1.0 + _SAME)) <= 2 * who.size:
+            return True
+    return False
+
+
+@cache
+def _quantile(freedom: int) -> float:
+    """Misfit that the right trace exceeds with a probability of 1 %."""
+    return float(chi2.isf(0.01, freedom))

@@ -18,7 +18,7 @@ import numpy as np
 from gridsec.arrays import Floats, Ints
 from gridsec.detect import MeterAccuracy
 from gridsec.droop import Droop
-from gridsec.feeder import LinDistFlow
+from gridsec.feeder import Feeder, bus_voltages, common_paths, path_sums
 from gridsec.sequential.conditional import Prior
 
 
@@ -61,7 +61,7 @@ class LoadDoubt:
 
 
 def prior(
-    model: LinDistFlow, at: Ints, doubt: LoadDoubt, *, busbar: float, inverters: Floats | None = None
+    feeder: Feeder, at: Ints, doubt: LoadDoubt, *, busbar: float, inverters: Floats | None = None
 ) -> Prior:
     """Covariance of the buses' squared voltages without any meter.
 
@@ -69,8 +69,8 @@ def prior(
 
     Parameters
     ----------
-    model
-        The linear power flow.
+    feeder
+        The feeder.
     at : (p,)
         Bus of each meter.
     doubt
@@ -81,17 +81,65 @@ def prior(
         Standard deviation of the injections that observers attribute to the customers' inverters, pu.
     """
     q = doubt.q if inverters is None else np.hypot(doubt.q, inverters)
-    of_meters = np.full((len(model.R_bus), at.size), busbar**2)
-    variance = np.full(len(model.R_bus), busbar**2)
-    for matrix, std, common in (
-        (model.R_bus, doubt.p, doubt.common_p),
-        (model.X_bus, q, doubt.common_q),
+    of_meters = np.full((len(feeder.buses), at.size), busbar**2)
+    variance = np.full(len(feeder.buses), busbar**2)
+    none = np.zeros_like(q)
+    for branch, std, common, shared in (
+        (feeder.r, doubt.p, doubt.common_p, bus_voltages(feeder, doubt.p, none, 0.0, steps=0)),
+        (feeder.x, q, doubt.common_q, bus_voltages(feeder, none, q, 0.0, steps=0)),
     ):
-        spread = matrix * (2.0 * np.sqrt(1.0 - common) * std)
-        shared = 2.0 * np.sqrt(common) * (matrix @ std)
-        of_meters += spread @ spread[at].T + np.multiply.outer(shared, shared[at])
-        variance += np.einsum("ij,ij->i", spread, spread) + shared * shared
+        of_meters += _own(feeder, at, branch, (1.0 - common) * std**2)
+        variance += squares(feeder, branch, (1.0 - common) * std**2)
+        if common:
+            of_meters += np.multiply.outer(common * shared, shared[at])
+            variance += common * shared**2
     return Prior(of_meters, at, variance)
+
+
+def _own(feeder: Feeder, at: Ints, branch: Floats, variance: Floats) -> Floats:
+    """Columns `at` of ``4 R V R^T`` for diagonal V, (n, p); O(n p).
+
+    A voltage is that of the bus above less what the branch between takes off, and this depends on the flow,
+    the sum of the powers below. So covariances with flows are summed up the tree, those with voltages down.
+
+    Parameters
+    ----------
+    feeder, at
+        As in `prior`.
+    branch : (b,)
+        Resistance or reactance of each branch.
+    variance : (N,)
+        Diagonal of V.
+    """
+    there = np.bincount(feeder.bus, weights=variance, minlength=len(feeder.buses))
+    parent, double = feeder.parent.tolist(), (2.0 * branch).tolist()
+    out: Floats = np.multiply(common_paths(feeder, branch, at), 2.0 * there[:, None], order="C")
+    for k in range(len(parent), 0, -1):
+        out[parent[k - 1]] += out[k]
+    out[0] = 0.0
+    for k, (above, factor) in enumerate(zip(parent, double, strict=True), 1):
+        out[k] *= factor
+        out[k] += out[above]
+    return out
+
+
+def squares(feeder: Feeder, branch: Floats, weight: Floats) -> Floats:
+    """Diagonal of ``4 R V R^T`` for diagonal V, (n,): whoever is below a bus shares all of its path.
+
+    Parameters
+    ----------
+    feeder
+        The feeder.
+    branch : (b,)
+        Resistance or reactance of each branch.
+    weight : (N,)
+        Diagonal of V.
+    """
+    below = np.bincount(feeder.bus, weights=weight, minlength=len(feeder.buses))
+    for k in range(feeder.parent.size, 0, -1):
+        below[feeder.parent[k - 1]] += below[k]
+    whole = path_sums(feeder, branch)
+    return path_sums(feeder, 4.0 * below[1:] * (whole[1:] ** 2 - whole[feeder.parent] ** 2))
 
 
 def injection_doubt(droop: Droop, accuracy: MeterAccuracy, meters: Ints, customers: int) -> Floats:

@@ -41,20 +41,23 @@ class Dictionary:
 
     Attributes
     ----------
-    at_meters : (p, k)
-        Change of the squared voltage at each meter, per unit of what is doubted.
     std : (k,)
-        How much it may be, pu.
+        How much of what is doubted there may be, pu.
     charge : (k,)
         What accusing it costs, in accusations of a meter.
-    column
-        `column(k)` is the change at every bus, (n,).
+    size : (k,)
+        Sum over the meters of the squares of what a direction changes there.
+    columns
+        `columns(which)` are the changes of every squared voltage per unit of what is doubted, (n, …).
+    along
+        `along(weights)` is the weighted sum of each direction's changes at the meters, (k,).
     """
 
-    at_meters: Floats
     std: Floats
     charge: Floats
-    column: Callable[[int], Floats]
+    size: Floats
+    columns: Callable[[Ints], Floats]
+    along: Callable[[Floats], Floats]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -241,10 +244,10 @@ class _Powers:
     """Gains of loosening, kept up to date: diag(A^T Q A) changes with Q by squares of one vector."""
 
     def __init__(self, now: Fit, dictionary: Dictionary, weights: Floats) -> None:
-        seen = dictionary.at_meters
-        towards = (weights @ seen) ** 2 / np.maximum(np.einsum("ij,ij->j", seen, seen), _FEATHER)
+        towards = dictionary.along(weights) ** 2 / np.maximum(dictionary.size, _FEATHER)
         self.index = np.argsort(-towards)[:_CANDIDATES]
-        self.dictionary, self.seen = dictionary, seen[:, self.index]
+        self.columns = dictionary.columns(self.index)
+        self.seen = self.columns[now.prior.meters]
         self.std, self.charge = dictionary.std[self.index], dictionary.charge[self.index]
         self.form = np.einsum("ij,ij->j", now.Q @ self.seen, self.seen)
 
@@ -261,7 +264,7 @@ class _Powers:
         u = self.std[k] * self.seen[:, k]
         Qu = now.Q @ u
         self.change(Qu, -1.0 / (1.0 + float(u @ Qu)))
-        loosen(now, self.dictionary.column(int(self.index[k])), float(self.std[k]))
+        loosen(now, self.columns[:, k], float(self.std[k]))
         accused.append(k)
 
 

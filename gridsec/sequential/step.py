@@ -9,7 +9,6 @@ import numpy as np
 from gridsec.arrays import Bools, Floats
 from gridsec.feeder import bus_voltages, model_error_bound
 from gridsec.frames import NO_VOLTAGE
-from gridsec.lure import known_input
 from gridsec.online import Estimate, Frame, Verdict
 from gridsec.sequential.commission import conclude as learn
 from gridsec.sequential.commission import gather, ripe
@@ -249,7 +248,7 @@ def _doubts(design: SequentialDesign, before: Doubts, frame: Frame, busbar: bool
         design.prior
         if plain
         else prior(
-            design.model,
+            design.plant.feeder,
             design.prior.meters,
             doubt,
             busbar=design.busbar if busbar else _UNMETERED,
@@ -281,20 +280,19 @@ def _inverters(design: SequentialDesign, state: SequentialState, frame: Frame, h
         return np.asarray(droop(droop.vbar**2 - y))
     w = None
     if not driven.all():
-        correction = np.zeros(heard.q.size)
+        v2 = _linear(design, frame, np.zeros(droop.tau.size), heard)
         if state.last is not None:
             # What losses took off at the last frame is close enough for inverters without a meter.
-            correction = state.last[0].v2 - _linear(design, frame, state, heard)
-        w = known_input(design.model, droop.vbar, frame.p, frame.q, heard.v0_squared, correction)
+            v2 += state.last[0].v2 - _linear(design, frame, state.x, heard)
+        w = droop.vbar**2 - v2
     return drive(design, state.x, y, driven, w, frame.t - state.t)
 
 
-def _linear(design: SequentialDesign, frame: Frame, state: SequentialState, heard: _Heard) -> Floats:
-    """Squared voltages by the linear model at the last injections, (N,)."""
-    plant, model = design.plant, design.model
-    x = np.zeros(plant.droop.tau.size) if state.x is None else state.x
-    q = frame.q + np.bincount(plant.droop.customer, weights=x, minlength=frame.q.size)
-    return np.asarray(heard.v0_squared + 2.0 * (model.R @ frame.p + model.X @ q))
+def _linear(design: SequentialDesign, frame: Frame, x: Floats, heard: _Heard) -> Floats:
+    """Squared voltages by the linear model with injections x, (N,)."""
+    feeder = design.plant.feeder
+    q = frame.q + np.bincount(design.plant.droop.customer, weights=x, minlength=frame.q.size)
+    return np.asarray(bus_voltages(feeder, frame.p, q, heard.v0_squared, steps=0)[feeder.bus])
 
 
 def _model_error(design: SequentialDesign, p: Floats, q: Floats, v0_squared: float) -> Floats:

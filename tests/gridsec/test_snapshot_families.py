@@ -64,11 +64,12 @@ class Bench:
 
 
 def bench(rng: np.random.Generator, p: int = 8, sigmas: float = 3.5, most: int = 3) -> Bench:
-    model = lindistflow(random_tree(p, rng, drop=0.04))
+    tree = random_tree(p, rng, drop=0.04)
+    model = lindistflow(tree)
     R, X = model.R_bus[1:], model.X_bus[1:]
     A = np.hstack([2.0 * R * P_STD, 2.0 * X * Q_STD, np.full((p, 1), BUSBAR)])
     doubt = LoadDoubt(np.full(p, P_STD), np.full(p, Q_STD), 600.0)
-    before = prior(model, np.arange(1, p + 1), doubt, busbar=BUSBAR)
+    before = prior(tree, np.arange(1, p + 1), doubt, busbar=BUSBAR)
     none, zeros = np.zeros(p, dtype=bool), np.zeros(p)
 
     def evidence(m: Floats, live: Bools | None = None) -> Evidence:

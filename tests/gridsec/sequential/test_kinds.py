@@ -17,6 +17,7 @@ from feeders.meters import MeterErrors
 from feeders.scenario import START, Scenario, simulate, snapshots
 from gridsec.arrays import Bools, Floats
 from gridsec.attack import Replay
+from gridsec.feeder import lindistflow
 from gridsec.online import Kind
 from gridsec.sequential import kinds, repeats
 from gridsec.sequential.repeats import BLOCKS, ROWS, SPAN, Memory, Rules
@@ -251,7 +252,8 @@ class TestShapes:
 
     def test_one_load_s_trace_and_offsets_that_are_none(self) -> None:
         made = design(choose(load("kerber-dorfnetz"), estimator=SEQUENTIAL)).design
-        traces, rng = made.shapes.traces, np.random.default_rng(0)
+        model, at = lindistflow(made.plant.feeder), made.plant.feeder.bus[made.plant.meters]
+        traces, rng = 2.0 * np.hstack([model.R_bus[at], model.X_bus[at]]), np.random.default_rng(0)
         found = chance = 0
         for _ in range(200):
             column = traces[:, int(rng.integers(traces.shape[1]))]
@@ -259,10 +261,10 @@ class TestShapes:
             if column[who].min() < 0.5 * column.max():
                 variance = np.full(4, 1e-6)
                 lies = -0.1 * column[who] / column[who].max() + 1e-3 * rng.standard_normal(4)
-                found += kinds.traced(traces, who, lies, variance)
-                assert not kinds.traced(traces, who, np.full(4, -0.1), variance)
+                found += kinds.traced(made.shapes.traces, who, lies, variance)
+                assert not kinds.traced(made.shapes.traces, who, np.full(4, -0.1), variance)
             some = np.sort(rng.choice(len(traces), 3, replace=False))
-            chance += kinds.traced(traces, some, rng.uniform(-0.2, -0.1, 3), np.full(3, 4e-5))
+            chance += kinds.traced(made.shapes.traces, some, rng.uniform(-0.2, -0.1, 3), np.full(3, 4e-5))
         assert found > 10
         assert chance <= 4
 

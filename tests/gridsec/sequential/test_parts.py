@@ -23,7 +23,7 @@ class TestLoads:
         tree = random_tree(6, rng, drop=0.004)
         p, q = np.full(6, 0.01), np.full(6, 0.02)
         doubt = LoadDoubt(p, q, 600.0, common_p=0.5, common_q=0.3)
-        found = prior(lindistflow(tree), np.arange(1, 7), doubt, busbar=1e-3)
+        found = prior(tree, np.arange(1, 7), doubt, busbar=1e-3)
         base = ac_voltages(tree, np.zeros(6, dtype=complex), 1.0) ** 2
         draws = []
         for _ in range(6000):
@@ -36,6 +36,33 @@ class TestLoads:
         np.testing.assert_allclose(found.of_meters / scale[:, 1:], sample[:, 1:] / scale[:, 1:], atol=0.06)
         np.testing.assert_allclose(found.variance, np.diagonal(sample), rtol=0.08, atol=1e-7)
         np.testing.assert_allclose(found.between, found.between.T)
+
+    def test_the_prior_is_that_of_the_matrices(self) -> None:
+        rng = np.random.default_rng(2)
+        tree = random_tree(12, rng, drop=0.04)
+        model, doubt = lindistflow(tree), LoadDoubt(rng.random(12), rng.random(12), 1.0, 0.3, 0.6)
+        at, inverters = rng.permutation(13)[:7], rng.random(12)
+        found = prior(tree, at, doubt, busbar=0.01, inverters=inverters)
+        expected = np.full((13, 13), 1e-4)
+        for R, s, c in (
+            (model.R_bus, doubt.p, 0.3),
+            (model.X_bus, np.hypot(doubt.q, inverters), 0.6),
+        ):
+            expected += 4.0 * R @ ((1.0 - c) * np.diag(s**2) + c * np.outer(s, s)) @ R.T
+        np.testing.assert_allclose(found.of_meters, expected[:, at], rtol=1e-12)
+        np.testing.assert_allclose(found.variance, np.diagonal(expected), rtol=1e-12)
+
+    def test_what_else_can_be_wrong_is_what_the_matrices_say(self) -> None:
+        rng = np.random.default_rng(3)
+        made = design(make_plant(rng), doubt=LoadDoubt(np.full(9, 0.006), np.full(9, 0.002), 600.0), step_s=1.0)
+        plant, book = made.plant, made.book
+        model, at = lindistflow(plant.feeder), plant.feeder.bus[plant.meters]
+        columns = 2.0 * np.hstack([model.R_bus, model.X_bus[:, plant.droop.customer]])
+        every = rng.permutation(columns.shape[1])
+        np.testing.assert_allclose(book.columns(every), columns[:, every], rtol=1e-12)
+        weights = rng.normal(size=at.size)
+        np.testing.assert_allclose(book.along(weights), weights @ columns[at], rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(book.size, (columns[at] ** 2).sum(axis=0), rtol=1e-12)
 
     def test_every_problem_is_named(self) -> None:
         with pytest.raises(ValueError, match=r"p must be.*q must be.*time_s.*common_p.*common_q"):

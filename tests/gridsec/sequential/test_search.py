@@ -20,9 +20,10 @@ SIGMAS = 3.5
 
 def street(rng: np.random.Generator, customers: int) -> tuple[Floats, Prior]:
     """A random tree; 2R, and what errors of 0.6 kW do to its voltages."""
-    model = lindistflow(random_tree(customers, rng, drop=0.04))
+    tree = random_tree(customers, rng, drop=0.04)
+    model = lindistflow(tree)
     doubt = LoadDoubt(np.full(customers, 0.006), np.full(customers, 0.002), 600.0)
-    return 2.0 * model.R_bus, prior(model, np.arange(1, customers + 1), doubt, busbar=4e-4)
+    return 2.0 * model.R_bus, prior(tree, np.arange(1, customers + 1), doubt, busbar=4e-4)
 
 
 def readings(rng: np.random.Generator, p: Prior, noise: Floats) -> Floats:
@@ -123,7 +124,13 @@ def test_a_load_that_nobody_knows_is_one_suspicion_and_not_many_liars() -> None:
     noise = np.full(20, 0.001**2)
     where = int(np.argmax(columns[1:].sum(axis=0)))
     m = readings(rng, p, noise) - 0.2 * columns[1:, where]
-    book = Dictionary(columns[1:], np.full(20, 0.1), np.full(20, 3.0), lambda k: columns[:, k])
+    book = Dictionary(
+        std=np.full(20, 0.1),
+        charge=np.full(20, 3.0),
+        size=(columns[1:] ** 2).sum(axis=0),
+        columns=lambda which: columns[:, which],
+        along=lambda weights: weights @ columns[1:],
+    )
     live, none = np.ones(20, dtype=bool), np.zeros(20, dtype=bool)
     start = fit(p, noise, live)
     plain = descend(start, m, live, limits(20), keep=none)
