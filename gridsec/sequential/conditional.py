@@ -21,7 +21,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, lapack
+from scipy.linalg import lapack
 
 from gridsec.arrays import Bools, Floats, Ints
 
@@ -153,9 +153,13 @@ def inverted(matrix: Floats) -> Floats:
     matrix : (k, k)
         The matrix.
     """
-    factor, lower = cho_factor(matrix, lower=True, check_finite=False)
-    inverse, _ = lapack.dpotri(factor, lower=lower)
-    return np.asarray(np.tril(inverse) + np.tril(inverse, -1).T)
+    factor, failed = lapack.dpotrf(matrix, lower=True)
+    if failed:
+        raise np.linalg.LinAlgError("the matrix is not positive definite")
+    lower, _ = lapack.dpotri(factor, lower=True)
+    inverse = lower + lower.T
+    inverse[np.diag_indices_from(inverse)] = lower.diagonal()
+    return np.asarray(inverse)
 
 
 def judge(now: Fit, m: Floats) -> Judged:

@@ -64,6 +64,36 @@ class Lies:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class FalsePowers:
+    """What false powers of customers do to squared voltages. p meters, each at its customer's bus.
+
+    Attributes
+    ----------
+    R, X : (p, p)
+        Squared voltages by active and reactive powers, 2R and 2X of the feeder.
+    p, q : (p,)
+        How false the powers of each may be, standard deviations, pu.
+    """
+
+    R: Floats
+    X: Floats
+    p: Floats
+    q: Floats
+
+    def columns(self, who: Ints) -> Floats:
+        """B of some customers, (p, k, 2)."""
+        B = np.empty((len(self.R), who.size, 2))
+        np.multiply(self.R[:, who], self.p[who], out=B[:, :, 0])
+        np.multiply(self.X[:, who], self.q[who], out=B[:, :, 1])
+        return B
+
+    def of(self, live: Ints) -> FalsePowers:
+        """For some of the meters alone."""
+        both = np.ix_(live, live)
+        return FalsePowers(self.R[both], self.X[both], self.p[live], self.q[live])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Explained:
     """One explanation. p meters.
 
@@ -111,7 +141,7 @@ class _State:
 class _Problem:
     """Readings, and what may be wrong with them."""
 
-    def __init__(self, lies: Lies, Q: Floats, false: Floats, curved: Curved | None) -> None:
+    def __init__(self, lies: Lies, Q: Floats, false: FalsePowers | None, curved: Curved | None) -> None:
         self.lies, self.false, self.curved = lies, false, curved
         self.size = p = len(Q)
         self.a2 = lies.size**2
@@ -129,16 +159,18 @@ class _Problem:
             + self.anybody * (count > 0)
         )
 
+    def charges(self, at: _State) -> float:
+        return self.charge(int(at.liars.sum()), int(at.powers.sum()))
+
     def cost(self, at: _State) -> float:
-        return at.fit + at.logdet + self.charge(int(at.liars.sum()), int(at.powers.sum()))
+        return at.fit + at.logdet + self.charges(at)
 
     def meters(self, at: _State) -> Floats:
         """Rise of J by accusing each meter, or by trusting it again, (p,)."""
         on = at.liars
         delta = np.where(on, -self.a2, self.a2)
         pivot = np.maximum(1.0 + delta * at.Q.diagonal(), np.finfo(np.float64).tiny)
-        k, f = int(on.sum()), int(at.powers.sum())
-        now = self.charge(k, f)
+        k, f, now = int(on.sum()), int(at.powers.sum()), self.charges(at)
         more, less = self.charge(k + 1, f) - now, self.charge(max(k - 1, 0), f) - now
         rise = np.log(pivot) - delta * at.g**2 / pivot + np.where(on, less, more)
         # Powers are false only where the meter lies.
@@ -146,20 +178,31 @@ class _Problem:
 
     def pairs(self, at: _State, who: Ints) -> Floats:
         """Rise of J by false powers of some customers, their meters included where trusted, (k,)."""
+        k, f, now = int(at.liars.sum()), int(at.powers.sum()), self.charges(at)
+        B = self._columns(who)
+        QB = (at.Q @ B.reshape(self.size, -1)).reshape(B.shape)
+        # The meter first, which changes Q and g by rank one; then its customer's powers.
+        own = np.where(at.liars[who], 0.0, self.a2)
+        pivot = 1.0 + own * at.Q[who, who]
+        row, g = QB[who, np.arange(who.size)], at.g[who]
+        M = np.einsum("jci,jck->cik", B, QB) - (own / pivot)[:, None, None] * row[:, :, None] * row[:, None]
+        h = np.einsum("j,jci->ci", at.g, B) - (own / pivot * g)[:, None] * row
+        det, gain = _by_two(M, h, 1.0)
+        more = np.where(at.liars[who], self.charge(k, f + 1), self.charge(k + 1, f + 1)) - now
+        return np.where(at.powers[who], np.inf, np.log(pivot * det) - own / pivot * g**2 - gain + more)
+
+    def believed(self, at: _State, who: Ints) -> Floats:
+        """Rise of J by believing the powers of some customers again, (k,)."""
         k, f = int(at.liars.sum()), int(at.powers.sum())
-        false = self.false[:, who]
-        Qb = (at.Q @ false.reshape(self.size, -1)).reshape(false.shape)
-        own = np.where(at.liars[who], 0.0, self.lies.size)
-        M = np.empty((who.size, 3, 3))
-        M[:, 0, 0] = 1.0 + own**2 * at.Q[who, who]
-        M[:, 0, 1:] = M[:, 1:, 0] = own[:, None] * Qb[who, np.arange(who.size)]
-        M[:, 1:, 1:] = np.eye(2) + np.einsum("jci,jck->cik", false, Qb)
-        h = np.column_stack([own * at.g[who], np.einsum("j,jci->ci", at.g, false)])
-        gain = np.einsum("ci,ci->c", h, np.linalg.solve(M, h[:, :, None])[:, :, 0])
-        sign, logdet = np.linalg.slogdet(M)
-        charges = np.where(at.liars[who], self.charge(k, f + 1), self.charge(k + 1, f + 1))
-        rise = logdet - gain + charges - self.charge(k, f)
-        return np.where(at.powers[who] | (sign <= 0), np.inf, rise)
+        B = self._columns(who)
+        M = np.einsum("jci,jl,lck->cik", B, at.Q, B, optimize=True)
+        det, gain = _by_two(M, np.einsum("j,jci->ci", at.g, B), -1.0)
+        return np.log(det) - gain + self.charge(k, f - 1) - self.charge(k, f)
+
+    def _columns(self, who: Ints) -> Floats:
+        if self.false is None:
+            raise ValueError("there are no false powers")
+        return self.false.columns(who)
 
     def settle(self, at: _State) -> None:
         """Linearise about what this explanation says of the powers."""
@@ -183,7 +226,7 @@ class _Problem:
 
     def powers(self, at: _State, c: int, sign: float = 1.0) -> None:
         """Doubt a customer's powers, or with `sign` -1 believe them again."""
-        u = self.false[:, c]
+        u = self._columns(np.array([c]))[:, 0]
         Qu, h = at.Q @ u, u.T @ at.g
         M = sign * np.eye(2) + u.T @ Qu
         solved = np.linalg.solve(M, np.column_stack([Qu.T, h]))
@@ -192,6 +235,13 @@ class _Problem:
         at.g = at.g - Qu @ solved[:, -1]
         at.Q -= Qu @ solved[:, :-1]
         at.powers[c] = sign > 0
+
+
+def _by_two(M: Floats, h: Floats, sign: float) -> tuple[Floats, Floats]:
+    """``det(sign I + M)`` and ``h^T (sign I + M)^-1 h`` of many, (k, 2, 2) and (k, 2)."""
+    a, b, c = M[:, 0, 0] + sign, M[:, 0, 1], M[:, 1, 1] + sign
+    det = np.maximum(a * c - b * b, np.finfo(np.float64).tiny)
+    return det, (c * h[:, 0] ** 2 - 2.0 * b * h[:, 0] * h[:, 1] + a * h[:, 1] ** 2) / det
 
 
 _PASSES = 2
@@ -211,7 +261,7 @@ def identify(
     live: Bools,
     *,
     lies: Lies | None = None,
-    false: Floats | None = None,
+    false: FalsePowers | None = None,
     curved: Curved | None = None,
 ) -> tuple[Explained, ...]:
     """The likeliest explanations of one set of readings.
@@ -228,9 +278,8 @@ def identify(
         Which meters have a reading.
     lies
         What lies are expected to be like; the defaults of `Lies` by default.
-    false : (p, p, 2)
-        `false[:, c]` is what false active and reactive powers of the customer of meter c do to the squared
-        voltages of all meters' buses, times how false they may be; none by default.
+    false
+        What false powers do to voltages, and how false they may be; none by default.
     curved
         The power flow is not linear, and false powers may be large: `curved(weights, powers)` is `m` for the
         live meters linearised about the powers of an explanation, by its weights and who reports false ones,
@@ -242,13 +291,15 @@ def identify(
         The likeliest first; there is always one.
     """
     lies = Lies() if lies is None else lies
-    at: Ints | slice = slice(None) if live.all() else np.flatnonzero(live)
-    d, y, bus = noise[at], m[at], prior.meters[at]
-    doubts = np.zeros((d.size, d.size, 0)) if false is None else false[at][:, at]
-    K = prior.of_meters[bus][:, at]
+    if live.all():
+        d, y, K = noise, m, prior.between
+    else:
+        at = np.flatnonzero(live)
+        d, y, K = noise[at], m[at], prior.of_meters[np.ix_(prior.meters[at], at)]
+        false = None if false is None else false.of(at)
     K[np.diag_indices(d.size)] += d
     Q = inverted(K)
-    problem = _Problem(lies, Q, doubts, curved)
+    problem = _Problem(lies, Q, false, curved)
     none = np.zeros(d.size, dtype=np.bool_)
     g = Q @ y
     start = _State(none, none.copy(), y, Q, g, 0.0, float(y @ g))
@@ -306,11 +357,12 @@ def _best(problem: _Problem, at: _State, false: bool) -> _State | None:
     j = int(np.argmin(rise))
     least, move = float(rise[j]), "meter"
     if false and at.liars.any():
-        for c in np.flatnonzero(at.powers).tolist():
-            after = at.copy()
-            problem.powers(after, c, -1.0)
-            if problem.cost(after) - problem.cost(at) < min(least, -_LEAST):
-                return after
+        doubted = np.flatnonzero(at.powers)
+        if doubted.size:
+            rises = problem.believed(at, doubted)
+            c = int(np.argmin(rises))
+            if rises[c] < least:
+                j, least, move = int(doubted[c]), float(rises[c]), "believe"
         who = np.flatnonzero(at.liars)
         doubts = problem.pairs(at, who)
         c = int(np.argmin(doubts))
@@ -321,7 +373,10 @@ def _best(problem: _Problem, at: _State, false: bool) -> _State | None:
     if move == "powers":
         return _doubted(problem, at, j)
     after = at.copy()
-    problem.toggle(after, j)
+    if move == "believe":
+        problem.powers(after, j, -1.0)
+    else:
+        problem.toggle(after, j)
     return after
 
 

@@ -10,21 +10,25 @@ import pytest
 
 from gridsec.arrays import Bools, Floats
 from gridsec.sequential.conditional import Prior
-from gridsec.sequential.snapshot import Explained, Lies, identify
+from gridsec.sequential.snapshot import Explained, FalsePowers, Lies, identify
 
 P = 7
 LIES = Lies()
 
 
-Known = tuple[Prior, Floats, Floats]
+Known = tuple[Prior, Floats, FalsePowers]
 
 
 def street(rng: np.random.Generator) -> Known:
-    """A line of customers: prior, noise, and what false powers do to voltages, (p, p, 2)."""
+    """A line of customers: prior, noise, and what false powers do to voltages."""
     r = np.cumsum(rng.uniform(0.01, 0.05, P))
     R = 2.0 * np.minimum.outer(r, r)
     K = R @ np.diag(rng.uniform(0.005, 0.02, P) ** 2) @ R.T
-    return Prior(K, np.arange(P), K.diagonal()), np.full(P, 0.004**2), np.stack([R, 0.3 * R], axis=2)
+    return (
+        Prior(K, np.arange(P), K.diagonal()),
+        np.full(P, 0.004**2),
+        FalsePowers(R, R, np.ones(P), np.full(P, 0.3)),
+    )
 
 
 def dense(known: Known, m: Floats, liars: tuple[int, ...], powers: tuple[int, ...] = ()) -> float:
@@ -35,7 +39,8 @@ def dense(known: Known, m: Floats, liars: tuple[int, ...], powers: tuple[int, ..
     for j in liars:
         K[j, j] += LIES.size**2
     for c in powers:
-        K += false[:, c] @ false[:, c].T
+        B = np.column_stack([false.R[:, c] * false.p[c], false.X[:, c] * false.q[c]])
+        K += B @ B.T
     logs = np.linalg.slogdet(K)[1] - np.linalg.slogdet(honest)[1]
     sets = 2.0 * np.log(comb(P, len(liars)))
     return float(m @ np.linalg.solve(K, m) + logs + sets + LIES.each * len(liars) + LIES.false * len(powers))
@@ -78,7 +83,7 @@ def test_false_powers_are_found_with_their_meter() -> None:
         c = int(rng.integers(2, P - 1))
         # The model follows the false powers, all meters but the customer's own tell the truth.
         honest = rng.multivariate_normal(np.zeros(P), prior.between + np.diag(noise))
-        m = honest - 0.7 * false[:, c, 0]
+        m = honest - 0.7 * false.R[:, c]
         m[c] = honest[c]
         found = identify(prior, noise, m, LIVE, false=false)
         best = min(
