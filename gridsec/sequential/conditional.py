@@ -21,7 +21,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import lapack
+from scipy.linalg import blas, lapack
 
 from gridsec.arrays import Bools, Floats, Ints
 
@@ -132,17 +132,62 @@ def fit(prior: Prior, noise: Floats, trusted: Bools, loose: Floats | None = None
     loose : (n, k)
         Additional directions with their standard deviations, see `loosen`.
     """
-    p = noise.size
     more = np.zeros((prior.variance.size, 0)) if loose is None else loose
     at = np.flatnonzero(trusted)
-    K = prior.of_meters[:, at] + more @ more[prior.meters[at]].T
-    Q = np.zeros((p, p))
-    variance = prior.variance + np.einsum("ij,ij->i", more, more)
-    if at.size:
-        inverse = inverted(K[prior.meters[at]] + np.diag(noise[at]))
-        Q[np.ix_(at, at)] = inverse
-        variance = variance - np.einsum("ij,ij->i", K @ inverse, K)
-    return Fit(prior, noise, trusted.copy(), Q, np.maximum(variance, 0.0), more)
+    # Symmetric: its transpose is the same in the order of LAPACK, to be inverted where it is.
+    inverse = prior.of_meters[np.ix_(prior.meters[at], at)].T
+    if more.shape[1]:
+        inverse += more[prior.meters[at]] @ more[prior.meters[at]].T
+    inverse[np.diag_indices(at.size)] += noise[at]
+    _invert(inverse)
+    now = Fit(prior, noise, trusted.copy(), inverse.T, _whole(prior, more), more)
+    if at.size < noise.size:
+        now.Q = np.zeros((noise.size, noise.size))
+        now.Q[np.ix_(at, at)] = inverse
+    _narrow(now, at, inverse)
+    return now
+
+
+def _whole(prior: Prior, more: Floats) -> Floats:
+    return np.asarray(prior.variance + np.einsum("ij,ij->i", more, more))
+
+
+def _narrow(now: Fit, at: Ints, inverse: Floats) -> None:
+    """Take off the variances what meters `at` know, with their inverse covariance."""
+    buses, noise, before = now.prior.meters[at], now.noise[at], now.variance
+    # What a meter knows of its own bus follows from what it leaves open of its reading.
+    good = noise < before[buses]
+    own = noise[good] * (1.0 - noise[good] * inverse.diagonal()[good])
+    left = np.ones(before.size, dtype=np.bool_)
+    left[buses[good]] = False
+    others = np.flatnonzero(left)
+    for first in range(0, others.size if at.size else 0, _ROWS):
+        some = others[first : first + _ROWS]
+        K = now.prior.of_meters[np.ix_(some, at)]
+        if now.loose.shape[1]:
+            K += now.loose[some] @ now.loose[now.prior.meters[at]].T
+        before[some] -= np.einsum("ij,ij->i", K @ inverse, K)
+    before[buses[good]] = own
+    np.maximum(before, 0.0, out=before)
+
+
+# Rows that are worked on together.
+_ROWS = 256
+
+
+def _invert(matrix: Floats) -> None:
+    """Invert a symmetric positive definite matrix in place, in the order of LAPACK, by Cholesky."""
+    if not matrix.size:
+        return
+    _, failed = lapack.dpotrf(matrix, lower=True, clean=False, overwrite_a=True)
+    if failed:
+        raise np.linalg.LinAlgError("the matrix is not positive definite")
+    lapack.dpotri(matrix, lower=True, overwrite_c=True)
+    for first in range(0, len(matrix), _ROWS):
+        last = first + _ROWS
+        corner = matrix[first:last, first:last]
+        corner[:] = np.tril(corner) + np.tril(corner, -1).T
+        matrix[first:last, last:] = matrix[last:, first:last].T
 
 
 def inverted(matrix: Floats) -> Floats:
@@ -153,13 +198,9 @@ def inverted(matrix: Floats) -> Floats:
     matrix : (k, k)
         The matrix.
     """
-    factor, failed = lapack.dpotrf(matrix, lower=True)
-    if failed:
-        raise np.linalg.LinAlgError("the matrix is not positive definite")
-    lower, _ = lapack.dpotri(factor, lower=True)
-    inverse = lower + lower.T
-    inverse[np.diag_indices_from(inverse)] = lower.diagonal()
-    return np.asarray(inverse)
+    inverse: Floats = np.array(matrix, order="F")
+    _invert(inverse)
+    return inverse
 
 
 def judge(now: Fit, m: Floats) -> Judged:
@@ -177,15 +218,35 @@ def judge(now: Fit, m: Floats) -> Judged:
     w = prior.of_meters @ weights
     if now.loose.shape[1]:
         w += now.loose @ (weights @ now.loose[prior.meters])
-    diagonal = now.Q.diagonal()
-    at = prior.meters
+    return _judged(now, m, weights, w)
+
+
+def _judged(now: Fit, m: Floats, weights: Floats, w: Floats) -> Judged:
+    diagonal, at = now.Q.diagonal(), now.prior.meters
     with np.errstate(divide="ignore", invalid="ignore"):
         offset = np.where(now.trusted, weights / diagonal, m - w[at])
         variance = np.where(now.trusted, 1.0 / diagonal, now.variance[at] + now.noise)
     return Judged(weights, offset, np.sqrt(variance), w, float(m @ weights))
 
 
-def drop(now: Fit, j: int) -> None:
+@dataclass(frozen=True, slots=True, eq=False)
+class Move:
+    """A change of rank one: Q has gained ``factor q q^T``. n buses, p meters.
+
+    Attributes
+    ----------
+    factor, q : (p,)
+        The change.
+    spread : (n,)
+        What weights q say about every bus.
+    """
+
+    factor: float
+    q: Floats
+    spread: Floats
+
+
+def drop(now: Fit, j: int) -> Move:
     """Trust meter j no more; O(n p).
 
     Parameters
@@ -196,16 +257,14 @@ def drop(now: Fit, j: int) -> None:
         A trusted meter.
     """
     q = now.Q[:, j].copy()
-    pivot = q[j]
-    spread = _covariance(now, q)
-    now.variance += spread * spread / pivot
-    now.Q -= np.multiply.outer(q, q / pivot)
+    move = Move(-1.0 / q[j], q, _covariance(now, q))
+    _change(now, move)
     now.Q[j] = now.Q[:, j] = 0.0
     now.trusted[j] = False
-    now.changes += 1
+    return move
 
 
-def admit(now: Fit, j: int) -> None:
+def admit(now: Fit, j: int) -> Move:
     """Trust meter j from now on; O(n p).
 
     Parameters
@@ -215,18 +274,18 @@ def admit(now: Fit, j: int) -> None:
     j
         A meter that is not trusted.
     """
-    open_ = _left_open(now, j)
+    column = _column(now, j)
+    q = now.Q @ column[now.prior.meters]
+    open_ = column - _covariance(now, q)
     pivot = max(open_[now.prior.meters[j]], 0.0) + now.noise[j]
-    v = now.Q @ _column(now, j)[now.prior.meters]
-    v[j] -= 1.0
-    now.Q += np.multiply.outer(v, v / pivot)
-    now.variance -= open_ * open_ / pivot
-    np.maximum(now.variance, 0.0, out=now.variance)
+    q[j] -= 1.0
+    move = Move(1.0 / pivot, q, -open_)
+    _change(now, move)
     now.trusted[j] = True
-    now.changes += 1
+    return move
 
 
-def loosen(now: Fit, direction: Floats, std: float) -> None:
+def loosen(now: Fit, direction: Floats, std: float) -> Move:
     """Let the squared voltages differ in one more direction; O(n p).
 
     Parameters
@@ -239,13 +298,37 @@ def loosen(now: Fit, direction: Floats, std: float) -> None:
         Standard deviation of the amount, pu.
     """
     u = std * direction
-    Qu = now.Q @ u[now.prior.meters]
-    pivot = 1.0 + float(u[now.prior.meters] @ Qu)
-    rest = u - _covariance(now, Qu)
-    now.Q -= np.multiply.outer(Qu, Qu / pivot)
-    now.variance += rest * rest / pivot
+    q = now.Q @ u[now.prior.meters]
+    pivot = 1.0 + float(u[now.prior.meters] @ q)
+    move = Move(-1.0 / pivot, q, _covariance(now, q) - u)
+    _change(now, move)
     now.loose = np.column_stack([now.loose, u])
+    return move
+
+
+def _change(now: Fit, move: Move) -> None:
+    # In place: Q is symmetric, and its transpose in the order of BLAS.
+    now.Q = blas.dger(move.factor, move.q, move.q, a=now.Q.T, overwrite_a=True).T
+    now.variance -= move.factor * move.spread * move.spread
+    np.maximum(now.variance, 0.0, out=now.variance)
     now.changes += 1
+
+
+def follow(now: Fit, m: Floats, judged: Judged, move: Move) -> Judged:
+    """Judge anew after a move; O(n).
+
+    Parameters
+    ----------
+    now
+        After the move.
+    m : (p,)
+        As in `judge`.
+    judged, move
+        What was judged before the move, and the move.
+    """
+    amount = move.factor * float(move.q @ m)
+    weights = np.where(now.trusted, judged.weights + amount * move.q, 0.0)
+    return _judged(now, m, weights, judged.w + amount * move.spread)
 
 
 def _covariance(now: Fit, weights: Floats) -> Floats:
@@ -262,9 +345,3 @@ def _column(now: Fit, j: int) -> Floats:
     if now.loose.shape[1]:
         out = out + now.loose @ now.loose[now.prior.meters[j]]
     return np.asarray(out)
-
-
-def _left_open(now: Fit, j: int) -> Floats:
-    """Column j of M, (n,)."""
-    column = _column(now, j)
-    return np.asarray(column - _covariance(now, now.Q @ column[now.prior.meters]))

@@ -32,7 +32,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from gridsec.arrays import Bools, Floats, Ints
-from gridsec.sequential.conditional import Fit, Judged, Prior, admit, drop, judge, loosen
+from gridsec.sequential.conditional import Fit, Judged, Move, Prior, admit, drop, follow, judge, loosen
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,8 +162,8 @@ def descend(
         move = _best(_Place(now, judged, limits, barred, powers, accused))
         if move is None:
             break
-        move()
-        judged = judge(now, m)
+        judged = follow(now, m, judged, move())
+    judged = judge(now, m)  # without what rounding has left
     dropped = int(np.count_nonzero(live & ~now.trusted))
     loosened = [] if powers is None else powers.index[accused].tolist()
     size = int(np.count_nonzero(live))
@@ -200,7 +200,7 @@ class _Place:
     accused: list[int]
 
 
-def _best(here: _Place) -> Callable[[], None] | None:
+def _best(here: _Place) -> Callable[[], Move] | None:
     """The next move, or None where none helps."""
     now, judged, powers = here.fit, here.judged, here.powers
     excess = np.abs(judged.offset) / here.limits.of(judged.std)
@@ -215,25 +215,18 @@ def _best(here: _Place) -> Callable[[], None] | None:
         if gains[first] > max(other, 0.0):
             return lambda: powers.loosen(now, first, here.accused)
     if drops:
-        return lambda: _drop(now, worst, powers)
+        return lambda: _moved(drop(now, worst), powers)
     outside = np.where(now.trusted | here.barred, np.inf, excess)
     nearest = int(np.argmin(outside))
     if outside[nearest] < 1.0:
-        return lambda: _admit(now, nearest, powers)
+        return lambda: _moved(admit(now, nearest), powers)
     return None
 
 
-def _drop(now: Fit, j: int, powers: _Powers | None) -> None:
+def _moved(move: Move, powers: _Powers | None) -> Move:
     if powers is not None:
-        powers.change(now.Q[:, j], -1.0 / now.Q[j, j])
-    drop(now, j)
-
-
-def _admit(now: Fit, j: int, powers: _Powers | None) -> None:
-    admit(now, j)
-    if powers is not None:
-        # The change of Q is q q^T / Q_jj with the new column q.
-        powers.change(now.Q[:, j], 1.0 / now.Q[j, j])
+        powers.change(move)
+    return move
 
 
 # So many directions of a dictionary are tried, those that the residuals point at most.
@@ -255,17 +248,14 @@ class _Powers:
         """How much each direction would lower the misfit, (k,)."""
         return np.asarray((weights @ self.seen) ** 2 / (self.std**-2.0 + self.form))
 
-    def change(self, q: Floats, factor: float) -> None:
-        """Q has gained, or is about to lose, ``|factor| q q^T``."""
-        self.form += factor * (q @ self.seen) ** 2
+    def change(self, move: Move) -> None:
+        """Q has changed."""
+        self.form += move.factor * (move.q @ self.seen) ** 2
 
-    def loosen(self, now: Fit, k: int, accused: list[int]) -> None:
+    def loosen(self, now: Fit, k: int, accused: list[int]) -> Move:
         """Loosen a direction."""
-        u = self.std[k] * self.seen[:, k]
-        Qu = now.Q @ u
-        self.change(Qu, -1.0 / (1.0 + float(u @ Qu)))
-        loosen(now, self.columns[:, k], float(self.std[k]))
         accused.append(k)
+        return _moved(loosen(now, self.columns[:, k], float(self.std[k])), self)
 
 
 _HARDER = 2.5

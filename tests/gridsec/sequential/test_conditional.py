@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gridsec.arrays import Bools, Floats
-from gridsec.sequential.conditional import Fit, Prior, admit, drop, fit, inverted, judge, loosen
+from gridsec.sequential.conditional import Fit, Prior, admit, drop, fit, follow, inverted, judge, loosen
 
 
 def problem(rng: np.random.Generator, buses: int, meters: int) -> tuple[Floats, Prior, Floats, Floats]:
@@ -67,15 +67,19 @@ def test_any_sequence_of_moves_is_a_fit_of_where_it_ends(seed: int, moves: int) 
     rng = np.random.default_rng(seed)
     S, prior, noise, m = problem(rng, 9, 7)
     now = fit(prior, noise, rng.random(7) < 0.5)
+    judged = judge(now, m)
     for _ in range(moves):
         j = int(rng.integers(7))
         if rng.random() < 0.2 and now.loose.shape[1] < 3:
             direction, std = rng.normal(size=9), float(rng.uniform(0.1, 2.0))
-            loosen(now, direction, std)
+            judged = follow(now, m, judged, loosen(now, direction, std))
             S = S + std**2 * np.outer(direction, direction)
         else:
-            (drop if now.trusted[j] else admit)(now, j)
+            judged = follow(now, m, judged, (drop if now.trusted[j] else admit)(now, j))
     agrees(now, S, m)
+    anew = judge(now, m)
+    for name in ("weights", "offset", "std", "w", "misfit"):
+        np.testing.assert_allclose(getattr(judged, name), getattr(anew, name), rtol=1e-7, atol=1e-7)
 
 
 @settings(max_examples=40)

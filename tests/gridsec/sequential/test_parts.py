@@ -54,7 +54,8 @@ class TestLoads:
 
     def test_what_else_can_be_wrong_is_what_the_matrices_say(self) -> None:
         rng = np.random.default_rng(3)
-        made = design(make_plant(rng), doubt=LoadDoubt(np.full(9, 0.006), np.full(9, 0.002), 600.0), step_s=1.0)
+        doubt = LoadDoubt(np.full(9, 0.006), np.full(9, 0.002), 600.0)
+        made = design(make_plant(rng), doubt=doubt, step_s=1.0)
         plant, book = made.plant, made.book
         model, at = lindistflow(plant.feeder), plant.feeder.bus[plant.meters]
         columns = 2.0 * np.hstack([model.R_bus, model.X_bus[:, plant.droop.customer]])
