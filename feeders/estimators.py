@@ -15,7 +15,7 @@ from feeders.design_cache import bank_gains
 from feeders.doubts import load_doubt
 from feeders.load import Site, from_tables, plant
 from gridsec import monitor, sequential
-from gridsec.arrays import Floats
+from gridsec.arrays import Bools, Floats
 from gridsec.certificates import certify
 from gridsec.errors import FeederInvalid
 from gridsec.families import decoders, partial, set_search, ticks, unknown_input, windowed
@@ -23,6 +23,7 @@ from gridsec.feeder import lindistflow
 from gridsec.gains import CircleOptions, options_for
 from gridsec.lure import Lure, close_loop
 from gridsec.online import Estimate, Frame, Verdict
+from gridsec.sequential import Commission
 from gridsec.sequential.decoder import Decoder
 
 __all__ = [
@@ -32,6 +33,7 @@ __all__ = [
     "SEQUENTIAL",
     "Family",
     "Job",
+    "Learner",
     "Watcher",
     "choose",
     "design",
@@ -74,6 +76,32 @@ class Job:
 
 
 @dataclass(frozen=True, slots=True)
+class Learner:
+    """What a family can do besides that learns the fixed errors of its meters.
+
+    Attributes
+    ----------
+    needed_s
+        `needed_s(design)`: over what time they are learned, s; 0 for never.
+    init
+        `init(design, t, commission)` begins to watch with what is known from before.
+    commission
+        `commission(state)`: what is known now.
+    renew
+        `renew(design, state, which)`: some meters were replaced and are learned anew.
+    read
+        `read(design, arrays)`: what `gridsec.sequential.to_arrays` gave, if it fits the design; a
+        `ValueError` names every problem.
+    """
+
+    needed_s: Callable[[Any], float]
+    init: Callable[[Any, float, Commission], Any]
+    commission: Callable[[Any], Commission]
+    renew: Callable[[Any, Any, Bools], Any]
+    read: Callable[[Any, Mapping[str, Floats]], Commission]
+
+
+@dataclass(frozen=True, slots=True)
 class Family:
     """An estimator family: three functions and a name.
 
@@ -95,6 +123,8 @@ class Family:
         One line on why its estimate converges; empty where nothing is proven.
     withstands
         How many manipulated meters a design tells apart; None: as many as the feeder's file asks for.
+    learner
+        How it learns its meters' fixed errors; None: it does not.
     """
 
     name: str
@@ -105,6 +135,7 @@ class Family:
     observers: Callable[[Any], int]
     proof: Callable[[Any], str]
     withstands: Callable[[Any], int] | None = None
+    learner: Learner | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,15 +171,25 @@ class Watcher:
         """One line on why the estimate converges; empty where nothing is proven."""
         return self.family.proof(self.design)
 
-    def init(self, t: float) -> Any:
+    @property
+    def learner(self) -> Learner | None:
+        """How the meters' fixed errors are learned; None where they are not."""
+        learner = self.family.learner
+        return learner if learner is not None and learner.needed_s(self.design) > 0 else None
+
+    def init(self, t: float, commission: Commission | None = None) -> Any:
         """Begin to watch.
 
         Parameters
         ----------
         t
             Unix time, s.
+        commission
+            What is known of the meters' fixed errors from before, for families that learn them.
         """
-        return self.family.init(self.design, t)
+        if self.learner is None or commission is None:
+            return self.family.init(self.design, t)
+        return self.learner.init(self.design, t, commission)
 
     def step(self, state: Any, frame: Frame) -> tuple[Any, Estimate, Verdict]:
         """Take one frame in.
@@ -353,6 +394,13 @@ FAMILIES: Final[Mapping[str, Family]] = MappingProxyType(
                 lambda d: int(d.observers),
                 _certificate,
                 lambda d: int(d.most),
+                Learner(
+                    needed_s=lambda d: float(d.options.commission_s),
+                    init=lambda d, t, known: sequential.init(d, t, known.learned, known.learning),
+                    commission=lambda state: state.commission,
+                    renew=sequential.renew,
+                    read=sequential.from_arrays,
+                ),
             ),
             _bank(DIRECT, "banks of circle-criterion observers, direct injection (chong2020)", _direct_bank),
             _bank(LMI, "the same banks, gains by matrix inequality (chong2020)", _lmi_bank),

@@ -12,10 +12,11 @@ import asyncio
 import hashlib
 import json
 import secrets
-from collections.abc import AsyncGenerator, AsyncIterator
+from collections.abc import AsyncIterator
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path as FilePath
-from typing import Annotated, Any, Protocol, cast
+from typing import Annotated, Any, cast
 
 from anyio import to_thread
 from fastapi import APIRouter, Depends, FastAPI, Header, HTTPException, Path, Query, Request, Response
@@ -28,11 +29,12 @@ from gridsec.errors import FeederInvalid
 from service import models
 from service.alarms import AlarmKind, AlarmState, AlarmUnknown, Severity
 from service.alarms import to_json as alarm_json
+from service.backend import Backend
 from service.errors import FeederUnknown
 from service.problem import Guard, handlers, problem
 from service.report import FeederReport
 from service.report import to_json as report_json
-from service.store import Event, Store, StoreUnavailable
+from service.store import Event, StoreUnavailable
 
 MAX_BODY = 4 << 20
 """Longest request body that is read, bytes."""
@@ -40,52 +42,6 @@ MAX_STREAMS = 100
 """Event streams that may be open at once."""
 _WEB = FilePath(__file__).with_name("web")
 _NAME = r"^[A-Za-z0-9_-]{1,64}$"
-
-
-class Backend(Protocol):
-    """What the API needs from the running service."""
-
-    @property
-    def store(self) -> Store:
-        """The database, for reads."""
-
-    def feeders(self) -> list[dict[str, Any]]:
-        """Return the fields of `models.FeederSummary` for every feeder; verdict and time are added here."""
-
-    def feeder(self, name: str) -> dict[str, Any] | None:
-        """Return the fields of `models.FeederDetail`, or None if there is no such feeder."""
-
-    def known(self, name: str) -> bool:
-        """Whether there is such a feeder; costs nothing."""
-
-    def report(self, name: str) -> FeederReport | None:
-        """Return the latest report of a feeder, or None before its first tick."""
-
-    def metrics(self) -> bytes:
-        """Return the metrics in Prometheus's text format."""
-
-    def ready(self) -> tuple[bool, list[str]]:
-        """Say whether everything works that is needed to watch, and what does not."""
-
-    def healthy(self) -> tuple[bool, list[str]]:
-        """Say whether the process should live on, and if not, why."""
-
-    async def put_feeder(self, name: str, tables: dict[str, Any]) -> None:
-        """Take over a feeder's tables; raises what says that it is wrong, or TooManyFeeders."""
-
-    async def delete_feeder(self, name: str) -> None:
-        """Watch a feeder no more; raises FeederUnknown or FeederFixed."""
-
-    async def acknowledge(self, alarm_id: str, who: str, comment: str) -> dict[str, Any]:
-        """Answer an alarm and return it; raises AlarmUnknown or AlreadyAcknowledged."""
-
-    def subscribe(self) -> AsyncGenerator[dict[str, Any], None]:
-        """Return an asynchronous generator of wake-ups; it ends when the service stops.
-
-        Each is `{"type": "alarm" | "state", "data": ...}`, sent after the alarm has been stored or the
-        report replaced. Only the type is read here, so the backend may drop wake-ups of a client that is
-        slow, as long as one is left. The first step into the generator subscribes, closing it ends that.
-        """
 
 
 def create_api(backend: Backend) -> FastAPI:
@@ -260,12 +216,14 @@ def get_state(report: Latest, response: Response) -> models.State:
 
 
 @_feeders.get("/{feeder}/meters/{meter}")
-def get_meter(report: Latest, meter: str, response: Response) -> models.MeterNow:
-    """One meter at the latest tick."""
+def get_meter(backend: BackendHere, report: Latest, meter: str, response: Response) -> models.MeterNow:
+    """One meter at the latest tick, and what is known of its own error."""
     response.headers["Cache-Control"] = "no-store"
+    known = backend.commissioning(report.feeder) or {"meters": ()}
     for found in report_json(report)["meters"]:
         if found["meter"] == meter:
-            whole = {"feeder": report.feeder, "t": report.t, "verdict": report.verdict}
+            own = next((one for one in known["meters"] if one["meter"] == meter), None)
+            whole = {"feeder": report.feeder, "t": report.t, "verdict": report.verdict, "commissioning": own}
             return models.MeterNow.model_validate({**found, **whole})
     raise HTTPException(404, f"feeder {report.feeder!r} has no meter {meter!r}")
 
@@ -284,6 +242,46 @@ def get_history(
     rows = backend.store.history(feeder, since=since, until=until, meter=meter, limit=limit)
     points = [models.HistoryPoint.model_validate(row) for row in rows]
     return models.History(feeder=feeder, points=points, more=len(rows) == limit)
+
+
+@_feeders.get("/{feeder}/commissioning", response_model=models.Commissioning)
+def get_commissioning(backend: BackendHere, feeder: KnownFeeder, response: Response) -> Any:
+    """How far the meters' own fixed errors are known: what was gathered, what was learned, and when."""
+    response.headers["Cache-Control"] = "no-store"
+    return _commissioning(backend, feeder, backend.commissioning(feeder))
+
+
+@_feeders.post(
+    "/{feeder}/commissioning",
+    response_model=models.Commissioning,
+    dependencies=[Depends(_json_only)],
+    openapi_extra=models.Recommissioning.in_openapi(),
+)
+async def recommission(backend: BackendHere, feeder: KnownFeeder, request: Request) -> Any:
+    """Learn anew: meters that were replaced, while the others stay, or without `meters` the whole feeder."""
+    layout = _detail(backend, feeder)["layout"]
+    meters = [row["meter"] for row in layout["customers"] if row["meter"]]
+    found = models.Recommissioning.of(await request.body(), meters)
+    if isinstance(found, list):
+        raise RequestValidationError(found)
+    fields = await backend.recommission(feeder, found.meters or (), found.who, found.reason)
+    return await to_thread.run_sync(_commissioning, backend, feeder, fields)
+
+
+@_feeders.get("/{feeder}/commissioning/events")
+def get_commissioning_events(
+    backend: BackendHere, feeder: KnownFeeder, limit: Annotated[int, Query(ge=1, le=1000)] = 100
+) -> models.CommissioningEvents:
+    """What happened to the commissioning, who wanted it and why: the newest ones, oldest first."""
+    found = [asdict(event) for event in backend.store.commission_events(feeder, limit)]
+    return models.CommissioningEvents.model_validate({"events": found})
+
+
+def _commissioning(backend: Backend, feeder: str, fields: dict[str, Any] | None) -> dict[str, Any]:
+    if fields is None:
+        raise FeederUnknown(feeder)
+    kept = backend.store.commission(feeder)
+    return {**fields, "kept": None if kept is None else kept.t}
 
 
 @_feeders.get(

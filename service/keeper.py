@@ -20,6 +20,8 @@ import structlog
 from service.alarms import Alarm, Transition
 from service.alarms import to_json as alarm_json
 from service.bus import BusCounts
+from service.commissioning import Happened
+from service.kept import Kept
 from service.metrics import Metrics
 from service.store import Event, Store, StoreUnavailable
 from service.waiting import Batch, Waiting
@@ -155,13 +157,20 @@ class Keeper:
             self._metrics.unstored.set(len(self.waiting))
             self._apart(partial(_write, self._store, job), partial(self._written, job))
 
-    def store_now(self, more: tuple[Transition, ...] = (), *, without: str | None = None) -> None:
-        """Commit everything gathered and `more`, all or nothing, before this returns.
+    def store_now(
+        self,
+        more: tuple[Transition, ...] = (),
+        *,
+        kept: tuple[Kept, ...] = (),
+        happened: tuple[Happened, ...] = (),
+        without: str | None = None,
+    ) -> None:
+        """Commit everything gathered and what is given, all or nothing, before this returns.
 
         Parameters
         ----------
-        more
-            Transitions that are only wanted if they can be stored now.
+        more, kept, happened
+            What is only wanted if it can be stored now.
         without
             Forget the tables of this feeder.
 
@@ -173,7 +182,12 @@ class Keeper:
         if self.problem is not None:
             raise StoreUnavailable(self.problem)
         gathered = self.waiting.take()
-        batch = Batch((*gathered.transitions, *more), gathered.reports, gathered.rejected)
+        batch = replace(
+            gathered,
+            transitions=(*gathered.transitions, *more),
+            kept=(*gathered.kept, *kept),
+            happened=(*gathered.happened, *happened),
+        )
         done = _write(self._store, Job(batch, without=without))
         self._written(Job(gathered if done.numbers is None else batch), done)
         if done.error is not None:
@@ -277,7 +291,12 @@ def _write(store: Store, job: Job) -> Done:
             store.check()
         batch = job.batch
         numbers = store.commit(
-            batch.transitions, reports=batch.reports, rejected=batch.rejected, without=job.without
+            batch.transitions,
+            reports=batch.reports,
+            rejected=batch.rejected,
+            kept=batch.kept,
+            happened=batch.happened,
+            without=job.without,
         )
         done = Done(numbers)
         store.outbox_done(job.published)

@@ -53,6 +53,9 @@ class Metrics:
         self.suspects = Gauge(
             "gridsec_suspects", "Meters under suspicion at the latest tick.", ["feeder"], registry=registry
         )
+        self.learned = Gauge(
+            "gridsec_meters_learned", "Meters whose own error is known.", ["feeder"], registry=registry
+        )
         self.alarms = Gauge("gridsec_alarms_active", "Alarms that stand.", ["feeder"], registry=registry)
         self.transitions = Counter(
             "gridsec_alarm_transitions",
@@ -110,7 +113,7 @@ class Metrics:
         feeder
             Its name.
         """
-        for gauge in (self.seen, self.suspects, self.alarms):
+        for gauge in (self.seen, self.suspects, self.learned, self.alarms):
             if (feeder,) in {tuple(sample.labels.values()) for m in gauge.collect() for sample in m.samples}:
                 gauge.remove(feeder)
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import math
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StringConstraints
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StringConstraints, ValidationError
 
 from gridsec.online import Cause, Decision
 from service.alarms import AlarmKind, AlarmState, Change, Severity
+from service.commissioning import Stage, Step
 
 
 def _finite(value: Any) -> Any:
@@ -118,12 +121,70 @@ class State(BaseModel):
     explanations: list[ExplanationModel] = []
 
 
+class MeterCommissioning(BaseModel):
+    """What is known of one meter's own fixed error."""
+
+    meter: str
+    state: Stage
+    since: Number = Field(description="Since when it is being learned, Unix s; null once it is learned.")
+    learned_at: Number = Field(description="When it was learned, Unix s; null while it is not.")
+    gathered_s: Number = Field(description="For how long it was heard and trusted meanwhile, s.")
+    expected: Number = Field(description="When it is learned at the latest if heard and trusted, Unix s.")
+    error_volt: Number = Field(description="Its own error at nominal voltage, V; 0 while not learned.")
+    error_volt_std: Number = Field(description="Standard deviation of that, ageing included, V.")
+    allowed_volt: Number = Field(description="By how much it may honestly differ from its error, V.")
+
+
 class MeterNow(MeterState):
     """One meter at the latest tick, with what it belongs to."""
 
     feeder: str
     t: float
     verdict: Decision
+    commissioning: MeterCommissioning | None = Field(
+        default=None, description="What is known of its own error; null where that is not learned."
+    )
+
+
+class Commissioning(BaseModel):
+    """How far the meters' own fixed errors are known."""
+
+    feeder: str
+    estimator: str
+    state: Stage = Field(
+        description="`off`: this monitor learns nothing. `waiting`: no monitor or no tick yet. `learning`: "
+        "at least one meter is being learned. `learned`: all are."
+    )
+    t: Number = Field(description="Tick that this is about, Unix s.")
+    tick_s: float = Field(description="Interval of the monitor's steps, s.")
+    needed_s: float = Field(description="`commission_s`: for how long a meter has to be heard, s.")
+    gathered_s: Number = Field(
+        description="For how long the meter heard least was, of those being learned, s."
+    )
+    since: Number = Field(description="Since when there is something to learn, Unix s.")
+    expected: Number = Field(description="When it will be finished, Unix s; null if `held`.")
+    learned_at: Number = Field(description="When the last meter was learned, Unix s.")
+    held: bool = Field(description="Time enough has passed, but nothing is learned while one is suspected.")
+    restored: bool = Field(description="It goes on from what an earlier run of the service kept.")
+    note: str = Field(description="Why what was kept is not used; empty if all is well.")
+    kept: Number = Field(description="Tick up to which it is in the database, Unix s.")
+    meters: list[MeterCommissioning]
+
+
+class CommissioningEvent(BaseModel):
+    """Something that happened to a commissioning."""
+
+    t: float
+    change: Step
+    meters: list[str]
+    who: str | None
+    reason: str
+
+
+class CommissioningEvents(BaseModel):
+    """What happened to a commissioning, oldest first."""
+
+    events: list[CommissioningEvent]
 
 
 class FeederSummary(BaseModel):
@@ -243,6 +304,55 @@ class Acknowledgement(BaseModel):
 
     who: Line
     comment: Text = ""
+
+
+class Recommissioning(BaseModel):
+    """The wish of an operator to have meters learned anew."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    who: Line
+    reason: Annotated[Text, StringConstraints(min_length=1)]
+    meters: Annotated[list[str], Field(min_length=1)] | None = Field(
+        default=None, description="Which meters were replaced; without this, all are learned anew."
+    )
+
+    @classmethod
+    def of(cls, body: bytes, known: Sequence[str]) -> Recommissioning | list[Any]:
+        """Return what a body says, or everything that is wrong with it at once.
+
+        Parameters
+        ----------
+        body
+            JSON.
+        known
+            The feeder's meters.
+        """
+        try:
+            given = json.loads(body)
+        except ValueError as error:
+            return [{"loc": ("body",), "msg": f"no JSON: {error}", "type": "json_invalid"}]
+        found, problems = None, list[Any]()
+        try:
+            found = cls.model_validate(given)
+        except ValidationError as error:
+            problems = [{**one, "loc": ("body", *one["loc"])} for one in error.errors(include_url=False)]
+        meters = given.get("meters") if isinstance(given, dict) else None
+        seen: set[str] = set()
+        for k, meter in enumerate(meters if isinstance(meters, list) else ()):
+            if not isinstance(meter, str):
+                continue
+            what = f"there is no meter {meter!r}" if meter not in known else f"meter {meter!r} is named twice"
+            if meter not in known or meter in seen:
+                problems.append({"loc": ("body", "meters", k), "msg": what, "type": "meter"})
+            seen.add(meter)
+        return problems or found or []
+
+    @classmethod
+    def in_openapi(cls) -> dict[str, Any]:
+        """Return how a request is described."""
+        schema = cls.model_json_schema()
+        return {"requestBody": {"required": True, "content": {"application/json": {"schema": schema}}}}
 
 
 class HistoryPoint(BaseModel):

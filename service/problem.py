@@ -13,6 +13,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from gridsec.errors import DesignInfeasible, FeederInvalid, GridsecError, NotObservable
 from service.alarms import AlarmUnknown, AlreadyAcknowledged
+from service.commissioning import NothingToLearn
 from service.errors import FeederFixed, FeederUnknown, TooManyFeeders
 from service.store import StoreUnavailable
 
@@ -113,6 +114,7 @@ _STATUS: dict[type[GridsecError], int] = {
     FeederUnknown: 404,
     AlreadyAcknowledged: 409,
     FeederFixed: 409,
+    NothingToLearn: 409,
     TooManyFeeders: 409,
     StoreUnavailable: 503,
     GridsecError: 500,

@@ -9,12 +9,13 @@ Nobody who watches waits for the database: see `keeper`.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import msgspec
+import numpy as np
 import structlog
 
 from feeders.load import Site
@@ -22,6 +23,8 @@ from service.alarms import AlarmRules, close, restore
 from service.alarms import to_json as alarm_json
 from service.align import Clock, Outcome
 from service.bus import Sample
+from service.commissioning import Commissioning, Happened
+from service.commissioning import to_json as commissioning_json
 from service.errors import FeederUnknown
 from service.keeper import Apart, Keeper, alarm_key, at_once
 from service.metrics import Metrics
@@ -119,7 +122,8 @@ class Rounds:
         config, name = self.config, site.feeder.name
         stored = self.store.active(name, cleared_since=self._wall() - AlarmRules().memory_s)
         rules = align_rules(site, config.clock, max_skew_s=config.max_skew_s, grace_s=config.grace_s)
-        watch = Watch(site, rules, restore(name, stored))
+        commissioning = Commissioning(site, self.store.commission(name))
+        watch = Watch(site, rules, restore(name, stored), commissioning)
         self.watches = {**self.watches, name: watch}
         self._learn()
         return watch
@@ -192,11 +196,33 @@ class Rounds:
         for result in results:
             self.keeper.waiting.add(transitions=result.transitions, reports=(result.report,))
             self._count_tick(result.report, now)
+        self.keep_commissions()
         self.keeper.commit()
         self._publish_estimates(results)
         if samples or results:
             self.metrics.cycle.observe(time.perf_counter() - started)
         return bool(results)
+
+    def keep_commissions(self, *, at_once: bool = False) -> None:
+        """Let what is known of the meters' errors be stored, where it is time.
+
+        Parameters
+        ----------
+        at_once
+            Also what could wait.
+        """
+        for watch in self.watches.values():
+            kept, happened = watch.commissioning.due(at_once=at_once)
+            self.keeper.waiting.add(kept=kept, happened=happened)
+            for one in happened:
+                _say(one)
+            if happened:
+                self._count_learned(watch)
+
+    def _count_learned(self, watch: Watch) -> None:
+        known = watch.commissioning.known
+        if known is not None:
+            self.metrics.learned.labels(watch.name).set(np.isfinite(known.learned.at).sum())
 
     def _decode(self, sample: Sample) -> Decoded:
         """Decode a payload; a defect of the decoder costs this payload and nothing else."""
@@ -299,3 +325,45 @@ class Rounds:
         self.keeper.commit()
         self._stored()
         return alarm_json(alarm)
+
+    def recommission(self, name: str, meters: Sequence[str], who: str, reason: str) -> dict[str, Any]:
+        """Learn meters' errors anew; it is on the disk when this returns.
+
+        Parameters
+        ----------
+        name, meters, who, reason
+            The feeder, which of its meters (none for all), who wants it, and why.
+
+        Raises
+        ------
+        FeederUnknown, NothingToLearn, StoreUnavailable
+            If that cannot be; nothing has changed then.
+        """
+        watch = self.watches.get(name)
+        if watch is None:
+            raise FeederUnknown(name)
+        t = self._wall() if watch.book.t is None else watch.book.t
+        take_back = watch.recommission(meters, t, who, reason)
+        kept, happened = watch.commissioning.due()
+        try:
+            self.keeper.store_now(kept=kept, happened=happened)
+        except StoreUnavailable:
+            take_back()
+            raise
+        for one in happened:
+            _say(one)
+        self._count_learned(watch)
+        return commissioning_json(watch.commissioning.progress())
+
+
+def _say(happened: Happened) -> None:
+    """Tell the log what happened to a commissioning."""
+    _log.info(
+        "commissioning",
+        feeder=happened.feeder,
+        change=str(happened.change),
+        meters=len(happened.meters),
+        who=happened.who,
+        reason=happened.reason or None,
+        t=happened.t,
+    )

@@ -11,7 +11,7 @@ import contextlib
 import threading
 import time
 from collections import deque
-from collections.abc import AsyncGenerator, Callable, Iterable
+from collections.abc import AsyncGenerator, Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, TypeVar
@@ -25,6 +25,7 @@ from gridsec.errors import FeederInvalid, GridsecError
 from service import describe
 from service.align import Clock
 from service.bus import Sample
+from service.commissioning import to_json as commissioning_json
 from service.errors import FeederFixed, TooManyFeeders
 from service.inbox import Inbox
 from service.keeper import Done, Publisher, at_once
@@ -185,6 +186,7 @@ class Runtime:
     async def _last_commit(self) -> None:
         """Store what is left, after what is on its way."""
         await self._landed()
+        await self._in_worker(partial(self._rounds.keep_commissions, at_once=True))
         await self._in_worker(partial(self._rounds.keeper.commit, at_once=True))
         await self._landed()
 
@@ -307,6 +309,17 @@ class Runtime:
         watch = self._rounds.watches.get(name)
         return None if watch is None else watch.report
 
+    def commissioning(self, name: str) -> dict[str, Any] | None:
+        """Return how far a feeder's meters are known, or None.
+
+        Parameters
+        ----------
+        name
+            Its name.
+        """
+        watch = self._rounds.watches.get(name)
+        return None if watch is None else commissioning_json(watch.commissioning.progress())
+
     def metrics(self) -> bytes:
         """Return the metrics in Prometheus's text format."""
         return self._rounds.metrics.exposition()
@@ -363,9 +376,10 @@ class Runtime:
 
         def install() -> None:
             self._make_room(name)
+            self._rounds.keep_commissions(at_once=True)
             self._rounds.keeper.store_now()
             self._rounds.store.put_feeder(name, tables)
-            self._rounds.add(site).install(finished)
+            _install(self._rounds.add(site), finished, "")
 
         await self._command(install)
 
@@ -408,6 +422,21 @@ class Runtime:
         """
         return await self._command(partial(self._rounds.acknowledge, alarm_id, who, comment))
 
+    async def recommission(self, name: str, meters: Sequence[str], who: str, reason: str) -> dict[str, Any]:
+        """Learn meters' errors anew; it is on the disk when this returns.
+
+        Parameters
+        ----------
+        name, meters, who, reason
+            The feeder, which of its meters (none for all), who wants it, and why.
+
+        Raises
+        ------
+        FeederUnknown, NothingToLearn, StoreUnavailable
+            If that cannot be; nothing has changed then.
+        """
+        return await self._command(partial(self._rounds.recommission, name, meters, who, reason))
+
     async def subscribe(self) -> AsyncGenerator[dict[str, Any], None]:
         """Yield a wake-up after each stored alarm and each new report, until the service stops."""
         queue: asyncio.Queue[str] = asyncio.Queue(maxsize=4)
@@ -433,6 +462,10 @@ def _install(watch: Watch, finished: Watcher | None, problem: str) -> None:
         watch.fail(problem)
     else:
         watch.install(finished)
+        if watch.commissioning.restored:
+            _log.info("commissioning goes on from what was kept", feeder=watch.name)
+        elif watch.commissioning.note:
+            _log.warning("commissioning begins anew", feeder=watch.name, reason=watch.commissioning.note)
 
 
 def _said(feeder: str) -> Callable[[int, int], None]:

@@ -1,10 +1,10 @@
 """What waits for the database, within stated bounds: nothing goes without being counted. Pure bookkeeping.
 
-Reports and bad readings are records: of too many, the oldest go. Transitions are state: of too many, each
-alarm keeps its newest one, which says all that is true of it; if that is not enough, those alarms go that
-came and went while the database knew nothing of them. What stands, what the database believes to stand and
-what an operator has answered is kept in any case, and there is only so much of it: at most a few alarms for
-each meter.
+Reports, bad readings and what happened to commissionings are records: of too many, the oldest go.
+Transitions are state: of too many, each alarm keeps its newest one, which says all that is true of it; if
+that is not enough, those alarms go that came and went while the database knew nothing of them. What stands,
+what the database believes to stand and what an operator has answered is kept in any case, and there is only
+so much of it: at most a few alarms for each meter.
 """
 
 from __future__ import annotations
@@ -15,13 +15,15 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from service.alarms import Change, Transition
+from service.commissioning import Happened
+from service.kept import Kept
 from service.report import FeederReport
 from service.store import Rejected
 
 TRANSITIONS_KEPT = 10_000
 """So many transitions wait before they are thinned out."""
 RECORDS_KEPT = 3600
-"""So many reports, and as many bad readings, wait; then the oldest go."""
+"""So many reports, and as many bad readings and so on, wait; then the oldest go."""
 
 T = TypeVar("T")
 
@@ -33,10 +35,12 @@ class Batch:
     transitions: tuple[Transition, ...] = ()
     reports: tuple[FeederReport, ...] = ()
     rejected: tuple[Rejected, ...] = ()
+    kept: tuple[Kept, ...] = ()
+    happened: tuple[Happened, ...] = ()
 
     def __bool__(self) -> bool:
         """Whether there is anything in it."""
-        return bool(self.transitions or self.reports or self.rejected)
+        return any((self.transitions, self.reports, self.rejected, self.kept, self.happened))
 
 
 class Waiting:
@@ -59,6 +63,8 @@ class Waiting:
         self._transitions: list[Transition] = []
         self._reports: deque[FeederReport] = deque()
         self._rejected: deque[Rejected] = deque()
+        self._kept: dict[str, Kept] = {}
+        self._happened: deque[Happened] = deque()
         # Alarms of which the database knows nothing; those of a batch on its way may be known any moment.
         self._unheard: set[str] = set()
         self._on_the_way: set[str] = set()
@@ -75,12 +81,14 @@ class Waiting:
         transitions: Iterable[Transition] = (),
         reports: Iterable[FeederReport] = (),
         rejected: Iterable[Rejected] = (),
+        kept: Iterable[Kept] = (),
+        happened: Iterable[Happened] = (),
     ) -> None:
         """Let something wait.
 
         Parameters
         ----------
-        transitions, reports, rejected
+        transitions, reports, rejected, kept, happened
             As in `Store.commit`.
         """
         for item in transitions:
@@ -89,14 +97,24 @@ class Waiting:
             self._transitions.append(item)
         self._reports.extend(reports)
         self._rejected.extend(rejected)
+        self._kept.update((item.feeder, item) for item in kept)
+        self._happened.extend(happened)
         self._bound()
 
     def take(self) -> Batch:
         """Take everything out; `stored` or `give_back` must follow."""
-        batch = Batch(tuple(self._transitions), tuple(self._reports), tuple(self._rejected))
+        batch = Batch(
+            tuple(self._transitions),
+            tuple(self._reports),
+            tuple(self._rejected),
+            tuple(self._kept.values()),
+            tuple(self._happened),
+        )
         self._transitions.clear()
         self._reports.clear()
         self._rejected.clear()
+        self._kept.clear()
+        self._happened.clear()
         self._unheard, self._on_the_way = set(), self._unheard
         self._taken = len(batch.transitions)
         return batch
@@ -121,11 +139,15 @@ class Waiting:
         self._transitions[:0] = batch.transitions
         self._reports.extendleft(reversed(batch.reports))
         self._rejected.extendleft(reversed(batch.rejected))
+        # Of each feeder only the newest is of use.
+        self._kept = {item.feeder: item for item in batch.kept} | self._kept
+        self._happened.extendleft(reversed(batch.happened))
         self._bound()
 
     def _bound(self) -> None:
         self._drop_oldest(self._reports, "report")
         self._drop_oldest(self._rejected, "bad-reading")
+        self._drop_oldest(self._happened, "commissioning")
         if len(self._transitions) > self._thin_at:
             before = len(self._transitions)
             most = TRANSITIONS_KEPT * 3 // 4

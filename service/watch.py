@@ -7,7 +7,8 @@ owns a `Watch` calls it from one place at a time.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from copy import copy
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
@@ -17,6 +18,7 @@ from feeders.load import Site, to_frame
 from gridsec.online import Cause
 from service.alarms import AlarmBook, AlarmRules, Transition, acknowledge, advance
 from service.align import Aligner, AlignRules, Clock, Outcome, Tick, rules
+from service.commissioning import Commissioning
 from service.conditions import conditions
 from service.reading import Known, Reading
 from service.report import FeederReport, blind, build, snapshot
@@ -110,6 +112,8 @@ class Watch:
         Its times.
     book
         Its alarms so far.
+    commissioning
+        What is known of its meters; None: nothing.
 
     Attributes
     ----------
@@ -119,12 +123,15 @@ class Watch:
         The latest report, or None before the first tick.
     """
 
-    def __init__(self, site: Site, rules: AlignRules, book: AlarmBook) -> None:
+    def __init__(
+        self, site: Site, rules: AlignRules, book: AlarmBook, commissioning: Commissioning | None = None
+    ) -> None:
         self.site = site
         self.name = site.feeder.name
         self.max_attacked = site.tables.meta.monitor.max_attacked
         self.aligner = Aligner(site.meter_ids, rules)
         self.book = book
+        self.commissioning = commissioning or Commissioning(site)
         self.phase = Phase.DESIGNING
         self.problem = ""
         self.report: FeederReport | None = None
@@ -142,6 +149,7 @@ class Watch:
         """
         self._watcher, self._state = finished, None
         self.max_attacked = finished.max_attacked
+        self.commissioning.install(finished)
         self.phase, self.problem = Phase.WATCHING, ""
 
     def fail(self, problem: str) -> None:
@@ -191,6 +199,27 @@ class Watch:
         self.book, transitions = acknowledge(self.book, alarm_id, who, comment, t)
         return transitions
 
+    def recommission(self, meters: Sequence[str], t: float, who: str, reason: str) -> Callable[[], None]:
+        """Learn meters' errors anew, because they were replaced.
+
+        Parameters
+        ----------
+        meters, t, who, reason
+            As in `Commissioning.renew`.
+
+        Returns
+        -------
+        callable
+            Takes it back, as long as nothing else has happened.
+        """
+        state, before = self._state, copy(self.commissioning)
+        self._state = self.commissioning.renew(state, meters, t, who, reason)
+
+        def take_back() -> None:
+            self._state, self.commissioning = state, before
+
+        return take_back
+
     def _run(self, ticks: Iterable[Tick]) -> list[TickResult]:
         results = []
         for tick in ticks:
@@ -210,7 +239,8 @@ class Watch:
             return blind(self.site, tick, self.max_attacked, cause, reason)
         if self._state is None or (self.report is not None and tick.t <= self.report.t):
             # The first tick, or the clock was set back: what was known belongs to another time.
-            self._state = self._watcher.init(tick.t)
+            self._state = self._watcher.init(tick.t, self.commissioning.known)
         frame = to_frame(self.site, snapshot(tick))
         self._state, estimate, verdict = self._watcher.step(self._state, frame)
+        self.commissioning.follow(self._state, tick.t)
         return build(self.site, tick, self.max_attacked, estimate, verdict)

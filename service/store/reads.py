@@ -10,10 +10,22 @@ from typing import Any
 import sqlalchemy as sa
 
 from service.alarms import Alarm, AlarmState, Change, from_json
+from service.commissioning import Happened, Step
 from service.history import unpack
+from service.kept import Kept
 from service.store.connect import Connections
 from service.store.records import Event, Rejected
-from service.store.schema import ALARM, BAD, EVENT, FEEDER, HISTORY, LAYOUT, OUTBOX
+from service.store.schema import (
+    ALARM,
+    BAD,
+    COMMISSION,
+    COMMISSION_EVENT,
+    EVENT,
+    FEEDER,
+    HISTORY,
+    LAYOUT,
+    OUTBOX,
+)
 
 
 class Reader:
@@ -225,6 +237,45 @@ class Reader:
         with self._read() as connection:
             rows = connection.execute(sa.select(FEEDER.c.name, FEEDER.c.tables).order_by(FEEDER.c.name))
             return {name: json.loads(tables) for name, tables in rows}
+
+    def commission(self, feeder: str) -> Kept | None:
+        """Return what is kept of a feeder's commissioning, or None.
+
+        Parameters
+        ----------
+        feeder
+            Its name.
+        """
+        c = COMMISSION.c
+        with self._read() as connection:
+            row = connection.execute(sa.select(c.feeder, c.t, c.data).where(c.feeder == feeder)).first()
+            return None if row is None else Kept(*row)
+
+    def commission_events(self, feeder: str, limit: int = 100) -> list[Happened]:
+        """Return the newest entries of a feeder's record of commissioning, oldest first.
+
+        Parameters
+        ----------
+        feeder
+            Its name.
+        limit
+            At most so many.
+        """
+        c = COMMISSION_EVENT.c
+        query = sa.select(COMMISSION_EVENT).where(c.feeder == feeder).order_by(c.seq.desc()).limit(limit)
+        with self._read() as connection:
+            rows = connection.execute(query).mappings().all()
+        return [
+            Happened(
+                feeder,
+                row["t"],
+                Step(row["change"]),
+                tuple(json.loads(row["meters"])),
+                row["who"],
+                row["reason"],
+            )
+            for row in reversed(rows)
+        ]
 
 
 def _event(row: sa.RowMapping) -> Event:

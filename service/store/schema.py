@@ -76,8 +76,33 @@ FEEDER = sa.Table(
     sa.Column("name", sa.String(64), primary_key=True),
     sa.Column("tables", sa.Text, nullable=False),
 )
+COMMISSION = sa.Table(
+    "commission",
+    META,
+    sa.Column("feeder", sa.String(64), primary_key=True),
+    sa.Column("t", sa.Double, nullable=False),
+    sa.Column("data", sa.Text, nullable=False),
+)
+COMMISSION_EVENT = sa.Table(
+    "commission_event",
+    META,
+    sa.Column("seq", SEQ, primary_key=True, autoincrement=True),
+    sa.Column("feeder", sa.String(64), nullable=False, index=True),
+    sa.Column("t", sa.Double, nullable=False),
+    sa.Column("change", sa.String(16), nullable=False),
+    sa.Column("meters", sa.Text, nullable=False),
+    sa.Column("who", sa.Text),
+    sa.Column("reason", sa.Text, nullable=False),
+    sqlite_autoincrement=True,
+)
 
-MIGRATIONS: tuple[Callable[[sa.Connection], None], ...] = ()
+
+def _add_commissioning(connection: sa.Connection) -> None:
+    for table in (COMMISSION, COMMISSION_EVENT):
+        table.create(connection)
+
+
+MIGRATIONS: tuple[Callable[[sa.Connection], None], ...] = (_add_commissioning,)
 """Step k leads from schema version k + 1 to k + 2. A new database starts at the newest version."""
 
 

@@ -11,12 +11,26 @@ from typing import Any
 import sqlalchemy as sa
 
 from service.alarms import AlarmUnknown, Transition, acknowledged, to_json
+from service.commissioning import Happened
 from service.history import HistoryRules, Mark, mark, pack, worth_keeping
+from service.kept import Kept
 from service.report import FeederReport
 from service.store.connect import Connections
 from service.store.reads import Reader
 from service.store.records import Rejected, StoreUnavailable
-from service.store.schema import ALARM, BAD, EVENT, FEEDER, HISTORY, LAYOUT, OUTBOX, VERSION, migrate
+from service.store.schema import (
+    ALARM,
+    BAD,
+    COMMISSION,
+    COMMISSION_EVENT,
+    EVENT,
+    FEEDER,
+    HISTORY,
+    LAYOUT,
+    OUTBOX,
+    VERSION,
+    migrate,
+)
 
 BAD_READINGS_KEPT = 1000
 _PAYLOAD_KEPT = 256
@@ -84,6 +98,8 @@ class Store(Reader):
         *,
         reports: Iterable[FeederReport] = (),
         rejected: Iterable[Rejected] = (),
+        kept: Iterable[Kept] = (),
+        happened: Iterable[Happened] = (),
         without: str | None = None,
     ) -> tuple[int, ...]:
         """Store what a tick brought, in one transaction; it is on the disk when this returns.
@@ -96,8 +112,10 @@ class Store(Reader):
             Reports of the feeders; those worth keeping go into the history.
         rejected
             Readings that could not be used; the newest `BAD_READINGS_KEPT` are kept.
+        kept, happened
+            What goes on of the feeders' commissioning, and what happened to it.
         without
-            Forget the tables of this feeder.
+            Forget the tables of this feeder, and what was learned of its meters.
 
         Returns
         -------
@@ -110,19 +128,25 @@ class Store(Reader):
             If nothing was stored.
         """
         transitions, rejected = tuple(transitions), tuple(rejected)
+        kept, happened = tuple(kept), tuple(happened)
         with self._lock:
             marks = dict(self._marks)
-            kept = [report for report in reports if self._worth(marks, report)]
-            if not (transitions or kept or rejected or without):
+            worthy = [report for report in reports if self._worth(marks, report)]
+            if not (transitions or worthy or rejected or kept or happened or without):
                 return ()
             with self._write() as connection:
                 numbers = tuple(self._put_transition(connection, item) for item in transitions)
-                for report in kept:
+                for report in worthy:
                     self._put_history(connection, report)
                 if rejected:
                     _put_rejected(connection, rejected)
+                for item in kept:
+                    self._put_kept(connection, item)
+                if happened:
+                    connection.execute(COMMISSION_EVENT.insert(), [_happened(item) for item in happened])
                 if without is not None:
                     connection.execute(FEEDER.delete().where(FEEDER.c.name == without))
+                    connection.execute(COMMISSION.delete().where(COMMISSION.c.feeder == without))
             self._marks = marks
             self._last_event = max((self._last_event, *numbers))
             return numbers
@@ -236,6 +260,11 @@ class Store(Reader):
         connection.execute(OUTBOX.insert().values(seq=number))
         return number
 
+    def _put_kept(self, connection: sa.Connection, kept: Kept) -> None:
+        row = {"feeder": kept.feeder, "t": kept.t, "data": kept.text}
+        statement = self._connections.insert(COMMISSION).values(row)
+        connection.execute(statement.on_conflict_do_update(index_elements=["feeder"], set_=row))
+
     def _worth(self, marks: dict[str, Mark], report: FeederReport) -> bool:
         """Say whether a report gets a row, and if so, let the following ones be compared with it."""
         now = mark(report)
@@ -269,6 +298,17 @@ class Store(Reader):
             inserted = connection.execute(LAYOUT.insert().values(meters=meters).returning(LAYOUT.c.id))
             known = inserted.scalar_one()
         return int(known)
+
+
+def _happened(item: Happened) -> dict[str, Any]:
+    return {
+        "feeder": item.feeder,
+        "t": item.t,
+        "change": str(item.change),
+        "meters": json.dumps(item.meters),
+        "who": item.who,
+        "reason": item.reason,
+    }
 
 
 def _put_rejected(connection: sa.Connection, rejected: Iterable[Rejected]) -> None:

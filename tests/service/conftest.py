@@ -6,7 +6,8 @@ import asyncio
 import math
 import threading
 import time
-from collections.abc import AsyncGenerator, Callable, Iterator
+from collections.abc import AsyncGenerator, Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from gridsec.errors import FeederInvalid
 from gridsec.online import Cause, Decision
 from service.alarms import AlarmBook, AlarmRules, AlarmUnknown, acknowledge, advance, conditions, to_json
 from service.api import create_api
+from service.commissioning import Happened, Step
 from service.errors import FeederFixed, TooManyFeeders
 from service.report import FeederReport, MeterReport
 from service.store import Store
@@ -122,6 +124,8 @@ class SmallService:
         self.reports: dict[str, FeederReport] = {}
         self.rules = AlarmRules()
         self.books = {name: AlarmBook(name) for name in self.villages}
+        self.learning: set[str] = set()
+        self.note = ""
         self.is_ready: tuple[bool, list[str]] = (True, [])
         self.is_healthy: tuple[bool, list[str]] = (True, [])
         self.loop: asyncio.AbstractEventLoop | None = None
@@ -158,6 +162,40 @@ class SmallService:
 
     def report(self, name: str) -> FeederReport | None:
         return self.reports.get(name)
+
+    def commissioning(self, name: str) -> dict[str, Any] | None:
+        village = self.villages.get(name)
+        if village is None:
+            return None
+        open_ones = [m for m in village.meters if m in self.learning]
+        now = self.reports[name].t if name in self.reports else None
+        return {
+            "feeder": name, "estimator": "sequential", "state": "learning" if open_ones else "learned",
+            "t": now, "tick_s": 1.0, "needed_s": 86400.0, "gathered_s": 18_000.0 if open_ones else None,
+            "since": T0 - 18_000.0 if open_ones else None, "expected": T0 + 68_400.0 if open_ones else None,
+            "learned_at": None if len(open_ones) == len(village.meters) else T0 - 9e5,
+            "held": False, "restored": True, "note": self.note,
+            "meters": [
+                {
+                    "meter": m, "state": "learning" if m in open_ones else "learned",
+                    "since": T0 - 18_000.0 if m in open_ones else None,
+                    "learned_at": None if m in open_ones else T0 - 9e5,
+                    "gathered_s": 18_000.0 if m in open_ones else None,
+                    "expected": T0 + 68_400.0 if m in open_ones else None,
+                    "error_volt": 0.0 if m in open_ones else 0.41,
+                    "error_volt_std": 0.67 if m in open_ones else 0.09,
+                    "allowed_volt": 1.15 if m in open_ones else 0.27,
+                }
+                for m in village.meters
+            ],
+        }  # fmt: skip
+
+    async def recommission(self, name: str, meters: Sequence[str], who: str, reason: str) -> dict[str, Any]:
+        chosen = tuple(meters) or tuple(self.villages[name].meters)
+        event = Happened(name, T0, Step.RECOMMISSIONED, chosen, who, reason)
+        await asyncio.to_thread(partial(self.store.commit, happened=[event]))
+        self.learning.update(chosen)
+        return self.commissioning(name) or {}
 
     def metrics(self) -> bytes:
         return b"# HELP gridsec_up Whether it runs.\n# TYPE gridsec_up gauge\ngridsec_up 1.0\n"

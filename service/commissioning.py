@@ -1,0 +1,373 @@
+"""How far the monitor of one feeder knows its meters' own errors: followed, kept, and begun anew.
+
+`Commissioning` has no clock and no input or output, like the `Watch` that owns it: time comes from the
+ticks, texts that are kept come and go as values. Readers on other threads only take references.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+
+from feeders.estimators import Learner, Watcher
+from feeders.load import Site
+from gridsec.arrays import Bools, Floats
+from gridsec.errors import GridsecError
+from gridsec.sequential import Commission, to_arrays
+from service.kept import Kept, KeptInvalid, decode, encode
+
+SAVE_S = 60.0
+"""What is gathered is kept this often, s; all else at once."""
+
+
+class NothingToLearn(GridsecError):
+    """The feeder's monitor does not learn its meters' errors."""
+
+    def __init__(self, feeder: str, why: str) -> None:
+        super().__init__(f"feeder {feeder!r}: {why}")
+
+
+class Stage(StrEnum):
+    """Where the commissioning of a feeder, or of a meter, stands."""
+
+    OFF = "off"
+    WAITING = "waiting"
+    LEARNING = "learning"
+    LEARNED = "learned"
+
+
+class Step(StrEnum):
+    """What happened to a commissioning."""
+
+    BEGUN = "begun"
+    LEARNED = "learned"
+    RECOMMISSIONED = "recommissioned"
+
+
+@dataclass(frozen=True, slots=True)
+class Happened:
+    """One entry of a feeder's record of commissioning.
+
+    Attributes
+    ----------
+    feeder
+        Whose.
+    t
+        Unix time, s.
+    change
+        What happened.
+    meters
+        To which meters.
+    who, reason
+        Who wanted it, if somebody did, and why.
+    """
+
+    feeder: str
+    t: float
+    change: Step
+    meters: tuple[str, ...]
+    who: str | None = None
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class MeterStage:
+    """One meter.
+
+    Attributes
+    ----------
+    meter
+        Its id.
+    state
+        Learning or learned.
+    since, learned_at
+        Since when it is being learned, or when it was learned, Unix s.
+    gathered_s
+        For how long it was heard and trusted while being learned, s.
+    expected
+        When it will be learned if it is heard and trusted from now on, Unix s.
+    error_volt, error_volt_std
+        Its own fixed error at the nominal voltage, and the standard deviation of that, V.
+    allowed_volt
+        By how much it may honestly differ from that error, V.
+    """
+
+    meter: str
+    state: Stage
+    since: float | None
+    learned_at: float | None
+    gathered_s: float | None
+    expected: float | None
+    error_volt: float
+    error_volt_std: float
+    allowed_volt: float
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """A feeder.
+
+    Attributes
+    ----------
+    feeder, estimator
+        Its name, and what watches it.
+    state
+        Learning as long as one meter is.
+    t
+        Unix time of the tick that this is about, s.
+    tick_s
+        Interval of the monitor's steps, s.
+    needed_s, gathered_s
+        For how long meters have to be heard, and for how long the last one was, s.
+    since, expected, learned_at
+        The earliest begin, the latest expected end, and when the last one was learned, Unix s.
+    held
+        Time enough has gone by, but somebody is suspected, and while that is so nothing is learned.
+    restored
+        Whether this goes on from what was kept by an earlier run.
+    note
+        Why it does not, if something was kept.
+    meters
+        One by one.
+    """
+
+    feeder: str
+    estimator: str
+    state: Stage
+    t: float | None
+    tick_s: float
+    needed_s: float
+    gathered_s: float | None
+    since: float | None
+    expected: float | None
+    learned_at: float | None
+    held: bool
+    restored: bool
+    note: str
+    meters: tuple[MeterStage, ...]
+
+
+class Commissioning:
+    """The commissioning of one feeder.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    kept
+        What the store has of it.
+
+    Attributes
+    ----------
+    known
+        What is known of the meters' errors; None before the first tick, unless something was kept.
+    restored, note
+        As in `Progress`.
+    """
+
+    def __init__(self, site: Site, kept: Kept | None = None) -> None:
+        self.known: Commission | None = None
+        self.restored = False
+        self.note = ""
+        self._site, self._kept = site, kept
+        self._watcher: Watcher | None = None
+        self._t: float | None = None
+        self._saved_t: float | None = None
+        self._happened: tuple[Happened, ...] = ()
+
+    @property
+    def learner(self) -> Learner | None:
+        """How the present monitor learns; None where it does not, or where there is none yet."""
+        return None if self._watcher is None else self._watcher.learner
+
+    def install(self, watcher: Watcher) -> None:
+        """Take a finished design, and what was kept if it fits.
+
+        Parameters
+        ----------
+        watcher
+            The design.
+        """
+        self._watcher = watcher
+        if self.learner is None:
+            self.known = None
+        elif self.known is None and self._kept is not None:
+            try:
+                self.known = self.learner.read(watcher.design, decode(self._site, self._kept))
+            except (KeptInvalid, ValueError) as error:
+                self.note = f"what was learned until {self._kept.t:.0f} is not used: {error}"
+            else:
+                self._t = self._saved_t = self._kept.t
+                self.restored = True
+
+    def follow(self, state: Any, t: float) -> None:
+        """Take over what a tick brought.
+
+        Parameters
+        ----------
+        state
+            The monitor's, after the tick.
+        t
+            Unix time of the tick, s.
+        """
+        if self.learner is None:
+            return
+        before, self.known, self._t = self.known, self.learner.commission(state), t
+        if before is None:
+            every = np.ones(len(self._site.meter_ids), dtype=np.bool_)
+            self._note(Step.BEGUN, every, t, reason=self.note)
+        elif self.known.learned is not before.learned:
+            self._note(Step.LEARNED, self.known.learned.at == t, t)
+
+    def renew(self, state: Any, meters: Sequence[str], t: float, who: str, reason: str) -> Any:
+        """Learn meters anew.
+
+        Parameters
+        ----------
+        state
+            The monitor's; None before the first tick.
+        meters
+            Which; none for all.
+        t, who, reason
+            When (Unix s), who wants it, and why.
+
+        Returns
+        -------
+        Any
+            The monitor's new state; None if it was None.
+
+        Raises
+        ------
+        NothingToLearn
+            If the monitor does not learn.
+        """
+        learner, watcher = self.learner, self._watcher
+        if learner is None or watcher is None:
+            raise NothingToLearn(self._site.feeder.name, self._why_not())
+        chosen = set(meters)
+        which = np.array([not chosen or meter in chosen for meter in self._site.meter_ids], dtype=np.bool_)
+        begun = watcher.init(t, self.known) if state is None else state
+        after = learner.renew(watcher.design, begun, which)
+        self.known = learner.commission(after)
+        self._t = t if self._t is None else self._t
+        self._note(Step.RECOMMISSIONED, which, t, who=who, reason=reason)
+        return None if state is None else after
+
+    def _why_not(self) -> str:
+        if self._watcher is None:
+            return "there is no monitor yet, or it could not be designed"
+        family = self._watcher.family
+        if family.learner is None:
+            return f"its estimator, {family.name}, does not learn meters' errors"
+        return "commission_s is 0: nothing is learned"
+
+    def _note(
+        self, change: Step, which: Bools, t: float, *, who: str | None = None, reason: str = ""
+    ) -> None:
+        meters = tuple(meter for meter, one in zip(self._site.meter_ids, which, strict=True) if one)
+        one_more = Happened(self._site.feeder.name, t, change, meters, who, reason)
+        # Never changed in place: whoever took a copy of all this can go back to it.
+        self._happened = (*self._happened, one_more)
+
+    # ---------------------------------------------------------------- to keep
+
+    def due(self, *, at_once: bool = False) -> tuple[tuple[Kept, ...], tuple[Happened, ...]]:
+        """Return what is to be stored now; it counts as stored from here on.
+
+        Parameters
+        ----------
+        at_once
+            Also what could wait.
+        """
+        happened, self._happened = self._happened, ()
+        if self.known is None or self._t is None:
+            return (), happened
+        far = self._saved_t is None or abs(self._t - self._saved_t) >= SAVE_S
+        wanted = self.known.learning is not None and (far or at_once) and self._t != self._saved_t
+        if not (happened or wanted):
+            return (), happened
+        self._saved_t = self._t
+        return (encode(self._site, self._t, to_arrays(self.known)),), happened
+
+    # ---------------------------------------------------------------- to show
+
+    def progress(self) -> Progress:
+        """Return how far it is."""
+        known, learner, monitor = self.known, self.learner, self._site.tables.meta.monitor
+        meters = () if known is None else self._meters(known)
+        still = [m for m in meters if m.state is Stage.LEARNING]
+        if self._watcher is not None and learner is None:
+            state = Stage.OFF
+        elif known is None:
+            state = Stage.WAITING
+        else:
+            state = Stage.LEARNING if still else Stage.LEARNED
+        needed = monitor.commission_s
+        held = any(m.gathered_s is not None and m.gathered_s >= needed for m in still)
+        return Progress(
+            feeder=self._site.feeder.name,
+            estimator=monitor.estimator,
+            state=state,
+            t=self._t,
+            tick_s=monitor.tick_s,
+            needed_s=needed,
+            gathered_s=_least(m.gathered_s for m in still),
+            since=_least(m.since for m in still),
+            expected=None if held else _most(m.expected for m in still),
+            learned_at=_most(m.learned_at for m in meters),
+            held=held,
+            restored=self.restored,
+            note=self.note,
+            meters=meters,
+        )
+
+    def _meters(self, known: Commission) -> tuple[MeterStage, ...]:
+        learned, learning = known.learned, known.learning
+        base, needed, t = self._site.feeder.base_volt, self._site.tables.meta.monitor.commission_s, self._t
+        none = np.full(learned.at.size, np.nan)
+        since, gathered = (none, none) if learning is None else (learning.since, learning.time_s)
+        error = base * (np.sqrt(1.0 + learned.bias) - 1.0)
+        std, allowed = 0.5 * base * np.sqrt(learned.variance), 0.5 * base * learned.allowed
+        return tuple(
+            MeterStage(
+                meter=meter,
+                state=Stage.LEARNING if np.isfinite(since[k]) else Stage.LEARNED,
+                since=_time(since, k),
+                learned_at=_time(learned.at, k),
+                gathered_s=float(gathered[k]) if np.isfinite(since[k]) else None,
+                expected=t + max(needed - float(gathered[k]), 0.0)
+                if t is not None and np.isfinite(since[k])
+                else None,
+                error_volt=float(error[k]),
+                error_volt_std=float(std[k]),
+                allowed_volt=float(allowed[k]),
+            )
+            for k, meter in enumerate(self._site.meter_ids)
+        )
+
+
+def to_json(progress: Progress) -> dict[str, Any]:
+    """Return the JSON object that REST shows.
+
+    Parameters
+    ----------
+    progress
+        How far it is.
+    """
+    return asdict(progress)
+
+
+def _time(values: Floats, k: int) -> float | None:
+    return float(values[k]) if np.isfinite(values[k]) else None
+
+
+def _least(values: Any) -> float | None:
+    return min((value for value in values if value is not None), default=None)
+
+
+def _most(values: Any) -> float | None:
+    return max((value for value in values if value is not None), default=None)
