@@ -17,7 +17,7 @@ from gridsec.sequential.commission import Learned
 from gridsec.sequential.conditional import Fit, Judged, Prior, admit, drop, fit, judge
 from gridsec.sequential.decoder import Accused, Evidence
 from gridsec.sequential.design import SequentialDesign
-from gridsec.sequential.search import Dictionary, Explanation, Limits
+from gridsec.sequential.search import Dictionary, Explanation, Found, Limits, Solution, likelier
 from gridsec.sequential.state import SequentialState, Trust
 from gridsec.sequential.windows import Window
 
@@ -58,13 +58,13 @@ class Examined:
     fits, views : (s,)
         By scale; a view is None where the scale was not looked at.
     found
-        The explanations that searches came to, by scale, the likeliest first.
+        The likeliest explanation that a search came to, and the others, by scale.
     """
 
     trust: Trust
     fits: tuple[Fit | None, ...]
     views: tuple[View | None, ...]
-    found: dict[int, tuple[Explanation, ...]]
+    found: dict[int, Found]
 
 
 # A long scale hardly changes from tick to tick: it is looked at this many times per length.
@@ -91,7 +91,7 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats) -> 
     trust, fits, window, prior, tick = state.trust, state.fits, state.window, state.doubts.prior, state.ticks
     views: list[View | None] = []
     after: list[Fit | None] = []
-    found: dict[int, tuple[Explanation, ...]] = {}
+    found: dict[int, Found] = {}
     scales = _Scales(design, prior, window, state.learned, model)
     for s, length in enumerate(design.lengths):
         before = fits[s]
@@ -107,11 +107,11 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats) -> 
         view = _view(design, here, now)
         if design.decoder is not None:
             found[s], trust = _decoded(design, here, now, trust, s)
-            now = found[s][0].fit
+            now = found[s].best.fit
             view = _view(design, here, now)
         elif (view.over & trust.trusted).any() or _due(design, trust, view, s, tick):
             found[s], trust = _Search(design, scales, fits, trust, s)(now, view)
-            now = found[s][0].fit
+            now = found[s].best.fit
             view = _view(design, here, now)
         bad, still = trust.bad.copy(), trust.still.copy()
         bad[s], still[s] = view.over & ~trust.trusted, view.still & ~trust.trusted
@@ -275,49 +275,65 @@ class _Search:
         self.keep = _held(trust, s)
         self.accused = tuple(suspicion for suspicion in trust.accused if suspicion[1] > s)
 
-    def __call__(self, now: Fit, view: View) -> tuple[tuple[Explanation, ...], Trust]:
-        """The explanations, the likeliest first, and whom that leaves trusted."""
+    def __call__(self, now: Fit, view: View) -> tuple[Found, Trust]:
+        """What is found, and whom that leaves trusted."""
         start = now if len(self.accused) == len(self.trust.accused) else self._fit(now.trusted)
         few = np.count_nonzero(view.over & now.trusted) <= _FEW
-        found = [self._descend(start, self.keep)] if few else []
+        found = Found(self._descend(start, self.keep)) if few else None
         free = None
-        if not few or self._suspected(found[0]) > self.design.options.several:
-            starts = [self._descend(self._fit(chosen), np.zeros_like(chosen)) for chosen in self._starts()]
-            free = min(starts, key=lambda each: each.cost)
-            if (free.fit.trusted & self.keep).any():
-                found.append(self._descend(self._fit(free.fit.trusted & ~self.keep), self.keep))
+        if found is None or self._suspected(found) > self.design.options.several:
+            free = self._free()
+            if (free.best.trusted & self.keep).any():
+                held = self._fit(free.best.trusted & ~self.keep)
+                found = likelier(found, Found(self._descend(held, self.keep, fresh=True)))
             else:
-                found += starts
-                free = None
-        if few and min(self._suspected(each) for each in found) > 0:
-            found.append(self._descend(start, self.keep, self.design.book))
-        found.sort(key=lambda each: each.cost)
-        if free is not None and free.cost < found[0].cost and self._total(free) < self._total(found[0]):
-            found.insert(0, free)
-        return tuple(found), self._believe(found[0])
+                found, free = likelier(found, free), None
+        if few and self._suspected(found) > 0:
+            found = likelier(found, Found(self._descend(start, self.keep, self.design.book)))
+        best = found.best
+        if free is not None and free.best.cost < best.cost and self._total(free.best) < self._total(best):
+            found = Found(free.best, (best.bare(), *found.others))
+        return found, self._believe(found.best)
 
-    def _suspected(self, found: Explanation) -> int:
-        return int(np.count_nonzero(self.here.enough & ~found.fit.trusted))
+    def _suspected(self, found: Found) -> int:
+        """How many meters are suspected at least."""
+        enough = self.here.enough
+        return min(int(np.count_nonzero(enough & ~each.trusted)) for each in (found.best, *found.others))
+
+    def _free(self) -> Found:
+        """What is found from starts that owe nothing to what was believed."""
+        found: Found | None = None
+        for chosen in self._starts():
+            # A descent stays where another one has ended.
+            if found is None or not np.array_equal(chosen & self.here.enough, found.best.trusted):
+                new = self._descend(self._fit(chosen), np.zeros_like(chosen), fresh=True)
+                found = likelier(found, Found(new))
+        assert found is not None  # noqa: S101  # there is a start
+        return found
 
     def _starts(self) -> tuple[Bools, Bools]:
-        """Sets that owe nothing to what was believed: a robust fit, and the meters close to the model."""
+        """A robust fit, and the meters close to the model."""
         here, prior = self.here, self.scales.prior
         focus, std = self.design.options.focus, np.sqrt(here.noise)
         chosen = search.robust(prior, here.noise, here.m, here.enough, here.limits.model + focus * std)
         alone = np.sqrt(prior.variance[prior.meters] + here.noise)
         return chosen, here.enough & (np.abs(here.m) <= here.limits.model + focus * alone)
 
-    def _descend(self, start: Fit, keep: Bools, book: Dictionary | None = None) -> Explanation:
+    def _descend(
+        self, start: Fit, keep: Bools, book: Dictionary | None = None, *, fresh: bool = False
+    ) -> Solution:
         here = self.here
-        return search.descend(start, here.m, here.enough, here.limits, keep=keep, dictionary=book)
+        return search.descend(
+            start, here.m, here.enough, here.limits, keep=keep, dictionary=book, fresh=fresh
+        )
 
     def _fit(self, trusted: Bools) -> Fit:
         loose = _directions(self.design, self.accused)
         return fit(self.scales.prior, self.here.noise, trusted & self.here.enough, loose)
 
-    def _total(self, found: Explanation) -> float:
+    def _total(self, found: Solution) -> float:
         """The misfit on all scales and, once, what the accusations cost."""
-        trusted = np.where(self.here.enough, found.fit.trusted, self.trust.trusted)
+        trusted = np.where(self.here.enough, found.trusted, self.trust.trusted)
         loose = found.fit.loose if found.fit.loose.shape[1] else None
         total = found.charge + search.price(trusted.size, int(np.count_nonzero(~trusted)))
         for s, before in enumerate(self.fits):
@@ -329,7 +345,7 @@ class _Search:
 
     def _believe(self, best: Explanation) -> Trust:
         trust = self.trust
-        trusted = np.where(self.here.enough, best.fit.trusted, trust.trusted)
+        trusted = np.where(self.here.enough, best.trusted, trust.trusted)
         fallen = trust.trusted & ~trusted
         return replace(
             trust,
@@ -341,9 +357,7 @@ class _Search:
         )
 
 
-def _decoded(
-    design: SequentialDesign, here: _Scale, now: Fit, trust: Trust, s: int
-) -> tuple[tuple[Explanation, ...], Trust]:
+def _decoded(design: SequentialDesign, here: _Scale, now: Fit, trust: Trust, s: int) -> tuple[Found, Trust]:
     """What the design's decoder says, as explanations, and whom that leaves trusted."""
     judged = judge(now, here.m)
     over = here.enough & (np.abs(judged.offset) > here.limits.of(judged.std))
@@ -361,8 +375,9 @@ def _decoded(
     )
     assert design.decoder is not None  # noqa: S101  # the caller has looked
     answers = design.decoder(evidence)
-    found = tuple(_explanation(here, whole, answer) for answer in answers)
     best = answers[0]
+    others = (Explanation(here.enough & ~each.meters, (), 0.0, each.worse) for each in answers[1:])
+    found = Found(_solution(here, whole, best), tuple(others))
     trusted = np.where(here.enough, ~best.meters, trust.trusted)
     fallen = trust.trusted & ~trusted
     return found, replace(
@@ -375,11 +390,11 @@ def _decoded(
     )
 
 
-def _explanation(here: _Scale, whole: Fit, answer: Accused) -> Explanation:
+def _solution(here: _Scale, whole: Fit, answer: Accused) -> Solution:
     now = whole.copy()
     for j in np.flatnonzero(answer.meters & here.enough).tolist():
         drop(now, j)
-    return Explanation(now, judge(now, here.m), [], 0.0, answer.worse)
+    return Solution(now.trusted, (), 0.0, answer.worse, now, judge(now, here.m))
 
 
 def _held(trust: Trust, s: int) -> Bools:

@@ -7,6 +7,7 @@ docs/theory-sequential.md, section 5.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +16,6 @@ from gridsec.arrays import Bools, Ints
 from gridsec.online import Explanation
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.examine import Examined, confirm
-from gridsec.sequential.search import Explanation as Found
 from gridsec.sequential.search import swaps
 from gridsec.sequential.state import Trust
 
@@ -66,7 +66,7 @@ def _inverters(design: SequentialDesign, before: Trust, trust: Trust) -> tuple[I
     return count, (before.inverters & (count > 0)) | (now & (count >= need))
 
 
-def inverters_of(design: SequentialDesign, accused: list[int]) -> Bools:
+def inverters_of(design: SequentialDesign, accused: Sequence[int]) -> Bools:
     """Which inverters are among other suspicions, (m,).
 
     Parameters
@@ -86,22 +86,18 @@ def _rivals(design: SequentialDesign, seen: Examined, fresh: Bools, new: Bools) 
     within = 2.0 * float(np.log(design.options.like))
     out: list[tuple[Bools, Bools, float]] = []
     for found in seen.found.values():
-        best = found[0]
-        near = [(_meters(each), each, each.cost - best.cost) for each in found]
+        best = found.best
+        near = [(~each.trusted, each.loosened, each.cost - best.cost) for each in (best, *found.others)]
         for swap in swaps(best, np.isfinite(best.judged.offset), within):
             other = near[0][0].copy()
             other[swap.accused], other[swap.innocent] = False, True
-            near.append((other, best, swap.worse))
-        for meters, each, worse in near:
-            inverters = inverters_of(design, each.loosened)
+            near.append((other, best.loosened, swap.worse))
+        for k, (meters, loosened, worse) in enumerate(near):
+            inverters = inverters_of(design, loosened)
             differs = (fresh & ~meters).any() or (new & ~inverters).any()
-            if (each is best and worse == 0.0) or (worse <= within and differs):
+            if not k or (worse <= within and differs):
                 out.append((meters, inverters, float(np.exp(-0.5 * worse))))
     if not any((fresh & ~meters).any() or (new & ~inverters).any() for meters, inverters, _ in out):
         return ()
     total = sum(weight for _, _, weight in out)
     return tuple(Explanation(meters, inverters, weight / total) for meters, inverters, weight in out)
-
-
-def _meters(found: Found) -> Bools:
-    return ~found.fit.trusted

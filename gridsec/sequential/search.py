@@ -101,9 +101,31 @@ class Limits:
         return np.asarray(self.model + within)
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class Explanation:
-    """A fit, and what it accuses.
+    """What a search came to. p meters.
+
+    Attributes
+    ----------
+    trusted : (p,)
+        The meters that it does not accuse.
+    loosened
+        What else it accuses, indices into the dictionary.
+    charge
+        What that costs.
+    cost
+        J.
+    """
+
+    trusted: Bools
+    loosened: tuple[int, ...]
+    charge: float
+    cost: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution(Explanation):
+    """An explanation with all that follows from it.
 
     Attributes
     ----------
@@ -111,19 +133,44 @@ class Explanation:
         The trusted meters.
     judged
         Every meter, judged by them.
-    loosened
-        What the search loosened, indices into the dictionary.
-    charge
-        What that costs.
-    cost
-        J.
     """
 
     fit: Fit
     judged: Judged
-    loosened: list[int]
-    charge: float
-    cost: float
+
+    def bare(self) -> Explanation:
+        """The explanation alone: fits are large."""
+        return Explanation(self.trusted, self.loosened, self.charge, self.cost)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """What several searches came to.
+
+    Attributes
+    ----------
+    best
+        The likeliest.
+    others
+        The rest, in no order.
+    """
+
+    best: Solution
+    others: tuple[Explanation, ...] = ()
+
+
+def likelier(one: Found | None, other: Found) -> Found:
+    """Both together.
+
+    Parameters
+    ----------
+    one, other
+        The first one's best is kept where both are equally likely.
+    """
+    if one is None:
+        return other
+    first, second = (other, one) if other.best.cost < one.best.cost else (one, other)
+    return Found(first.best, (*first.others, second.best.bare(), *second.others))
 
 
 _MOVES_PER_METER = 4
@@ -132,14 +179,21 @@ _FEATHER = 1e-6
 
 
 def descend(
-    start: Fit, m: Floats, live: Bools, limits: Limits, *, keep: Bools, dictionary: Dictionary | None = None
-) -> Explanation:
+    start: Fit,
+    m: Floats,
+    live: Bools,
+    limits: Limits,
+    *,
+    keep: Bools,
+    dictionary: Dictionary | None = None,
+    fresh: bool = False,
+) -> Solution:
     """Drop, admit and loosen until no move makes the explanation better.
 
     Parameters
     ----------
     start
-        Where to begin; not changed.
+        Where to begin; not changed unless `fresh`.
     m : (p,)
         Readings minus what the model explains, squared pu.
     live : (p,)
@@ -150,8 +204,10 @@ def descend(
         Meters that must not be admitted.
     dictionary
         Directions that may be loosened; none by default.
+    fresh
+        `start` is of no further use.
     """
-    now = start.copy()
+    now = start if fresh else start.copy()
     barred = ~live | keep
     for j in np.flatnonzero(now.trusted & ~live):
         drop(now, int(j))
@@ -165,10 +221,11 @@ def descend(
         judged = follow(now, m, judged, move())
     judged = judge(now, m)  # without what rounding has left
     dropped = int(np.count_nonzero(live & ~now.trusted))
-    loosened = [] if powers is None else powers.index[accused].tolist()
+    loosened = () if powers is None else tuple(powers.index[accused].tolist())
     size = int(np.count_nonzero(live))
-    charge = 0.0 if dictionary is None else float(dictionary.charge[loosened].sum()) * price(size, 1)
-    return Explanation(now, judged, loosened, charge, judged.misfit + price(size, dropped) + charge)
+    charge = 0.0 if dictionary is None else float(dictionary.charge[list(loosened)].sum()) * price(size, 1)
+    cost = judged.misfit + price(size, dropped) + charge
+    return Solution(now.trusted, loosened, charge, cost, now, judged)
 
 
 @cache
@@ -331,7 +388,7 @@ class Swap:
     worse: float
 
 
-def swaps(found: Explanation, live: Bools, within: float) -> list[Swap]:
+def swaps(found: Solution, live: Bools, within: float) -> list[Swap]:
     """Exchanges of one accused meter for a trusted one that cost at most `within`; O(p^2) per accused.
 
     With accused k back, ``Q' = Q + v v^T / s`` with ``v = Q S_:k - e_k`` and ``s = M_kk + d_k``, and then
