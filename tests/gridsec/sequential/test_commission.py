@@ -1,0 +1,232 @@
+"""Commissioning meter by meter, against dense posteriors, integrals, and streets with replaced meters."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.integrate import dblquad
+
+from gridsec import sequential
+from gridsec.arrays import Bools
+from gridsec.sequential import Commission, SequentialDesign, SequentialOptions
+from gridsec.sequential.commission import (
+    Learning,
+    _share,
+    begin,
+    conclude,
+    fresh,
+    from_arrays,
+    gather,
+    nothing,
+    renew,
+    ripe,
+    to_arrays,
+)
+from gridsec.sequential.loads import LoadDoubt
+from tests.gridsec.sequential.test_monitor import prepare, watch
+from tests.gridsec.street import Street, make_plant
+
+P = 6
+
+
+def prepared(commission_s: float = 3600.0, seed: int = 3) -> SequentialDesign:
+    plant = make_plant(np.random.default_rng(seed), customers=P)
+    doubt = LoadDoubt(np.full(P, 0.006), np.full(P, 0.002), 600.0)
+    options = SequentialOptions(commission_s=commission_s, stability=0.0)
+    return sequential.design(plant, doubt=doubt, step_s=1.0, options=options)
+
+
+def one(k: int) -> Bools:
+    which = np.zeros(P, dtype=np.bool_)
+    which[k] = True
+    return which
+
+
+def learned(design: SequentialDesign, rng: np.random.Generator) -> Commission:
+    every = np.ones(P, dtype=np.bool_)
+    count = np.full(P, 3600)
+    gathered = Learning(rng.normal(size=P) * 0.002 * count, count, np.full(P, 3600.0), np.zeros(P))
+    known = conclude(design, nothing(design), gathered, every, 3600.0)
+    assert known.learning is None
+    return known
+
+
+@given(short=st.floats(0.05, 20.0), longer=st.floats(1.0, 5.0))
+def test_means_that_end_together_covary_as_the_double_integral_says(short: float, longer: float) -> None:
+    long = short * longer
+    exact = dblquad(lambda s, u: np.exp(-abs(s - u)), 0.0, short, 0.0, lambda u: u)[0]
+    exact += dblquad(lambda s, u: np.exp(-abs(s - u)), 0.0, short, lambda u: u, long)[0]
+    found = _share(np.array([short, long]))
+    assert found[0, 1] == found[1, 0] == pytest.approx(exact / (short * long), rel=1e-6)
+    assert np.linalg.eigvalsh(found).min() > -1e-12
+
+
+def test_a_replaced_meter_is_learned_by_what_the_others_say_of_the_loads() -> None:
+    """Against the dense posterior with the others' errors known to within what was learned."""
+    design, rng = prepared(), np.random.default_rng(5)
+    before = learned(design, rng)
+    known = renew(design, before, one(2), 5000.0)
+    assert known.learning is not None
+    assert known.learning.open.tolist() == one(2).tolist()
+    assert (known.learned.bias[2], known.learned.variance[2]) == (0.0, design.fixed[2])
+    use, mean = np.ones(P, dtype=np.bool_), rng.normal(size=P) * 1e-3
+    learning = known.learning
+    for _ in range(40):
+        learning = gather(learning, mean, use, 100.0)
+    assert ripe(design, learning).tolist() == one(2).tolist()
+    after = conclude(design, known.learned, learning, ripe(design, learning), 9000.0)
+    assert after.learning is None
+    B = np.diag(known.learned.variance)
+    rho = 600.0 / 4000.0
+    share = 2 * rho * (1 - rho * (1 - np.exp(-1 / rho)))
+    gain = B @ np.linalg.inv(share * design.prior.between + B + np.diag(design.white / 40))
+    assert after.learned.bias[2] == pytest.approx((gain @ mean)[2], rel=1e-9)
+    assert after.learned.variance[2] == pytest.approx((B - gain @ B)[2, 2], rel=1e-6)
+    others = ~one(2)
+    for name in ("bias", "variance", "allowed", "at"):
+        found, was = getattr(after.learned, name), getattr(before.learned, name)
+        np.testing.assert_array_equal(found[others], was[others])
+    assert after.learned.at[2] == 9000.0
+
+
+def test_a_silent_meter_is_waited_for_and_holds_up_nobody() -> None:
+    design = prepared()
+    use = ~one(4)
+    learning = begin(np.ones(P, dtype=np.bool_), 0.0)
+    for _ in range(35):
+        learning = gather(learning, np.full(P, 1e-4), use, 100.0)
+    assert not ripe(design, learning).any()
+    learning = gather(learning, np.full(P, 1e-4), use, 100.0)
+    assert ripe(design, learning).tolist() == use.tolist()
+    first = conclude(design, nothing(design), learning, ripe(design, learning), 3600.0)
+    assert first.learning is not None
+    assert first.learning.open.tolist() == one(4).tolist()
+    assert np.isnan(first.learned.at[4])
+    assert first.learned.variance[4] == design.fixed[4]
+
+
+def test_nothing_beyond_the_class_is_learned() -> None:
+    """Whoever lies by more than the class all the while is no honest meter with that error."""
+    design = prepared()
+    every, count = np.ones(P, dtype=np.bool_), np.full(P, 10**6)
+    gathered = Learning(one(1) * 1.0 * count, count, np.full(P, 1e7), np.zeros(P))
+    known = conclude(design, nothing(design), gathered, every, 1e7)
+    assert known.learned.bias[1] == design.allowed[1]
+    assert (np.abs(known.learned.bias) <= design.allowed).all()
+
+
+def test_two_replaced_at_different_times_keep_their_own_time() -> None:
+    design = prepared()
+    use = np.ones(P, dtype=np.bool_)
+    known = renew(design, learned(design, np.random.default_rng(6)), one(0), 4000.0)
+    assert known.learning is not None
+    half = gather(known.learning, np.zeros(P), use, 1800.0)
+    both = renew(design, Commission(known.learned, half), one(3), 5800.0)
+    assert both.learning is not None
+    np.testing.assert_array_equal(both.learning.time_s[[0, 1, 3]], [1800.0, 1800.0, 0.0])
+    np.testing.assert_array_equal(both.learning.since[[0, 1, 3]], [4000.0, np.nan, 5800.0])
+    later = gather(both.learning, np.zeros(P), use, 1800.0)
+    assert ripe(design, later).tolist() == one(0).tolist()
+
+
+def test_where_nothing_is_learned_nothing_is_begun_anew() -> None:
+    design = prepared(0.0)
+    known = fresh(design, 0.0)
+    assert known.learning is None
+    assert renew(design, known, one(1), 1.0) is known
+
+
+class TestArrays:
+    def test_there_and_back(self) -> None:
+        design = prepared()
+        for known in (
+            fresh(design, 7.0),
+            learned(design, np.random.default_rng(1)),
+            renew(design, learned(design, np.random.default_rng(2)), one(1), 9.0),
+        ):
+            found = from_arrays(design, to_arrays(known))
+            assert (found.learning is None) == (known.learning is None)
+            for name, value in to_arrays(known).items():
+                np.testing.assert_array_equal(to_arrays(found)[name], value)
+
+    @pytest.mark.parametrize(
+        ("name", "value", "said"),
+        [
+            ("bias", np.inf, "bias is beyond the class"),
+            ("bias", 0.5, "bias is beyond the class"),
+            ("variance", np.nan, "variance is not within"),
+            ("variance", -1.0, "variance is not within"),
+            ("allowed", 1.0, "allowed is not within the class"),
+            ("at", np.inf, "at is no time"),
+            ("since", 5.0, "neither learned nor being learned"),
+            ("total", np.nan, "total is no number"),
+            ("count", 1.5, "count is no number of readings"),
+            ("time_s", -1.0, "time_s is no time"),
+        ],
+    )
+    def test_what_cannot_be_is_refused(self, name: str, value: float, said: str) -> None:
+        design = prepared()
+        arrays = to_arrays(learned(design, np.random.default_rng(1)))
+        arrays[name] = np.where(one(3), value, arrays[name])
+        with pytest.raises(ValueError, match=said) as caught:
+            from_arrays(design, arrays)
+        assert "(meters 3)" in str(caught.value)
+
+    def test_all_problems_at_once(self) -> None:
+        design = prepared()
+        arrays = to_arrays(fresh(design, 0.0))
+        del arrays["bias"]
+        arrays |= {"more": np.zeros(P), "count": np.zeros(P + 1)}
+        with pytest.raises(
+            ValueError, match=r"bias is missing; more is not known; count has the shape \(7,\)"
+        ):
+            from_arrays(design, arrays)
+
+
+class TestStreets:
+    def test_a_restart_in_the_middle_goes_on(self) -> None:
+        rng = np.random.default_rng(12)
+        plant = make_plant(rng, customers=12, drop=0.03)
+        design, street = prepare(plant, commission_s=3000.0), Street(plant, rng)
+        state, _ = watch(street, design, 200, h=10.0)
+        known = from_arrays(design, to_arrays(state.commission))
+        assert known.learning is not None
+        street.advance(5000.0)  # the time without a service counts for nothing
+        again = sequential.init(design, street.t, known.learned, known.learning)
+        again, _ = watch(street, design, 102, h=10.0, state=again)
+        assert again.learning is None
+        assert (np.isfinite(again.learned.at)).all()
+
+    def test_a_replaced_meter_is_named_until_it_is_learned_anew(self) -> None:
+        """The new meter is within its class, but not where the old one was."""
+        rng = np.random.default_rng(12)
+        plant = make_plant(rng, customers=12, drop=0.03)
+        design, street = prepare(plant, commission_s=3000.0), Street(plant, rng)
+        state, _ = watch(street, design, 320, h=10.0)
+        assert state.learning is None
+        old = state.learned.bias[4]
+        change = 0.006 if old < 0 else -0.006
+        other = {4: change}
+        state, answers = watch(street, design, 90, state=state, lies=other)
+        assert list(np.flatnonzero(answers[-1][1].suspects)) == [4]
+        which = np.arange(design.plant.meters.size) == 4
+        state = sequential.renew(design, state, which)
+        state, answers = watch(street, design, 320, h=10.0, state=state, lies=other)
+        assert not any(verdict.suspects.any() for _, verdict in answers[20:])
+        assert state.learning is None
+        found = state.learned.bias[4] - old
+        assert found == pytest.approx(2.0 * change, abs=3.0 * np.sqrt(2.0 * state.learned.variance[4]))
+        # The others were not touched, and the new meter is watched as closely as the old one was.
+        _, answers = watch(street, design, 90, state=state, lies={4: change + np.copysign(0.006, -change)})
+        assert list(np.flatnonzero(answers[-1][1].suspects)) == [4]
+
+    def test_a_pause_of_the_frames_is_not_heard(self) -> None:
+        rng = np.random.default_rng(1)
+        plant = make_plant(rng, customers=6, drop=0.03)
+        design, street = prepare(plant, commission_s=3000.0), Street(plant, rng)
+        state, _ = watch(street, design, 10)
+        state, _ = watch(street, design, 1, h=50_000.0, state=state)
+        assert state.learning is not None
+        assert state.learning.time_s.max() == pytest.approx(10.0)
