@@ -51,6 +51,10 @@ class Feeder:
         `start` lies in `[start[k], stop[k])`.
     depth : (b + 1,)
         Derived. Number of branches between bus k and the busbar.
+    enter, leave : (b + 1,)
+        Derived. When a walk around the tree comes to a bus first, and when it has left it.
+    half : (b + 1,)
+        Derived. Shunt susceptance at the buses, pu.
 
     Raises
     ------
@@ -71,6 +75,9 @@ class Feeder:
     start: Ints = field(init=False, repr=False)
     stop: Ints = field(init=False, repr=False)
     depth: Ints = field(init=False, repr=False)
+    enter: Ints = field(init=False, repr=False)
+    leave: Ints = field(init=False, repr=False)
+    half: Floats = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         for name in ("r", "x", "charging"):
@@ -81,8 +88,15 @@ class Feeder:
         if problems:
             raise FeederInvalid(problems)
         start, stop, depth = _depth_first(self.parent)
-        for name, value in (("start", start), ("stop", stop), ("depth", depth)):
+        enter = 2 * start - depth
+        leave = enter + 2 * (stop - start) - 1
+        names = ("start", "stop", "depth", "enter", "leave")
+        for name, value in zip(names, (start, stop, depth, enter, leave), strict=True):
             object.__setattr__(self, name, frozen_ints(value))
+        half: Floats = np.zeros(start.size)
+        np.add.at(half, self.parent, 0.5 * self.charging)
+        half[1:] += 0.5 * self.charging
+        object.__setattr__(self, "half", frozen(half))
 
 
 def _problems(feeder: Feeder) -> list[str]:
@@ -353,7 +367,7 @@ def _correction(feeder: Feeder, flows: _Flows, steps: int) -> Floats:
     v2, P, Q = flows.v2, flows.P, flows.charged
     for _ in range(steps):
         current = (P**2 + Q**2) / v2[..., 1:]
-        loss_p, loss_q, drop = _losses(feeder, current, flows.half * v2, sign=-1.0)
+        loss_p, loss_q, drop = _losses(feeder, current, feeder.half * v2, sign=-1.0)
         v2 = flows.v2 + _from_busbar(feeder, -drop)
         P, Q = flows.P + loss_p, flows.Q + loss_q
     return np.asarray(v2 - flows.v2)
@@ -383,12 +397,12 @@ def model_error_bound(feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats |
 def _remainder(feeder: Feeder, flows: _Flows) -> Floats:
     with np.errstate(all="ignore"):
         current = (flows.P**2 + flows.charged**2) / flows.v2[..., 1:]
-        charge = flows.half * flows.v2
+        charge = feeder.half * flows.v2
         loss_p, loss_q, drop = _losses(feeder, current, charge, sign=-1.0)
         v2 = flows.v2 + _from_busbar(feeder, -drop)
         later = ((flows.P + loss_p) ** 2 + (flows.Q + loss_q) ** 2) / v2[..., 1:]
         first = _from_busbar(feeder, _losses(feeder, np.abs(current), np.abs(charge), sign=1.0)[2])
-        change = np.abs(flows.half * (v2 - flows.v2))
+        change = np.abs(feeder.half * (v2 - flows.v2))
         second = _from_busbar(feeder, _losses(feeder, np.abs(later - current), change, sign=1.0)[2])
         shrinks = np.max(second, axis=-1, keepdims=True) <= 0.5 * np.max(first, axis=-1, keepdims=True)
         shrinks &= np.all(v2 > 0, axis=-1, keepdims=True) & np.all(flows.v2 > 0, axis=-1, keepdims=True)
@@ -401,33 +415,34 @@ class _Flows:
     """The linear power flow.
 
     P, Q: flows at the end of the branches, (…, b). charged: Q less what the charging below supplies.
-    v2: squared voltages (…, b + 1). half: susceptance at the buses (b + 1,).
+    v2: squared voltages (…, b + 1).
     """
 
     P: Floats
     Q: Floats
     charged: Floats
     v2: Floats
-    half: Floats
 
 
 def _linear_flows(feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats | float) -> _Flows:
     """The linear power flow, from the injections of the customers."""
-    both = np.stack(np.broadcast_arrays(p, q)).astype(np.float64, copy=False)
-    P, Q = _below(feeder, -_at_buses(feeder, both))[..., 1:]
+    both = np.empty((2, *np.broadcast(p, q).shape))
+    both[0], both[1] = p, q
+    P, Q = -_below(feeder, _at_buses(feeder, both))[..., 1:]
     base = np.asarray(v0_squared, dtype=np.float64)[..., None]
     v2 = base + _from_busbar(feeder, -2.0 * (feeder.r * P + feeder.x * Q))
-    half = np.asarray(
-        np.bincount(feeder.parent, weights=0.5 * feeder.charging, minlength=len(feeder.buses)), np.float64
-    )
-    half[1:] += 0.5 * feeder.charging
-    return _Flows(P, Q, Q - _below(feeder, half * v2)[..., 1:], v2, half)
+    charged = Q - _below(feeder, feeder.half * v2)[..., 1:] if feeder.half.any() else Q
+    return _Flows(P, Q, charged, v2)
 
 
 def _losses(feeder: Feeder, current: Floats, charge: Floats, *, sign: float) -> tuple[Floats, Floats, Floats]:
     """What squared currents (…, b) and charging powers (…, b + 1) add to P, Q and to the drop of v^2."""
-    loss_p, loss_q = _strictly_below(feeder, np.stack([feeder.r * current, feeder.x * current]))
-    loss_q = loss_q + sign * _below(feeder, charge)[..., 1:]
+    own = np.zeros((2, *current.shape[:-1], current.shape[-1] + 1))
+    np.multiply(feeder.r, current, out=own[0, ..., 1:])
+    np.multiply(feeder.x, current, out=own[1, ..., 1:])
+    loss_p, loss_q = (_below(feeder, own) - own)[..., 1:]
+    if feeder.half.any():
+        loss_q = loss_q + sign * _below(feeder, charge)[..., 1:]
     drop = 2.0 * (feeder.r * loss_p + feeder.x * loss_q) + (feeder.r**2 + feeder.x**2) * current
     return loss_p, loss_q, drop
 
@@ -444,25 +459,15 @@ def _below(feeder: Feeder, values: Floats) -> Floats:
     """Sum of bus values (…, b + 1) over the subtree of each bus, itself included."""
     total = np.zeros((*values.shape[:-1], values.shape[-1] + 1))
     # Depth-first order makes a subtree one interval, and its sum the difference of two running sums.
-    ordered = np.empty_like(values)
-    ordered[..., feeder.start] = values
-    np.cumsum(ordered, axis=-1, out=total[..., 1:])
+    total[..., feeder.start + 1] = values
+    total = total.cumsum(axis=-1)
     return np.asarray(total[..., feeder.stop] - total[..., feeder.start])
-
-
-def _strictly_below(feeder: Feeder, values: Floats) -> Floats:
-    """Sum of branch values (…, b) over the branches below each branch, itself excluded."""
-    at_buses = np.zeros((*values.shape[:-1], values.shape[-1] + 1))
-    at_buses[..., 1:] = values
-    return _below(feeder, at_buses)[..., 1:] - values
 
 
 def _from_busbar(feeder: Feeder, values: Floats) -> Floats:
     """Sum of branch values (…, b) over the path from the busbar to each bus, (…, b + 1)."""
-    # Euler tour: a branch counts from when its bus is entered until it is left.
-    enter = 2 * feeder.start - feeder.depth
-    leave = enter + 2 * (feeder.stop - feeder.start) - 1
-    tour = np.zeros((*values.shape[:-1], 2 * enter.size))
-    tour[..., enter[1:]] = values
-    tour[..., leave[1:]] = -values
-    return np.asarray(np.cumsum(tour, axis=-1)[..., enter])
+    # A branch counts from when its bus is entered until it is left.
+    tour = np.zeros((*values.shape[:-1], 2 * feeder.enter.size))
+    tour[..., feeder.enter[1:]] = values
+    tour[..., feeder.leave[1:]] = -values
+    return np.asarray(tour.cumsum(axis=-1)[..., feeder.enter])
