@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -34,6 +34,8 @@ class Score:
         Median time of a snapshot.
     seen
         Snapshots in which a chi-square test alone says that something is wrong; -1 where there is none.
+    hits
+        Whether the named meters are exactly the liars, snapshot by snapshot.
     """
 
     trials: int = 0
@@ -44,6 +46,7 @@ class Score:
     failed: int = 0
     ms: float = 0.0
     seen: int = -1
+    hits: list[bool] = field(default_factory=list)
 
 
 def cells(feeders: tuple[str, ...]) -> Iterator[Cell]:
@@ -113,6 +116,7 @@ def _count(score: Score, answer: Answer, told: Snapshot) -> None:
     exact = bool(np.array_equal(answer.named, told.liars)) and not answer.failed
     score.trials += 1
     score.exact += exact
+    score.hits.append(exact)
     score.among += exact or any(np.array_equal(other, told.liars) for other, _ in answer.others)
     score.missed += bool((told.liars & ~answer.named).any())
     score.false += bool((answer.named & ~told.liars).any())

@@ -55,9 +55,6 @@ def _exact(scores: Scores) -> str:
     for cell, here in scores.items():
         if cell.attack == "clean":
             continue
-        best = max(
-            (100.0 * s.exact / s.trials for n, s in here.items() if n != OURS and s.trials), default=0.0
-        )
         ours = here[OURS]
         row = [_percent(here[name].exact, here[name]) for name in names if name != OURS]
         own = f"**{_percent(ours.exact, ours)}**"
@@ -67,7 +64,7 @@ def _exact(scores: Scores) -> str:
                 *row,
                 own,
                 _percent(ours.among, ours),
-                f"{100.0 * ours.exact / ours.trials - best:+.0f}",
+                _paired(here),
             ]
         )
     head = [
@@ -77,9 +74,22 @@ def _exact(scores: Scores) -> str:
         *(n for n in names if n != OURS),
         "ours",
         "ours, among explanations",
-        "ours - best peer",
+        "ours - best peer (only ours : only the peer)",
     ]
     return "Named exactly the liars, % of snapshots:\n\n" + _rows(head, rows)
+
+
+def _paired(here: dict[str, Score]) -> str:
+    """The least difference to a peer in snapshots that both saw, in per cent and in numbers of snapshots."""
+    pairs = [
+        (sum(ours and not its for ours, its in both), sum(its and not ours for ours, its in both), len(both))
+        for name, peer in here.items()
+        if name != OURS and (both := list(zip(here[OURS].hits, peer.hits, strict=False)))
+    ]
+    if not pairs:
+        return ""
+    only, other, shared = min(pairs, key=lambda each: ((each[0] - each[1]) / each[2], -each[2]))
+    return f"{100.0 * (only - other) / shared:+.1f} ({only} : {other})"
 
 
 def _clean(scores: Scores) -> str:

@@ -6,34 +6,38 @@ voltages along the columns of ``B_c = std_c [2 R_:c, 2 X_:c]``. With the liars L
 powers are false too,
 
     K = S + diag(d) + A^2 sum_{j in L} e_j e_j^T + sum_{c in F} B_c B_c^T
-    J = m^T K^-1 m + ln det K + 2 ln binom(p, |L|) + false |F| + anybody [L not empty]
+    J = m^T K^-1 m + ln det K + price(|L|) + false |F| + anybody [L not empty]
 
 is minus twice the logarithm of an explanation's probability. ``ln det K`` charges an accusation for the
 freedom that it gives: what one meter costs follows from A and from how well the others know its voltage.
 Accusing changes K by a matrix of rank one, false powers by one of rank two; the gains of *all* single
 accusations come from ``Q = K^-1`` and ``g = Q m`` without solving anything.
 
-`anybody` is what makes a false alarm as rare as asked for: nobody is named unless accusing one meter lowers
-J, and with it that takes a leave-one-out residual beyond the ``1 - rate / (2 p)`` quantile of the normal
-distribution. `rate` is an upper bound: where the freedom and the prior alone cost more, `anybody` is zero and
-fewer are named. Once one is accused, others lie more probably.
+The price is that of sets whose members each lie with a probability that is Beta(a, b) distributed: the k-th
+liar costs ``2 ln((p - k + b) / (k - 1 + a)) + each``, less the more there are already.
+
+`anybody` is what makes a false alarm as rare as asked for. Nobody is named unless accusing one meter lowers
+J, and with it that takes a leave-one-out residual beyond the ``1 - r / (2 p)`` quantile of the normal
+distribution; or unless a meter together with its customer's powers explains more than the ``1 - r' / p``
+quantile of chi-square with three degrees of freedom. ``r + r'`` is `rate`, an upper bound: where freedom and
+price alone cost more, `anybody` is zero and fewer are named. Once one is accused, others lie more probably.
 
 References
 ----------
-George and McCulloch 1993 (spike and slab); Chen and Chen 2008 (the prior over sets).
+George and McCulloch 1993 (spike and slab); Scott and Berger 2010 (the prior over sets).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
-from scipy.special import ndtri
+from scipy.special import chdtri, ndtri
 
-from gridsec.arrays import Bools, Floats, Ints
+from gridsec.arrays import Bools, Floats, Ints, frozen
 from gridsec.sequential.conditional import Prior, inverted
-from gridsec.sequential.search import price
 
 Curved = Callable[[Floats, Bools], Floats]
 
@@ -47,7 +51,9 @@ class Lies:
     size
         Standard deviation A of a lie, squared pu: 0.2 is 10 % of the voltage.
     each
-        What every accusation costs beside its freedom and the number of such sets.
+        What every accusation costs beside its freedom and the price of the set.
+    seen
+        Liars and honest meters as if seen before, a and b.
     false
         What false powers cost beside their freedom, as minus twice a logarithm.
     rate
@@ -57,9 +63,10 @@ class Lies:
     """
 
     size: float = 0.2
-    each: float = 1.4
+    each: float = 2.3
+    seen: tuple[float, float] = (4.0, 6.0)
     false: float = 3.0
-    rate: float = 0.005
+    rate: float = 0.006
     like: float = 1e3
 
 
@@ -137,6 +144,10 @@ class _State:
     def key(self) -> bytes:
         return self.liars.tobytes() + self.powers.tobytes()
 
+    @property
+    def counts(self) -> tuple[int, int]:
+        return int(np.count_nonzero(self.liars)), int(np.count_nonzero(self.powers))
+
 
 class _Problem:
     """Readings, and what may be wrong with them."""
@@ -145,59 +156,60 @@ class _Problem:
         self.lies, self.false, self.curved = lies, false, curved
         self.size = p = len(Q)
         self.a2 = lies.size**2
-        self.anybody = 0.0
+        self.prices = _prices(p, *lies.seen) + lies.each * np.arange(p + 1)
         if p:
             # The meter that the others know least well is accused for the least freedom.
-            least = ndtri(lies.rate / (2.0 * p)) ** 2 - price(p, 1) - lies.each
-            self.anybody = max(0.0, float(least - np.log1p(self.a2 * Q.diagonal().min())))
+            least = ndtri(lies.rate * (1.0 - _OF_PAIRS) / (2.0 * p)) ** 2 - self.prices[1]
+            self.prices[1:] += max(0.0, float(least - np.log1p(self.a2 * Q.diagonal().min())))
+            self.rare = float(chdtri(3, lies.rate * _OF_PAIRS / p))
 
     def charge(self, count: int, false: int) -> float:
-        return (
-            price(self.size, count)
-            + self.lies.each * count
-            + self.lies.false * false
-            + self.anybody * (count > 0)
-        )
-
-    def charges(self, at: _State) -> float:
-        return self.charge(int(at.liars.sum()), int(at.powers.sum()))
+        return float(self.prices[count]) + self.lies.false * false
 
     def cost(self, at: _State) -> float:
-        return at.fit + at.logdet + self.charges(at)
+        return at.fit + at.logdet + self.charge(*at.counts)
 
     def meters(self, at: _State) -> Floats:
         """Rise of J by accusing each meter, or by trusting it again, (p,)."""
         on = at.liars
         delta = np.where(on, -self.a2, self.a2)
         pivot = np.maximum(1.0 + delta * at.Q.diagonal(), np.finfo(np.float64).tiny)
-        k, f, now = int(on.sum()), int(at.powers.sum()), self.charges(at)
-        more, less = self.charge(k + 1, f) - now, self.charge(max(k - 1, 0), f) - now
+        k, _ = at.counts
+        now = self.prices[k]
+        more, less = self.prices[min(k + 1, self.size)] - now, self.prices[max(k - 1, 0)] - now
         rise = np.log(pivot) - delta * at.g**2 / pivot + np.where(on, less, more)
         # Powers are false only where the meter lies.
         return np.where(at.powers, np.inf, rise)
 
-    def pairs(self, at: _State, who: Ints) -> Floats:
-        """Rise of J by false powers of some customers, their meters included where trusted, (k,)."""
-        k, f, now = int(at.liars.sum()), int(at.powers.sum()), self.charges(at)
-        B = self._columns(who)
-        QB = (at.Q @ B.reshape(self.size, -1)).reshape(B.shape)
+    def pairs(self, at: _State, who: Ints) -> tuple[Floats, Floats]:
+        """Rise of J by false powers of some customers, and how much they explain, (k,) each.
+
+        Their meters are accused with them where they are trusted.
+        """
+        QB, M, h = self._against(at, who)
         # The meter first, which changes Q and g by rank one; then its customer's powers.
         own = np.where(at.liars[who], 0.0, self.a2)
         pivot = 1.0 + own * at.Q[who, who]
-        row, g = QB[who, np.arange(who.size)], at.g[who]
-        M = np.einsum("jci,jck->cik", B, QB) - (own / pivot)[:, None, None] * row[:, :, None] * row[:, None]
-        h = np.einsum("j,jci->ci", at.g, B) - (own / pivot * g)[:, None] * row
-        det, gain = _by_two(M, h, 1.0)
-        more = np.where(at.liars[who], self.charge(k, f + 1), self.charge(k + 1, f + 1)) - now
-        return np.where(at.powers[who], np.inf, np.log(pivot * det) - own / pivot * g**2 - gain + more)
+        row, g, by = QB[who, np.arange(who.size)], at.g[who], own / pivot
+        M -= by[:, None, None] * row[:, :, None] * row[:, None]
+        det, gain = _by_two(M, h - (by * g)[:, None] * row, 1.0)
+        k, _ = at.counts
+        more = np.where(at.liars[who], 0.0, self.prices[min(k + 1, self.size)] - self.prices[k])
+        gain += by * g**2
+        rise = np.log(pivot * det) - gain + more + self.lies.false
+        return np.where(at.powers[who], np.inf, rise), gain
 
     def believed(self, at: _State, who: Ints) -> Floats:
         """Rise of J by believing the powers of some customers again, (k,)."""
-        k, f = int(at.liars.sum()), int(at.powers.sum())
+        _, M, h = self._against(at, who)
+        det, gain = _by_two(M, h, -1.0)
+        return np.log(det) - gain - self.lies.false
+
+    def _against(self, at: _State, who: Ints) -> tuple[Floats, Floats, Floats]:
+        """Q B, B^T Q B and B^T g of some customers."""
         B = self._columns(who)
-        M = np.einsum("jci,jl,lck->cik", B, at.Q, B, optimize=True)
-        det, gain = _by_two(M, np.einsum("j,jci->ci", at.g, B), -1.0)
-        return np.log(det) - gain + self.charge(k, f - 1) - self.charge(k, f)
+        QB = (at.Q @ B.reshape(self.size, -1)).reshape(B.shape)
+        return QB, np.einsum("jci,jck->cik", B, QB), (at.g @ B.reshape(self.size, -1)).reshape(-1, 2)
 
     def _columns(self, who: Ints) -> Floats:
         if self.false is None:
@@ -228,13 +240,23 @@ class _Problem:
         """Doubt a customer's powers, or with `sign` -1 believe them again."""
         u = self._columns(np.array([c]))[:, 0]
         Qu, h = at.Q @ u, u.T @ at.g
-        M = sign * np.eye(2) + u.T @ Qu
-        solved = np.linalg.solve(M, np.column_stack([Qu.T, h]))
-        at.fit -= float(h @ solved[:, -1])
-        at.logdet += float(np.linalg.slogdet(M)[1])
-        at.g = at.g - Qu @ solved[:, -1]
-        at.Q -= Qu @ solved[:, :-1]
+        (a, b), (_, d) = sign * np.eye(2) + u.T @ Qu
+        det = a * d - b * b
+        inverse = np.array([[d, -b], [-b, a]]) / det
+        by = Qu @ inverse
+        at.fit -= float(h @ inverse @ h)
+        at.logdet += float(np.log(det))
+        at.g = at.g - by @ h
+        at.Q -= by @ Qu.T
         at.powers[c] = sign > 0
+
+
+@cache
+def _prices(meters: int, liars: float, honest: float) -> Floats:
+    """What naming 0, 1, 2, … of so many meters costs, but always rising."""
+    k = np.arange(meters)
+    each = np.maximum(2.0 * np.log((meters - 1 - k + honest) / (k + liars)), 0.0)
+    return frozen(np.concatenate([[0.0], np.cumsum(each)]))
 
 
 def _by_two(M: Floats, h: Floats, sign: float) -> tuple[Floats, Floats]:
@@ -250,8 +272,12 @@ _LEAST = 1e-9
 # A fit this many standard deviations above its expectation leaves something unexplained.
 _MISFIT = 3.0
 _MOVES = 4
-# So many customers, those that explain most, are where a search with false powers begins.
-_STARTS = 6
+# So many customers, those whose meters are most suspicious, are where a search with false powers may begin.
+_STARTS = 8
+# Where nobody is named, meters beyond so many standard deviations are.
+_SUSPICIOUS = 3.0
+# Of the false alarms that are allowed, for false powers where no meter alone is suspicious enough.
+_OF_PAIRS = 0.2
 
 
 def identify(
@@ -297,7 +323,7 @@ def identify(
         at = np.flatnonzero(live)
         d, y, K = noise[at], m[at], prior.of_meters[np.ix_(prior.meters[at], at)]
         false = None if false is None else false.of(at)
-    K[np.diag_indices(d.size)] += d
+    K.ravel()[:: d.size + 1] += d
     Q = inverted(K)
     problem = _Problem(lies, Q, false, curved)
     none = np.zeros(d.size, dtype=np.bool_)
@@ -313,20 +339,34 @@ def _explanations(problem: _Problem, start: _State, false: bool) -> list[_State]
         return [start]
     known: dict[bytes, _State] = {start.key: start}
     first = _descend(problem, start, known, false)
-    if first is start:
-        return [start]
-    if false and first.fit > problem.size + _MISFIT * np.sqrt(2.0 * problem.size):
-        for c in _doubtful(problem, start):
+    if false and (first is start or first.fit > problem.size + _MISFIT * np.sqrt(2.0 * problem.size)):
+        for c in _doubtful(problem, start, anybody=first is not start):
             _descend(problem, _doubted(problem, start, c), known, false)
+    if len(known) == 1:
+        return [start]
     _exchange(problem, min(known.values(), key=problem.cost), known, false)
     return list(known.values())
 
 
-def _doubtful(problem: _Problem, at: _State) -> list[int]:
-    """Customers whose false powers explain more than their lying meter alone, the best first."""
-    rise = problem.pairs(at, np.arange(problem.size))
-    order = np.argsort(rise)[:_STARTS]
-    return [int(c) for c in order[(rise < problem.meters(at))[order]]]
+def _doubtful(problem: _Problem, at: _State, *, anybody: bool) -> list[int]:
+    """Customers whose false powers explain more than their lying meter alone, the best first.
+
+    Unless `anybody` is named anyway, only those whose meters are suspicious and who explain so much that it
+    is rare.
+    """
+    if anybody:
+        single = problem.meters(at)
+        who = np.argsort(single)[:_STARTS]
+        rise, _ = problem.pairs(at, who)
+        worth = rise < single[who]
+    else:
+        who = np.flatnonzero(at.g**2 > _SUSPICIOUS**2 * at.Q.diagonal())
+        if not who.size:
+            return []
+        rise, gain = problem.pairs(at, who)
+        worth = (rise < 0.0) & (gain > problem.rare)
+    order = np.argsort(rise)
+    return [int(c) for c in who[order][worth[order]][:_STARTS]]
 
 
 def _doubted(problem: _Problem, at: _State, c: int) -> _State:
@@ -364,7 +404,7 @@ def _best(problem: _Problem, at: _State, false: bool) -> _State | None:
             if rises[c] < least:
                 j, least, move = int(doubted[c]), float(rises[c]), "believe"
         who = np.flatnonzero(at.liars)
-        doubts = problem.pairs(at, who)
+        doubts, _ = problem.pairs(at, who)
         c = int(np.argmin(doubts))
         if doubts[c] < least:
             j, least, move = int(who[c]), float(doubts[c]), "powers"
@@ -391,8 +431,12 @@ def _exchange(problem: _Problem, at: _State, known: dict[bytes, _State], false: 
         rise = problem.meters(after)
         rise[j] = np.inf
         k = int(np.argmin(rise))
-        problem.toggle(after, k)
-        if after.key not in known and problem.cost(after) - least <= within:
+        cost = problem.cost(after) + rise[k]
+        after.liars[k] ^= True
+        new = after.key not in known
+        after.liars[k] ^= True
+        if new and cost - least <= within:
+            problem.toggle(after, k)
             _descend(problem, after, known, false)
 
 

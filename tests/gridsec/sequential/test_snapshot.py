@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from itertools import chain, combinations
-from math import comb
 
 import numpy as np
 import pytest
+from scipy.special import betaln
 
 from gridsec.arrays import Bools, Floats
 from gridsec.sequential.conditional import Prior
@@ -42,7 +42,8 @@ def dense(known: Known, m: Floats, liars: tuple[int, ...], powers: tuple[int, ..
         B = np.column_stack([false.R[:, c] * false.p[c], false.X[:, c] * false.q[c]])
         K += B @ B.T
     logs = np.linalg.slogdet(K)[1] - np.linalg.slogdet(honest)[1]
-    sets = 2.0 * np.log(comb(P, len(liars)))
+    a, b = LIES.seen
+    sets = 2.0 * (betaln(a, P + b) - betaln(len(liars) + a, P - len(liars) + b))
     return float(m @ np.linalg.solve(K, m) + logs + sets + LIES.each * len(liars) + LIES.false * len(powers))
 
 
