@@ -171,6 +171,8 @@ _SHOWN = 5
 
 def _list(now: Situation, which: Bools) -> str:
     """The meters' names, the first few of many."""
+    if not which.any():
+        return ""
     names = [now.names[j] for j in np.flatnonzero(which).tolist()]
     rest = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
     return ", ".join(names[:_SHOWN]) + rest

@@ -68,17 +68,17 @@ def conclude(design: SequentialDesign, state: SequentialState, tick: Tick) -> tu
     plant, trust = design.plant, state.trust
     estimate = _estimate(design, state, tick)
     score, threshold, judged = _worst(design, tick.seen, tick.live.size)
-    live = judged & tick.live
+    live, beyond = judged & tick.live, score > threshold
     at = plant.feeder.bus[plant.meters]
     attack = np.where(trust.named & tick.live, tick.y - state.learned.bias - estimate.v2_bus[at], 0.0)
     amounts = _amounts(design, state, tick.seen)
-    settled = bool(np.all(tick.transient <= design.options.settled * threshold))
+    settled = bool((tick.transient <= design.options.settled * threshold).all())
     said = decide(
         Situation(
             names=design.names,
             max_attacked=max(1, min(design.most, int(np.count_nonzero(live)) // 3)),
             live=live,
-            suspected=~trust.trusted | (judged & (np.nan_to_num(score) > threshold)),
+            suspected=~trust.trusted | beyond,
             named=trust.named,
             wide=live & (threshold > design.options.widest),
             valid=True,
@@ -86,9 +86,7 @@ def conclude(design: SequentialDesign, state: SequentialState, tick: Tick) -> tu
             busbar=True,
         )
     )
-    said = _contradicted(
-        design, ~trust.named & judged & (np.nan_to_num(score) > threshold), trust.named, said
-    )
+    said = _contradicted(design, beyond & ~trust.named, trust.named, said)
     decision, cause, reason = _beside_meters(design, state, tick, amounts, said)
     injected = np.zeros(plant.droop.tau.size)
     for k, amount in amounts.items():

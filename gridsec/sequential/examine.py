@@ -36,15 +36,23 @@ class View:
         Largest honest offset, squared pu.
     over : (p,)
         Whose offset is larger.
-    still : (p,)
-        Whose offset is larger than what is expected of a meter that is to be trusted again.
+    limits, lower
+        How the limits come about, and the part of `sigmas` that is expected of a meter that is to be
+        trusted again.
     """
 
     judged: Judged
     enough: Bools
     limit: Floats
     over: Bools
-    still: Bools
+    limits: Limits
+    lower: float
+
+    @property
+    def still(self) -> Bools:
+        """Whose offset is larger than what is expected of a meter that is to be trusted again, (p,)."""
+        judged = self.judged
+        return self.enough & (np.abs(judged.offset) > self.limits.of(judged.std, self.lower))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,7 +96,9 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats) -> 
     model : (p,)
         What the model may be off, squared pu.
     """
-    trust, fits, window, prior, tick = state.trust, state.fits, state.window, state.doubts.prior, state.ticks
+    fits, window, prior, tick = state.fits, state.window, state.doubts.prior, state.ticks
+    bad, still = state.trust.bad.copy(), state.trust.still.copy()
+    trust = replace(state.trust, bad=bad, still=still)
     views: list[View | None] = []
     after: list[Fit | None] = []
     found: dict[int, Found] = {}
@@ -113,9 +123,9 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats) -> 
             found[s], trust = _Search(design, scales, fits, trust, s)(now, view)
             now = found[s].best.fit
             view = _view(design, here, now)
-        bad, still = trust.bad.copy(), trust.still.copy()
-        bad[s], still[s] = view.over & ~trust.trusted, view.still & ~trust.trusted
-        trust = replace(trust, bad=bad, still=still)
+        bad[s] = still[s] = False
+        if not trust.trusted.all():
+            bad[s], still[s] = view.over & ~trust.trusted, view.still & ~trust.trusted
         views.append(view)
         after.append(now)
     return Examined(trust, tuple(after), tuple(views), found)
@@ -160,11 +170,13 @@ def _due(design: SequentialDesign, trust: Trust, view: View, s: int, tick: int) 
     """
     if any(scale <= s for _, scale in trust.accused):
         return True
+    if trust.trusted.all():
+        return False
     about = ~trust.trusted & ~trust.named & view.over & (trust.scale == s)
     if (about & (trust.age + 1 >= confirm(design.lengths[s]))).any():
         return True
     last = len(design.lengths) - 1
-    return s == last and tick % design.lengths[last] == 0 and not trust.trusted.all()
+    return s == last and tick % design.lengths[last] == 0
 
 
 def confirm(length: int) -> int:
@@ -211,9 +223,8 @@ class _Scales:
 def _view(design: SequentialDesign, here: _Scale, now: Fit) -> View:
     judged = judge(now, here.m)
     limit = here.limits.of(judged.std)
-    offset = np.abs(judged.offset)
-    lower = here.limits.of(judged.std, design.options.lower)
-    return View(judged, here.enough, limit, here.enough & (offset > limit), here.enough & (offset > lower))
+    over = here.enough & (np.abs(judged.offset) > limit)
+    return View(judged, here.enough, limit, over, here.limits, design.options.lower)
 
 
 def _directions(design: SequentialDesign, accused: tuple[tuple[int, int], ...]) -> Floats | None:
