@@ -11,6 +11,8 @@ from feeders.meters import BUSBAR
 from feeders.scenario import Reading as Recorded
 from service.alarms import AlarmBook
 from service.align import Clock, Outcome
+from service.commissioning import Commissioning
+from service.kept import Kept
 from service.reading import Findings, Known, Reading, judge, to_reading
 from service.watch import TickResult, Watch, align_rules, design, known_of
 
@@ -25,7 +27,12 @@ class Tally:
 
 
 def replay(
-    site: Site, recorded: Iterable[Recorded], tally: Tally, *, grace_s: float | None = None
+    site: Site,
+    recorded: Iterable[Recorded],
+    tally: Tally,
+    *,
+    grace_s: float | None = None,
+    kept: Kept | None = None,
 ) -> Iterator[TickResult]:
     """Yield what the service would have made of recorded readings.
 
@@ -39,13 +46,16 @@ def replay(
         Filled on the way.
     grace_s
         As in `align.rules`.
+    kept
+        What was known of the meters when the recording began, as in `Commissioning`; None: nothing.
 
     Raises
     ------
     NotObservable, DesignInfeasible
         If the feeder cannot be watched.
     """
-    watch = Watch(site, align_rules(site, Clock.EVENTS, grace_s=grace_s), AlarmBook(site.feeder.name))
+    rules = align_rules(site, Clock.EVENTS, grace_s=grace_s)
+    watch = Watch(site, rules, AlarmBook(site.feeder.name), Commissioning(site, kept))
     watch.install(design(site))
     known = known_of(site)
     for reading in (_checked(watch.name, known, one, tally) for one in recorded):

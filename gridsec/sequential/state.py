@@ -190,9 +190,22 @@ def renew(design: SequentialDesign, state: SequentialState, which: Bools) -> Seq
     design, state
         The design, and the state.
     which : (p,)
-        The meters. One that is not trusted stays so until six ticks of it were without evidence.
+        The meters. What spoke against the old ones does not speak against the new ones: they are trusted
+        until something does.
     """
-    known = learn_anew(design, state.commission, which, state.t)
-    window = forget(state.window, which)
-    fits = (None,) * len(state.fits)
-    return replace(state, learned=known.learned, learning=known.learning, window=window, fits=fits)
+    known, trust = learn_anew(design, state.commission, which, state.t), state.trust
+    return replace(
+        state,
+        learned=known.learned,
+        learning=known.learning,
+        window=forget(state.window, which),
+        fits=(None,) * len(state.fits),
+        trust=replace(
+            trust,
+            trusted=trust.trusted | which,
+            quiet=np.where(which, 0, trust.quiet),
+            bad=trust.bad & ~which,
+            still=trust.still & ~which,
+            named=trust.named & ~which,
+        ),
+    )

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import math
+import os
+import shutil
+import tempfile
 import threading
 import time
 from collections.abc import AsyncGenerator, Callable, Iterator, Sequence
@@ -22,6 +25,7 @@ from service.commissioning import Happened, Step
 from service.errors import FeederFixed, TooManyFeeders
 from service.report import FeederReport, MeterReport
 from service.store import Store
+from tests.service.databases import Cluster, find_postgresql
 
 T0 = 1_795_212_000.0
 NOMINAL = 230.94
@@ -281,6 +285,30 @@ class Server:
         self.thread.join(timeout=20)
         assert not self.thread.is_alive()
         self.service.loop = None
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Cluster]:
+    binaries = find_postgresql()
+    if binaries is None:
+        pytest.skip("PostgreSQL's initdb, pg_ctl and postgres are not installed")
+    if os.geteuid() == 0 and shutil.which("setpriv") is None:
+        pytest.skip("PostgreSQL refuses to run as root, and there is no setpriv to become somebody else")
+    with tempfile.TemporaryDirectory(prefix="gridsec-pg-", dir="/tmp") as folder:
+        made = Cluster(binaries, Path(folder))
+        made.start()
+        try:
+            yield made
+        finally:
+            made.stop()
+
+
+@pytest.fixture
+def url(family: str, tmp_path: Path, request: pytest.FixtureRequest) -> str:
+    if family == "sqlite":
+        return f"sqlite:///{tmp_path}/gridsec.db"
+    made: Cluster = request.getfixturevalue("cluster")
+    return made.database()
 
 
 @pytest.fixture

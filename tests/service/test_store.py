@@ -1,21 +1,16 @@
 from __future__ import annotations
 
-import os
-import shutil
 import signal
 import sqlite3
 import subprocess
 import sys
-import tempfile
 import textwrap
 import threading
 import time
-import uuid
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import psycopg
 import pytest
 
 from gridsec.online import Cause, Decision
@@ -31,83 +26,13 @@ from service.alarms import (
     Transition,
     acknowledged,
 )
+from service.commissioning import Happened, Step
+from service.kept import Kept
 from service.report import FeederReport, MeterReport
 from service.store import BAD_READINGS_KEPT, HistoryRules, Rejected, Store, StoreUnavailable, connect, schema
+from tests.service.databases import Cluster, both
 
 T0 = 1_795_212_000.0
-NOBODY = 65534
-
-
-# ----------------------------------------------------------------- databases
-
-
-def find_postgresql() -> Path | None:
-    on_path = shutil.which("initdb")
-    folders = [Path(on_path).resolve().parent] if on_path else []
-    folders += sorted(Path("/usr/lib/postgresql").glob("*/bin"), reverse=True)
-    wanted = ("initdb", "pg_ctl", "postgres")
-    return next((folder for folder in folders if all((folder / name).exists() for name in wanted)), None)
-
-
-class Cluster:
-    """A private PostgreSQL that listens on a socket in a folder of its own and on no network."""
-
-    def __init__(self, binaries: Path, folder: Path) -> None:
-        self.binaries, self.folder, self.data = binaries, folder, folder / "data"
-        # PostgreSQL refuses to run as root; the folder then belongs to nobody.
-        self.prefix = ["setpriv", f"--reuid={NOBODY}", f"--regid={NOBODY}", "--clear-groups"]
-        if os.geteuid() == 0:
-            os.chown(folder, NOBODY, NOBODY)
-        else:
-            self.prefix = []
-        self.run("initdb", "-D", self.data, "-A", "trust", "-U", "gridsec", "-E", "UTF8", "--no-sync")
-
-    def run(self, name: str, *arguments: object) -> None:
-        command = [*self.prefix, str(self.binaries / name), *map(str, arguments)]
-        done = subprocess.run(
-            command, cwd=self.folder, capture_output=True, text=True, timeout=60, check=False
-        )
-        assert done.returncode == 0, done.stdout + done.stderr
-
-    def start(self) -> None:
-        options = f"-c listen_addresses='' -c unix_socket_directories='{self.folder}' -c fsync=off"
-        self.run("pg_ctl", "-D", self.data, "-w", "-l", self.folder / "log", "-o", options, "start")
-
-    def stop(self) -> None:
-        self.run("pg_ctl", "-D", self.data, "-w", "-m", "immediate", "stop")
-
-    def database(self) -> str:
-        name = f"t{uuid.uuid4().hex}"
-        with psycopg.connect(f"host={self.folder} user=gridsec dbname=postgres", autocommit=True) as admin:
-            admin.execute(f'CREATE DATABASE "{name}"')
-        return f"postgresql+psycopg://gridsec@/{name}?host={self.folder}"
-
-
-@pytest.fixture(scope="module")
-def cluster() -> Iterator[Cluster]:
-    binaries = find_postgresql()
-    if binaries is None:
-        pytest.skip("PostgreSQL's initdb, pg_ctl and postgres are not installed")
-    if os.geteuid() == 0 and shutil.which("setpriv") is None:
-        pytest.skip("PostgreSQL refuses to run as root, and there is no setpriv to become somebody else")
-    with tempfile.TemporaryDirectory(prefix="gridsec-pg-", dir="/tmp") as folder:
-        made = Cluster(binaries, Path(folder))
-        made.start()
-        try:
-            yield made
-        finally:
-            made.stop()
-
-
-both = pytest.mark.parametrize("family", ["sqlite", pytest.param("postgresql", marks=pytest.mark.postgresql)])
-
-
-@pytest.fixture
-def url(family: str, tmp_path: Path, request: pytest.FixtureRequest) -> str:
-    if family == "sqlite":
-        return f"sqlite:///{tmp_path}/gridsec.db"
-    made: Cluster = request.getfixturevalue("cluster")
-    return made.database()
 
 
 @pytest.fixture
@@ -520,6 +445,36 @@ def test_sqlite_is_as_safe_as_it_says(tmp_path: Path) -> None:
             for name in ("journal_mode", "synchronous", "foreign_keys")
         }
         assert pragma == {"journal_mode": "wal", "synchronous": 2, "foreign_keys": 1}
+
+
+@both
+def test_what_was_learned_is_kept_as_it_is(store: Store) -> None:
+    assert store.commission("village") is None
+    assert store.commission_events("village") == []
+    other = Kept("town", T0, "{}")
+    begun = Happened("village", T0, Step.BEGUN, ("m1", "m2"), None, "")
+    store.commit(kept=[Kept("village", T0, '{"a": 1.0}'), other], happened=[begun])
+    wish = Happened("village", T0 + 5, Step.RECOMMISSIONED, ("m2",), "Ada", 'm2 replaced; it "hummed"')
+    store.commit(kept=[Kept("village", T0 + 5, '{"a": 2.0}')], happened=[wish])
+    assert store.commission("village") == Kept("village", T0 + 5, '{"a": 2.0}')
+    assert store.commission_events("village") == [begun, wish]
+    assert store.commission_events("village", 1) == [wish]
+    # A feeder that is deleted is forgotten, what happened to it is not, and others stay.
+    store.commit(without="village")
+    assert store.commission("village") is None
+    assert store.commission_events("village") == [begun, wish]
+    assert store.commission("town") == other
+
+
+@both
+def test_a_database_from_before_commissioning_was_kept_is_brought_forward(url: str) -> None:
+    with Store(url) as old, old._write() as connection:
+        for table in (schema.COMMISSION, schema.COMMISSION_EVENT):
+            table.drop(connection)
+        connection.execute(schema.VERSION.update().values(version=1))
+    with Store(url) as new:
+        new.commit(kept=[Kept("village", T0, "{}")])
+        assert new.commission("village") == Kept("village", T0, "{}")
 
 
 @both
