@@ -231,14 +231,23 @@ def common_paths(feeder: Feeder, branch: Floats, buses: Ints) -> Floats:
     start, whole = feeder.start, path_sums(feeder, branch)
     between = np.zeros(start.size)
     between[start[1:]] = whole[feeder.parent]
-    out, common = np.empty((buses.size, start.size)), np.empty(start.size)
-    for row, bus in zip(out, buses.tolist(), strict=True):
-        at = int(start[bus])
-        common[at] = whole[bus]
-        np.minimum.accumulate(between[at + 1 :], out=common[at + 1 :])
-        common[:at] = np.minimum.accumulate(between[at:0:-1])[::-1]
-        np.take(common, start, out=row)
+    out, count = np.empty((buses.size, start.size)), np.arange(start.size)
+    together = max(1, _TOGETHER // start.size)
+    for first in range(0, buses.size, together):
+        some = buses[first : first + together]
+        at = start[some][:, None]
+        later = np.where(count > at, between, np.inf)
+        later[count == at] = whole[some]
+        np.minimum.accumulate(later, axis=1, out=later)
+        earlier = np.where(count[1:] <= at, between[1:], np.inf)[:, ::-1]
+        earlier = np.minimum.accumulate(earlier, axis=1)[:, ::-1]
+        np.minimum(later[:, :-1], earlier, out=later[:, :-1])
+        out[first : first + together] = later[:, start]
     return out.T
+
+
+# Entries that are made together: as many as a processor has at hand.
+_TOGETHER = 16384
 
 
 def path_sums(feeder: Feeder, branch: Floats) -> Floats:

@@ -204,13 +204,18 @@ def describe(shapes: Shapes, heard: Kinds, model: Floats, named: Bools, variance
     since = np.where(named, np.where(heard.since < 0, tick, heard.since), -1)
     alone = [kind if there else None for kind, there in zip(heard.alone, named.tolist(), strict=True)]
     told, new = heard.told & named, bool((since == tick).any())
+    look: dict[int, list[int]] = {}
     for j in np.flatnonzero(named).tolist():
         if memory.stuck[j] or memory.run[j] * shapes.rules.surprise[j] >= _CALLED_STUCK:
             alone[j] = Kind.STUCK
         elif memory.lag[j]:
             alone[j] = Kind.REPLAY
         elif since[j] == tick or (tick + j) % _EVERY == 0:
-            alone[j] = _alone(shapes, memory, j, int(tick - since[j]), float(variance[j]), alone[j])
+            look.setdefault(int(tick - since[j]), []).append(j)
+    for age, meters in look.items():
+        found = _alone(shapes, memory, np.array(meters), age, variance, heard.alone)
+        for j, kind in zip(meters, found, strict=True):
+            alone[j] = kind
     if new or tick % _EVERY == 0:
         told = _together(shapes, memory, since, variance)
     return Kinds(memory, since, tuple(alone), told)
@@ -222,23 +227,38 @@ def _nobody(meters: int) -> tuple[Ints, tuple[Kind | None, ...], Bools]:
     return none.since, none.alone, none.told
 
 
-def _alone(  # noqa: PLR0917  # one meter, and what is known of it
-    shapes: Shapes, memory: Memory, meter: int, age: int, variance: float, before: Kind | None
-) -> Kind | None:
-    """What one meter's lie looks like by itself."""
-    # What takes a long look to see stays true when the lie rests: a drift that has arrived, a clock in calm.
-    if before is Kind.CLOCK_SHIFT:
-        return before
-    step, heard = shapes.rules.step[meter], min(age, _MANY)
-    if heard >= _FEW:
-        code, model = repeats.past(memory, meter, memory.first, memory.kept)
-        if shifted((code * step) ** 2, model, heard, age, 3.0 * float(np.sqrt(variance))):
-            return Kind.CLOCK_SHIFT
-    if before is Kind.DRIFT:
-        return before
+def _alone(  # noqa: PLR0917  # some meters, and what is known of them
+    shapes: Shapes,
+    memory: Memory,
+    meters: Ints,
+    age: int,
+    variance: Floats,
+    before: tuple[Kind | None, ...],
+) -> Iterator[Kind | None]:
+    """What the lies of meters named at the same time look like, each by itself."""
     start = max(memory.first, memory.tick - 2 * age - 4 * _BINS)
-    code, model = repeats.past(memory, meter, start, memory.kept)
-    return shape((code * step) ** 2 - model, float(np.sqrt(shapes.noise[meter])), age)
+    code, model = repeats.past(memory, meters, start, memory.kept)
+    lies = (code * shapes.rules.step[meters]) ** 2 - model
+    found = _shapes(lies, np.sqrt(shapes.noise[meters]), age)
+    for meter, looks in zip(meters.tolist(), found, strict=True):
+        # What takes a long look to see stays true when the lie rests: a drift that has arrived, a clock in
+        # calm.
+        kind = before[meter]
+        if kind is not Kind.CLOCK_SHIFT and _of_another_time(shapes, memory, meter, age, variance):
+            kind = Kind.CLOCK_SHIFT
+        yield kind if kind in _LASTING else looks
+
+
+_LASTING = (Kind.CLOCK_SHIFT, Kind.DRIFT)
+
+
+def _of_another_time(shapes: Shapes, memory: Memory, meter: int, age: int, variance: Floats) -> bool:
+    heard = min(age, _MANY)
+    if heard < _FEW:
+        return False
+    code, model = repeats.past(memory, meter, memory.first, memory.kept)
+    room = 3.0 * float(np.sqrt(variance[meter]))
+    return bool(shifted((code * shapes.rules.step[meter]) ** 2, model, heard, age, room))
 
 
 def shape(lie: Floats, noise: float, age: int) -> Kind | None:
@@ -257,51 +277,53 @@ def shape(lie: Floats, noise: float, age: int) -> Kind | None:
     age
         How many ticks ago the meter was named.
     """
-    means, white = _means(lie, noise)
-    if means.size < _SHORTEST:
-        return _constant(lie, noise, age)
-    ramps, lasts = _ramps(means.size)
-    left = _left(ramps, means)
-    step = float(left[lasts <= 1].min())
-    best = int(left.argmin())
-    grown = ramps[best] @ (means - means.mean()) / (ramps[best] @ ramps[best])
-    floor = means.size * white**2
-    lasting = lasts[best] >= _LASTS * means.size and left[best] + floor < _BETTER * (step + floor)
-    # What is left must be small against what has grown, or this is just a wild lie.
-    if lasting and np.sqrt(left[best] / means.size) < _LEFT * abs(grown):
+    heard = lie[np.isfinite(lie)]
+    if heard.size and _drifts(heard[:, None], np.array([noise]))[0]:
         return Kind.DRIFT
-    return _constant(lie, noise, age)
-
-
-def _constant(lie: Floats, noise: float, age: int) -> Kind | None:
-    """OFFSET where the lie has been about the same since it was named."""
     now = lie[-(age + 2) :]
     now = now[np.isfinite(now)]
     return Kind.OFFSET if now.size and now.std() < _LEFT * abs(now.mean()) + noise else None
 
 
-def _means(lie: Floats, noise: float) -> tuple[Floats, float]:
-    """Means over equal parts of what was heard, and the noise of one."""
-    heard = lie[np.isfinite(lie)]
-    width = max(1, heard.size // _BINS)
-    count = heard.size // width
-    return heard[heard.size - count * width :].reshape(count, width).mean(axis=1), noise / np.sqrt(width)
+def _shapes(lies: Floats, noise: Floats, age: int) -> list[Kind | None]:
+    """`shape` of several meters' lies, (n, k)."""
+    if not np.isfinite(lies).all():
+        return [shape(lie, std, age) for lie, std in zip(lies.T, noise.tolist(), strict=True)]
+    now = lies[-(age + 2) :]
+    constant = now.std(axis=0) < _LEFT * np.abs(now.mean(axis=0)) + noise
+    both = zip(_drifts(lies, noise).tolist(), constant.tolist(), strict=True)
+    return [Kind.DRIFT if drifts else Kind.OFFSET if rests else None for drifts, rests in both]
+
+
+def _drifts(lies: Floats, noise: Floats) -> Bools:
+    """Which lies, (n, k), grow; by means over equal parts of what was heard."""
+    width = max(1, len(lies) // _BINS)
+    count = len(lies) // width
+    if count < _SHORTEST:
+        return np.zeros(noise.size, dtype=np.bool_)
+    means = lies[len(lies) - count * width :].reshape(count, width, -1).mean(axis=1)
+    ramps, size, lasts = _ramps(count)
+    centred = means - means.mean(axis=0)
+    along = ramps @ centred
+    left = np.maximum(np.einsum("ij,ij->j", centred, centred) - along**2, 0.0)
+    best, at = left.argmin(axis=0), np.arange(noise.size)
+    least, grown = left[best, at], along[best, at] / size[best]
+    floor = count * noise**2 / width
+    lasting = lasts[best] >= _LASTS * count
+    lasting &= least + floor < _BETTER * (left[lasts <= 1].min(axis=0) + floor)
+    # What is left must be small against what has grown, or this is just a wild lie.
+    return np.asarray(lasting & (np.sqrt(least / count) < _LEFT * np.abs(grown)))
 
 
 @cache
-def _ramps(n: int) -> tuple[Floats, Ints]:
-    """All ramps from 0 to 1 over n bins, less their means, and how many bins they last."""
+def _ramps(n: int) -> tuple[Floats, Floats, Ints]:
+    """All ramps from 0 to 1 over n bins, less their means and of size 1; their sizes, and bins they last."""
     begin, end = np.triu_indices(n, 1)
     at = np.arange(n)
     ramps = np.clip((at - begin[:, None]) / (end - begin)[:, None], 0.0, 1.0)
-    return ramps - ramps.mean(axis=1, keepdims=True), np.asarray(end - begin)
-
-
-def _left(ramps: Floats, means: Floats) -> Floats:
-    """Squares that each ramp, of any size and on any level, leaves."""
-    centred = means - means.mean()
-    fit = (ramps @ centred) ** 2 / np.einsum("ij,ij->i", ramps, ramps)
-    return np.asarray(np.maximum(centred @ centred - fit, 0.0))
+    ramps -= ramps.mean(axis=1, keepdims=True)
+    size = np.linalg.norm(ramps, axis=1)
+    return ramps / size[:, None], size, np.asarray(end - begin)
 
 
 def shifted(y: Floats, model: Floats, heard: int, age: int, room: float) -> int:
@@ -379,16 +401,14 @@ def _together(shapes: Shapes, memory: Memory, since: Ints, variance: Floats) -> 
         return np.zeros_like(named)
     # From when all of them are named; evidence is a tick older than a name.
     start = max(memory.first, memory.kept - _EVERY, int(since.max()) - 1)
-    lies, heard = np.zeros(who.size), np.zeros(who.size)
-    for k, j in enumerate(who.tolist()):
-        code, model = repeats.past(memory, j, start, memory.kept)
-        lie = (code * shapes.rules.step[j]) ** 2 - model
-        lie = lie[np.isfinite(lie)]
-        lies[k], heard[k] = lie.mean() if lie.size else 0.0, lie.size
+    code, model = repeats.past(memory, who, start, memory.kept)
+    lies = (code * shapes.rules.step[who]) ** 2 - model
+    heard = np.isfinite(lies).sum(axis=0)
     if not heard.all():
         return np.zeros_like(named)
     spread = variance[who] + shapes.noise[who] / heard
-    return np.where(traced(shapes.traces, who, lies, spread), named, np.zeros_like(named))
+    same = traced(shapes.traces, who, np.nansum(lies, axis=0) / heard, spread)
+    return named if same else np.zeros_like(named)
 
 
 def traced(traces: Traces, who: Ints, lies: Floats, variance: Floats) -> bool:

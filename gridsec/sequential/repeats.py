@@ -278,8 +278,8 @@ def suspicious(memory: Memory) -> Bools:
     return memory.stuck | (memory.lag > 0)
 
 
-def past(memory: Memory, meter: int, start: int, stop: int) -> tuple[Floats, Floats]:
-    """Readings, in steps, and models of one meter at the ticks start to stop - 1.
+def past(memory: Memory, meter: int | Ints, start: int, stop: int) -> tuple[Floats, Floats]:
+    """Readings, in steps, and models of one meter, or some, at the ticks start to stop - 1.
 
     Parameters
     ----------
@@ -292,7 +292,7 @@ def past(memory: Memory, meter: int, start: int, stop: int) -> tuple[Floats, Flo
 
     Returns
     -------
-    code, model : (stop - start,)
+    code, model : (stop - start, …)
         Readings are NaN where there was none.
     """
     code = _column(memory, "code", meter, start, stop).astype(np.float64)
@@ -385,8 +385,8 @@ def repeated(memory: Memory, meter: int, lag: int, most: int) -> int:
     return int(np.count_nonzero(both[differ[-1] + 1 if differ.size else 0 :]))
 
 
-def _column(memory: Memory, name: str, meter: int, start: int, stop: int) -> NDArray[Any]:
-    """One meter's past at the ticks start to stop - 1, from the blocks and the tail."""
+def _column(memory: Memory, name: str, meter: int | Ints, start: int, stop: int) -> NDArray[Any]:
+    """One meter's past, or some meters', at the ticks start to stop - 1, from the blocks and the tail."""
     place = ("code", "hash", "model").index(name)
     begin = memory.first
     skip, last = (start - begin) // ROWS, (stop - 1 - begin) // ROWS

@@ -29,7 +29,7 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import lapack
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.sequential.conditional import Fit, Judged, Move, Prior, admit, drop, follow, judge, loosen
@@ -367,8 +367,12 @@ def robust(prior: Prior, noise: Floats, m: Floats, live: Bools, bound: Floats) -
 def _residual(K: Floats, d: Floats, weight: Floats, y: Floats) -> Floats:
     """``y - w_hat`` for meters with noise ``d / weight``."""
     noise = d / weight
-    whole = K + np.diag(noise)
-    return np.asarray(noise * cho_solve(cho_factor(whole, lower=True, check_finite=False), y))
+    whole: Floats = np.array(K, order="F")
+    whole[np.diag_indices_from(whole)] += noise
+    _, out, failed = lapack.dposv(whole, y, lower=True, overwrite_a=True)
+    if failed:
+        raise np.linalg.LinAlgError("the matrix is not positive definite")
+    return np.asarray(noise * out)
 
 
 @dataclass(frozen=True, slots=True)
@@ -386,6 +390,10 @@ class Swap:
     accused: int
     innocent: int
     worse: float
+
+
+# Accused meters that are exchanged together.
+_COLUMNS = 64
 
 
 def swaps(found: Solution, live: Bools, within: float) -> list[Swap]:
@@ -409,18 +417,20 @@ def swaps(found: Solution, live: Bools, within: float) -> list[Swap]:
         The best exchange of each accused meter for which there is one, cheapest first.
     """
     now, judged = found.fit, found.judged
-    prior, out = now.prior, []
-    for k in np.flatnonzero(live & ~now.trusted).tolist():
-        column = prior.of_meters[prior.meters, k]
-        if now.loose.shape[1]:
-            column = column + now.loose[prior.meters] @ now.loose[prior.meters[k]]
-        v = now.Q @ column
-        s = judged.std[k] ** 2
-        weights = judged.weights - v * (judged.offset[k] / s)
+    prior, accused, out = now.prior, np.flatnonzero(live & ~now.trusted), []
+    inside, diagonal = now.loose[prior.meters], now.Q.diagonal()
+    for first in range(0, accused.size, _COLUMNS):
+        who = accused[first : first + _COLUMNS]
+        columns = prior.of_meters[np.ix_(prior.meters, who)]
+        if inside.shape[1]:
+            columns += inside @ inside[who].T
+        v, s = now.Q @ columns, judged.std[who] ** 2
+        weights = judged.weights[:, None] - v * (judged.offset[who] / s)
         with np.errstate(divide="ignore", invalid="ignore"):
-            gain = np.where(now.trusted, weights**2 / (now.Q.diagonal() + v**2 / s), -np.inf)
-        j = int(np.argmax(gain))
-        worse = float(judged.offset[k] ** 2 / s - gain[j])
-        if worse <= within:
-            out.append(Swap(k, j, max(worse, 0.0)))
+            gain = weights**2 / (diagonal[:, None] + v**2 / s)
+        gain[~now.trusted] = -np.inf
+        best = gain.argmax(axis=0)
+        worse = judged.offset[who] ** 2 / s - gain[best, np.arange(who.size)]
+        near = np.flatnonzero(worse <= within)
+        out += [Swap(int(who[k]), int(best[k]), max(float(worse[k]), 0.0)) for k in near.tolist()]
     return sorted(out, key=lambda swap: swap.worse)
