@@ -233,11 +233,11 @@ def to_frame(site: Site, snapshot: Snapshot) -> Frame:
     Voltages: ``y = v |v|`` in pu, so that a negative reading stays a bad one.
 
     Active power: a register of f = `p_error_percent` and steps of 2 h shows r; the truth is within
-    ``(f |r| + h) / (1 - f)`` of it. What a register shows beyond the customer's largest load, or generation,
-    may be missing from the truth: a load that is not there is the cover of colluding voltage meters, and a
-    connection limits what it can hide. Where there is no reading, or one that is not finite or beyond anything
-    the customer could draw, all that is known is the interval from full generation without load to full
-    load without generation.
+    ``(f |r| + h) / (1 - f)`` of it. Beyond the customer's largest load or generation it is believed less and
+    less, and at twice of that not at all: a load that is not there is the cover of colluding voltage meters,
+    and a connection limits what it can pretend. Where there is no reading, or one that is not finite or
+    beyond anything the customer could draw, all that is known is the interval from full generation without
+    load to full load without generation.
 
     Reactive power of the load (the inverter's is the observer's business): with net import P, the load
     alone lies in ``[max(P, 0), max(P, min(P + pv, load_kw))]``, each end widened by the error of P;
@@ -262,8 +262,9 @@ def to_frame(site: Site, snapshot: Snapshot) -> Frame:
     known = np.abs(metered) <= model.credible  # False for NaN
     p = np.where(known, metered, 0.5 * (model.load_peak - model.pv_peak))
     beyond = np.maximum(p - model.load_peak, 0.0) + np.maximum(-p - model.pv_peak, 0.0)
+    doubt = np.minimum(2.0 * beyond, np.abs(p))
     p_error = np.where(
-        known, model.p_fraction * np.abs(p) + model.p_floor + beyond, 0.5 * (model.load_peak + model.pv_peak)
+        known, model.p_fraction * np.abs(p) + model.p_floor + doubt, 0.5 * (model.load_peak + model.pv_peak)
     )
     low = np.maximum(p - p_error, 0.0)
     most = np.minimum(p + p_error + model.pv_peak, model.load_peak)

@@ -17,7 +17,7 @@ from gridsec.judge import Situation, decide
 from gridsec.online import Cause, Decision, Estimate, Explanation, Frame, Verdict
 from gridsec.sequential.conditional import judge
 from gridsec.sequential.design import SequentialDesign
-from gridsec.sequential.examine import Examined
+from gridsec.sequential.examine import Examined, suspicions
 from gridsec.sequential.state import SequentialState
 
 
@@ -194,6 +194,7 @@ def _amounts(design: SequentialDesign, state: SequentialState, seen: Examined) -
     With prior variance s^2 and direction a the posterior mean is ``s^2 a^T Q m``.
     """
     out: dict[int, float] = {}
+    book = suspicions(design, state.doubts)
     for k, s in state.trust.accused:
         view, now = seen.views[s], state.fits[s]
         if view is not None:
@@ -202,7 +203,7 @@ def _amounts(design: SequentialDesign, state: SequentialState, seen: Examined) -
             weights = now.Q @ (state.window.sums[s] / np.maximum(state.window.counts[s], 1))
         else:
             continue
-        out[k] = float(design.book.std[k] ** 2 * design.book.along(weights)[k])
+        out[k] = float(book.std[k] ** 2 * book.along(weights)[k])
     return out
 
 

@@ -22,10 +22,10 @@ from gridsec.lure import Lure, close_loop
 from gridsec.plant import Plant
 from gridsec.sequential.conditional import Prior
 from gridsec.sequential.decoder import Decoder
+from gridsec.sequential.dictionary import Dictionary
 from gridsec.sequential.kinds import Shapes, Traces
 from gridsec.sequential.loads import LoadDoubt, injection_doubt, prior, squares
 from gridsec.sequential.repeats import rules
-from gridsec.sequential.search import Dictionary
 
 YEAR_S = 365.25 * 86400.0
 
@@ -56,8 +56,8 @@ class SequentialOptions:
     like
         Explanations no more than this factor less likely than the best are given with it.
     hidden_power
-        Power that a customer's readings may hide, standard deviation, pu: prior of accusing a customer's
-        powers instead of meters.
+        Power that a customer's readings may hide besides what they claim, standard deviation, pu: prior of
+        accusing a customer's powers.
     hidden_charge
         What accusing a customer's powers costs, in accusations of a meter. Loads are promised to be
         within `LoadDoubt`; the higher, the more meters' word is against that of one promise.
@@ -344,12 +344,18 @@ def _suspicions(plant: Plant, options: SequentialOptions) -> Dictionary:
         std=np.concatenate([np.full(customers, options.hidden_power), 2.0 * plant.droop.limit]),
         charge=np.repeat([options.hidden_charge, 1.0], [customers, own.size]),
         size=np.concatenate([load, injection[own]]),
+        meter=np.concatenate([_meter_at(plant), np.full(own.size, -1)]),
         columns=columns,
         along=along,
     )
 
 
 def _meter_of(plant: Plant) -> Ints:
+    return np.asarray(_meter_at(plant)[plant.droop.customer])
+
+
+def _meter_at(plant: Plant) -> Ints:
+    """Meter of each customer; -1 for none."""
     at = np.full(plant.feeder.bus.size, -1, dtype=np.intp)
     at[plant.meters] = np.arange(plant.meters.size)
-    return np.asarray(at[plant.droop.customer])
+    return at

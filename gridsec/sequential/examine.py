@@ -11,14 +11,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats
+from gridsec.arrays import Bools, Floats, Ints
 from gridsec.sequential import search
 from gridsec.sequential.commission import Learned
 from gridsec.sequential.conditional import Fit, Judged, Prior, admit, drop, fit, judge
 from gridsec.sequential.decoder import Accused, Evidence
 from gridsec.sequential.design import SequentialDesign
-from gridsec.sequential.search import Dictionary, Explanation, Found, Limits, Solution, likelier
-from gridsec.sequential.state import SequentialState, Trust
+from gridsec.sequential.dictionary import Dictionary
+from gridsec.sequential.search import Explanation, Found, Limits, Solution, likelier
+from gridsec.sequential.state import Doubts, SequentialState, Trust
 from gridsec.sequential.windows import Window
 
 
@@ -79,6 +80,8 @@ class Examined:
 _LOOKS = 8
 # With more meters than this beyond their limits at once, moving one after the other is no good start.
 _FEW = 32
+# With no more suspects than this, whether each of them could be honest is looked into by a search.
+_CLOSE = 8
 # A fit is made anew when that part of its meters changed, or after so many changes (rounding).
 _ANEW = 6
 _MOST_CHANGES = 400
@@ -103,6 +106,7 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats) -> 
     after: list[Fit | None] = []
     found: dict[int, Found] = {}
     scales = _Scales(design, prior, window, state.learned, model)
+    book = suspicions(design, state.doubts)
     for s, length in enumerate(design.lengths):
         before = fits[s]
         stale = before is None or bool((before.trusted & ~trust.trusted).any())
@@ -111,16 +115,14 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats) -> 
             after.append(before)
             continue
         here = scales[s]
-        now = adapt(
-            before, prior, here.noise, trust.trusted & here.enough, _directions(design, trust.accused)
-        )
+        now = adapt(before, prior, here.noise, trust.trusted & here.enough, _directions(book, trust.accused))
         view = _view(design, here, now)
         if design.decoder is not None:
             found[s], trust = _decoded(design, here, now, trust, s)
             now = found[s].best.fit
             view = _view(design, here, now)
         elif (view.over & trust.trusted).any() or _due(design, trust, view, s, tick):
-            found[s], trust = _Search(design, scales, fits, trust, s)(now, view)
+            found[s], trust = _Search(design, scales, book, fits, trust, s)(now, view)
             now = found[s].best.fit
             view = _view(design, here, now)
         bad[s] = still[s] = False
@@ -129,6 +131,18 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats) -> 
         views.append(view)
         after.append(now)
     return Examined(trust, tuple(after), tuple(views), found)
+
+
+def suspicions(design: SequentialDesign, doubts: Doubts) -> Dictionary:
+    """What else but meters can be wrong now: false powers are of the size of what is claimed.
+
+    Parameters
+    ----------
+    design, doubts
+        The design, and what the frame claims.
+    """
+    rest = design.book.std[design.customers :]
+    return replace(design.book, std=np.concatenate([doubts.claims, rest]))
 
 
 def ended(design: SequentialDesign, trust: Trust, seen: Examined, window: Window) -> Bools:
@@ -172,8 +186,8 @@ def _due(design: SequentialDesign, trust: Trust, view: View, s: int, tick: int) 
         return True
     if trust.trusted.all():
         return False
-    about = ~trust.trusted & ~trust.named & view.over & (trust.scale == s)
-    if (about & (trust.age + 1 >= confirm(design.lengths[s]))).any():
+    about = ~trust.trusted & ~trust.named & view.over
+    if (about & (trust.age + 1 >= confirmed(design)[trust.scale])).any():
         return True
     last = len(design.lengths) - 1
     return s == last and tick % design.lengths[last] == 0
@@ -188,6 +202,17 @@ def confirm(length: int) -> int:
         Ticks of the scale.
     """
     return 2 + length // 6
+
+
+def confirmed(design: SequentialDesign) -> Ints:
+    """The same for every scale, (s,).
+
+    Parameters
+    ----------
+    design
+        The design.
+    """
+    return np.array([confirm(length) for length in design.lengths])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -227,12 +252,12 @@ def _view(design: SequentialDesign, here: _Scale, now: Fit) -> View:
     return View(judged, here.enough, limit, over, here.limits, design.options.lower)
 
 
-def _directions(design: SequentialDesign, accused: tuple[tuple[int, int], ...]) -> Floats | None:
+def _directions(book: Dictionary, accused: tuple[tuple[int, int], ...]) -> Floats | None:
     """Loosened directions, (n, k)."""
     if not accused:
         return None
     which = np.array([k for k, _ in accused])
-    return np.asarray(design.book.columns(which) * design.book.std[which])
+    return np.asarray(book.columns(which) * book.std[which])
 
 
 def adapt(before: Fit | None, prior: Prior, noise: Floats, wanted: Bools, loose: Floats | None) -> Fit:
@@ -269,17 +294,25 @@ class _Search:
 
     The starts: what was believed, without what this scale and shorter ones suspect besides meters; where
     several meters are suspected, a robust fit and all meters close to the model; and where any is, what was
-    believed with suspicions besides meters. Longer means know better, so they decide anew about what
-    shorter ones suspected.
+    believed with suspicions besides meters. Where few are, everybody is believed once more, and meters may
+    fall in pairs; then for each suspect the likeliest explanation in which it is honest. Longer means know
+    better, so they decide anew about what shorter ones suspected.
 
     Meters against which other scales have evidence are not admitted, or lies that have just begun would
     be believed again. Unless the explanation that does admit them is cheaper over all scales together.
     """
 
-    def __init__(
-        self, design: SequentialDesign, scales: _Scales, fits: tuple[Fit | None, ...], trust: Trust, s: int
+    def __init__(  # noqa: PLR0917  # what is known, in the order it becomes known
+        self,
+        design: SequentialDesign,
+        scales: _Scales,
+        book: Dictionary,
+        fits: tuple[Fit | None, ...],
+        trust: Trust,
+        s: int,
     ) -> None:
-        self.design, self.scales, self.fits, self.trust, self.s = design, scales, fits, trust, s
+        self.design, self.scales, self.book = design, scales, book
+        self.fits, self.trust, self.s = fits, trust, s
         here = scales[s]
         sigmas = min(design.suspect, here.limits.sigmas)
         self.here = replace(here, limits=replace(here.limits, sigmas=sigmas))
@@ -300,11 +333,48 @@ class _Search:
             else:
                 found, free = likelier(found, free), None
         if few and self._suspected(found) > 0:
-            found = likelier(found, Found(self._descend(start, self.keep, self.design.book)))
+            found = likelier(found, Found(self._descend(start, self.keep, self.book)))
+            if self._suspected(found) <= _CLOSE:
+                nobody, all_ = np.zeros_like(self.keep), self._fit(self.here.enough)
+                close = self._descend(all_, nobody, self.book, pairs=True, fresh=True)
+                free = likelier(free, Found(close))
         best = found.best
-        if free is not None and free.best.cost < best.cost and self._total(free.best) < self._total(best):
-            found = Found(free.best, (best.bare(), *found.others))
+        if free is not None:
+            better = free.best.cost < best.cost and self._total(free.best) < self._total(best)
+            first, second = (free, found) if better else (found, free)
+            found = Found(first.best, (second.best.bare(), *first.others, *second.others))
+        rivals = (*found.others, *self._instead(found.best))
+        found = replace(found, others=tuple(self._compared(found.best, other) for other in rivals))
         return found, self._believe(found.best)
+
+    def _instead(self, best: Solution) -> list[Explanation]:
+        """Explanations in which one of those who might be named is honest."""
+        fresh = self.here.enough & ~best.trusted & ~self.trust.named
+        if np.count_nonzero(fresh) > _CLOSE:
+            return []
+        out, keep = [], self.keep & self.trust.named
+        # Nobody is named by this: whatever makes an explanation cheaper is worth trying.
+        fair = float(np.sqrt(search.price(fresh.size, 1)))
+        limits = replace(self.here.limits, sigmas=min(self.here.limits.sigmas, fair))
+        for j in np.flatnonzero(fresh).tolist():
+            other = self._descend(best.fit, keep, self.book, innocent=j, pairs=True, limits=limits)
+            if np.count_nonzero(self.here.enough & ~other.trusted) <= self.design.most:
+                charge = best.charge + other.charge
+                cost, loosened = best.charge + other.cost, best.loosened + other.loosened
+                out.append(Explanation(other.trusted, loosened, charge, cost))
+        return out
+
+    def _compared(self, best: Solution, other: Explanation) -> Explanation:
+        """A rival, at what it costs on the scale that speaks most against it.
+
+        Long means hardly know yet of a lie that has just begun, short ones hardly see a small one.
+        """
+        same = other.loosened == best.loosened and np.array_equal(other.trusted, best.trusted)
+        if same or other.cost - best.cost > 2.0 * np.log(self.design.options.like):
+            return other
+        prices = self._prices(other) - self._prices(best)
+        both = zip(self._misfits(other), self._misfits(best), strict=True)
+        return replace(other, cost=best.cost + prices + max(theirs - ours for theirs, ours in both))
 
     def _suspected(self, found: Found) -> int:
         """How many meters are suspected at least."""
@@ -331,28 +401,54 @@ class _Search:
         return chosen, here.enough & (np.abs(here.m) <= here.limits.model + focus * alone)
 
     def _descend(
-        self, start: Fit, keep: Bools, book: Dictionary | None = None, *, fresh: bool = False
+        self,
+        start: Fit,
+        keep: Bools,
+        book: Dictionary | None = None,
+        *,
+        innocent: int | None = None,
+        pairs: bool = False,
+        limits: Limits | None = None,
+        fresh: bool = False,
     ) -> Solution:
         here = self.here
         return search.descend(
-            start, here.m, here.enough, here.limits, keep=keep, dictionary=book, fresh=fresh
+            start,
+            here.m,
+            here.enough,
+            here.limits if limits is None else limits,
+            keep=keep,
+            dictionary=book,
+            innocent=innocent,
+            pairs=pairs,
+            fresh=fresh,
         )
 
     def _fit(self, trusted: Bools) -> Fit:
-        loose = _directions(self.design, self.accused)
+        loose = _directions(self.book, self.accused)
         return fit(self.scales.prior, self.here.noise, trusted & self.here.enough, loose)
 
-    def _total(self, found: Solution) -> float:
+    def _total(self, found: Explanation) -> float:
         """The misfit on all scales and, once, what the accusations cost."""
-        trusted = np.where(self.here.enough, found.trusted, self.trust.trusted)
-        loose = found.fit.loose if found.fit.loose.shape[1] else None
-        total = found.charge + search.price(trusted.size, int(np.count_nonzero(~trusted)))
+        return self._prices(found) + sum(self._misfits(found))
+
+    def _prices(self, found: Explanation) -> float:
+        suspects = int(np.count_nonzero(~self._trusted(found)))
+        return found.charge + search.price(self.keep.size, suspects)
+
+    def _trusted(self, found: Explanation) -> Bools:
+        return np.where(self.here.enough, found.trusted, self.trust.trusted)
+
+    def _misfits(self, found: Explanation) -> list[float]:
+        """What an explanation leaves unexplained on each scale."""
+        trusted, out = self._trusted(found), []
+        loose = _directions(self.book, (*self.accused, *((k, self.s) for k in found.loosened)))
         for s, before in enumerate(self.fits):
             there = self.scales[s]
-            wanted = trusted & there.enough
-            now = found.fit if s == self.s else adapt(before, self.scales.prior, there.noise, wanted, loose)
-            total += judge(now, there.m).misfit
-        return float(total)
+            known = found.fit if s == self.s and isinstance(found, Solution) else None
+            now = known or adapt(before, self.scales.prior, there.noise, trusted & there.enough, loose)
+            out.append(judge(now, there.m).misfit)
+        return out
 
     def _believe(self, best: Explanation) -> Trust:
         trust = self.trust

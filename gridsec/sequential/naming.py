@@ -15,7 +15,7 @@ import numpy as np
 from gridsec.arrays import Bools, Ints
 from gridsec.online import Explanation
 from gridsec.sequential.design import SequentialDesign
-from gridsec.sequential.examine import Examined, confirm
+from gridsec.sequential.examine import Examined, confirm, confirmed
 from gridsec.sequential.search import swaps
 from gridsec.sequential.state import Trust
 
@@ -39,8 +39,8 @@ def name(design: SequentialDesign, before: Trust, seen: Examined) -> tuple[Trust
     quiet = np.where(trust.still.any(axis=0), 0, trust.quiet + 1)
     trusted = (trust.trusted & ~before.named) | (quiet >= design.options.release)
     age = np.where(trusted, 0, trust.age + 1)
-    need = np.array([confirm(length) for length in design.lengths])[trust.scale]
-    fresh = ~trusted & ~before.named & trust.bad.any(axis=0) & (age >= need)
+    need = confirmed(design)[trust.scale]
+    fresh = ~trusted & ~before.named & trust.bad.any(axis=0) & (age >= need) & _accused(seen, trusted.size)
     named = before.named & (quiet < design.options.release)
     count, inverters = _inverters(design, before, trust)
     new = inverters & ~before.inverters
@@ -50,6 +50,14 @@ def name(design: SequentialDesign, before: Trust, seen: Examined) -> tuple[Trust
         inverters = inverters & (before.inverters | rival.inverters)
     trust = replace(trust, trusted=trusted, age=age, quiet=quiet, named=named | fresh)
     return replace(trust, counted=count, inverters=inverters), rivals
+
+
+def _accused(seen: Examined, meters: int) -> Bools:
+    """Whom the likeliest explanation of a scale accuses that was searched for at this very tick, (p,)."""
+    out = np.zeros(meters, dtype=np.bool_)
+    for found in seen.found.values():
+        out |= ~found.best.trusted
+    return out
 
 
 def _inverters(design: SequentialDesign, before: Trust, trust: Trust) -> tuple[Ints, Bools]:
@@ -84,7 +92,7 @@ def inverters_of(design: SequentialDesign, accused: Sequence[int]) -> Bools:
 def _rivals(design: SequentialDesign, seen: Examined, fresh: Bools, new: Bools) -> tuple[Explanation, ...]:
     """All explanations about as likely as the best, where one leaves out somebody about to be named."""
     within = 2.0 * float(np.log(design.options.like))
-    out: list[tuple[Bools, Bools, float]] = []
+    out: dict[bytes, tuple[Bools, Bools, float]] = {}
     for found in seen.found.values():
         best = found.best
         near = [(~each.trusted, each.loosened, each.cost - best.cost) for each in (best, *found.others)]
@@ -96,8 +104,11 @@ def _rivals(design: SequentialDesign, seen: Examined, fresh: Bools, new: Bools) 
             inverters = inverters_of(design, loosened)
             differs = (fresh & ~meters).any() or (new & ~inverters).any()
             if not k or (worse <= within and differs):
-                out.append((meters, inverters, float(np.exp(-0.5 * worse))))
-    if not any((fresh & ~meters).any() or (new & ~inverters).any() for meters, inverters, _ in out):
+                who, weight = meters.tobytes() + inverters.tobytes(), float(np.exp(-0.5 * worse))
+                if who not in out or out[who][2] < weight:
+                    out[who] = (meters, inverters, weight)
+    ways = sorted(out.values(), key=lambda way: -way[2])
+    if not any((fresh & ~meters).any() or (new & ~inverters).any() for meters, inverters, _ in ways):
         return ()
-    total = sum(weight for _, _, weight in out)
-    return tuple(Explanation(meters, inverters, weight / total) for meters, inverters, weight in out)
+    total = sum(weight for _, _, weight in ways)
+    return tuple(Explanation(meters, inverters, weight / total) for meters, inverters, weight in ways)

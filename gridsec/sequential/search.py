@@ -24,40 +24,15 @@ non-convexity, truncated least squares).
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 from scipy.linalg import lapack
 
 from gridsec.arrays import Bools, Floats, Ints
-from gridsec.sequential.conditional import Fit, Judged, Move, Prior, admit, drop, follow, judge, loosen
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Dictionary:
-    """Directions that can be loosened. n buses, p meters, k directions.
-
-    Attributes
-    ----------
-    std : (k,)
-        How much of what is doubted there may be, pu.
-    charge : (k,)
-        What accusing it costs, in accusations of a meter.
-    size : (k,)
-        Sum over the meters of the squares of what a direction changes there.
-    columns
-        `columns(which)` are the changes of every squared voltage per unit of what is doubted, (n, …).
-    along
-        `along(weights)` is the weighted sum of each direction's changes at the meters, (k,).
-    """
-
-    std: Floats
-    charge: Floats
-    size: Floats
-    columns: Callable[[Ints], Floats]
-    along: Callable[[Floats], Floats]
+from gridsec.sequential.conditional import Fit, Judged, Move, Prior, admit, drop, follow, judge
+from gridsec.sequential.dictionary import Dictionary, Powers, Step
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -186,6 +161,8 @@ def descend(
     *,
     keep: Bools,
     dictionary: Dictionary | None = None,
+    innocent: int | None = None,
+    pairs: bool = False,
     fresh: bool = False,
 ) -> Solution:
     """Drop, admit and loosen until no move makes the explanation better.
@@ -204,26 +181,36 @@ def descend(
         Meters that must not be admitted.
     dictionary
         Directions that may be loosened; none by default.
+    innocent
+        A meter that must be believed.
+    pairs
+        Whether two meters may be dropped at once. Two that tell the same story vouch for each other, so that
+        dropping either of them gains little; O(p^2) per move.
     fresh
         `start` is of no further use.
     """
     now = start if fresh else start.copy()
     barred = ~live | keep
+    if innocent is not None and not now.trusted[innocent]:
+        admit(now, innocent)
     for j in np.flatnonzero(now.trusted & ~live):
         drop(now, int(j))
     judged = judge(now, m)
-    powers = None if dictionary is None else _Powers(now, dictionary, judged.weights)
-    accused: list[int] = []
+    powers = None if dictionary is None else Powers(now, dictionary, judged.weights)
     for _ in range(_MOVES_PER_METER * m.size):
-        move = _best(_Place(now, judged, limits, barred, powers, accused))
-        if move is None:
+        steps = _best(_Place(now, judged, limits, barred, innocent, pairs, powers))
+        if not steps:
             break
-        judged = follow(now, m, judged, move())
+        for step in steps:
+            judged = follow(now, m, judged, step())
     judged = judge(now, m)  # without what rounding has left
     dropped = int(np.count_nonzero(live & ~now.trusted))
-    loosened = () if powers is None else tuple(powers.index[accused].tolist())
+    loosened = () if powers is None else powers.loosened
     size = int(np.count_nonzero(live))
-    charge = 0.0 if dictionary is None else float(dictionary.charge[list(loosened)].sum()) * price(size, 1)
+    charge = 0.0
+    if dictionary is not None and loosened:
+        charges = dictionary.charges(np.array(loosened, dtype=np.intp), now.trusted)
+        charge = float(charges.sum()) * price(size, 1)
     cost = judged.misfit + price(size, dropped) + charge
     return Solution(now.trusted, loosened, charge, cost, now, judged)
 
@@ -253,66 +240,80 @@ class _Place:
     judged: Judged
     limits: Limits
     barred: Bools
-    powers: _Powers | None
-    accused: list[int]
+    innocent: int | None
+    pairs: bool
+    powers: Powers | None
 
 
-def _best(here: _Place) -> Callable[[], Move] | None:
-    """The next move, or None where none helps."""
+def _best(here: _Place) -> list[Step]:
+    """The next move in steps; none where none helps."""
     now, judged, powers = here.fit, here.judged, here.powers
     excess = np.abs(judged.offset) / here.limits.of(judged.std)
     inside = np.where(now.trusted, excess, -np.inf)
+    if here.innocent is not None:
+        inside[here.innocent] = -np.inf
     worst = int(np.argmax(inside))
     drops = bool(inside[worst] > 1.0)
-    if powers is not None:
-        gains = powers.gains(judged.weights) - here.limits.penalty * powers.charge
-        gains[here.accused] = -np.inf
-        first = int(np.argmax(gains))
-        other = (judged.offset[worst] / judged.std[worst]) ** 2 - here.limits.penalty if drops else 0.0
-        if gains[first] > max(other, 0.0):
-            return lambda: powers.loosen(now, first, here.accused)
-    if drops:
-        return lambda: _moved(drop(now, worst), powers)
+    steps: list[Step] = [partial(_drop, now, worst, powers)] if drops else []
+    if here.pairs or powers is not None:
+        gain = (judged.offset[worst] / judged.std[worst]) ** 2 - here.limits.penalty if drops else 0.0
+        gain = max(float(gain), 0.0)
+        if here.pairs:
+            pair, gain = _pair(here, gain)
+            steps = [partial(_drop, now, j, powers) for j in pair] or steps
+        if powers is not None:
+            steps = powers.best(judged, here.limits.penalty, gain, here.innocent) or steps
+    if steps:
+        return steps
     outside = np.where(now.trusted | here.barred, np.inf, excess)
     nearest = int(np.argmin(outside))
     if outside[nearest] < 1.0:
-        return lambda: _moved(admit(now, nearest), powers)
-    return None
+        return [lambda: _moved(admit(now, nearest), powers)]
+    return []
 
 
-def _moved(move: Move, powers: _Powers | None) -> Move:
-    if powers is not None:
-        powers.change(move)
-    return move
+# Pairs are looked for among so many meters, those that dropping alone gains most for.
+_PAIRED = 256
 
 
-# So many directions of a dictionary are tried, those that the residuals point at most.
-_CANDIDATES = 64
+def _pair(here: _Place, than: float) -> tuple[tuple[int, ...], float]:
+    """Two meters that it pays to drop together, and what that gains; none unless more than `than`.
+
+    With b = Q m and G = Q of the two, ``b^T G^-1 b``; their offsets judged by all others are ``G^-1 b``.
+    """
+    now, weights = here.fit, here.judged.weights
+    free = now.trusted.copy()
+    if here.innocent is not None:
+        free[here.innocent] = False
+    at = np.flatnonzero(free)
+    if at.size > _PAIRED:
+        at = np.sort(at[np.argsort(-(weights[at] ** 2) / now.Q[at, at])[:_PAIRED]])
+    if at.size < 2:
+        return (), than
+    Q, b = now.Q[np.ix_(at, at)], weights[at]
+    d = Q.diagonal()
+    determinant = np.multiply.outer(d, d) - Q * Q
+    np.fill_diagonal(determinant, np.inf)
+    squares = np.multiply.outer(b * b, d)
+    gain = (squares + squares.T - 2.0 * np.multiply.outer(b, b) * Q) / determinant
+    first, second = divmod(int(np.argmax(gain)), at.size)
+    net = float(gain[first, second]) - 2.0 * here.limits.penalty
+    if not net > than:
+        return (), than
+    pick = np.array([first, second])
+    left_open, std = np.linalg.inv(Q[np.ix_(pick, pick)]), np.zeros(weights.size)
+    std[at[pick]] = np.sqrt(left_open.diagonal())
+    if not (np.abs(left_open @ b[pick]) > here.limits.of(std)[at[pick]]).all():
+        return (), than
+    return tuple(at[pick].tolist()), net
 
 
-class _Powers:
-    """Gains of loosening, kept up to date: diag(A^T Q A) changes with Q by squares of one vector."""
+def _drop(now: Fit, j: int, powers: Powers | None) -> Move:
+    return _moved(drop(now, j), powers)
 
-    def __init__(self, now: Fit, dictionary: Dictionary, weights: Floats) -> None:
-        towards = dictionary.along(weights) ** 2 / np.maximum(dictionary.size, _FEATHER)
-        self.index = np.argsort(-towards)[:_CANDIDATES]
-        self.columns = dictionary.columns(self.index)
-        self.seen = self.columns[now.prior.meters]
-        self.std, self.charge = dictionary.std[self.index], dictionary.charge[self.index]
-        self.form = np.einsum("ij,ij->j", now.Q @ self.seen, self.seen)
 
-    def gains(self, weights: Floats) -> Floats:
-        """How much each direction would lower the misfit, (k,)."""
-        return np.asarray((weights @ self.seen) ** 2 / (self.std**-2.0 + self.form))
-
-    def change(self, move: Move) -> None:
-        """Q has changed."""
-        self.form += move.factor * (move.q @ self.seen) ** 2
-
-    def loosen(self, now: Fit, k: int, accused: list[int]) -> Move:
-        """Loosen a direction."""
-        accused.append(k)
-        return _moved(loosen(now, self.columns[:, k], float(self.std[k])), self)
+def _moved(move: Move, powers: Powers | None) -> Move:
+    return move if powers is None else powers.follow(move)
 
 
 _HARDER = 2.5

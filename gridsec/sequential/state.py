@@ -69,12 +69,15 @@ class Doubts:
         Whether there is a busbar voltage.
     prior
         What follows.
+    claims : (N,)
+        How large the customers say that their active powers are, rounded up, pu: what may be false.
     """
 
     p: Floats
     q: Floats
     busbar: bool
     prior: Prior
+    claims: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,7 +176,7 @@ def init(
             np.zeros(m, dtype=np.bool_),
         ),
         fits=(None,) * s,
-        doubts=Doubts(one, one, True, design.prior),
+        doubts=Doubts(one, one, True, design.prior, design.book.std[:customers]),
         learning=known.learning,
         learned=known.learned,
         model_error=np.zeros(p),

@@ -236,8 +236,9 @@ def _doubts(design: SequentialDesign, before: Doubts, frame: Frame, busbar: bool
             (frame.q_error, design.doubt.q, before.q),
         )
     )
+    claims = _claims(np.abs(frame.p), design.options.hidden_power, before.claims)
     if busbar == before.busbar and np.array_equal(p, before.p) and np.array_equal(q, before.q):
-        return before
+        return before if claims is before.claims else replace(before, claims=claims)
     doubt = replace(
         design.doubt,
         p=np.where(p > 1.0, np.maximum(design.doubt.p, _EXACT) * p, design.doubt.p),
@@ -255,7 +256,15 @@ def _doubts(design: SequentialDesign, before: Doubts, frame: Frame, busbar: bool
             inverters=design.injections,
         )
     )
-    return Doubts(p, q, busbar, found)
+    return Doubts(p, q, busbar, found, claims)
+
+
+def _claims(power: Floats, least: float, old: Floats) -> Floats:
+    """Powers rounded up to powers of two, and kept while they are close to that."""
+    fine = (power <= old) & ((old <= least) | (4.0 * power >= old))
+    if fine.all():
+        return old
+    return np.where(fine, old, np.maximum(np.exp2(np.ceil(np.log2(np.maximum(power, least)))), least))
 
 
 # Powers are known no better than this, pu.

@@ -237,6 +237,7 @@ def reference(tables: FeederTables, p_kw: float, q_kvar: float, row: CustomerRow
     if abs(p_kw) <= limit:
         share = percent / 100.0
         p, p_error = p_kw, (share * abs(p_kw) + 0.5 * meters.p_resolution_kw) / (1.0 - share)
+        p_error += min(2.0 * max(p_kw - row.load_kw, -p_kw - row.pv_kw, 0.0), abs(p_kw))
     else:
         p, p_error = (row.load_kw - row.pv_kw) / 2.0, (row.load_kw + row.pv_kw) / 2.0
     smallest = max(p - p_error, 0.0)

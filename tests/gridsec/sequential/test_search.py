@@ -11,8 +11,9 @@ import pytest
 from gridsec.arrays import Bools, Floats
 from gridsec.feeder import lindistflow
 from gridsec.sequential.conditional import Prior, fit, judge
+from gridsec.sequential.dictionary import Dictionary
 from gridsec.sequential.loads import LoadDoubt, prior
-from gridsec.sequential.search import Dictionary, Limits, descend, price, robust, swaps
+from gridsec.sequential.search import Limits, descend, price, robust, swaps
 from tests.gridsec.street import random_tree
 
 SIGMAS = 3.5
@@ -128,6 +129,7 @@ def test_a_load_that_nobody_knows_is_one_suspicion_and_not_many_liars() -> None:
         std=np.full(20, 0.1),
         charge=np.full(20, 3.0),
         size=(columns[1:] ** 2).sum(axis=0),
+        meter=np.full(20, -1),
         columns=lambda which: columns[:, which],
         along=lambda weights: weights @ columns[1:],
     )

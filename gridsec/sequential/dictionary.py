@@ -1,0 +1,157 @@
+"""What else but meters can be wrong: directions that an explanation may loosen, and what that gains.
+
+Loosening direction a with standard deviation s lowers the misfit ``m^T Q m`` by
+
+    (a^T Q m)^2 / (1 / s^2 + a^T Q a),
+
+dropping meter j as well by ``g^T G^-1 g`` with g and G the weights and the precision of both. A customer who
+lies about its voltage may lie about its powers, and a made-up load only fits to made-up voltages: so the pair
+is one move.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats, Ints
+from gridsec.sequential.conditional import Fit, Judged, Move, drop, loosen
+
+OF_A_LIAR = 2.0
+"""What accusing the powers of a customer costs whose voltage meter is accused already."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Dictionary:
+    """Directions that can be loosened. n buses, p meters, k directions.
+
+    Attributes
+    ----------
+    std : (k,)
+        How much of what is doubted there may be, pu.
+    charge : (k,)
+        What accusing it costs, in accusations of a meter.
+    size : (k,)
+        Sum over the meters of the squares of what a direction changes there.
+    columns
+        `columns(which)` are the changes of every squared voltage per unit of what is doubted, (n, …).
+    meter : (k,)
+        Meter of the customer whose powers it doubts; -1 for none. Who is accused of lying about the voltage
+        is not believed about powers either: that costs no more than `OF_A_LIAR`.
+    along
+        `along(weights)` is the weighted sum of each direction's changes at the meters, (k,).
+    """
+
+    std: Floats
+    charge: Floats
+    size: Floats
+    meter: Ints
+    columns: Callable[[Ints], Floats]
+    along: Callable[[Floats], Floats]
+
+    def charges(self, which: Ints, trusted: Bools) -> Floats:
+        """What accusing some directions costs, in accusations of a meter.
+
+        Parameters
+        ----------
+        which : (c,)
+            The directions.
+        trusted : (p,)
+            Which meters are believed.
+        """
+        charge, of_liar = self.charge[which], (self.meter[which] >= 0) & ~trusted[self.meter[which]]
+        return np.where(of_liar, np.minimum(charge, OF_A_LIAR), charge)
+
+
+# So many directions are tried, those that the residuals point at most.
+_CANDIDATES = 64
+_TINY = 1e-6
+
+Step = Callable[[], Move]
+"""Changes a fit when called."""
+
+
+class Powers:
+    """Gains of loosening, kept up to date: diag(A^T Q A) changes with Q by squares of one vector.
+
+    Parameters
+    ----------
+    now
+        Where a search begins; its steps change it.
+    dictionary
+        What may be loosened.
+    weights : (p,)
+        Q m.
+    """
+
+    def __init__(self, now: Fit, dictionary: Dictionary, weights: Floats) -> None:
+        towards = dictionary.along(weights) ** 2 / np.maximum(dictionary.size, _TINY)
+        self.dictionary, self.now = dictionary, now
+        self.index = np.argsort(-towards)[:_CANDIDATES]
+        self.columns = dictionary.columns(self.index)
+        self.seen = self.columns[now.prior.meters]
+        self.std, self.meter = dictionary.std[self.index], dictionary.meter[self.index]
+        self.form = np.einsum("ij,ij->j", now.Q @ self.seen, self.seen)
+        self.accused: list[int] = []
+
+    @property
+    def loosened(self) -> tuple[int, ...]:
+        """What has been loosened, indices into the dictionary."""
+        return tuple(self.index[self.accused].tolist())
+
+    def best(self, judged: Judged, penalty: float, than: float, innocent: int | None) -> list[Step]:
+        """Loosening a direction, alone or with its meter dropped as well; nothing unless it gains more.
+
+        Parameters
+        ----------
+        judged
+            Where the search stands.
+        penalty
+            What an accusation must gain at least.
+        than
+            What something else would gain.
+        innocent
+            A meter that is not dropped.
+        """
+        alone = self._alone(judged.weights) - penalty * self.dictionary.charges(self.index, self.now.trusted)
+        both = self._with_meter(judged.weights) - penalty * (1.0 + OF_A_LIAR)
+        if innocent is not None:
+            both[self.meter == innocent] = -np.inf
+        alone[self.accused] = both[self.accused] = -np.inf
+        k, pair = int(np.argmax(alone)), int(np.argmax(both))
+        if max(alone[k], both[pair]) <= than:
+            return []
+        if alone[k] >= both[pair]:
+            return [lambda: self._loosen(k)]
+        return [lambda: self._loosen(pair), lambda: self.follow(drop(self.now, int(self.meter[pair])))]
+
+    def follow(self, move: Move) -> Move:
+        """Take note of a change of the fit.
+
+        Parameters
+        ----------
+        move
+            The change.
+        """
+        self.form += move.factor * (move.q @ self.seen) ** 2
+        return move
+
+    def _alone(self, weights: Floats) -> Floats:
+        """How much each direction would lower the misfit, (k,)."""
+        return np.asarray((weights @ self.seen) ** 2 / (self.std**-2.0 + self.form))
+
+    def _with_meter(self, weights: Floats) -> Floats:
+        """The same if its meter were dropped as well, (k,); -inf where that has none, or is not trusted."""
+        at, Q = self.meter, self.now.Q
+        a, b = self.std**-2.0 + self.form, Q[at, at]
+        c = np.einsum("ki,ik->k", Q[at], self.seen)
+        u, v = weights @ self.seen, weights[at]
+        free = (at >= 0) & self.now.trusted[at]
+        determinant = np.where(free, a * b - c * c, 1.0)
+        return np.where(free, (b * u * u - 2.0 * c * u * v + a * v * v) / determinant, -np.inf)
+
+    def _loosen(self, k: int) -> Move:
+        self.accused.append(k)
+        return self.follow(loosen(self.now, self.columns[:, k], float(self.std[k])))
