@@ -25,9 +25,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 
 from gridsec.arrays import Bools, Floats, Ints
+from gridsec.sequential.conditional import invert
 from gridsec.sequential.design import SequentialDesign
 
 
@@ -229,12 +229,16 @@ def conclude(
     if not done.any():
         return Commission(known, gathered)
     B, n = known.variance[heard], gathered.count[heard]
-    share = _share(gathered.time_s[heard] / design.doubt.time_s)
-    K = share * design.prior.between[np.ix_(heard, heard)] + np.diag(B + design.white[heard] / n)
-    factor = cho_factor(K, lower=True, check_finite=False)
+    # One matrix of this size, inverted where it is.
+    K = design.prior.of_meters[np.ix_(design.prior.meters[heard], heard)].T
+    time = gathered.time_s[heard] / design.doubt.time_s
+    for first in range(0, heard.size, _COLUMNS):
+        K[:, first : first + _COLUMNS] *= _share(time, time[first : first + _COLUMNS])
+    K[np.diag_indices_from(K)] += B + design.white[heard] / n
+    invert(K)
     bias, variance, allowed = known.bias.copy(), known.variance.copy(), known.allowed.copy()
-    bias[heard] += B * cho_solve(factor, gathered.total[heard] / n)
-    left = np.maximum(B - B * B * cho_solve(factor, np.eye(heard.size)).diagonal(), 0.0)
+    bias[heard] += B * (K @ (gathered.total[heard] / n))
+    left = np.maximum(B - B * B * K.diagonal(), 0.0)
     aging = design.options.stability * design.allowed[heard]
     # A uniform error of half-width a has the variance a^2 / 3.
     variance[heard] = np.minimum(left + aging**2 / 3.0, B)
@@ -257,12 +261,16 @@ def conclude(
     return Commission(learned, left_open)
 
 
-def _share(time: Floats) -> Floats:
-    """Covariance of two means of an Ornstein-Uhlenbeck process of variance 1 that end together, (k, k).
+# Columns that are worked on together.
+_COLUMNS = 128
+
+
+def _share(one: Floats, other: Floats) -> Floats:
+    """Covariance of two means of an Ornstein-Uhlenbeck process of variance 1 that end together, (j, k).
 
     The times are in units of its correlation time.
     """
-    a, b = np.minimum.outer(time, time), np.maximum.outer(time, time)
+    a, b = np.minimum.outer(one, other), np.maximum.outer(one, other)
     total = 2.0 * a + np.expm1(-a) + np.expm1(-b) - np.expm1(a - b)
     return np.asarray(np.clip(total / (a * b), 0.0, 1.0))
 

@@ -139,7 +139,7 @@ def fit(prior: Prior, noise: Floats, trusted: Bools, loose: Floats | None = None
     if more.shape[1]:
         inverse += more[prior.meters[at]] @ more[prior.meters[at]].T
     inverse[np.diag_indices(at.size)] += noise[at]
-    _invert(inverse)
+    invert(inverse)
     now = Fit(prior, noise, trusted.copy(), inverse.T, _whole(prior, more), more)
     if at.size < noise.size:
         now.Q = np.zeros((noise.size, noise.size))
@@ -175,8 +175,14 @@ def _narrow(now: Fit, at: Ints, inverse: Floats) -> None:
 _ROWS = 256
 
 
-def _invert(matrix: Floats) -> None:
-    """Invert a symmetric positive definite matrix in place, in the order of LAPACK, by Cholesky."""
+def invert(matrix: Floats) -> None:
+    """Invert a symmetric positive definite matrix in place, by Cholesky.
+
+    Parameters
+    ----------
+    matrix : (k, k)
+        In the order of LAPACK (Fortran's).
+    """
     if not matrix.size:
         return
     _, failed = lapack.dpotrf(matrix, lower=True, clean=False, overwrite_a=True)
@@ -199,7 +205,7 @@ def inverted(matrix: Floats) -> Floats:
         The matrix.
     """
     inverse: Floats = np.array(matrix, order="F")
-    _invert(inverse)
+    invert(inverse)
     return inverse
 
 

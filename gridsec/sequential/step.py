@@ -237,7 +237,8 @@ def _doubts(design: SequentialDesign, before: Doubts, frame: Frame, busbar: bool
         )
     )
     claims = _claims(np.abs(frame.p), design.options.hidden_power, before.claims)
-    if busbar == before.busbar and np.array_equal(p, before.p) and np.array_equal(q, before.q):
+    same = (new is old or np.array_equal(new, old) for new, old in ((p, before.p), (q, before.q)))
+    if busbar == before.busbar and all(same):
         return before if claims is before.claims else replace(before, claims=claims)
     doubt = replace(
         design.doubt,
@@ -274,6 +275,8 @@ _EXACT = 1e-6
 def _factor(error: Floats, std: Floats, old: Floats) -> Floats:
     """Power of two by which a frame knows a power less well than the design assumes, with hysteresis."""
     ratio = error / np.sqrt(3.0) / np.maximum(std, _EXACT)
+    if ratio.max(initial=0.0) <= _MUCH_LESS and old.max(initial=1.0) <= 1.0:
+        return old
     keep = (ratio <= old * _MUCH_LESS) & (ratio * _MUCH_LESS >= old) & (old > 1.0)
     raised = np.exp2(np.ceil(np.log2(np.maximum(ratio, 1.0))))
     return np.where(keep, old, np.where(ratio > _MUCH_LESS, raised, 1.0))

@@ -58,7 +58,8 @@ def test_means_that_end_together_covary_as_the_double_integral_says(short: float
     long = short * longer
     exact = dblquad(lambda s, u: np.exp(-abs(s - u)), 0.0, short, 0.0, lambda u: u)[0]
     exact += dblquad(lambda s, u: np.exp(-abs(s - u)), 0.0, short, lambda u: u, long)[0]
-    found = _share(np.array([short, long]))
+    times = np.array([short, long])
+    found = _share(times, times)
     assert found[0, 1] == found[1, 0] == pytest.approx(exact / (short * long), rel=1e-6)
     assert np.linalg.eigvalsh(found).min() > -1e-12
 
