@@ -1,6 +1,7 @@
 // Wires the page: which feeder is shown, its live states, and whether what is shown can still be believed.
 
 import { Alarms } from "./alarms.js";
+import { Commissioning } from "./commissioning.js";
 import { showDetail } from "./detail.js";
 import { Diagram } from "./diagram.js";
 import { bare, byId, clock, duration, el, getJson, isKnown, signed, status, volt } from "./dom.js";
@@ -24,6 +25,8 @@ const alarms = new Alarms({
   },
   onLink: (up) => { page.linked = up; },
 });
+
+const commissioning = new Commissioning({ onChange: () => detail() });
 
 // ---------------------------------------------------------------- the feeder
 
@@ -68,6 +71,7 @@ async function show(name) {
   diagram.show(page.feeder);
   verdict();
   alarms.watch(name);
+  commissioning.watch(name);
   listen(name);
 }
 
@@ -206,7 +210,9 @@ function detail() {
   const known = page.report.customers?.find(mine);
   const inverter = page.report.inverters?.find(mine);
   const now = { meter, inverter, v: diagram.voltAt(customer), std: known?.v_volt_std ?? meter?.v_volt_std };
-  showDetail(page.feeder, customer, now, page.past.get(customer.meter) ?? []);
+  const own = commissioning.of(customer.meter);
+  byId("replaced").hidden = own === null;
+  showDetail(page.feeder, customer, { ...now, own }, page.past.get(customer.meter) ?? []);
 }
 
 // ------------------------------------------------------------- all of them
@@ -232,6 +238,10 @@ function table() {
 
 byId("feeder").addEventListener("change", (event) => show(event.target.value));
 byId("unselect").addEventListener("click", () => select(null));
+byId("replaced").addEventListener("click", () => {
+  const { meter } = page.feeder.layout.customers.find((c) => c.customer === page.selected);
+  commissioning.ask(meter);
+});
 byId("meters-box").addEventListener("toggle", table);
 addEventListener("hashchange", () => {
   const name = decodeURIComponent(location.hash.slice(1));

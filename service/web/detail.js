@@ -62,7 +62,7 @@ function row(label, value, extra) {
   return [el("dt", { text: label }), el("dd", {}, el("b", { text: value }), extra ? el("span", { class: "quiet", text: ` ${extra}` }) : null)];
 }
 
-export function showDetail(feeder, customer, { meter, inverter, v, std }, points) {
+export function showDetail(feeder, customer, { meter, inverter, v, std, own }, points) {
   const limits = { low: feeder.v_min_volt, high: feeder.v_max_volt };
   const nominal = feeder.v_nominal_volt;
   const pu = (value) => (isKnown(value) ? `${(value / nominal).toFixed(4)} pu` : "");
@@ -76,6 +76,7 @@ export function showDetail(feeder, customer, { meter, inverter, v, std }, points
   if (meter) list.append(...row("Meter says", volt(meter.v_volt_reported, 2), pu(meter.v_volt_reported)));
   list.append(...row("Reconstructed", volt(v, 2), `${half === null ? "" : `± ${half.toFixed(2)} V, `}${pu(v)}`));
   if (half !== null) list.append(...row("Standard deviation", volt(std, 2)));
+  if (own) list.append(...row(...own));
   if (meter?.suspect) list.append(...row("Manipulation", `${signed(meter.attack_volt_estimated, 2)} V`, meter.kind ?? ""));
   if (inverter && isKnown(inverter.q_kvar_estimated)) {
     list.append(...row("Inverter injects", `${signed(inverter.q_kvar_estimated, 1)} kvar`, inverter.judged ? "" : "by its droop curve"));

@@ -297,6 +297,39 @@ def test_an_alarm_is_acknowledged_with_a_name(site: Site) -> None:
     assert (alarm.acknowledged_by, alarm.comment) == ("Ada <b>", "van sent")
 
 
+def test_what_is_learned_of_the_meters_and_a_replaced_one(site: Site) -> None:
+    site.tick(T0, 4, lies={"H3": 9.0})
+    page = site.open()
+    expect(page.locator("#commissioning")).to_contain_text("Meters' own errors learned on ")
+    customer(page, "H3").click()
+    panel = page.locator("#detail-card")
+    expect(panel).to_contain_text("+0.41 V")
+    expect(panel).to_contain_text("± 0.09 V, learned on ")
+    page.locator("#replaced").click()
+    expect(page.locator("#renew-what")).to_contain_text("Meter H3 of village")
+    page.fill("#renew-who", "Ada <b>")
+    page.fill("#renew-reason", "  ")
+    page.locator("#renew-form .primary").click()
+    expect(page.locator("#renew-error")).to_have_text("Please enter your name and the reason.")
+    page.fill("#renew-reason", "new <i>meter")
+    page.locator("#renew-form .primary").click()
+    expect(page.locator("#renew")).to_be_hidden()
+    expect(page.locator("#commissioning")).to_have_text("Learning 1 of 13 meters, 5 of 24 h.")
+    expect(panel).to_contain_text("not known yet 5 of 24 h heard")
+    (event,) = site.service.store.commission_events("village")
+    assert (event.who, event.reason, event.meters) == ("Ada <b>", "new <i>meter", ("H3",))
+
+
+def test_a_commissioning_that_begins_anew_says_why(site: Site) -> None:
+    site.service.learning.update(site.village.meters)
+    site.service.note = "the feeder has changed since (<b>lines)"
+    site.tick(T0)
+    page = site.open()
+    expect(page.locator("#commissioning")).to_have_text(
+        "Learning meters, 5 of 24 h. Begun anew: the feeder has changed since (<b>lines)."
+    )
+
+
 def test_the_second_operator_hears_who_was_first(site: Site) -> None:
     site.tick(T0, 4, lies={"H3": 9.0})
     one, two = site.open(), site.open()

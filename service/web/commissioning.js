@@ -1,0 +1,105 @@
+// What is known of the meters' own errors: a line for the feeder, numbers for a meter, and meters that were replaced.
+
+import { byId, getJson, isKnown, signed } from "./dom.js";
+
+const API = "/api/v1/feeders";
+const EVERY_MS = 60000;
+
+function hours(seconds) {
+  const h = seconds / 3600;
+  return h >= 10 || Number.isInteger(h) ? String(Math.floor(h)) : h.toFixed(1);
+}
+
+const day = (t) => new Date(t * 1000).toLocaleDateString();
+
+export class Commissioning {
+  constructor({ onChange }) {
+    this.onChange = onChange;
+    this.feeder = null;
+    this.known = null;
+    this.asking = null;
+    byId("renew-form").addEventListener("submit", (event) => this.answer(event));
+    byId("renew-cancel").addEventListener("click", () => byId("renew").close());
+    setInterval(() => this.load(), EVERY_MS);
+  }
+
+  async watch(feeder) {
+    this.feeder = feeder;
+    this.take(null);
+    await this.load();
+  }
+
+  async load() {
+    const { feeder } = this;
+    if (feeder === null) return;
+    const found = await getJson(`${API}/${encodeURIComponent(feeder)}/commissioning`).catch(() => null);
+    if (found !== null && feeder === this.feeder) this.take(found);
+  }
+
+  take(known) {
+    this.known = known;
+    byId("commissioning").textContent = this.line();
+    this.onChange();
+  }
+
+  line() {
+    const k = this.known;
+    if (k === null || k.state === "off" || (k.state === "waiting" && !k.note)) return "";
+    const note = k.note ? ` Begun anew: ${k.note}.` : "";
+    if (k.state === "learned") return `Meters' own errors learned on ${day(k.learned_at)}.${note}`;
+    if (k.state === "waiting") return note.trim();
+    const open = k.meters.filter((m) => m.state === "learning").length;
+    const who = open === k.meters.length ? "meters" : `${open} of ${k.meters.length} meters`;
+    const held = k.held ? " Waiting until no meter is suspected." : "";
+    return `Learning ${who}, ${hours(k.gathered_s)} of ${hours(k.needed_s)} h.${held}${note}`;
+  }
+
+  // Label, value and remark for the panel of a meter; null where nothing is learned.
+  of(meter) {
+    const found = this.known?.meters.find((m) => m.meter === meter);
+    if (!found) return null;
+    if (found.state === "learning") {
+      return ["Own error", "not known yet", `${hours(found.gathered_s)} of ${hours(this.known.needed_s)} h heard`];
+    }
+    const since = isKnown(found.learned_at) ? `, learned on ${day(found.learned_at)}` : "";
+    return ["Own error", `${signed(found.error_volt, 2)} V`, `± ${found.error_volt_std.toFixed(2)} V${since}`];
+  }
+
+  ask(meter) {
+    this.asking = meter;
+    byId("renew-what").textContent = `Meter ${meter} of ${this.feeder}: its own error is forgotten and learned anew, `
+      + `over ${hours(this.known.needed_s)} h. The other meters stay as they are.`;
+    byId("renew-who").value = localStorage.getItem("gridsec.who") ?? "";
+    byId("renew-reason").value = "";
+    byId("renew-error").hidden = true;
+    byId("renew").showModal();
+  }
+
+  async answer(event) {
+    event.preventDefault();
+    const [who, reason] = [byId("renew-who").value.trim(), byId("renew-reason").value.trim()];
+    if (!who || !reason) {
+      this.complain("Please enter your name and the reason.");
+      return;
+    }
+    localStorage.setItem("gridsec.who", who);
+    try {
+      const response = await fetch(`${API}/${encodeURIComponent(this.feeder)}/commissioning`, {
+        method: "POST",
+        headers: { "Content-Type": "application/json" },
+        body: JSON.stringify({ who, reason, meters: [this.asking] }),
+      });
+      const body = await response.json();
+      if (!response.ok) throw new Error(body.detail);
+      if (body.feeder === this.feeder) this.take(body);
+      byId("renew").close();
+    } catch (error) {
+      this.complain(`Not begun: ${error.message}`);
+    }
+  }
+
+  complain(text) {
+    byId("renew-error").textContent = text;
+    byId("renew-error").hidden = false;
+  }
+}
