@@ -56,12 +56,14 @@ class Ours:
         self.false_powers = false_powers
         self.live = np.ones(len(self.R), dtype=np.bool_)
         self.buses = np.arange(len(self.R))
+        self.spread = np.empty((len(self.R), 2 * len(self.R)))
 
     def __call__(self, told: Reading) -> Answer:
         """One snapshot."""
         v, v0, p, q = told.v, told.v0, told.p, told.q
-        R, X = self.R, self.X
-        spread = np.hstack([R * told.std_p, X * told.std_q])
+        R, X, spread = self.R, self.X, self.spread
+        np.multiply(R, told.std_p, out=spread[:, : v.size])
+        np.multiply(X, told.std_q, out=spread[:, v.size :])
         K = spread @ spread.T
         K += (2.0 * v0 * told.std_v) ** 2
         known = Prior(K, self.buses, K.diagonal())

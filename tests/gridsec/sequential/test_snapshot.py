@@ -97,6 +97,25 @@ def test_false_powers_are_found_with_their_meter() -> None:
     assert exact >= 18
 
 
+def test_false_powers_are_found_where_no_meter_alone_is_suspicious_enough() -> None:
+    found = 0
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        prior, noise, false = street(rng)
+        c = int(rng.integers(2, P - 1))
+        honest = rng.multivariate_normal(np.zeros(P), prior.between + np.diag(noise))
+        m = honest - 0.15 * false.R[:, c]
+        m[c] = honest[c]
+        if identify(prior, noise, m, LIVE)[0].liars.any():
+            continue
+        best = identify(prior, noise, m, LIVE, false=false)[0]
+        if best.liars.any():
+            assert who(best) == (c,)
+            assert best.powers[c]
+            found += 1
+    assert found >= 2
+
+
 def clean_and_named(rate: float, noise: Floats, trials: int) -> int:
     """In how many of so many clean snapshots somebody is named."""
     rng = np.random.default_rng(5)
