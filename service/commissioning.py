@@ -18,7 +18,7 @@ from feeders.load import Site
 from gridsec.arrays import Bools, Floats
 from gridsec.errors import GridsecError
 from gridsec.sequential import Commission, to_arrays
-from service.kept import Kept, KeptInvalid, decode, encode
+from service.kept import Kept, KeptInvalid, decode, encode, fingerprint
 
 SAVE_S = 60.0
 """What is gathered is kept this often, s; all else at once."""
@@ -173,7 +173,7 @@ class Commissioning:
         self.known: Commission | None = None
         self.restored = False
         self.note = ""
-        self._site, self._kept = site, kept
+        self._site, self._kept, self._fingerprint = site, kept, fingerprint(site)
         self._watcher: Watcher | None = None
         self._t: float | None = None
         self._saved_t: float | None = None
@@ -197,7 +197,9 @@ class Commissioning:
             self.known = None
         elif self.known is None and self._kept is not None:
             try:
-                self.known = self.learner.read(watcher.design, decode(self._site, self._kept))
+                self.known = self.learner.read(
+                    watcher.design, decode(self._site, self._fingerprint, self._kept)
+                )
             except (KeptInvalid, ValueError) as error:
                 self.note = f"what was learned until {self._kept.t:.0f} is not used: {error}"
             else:
@@ -291,7 +293,7 @@ class Commissioning:
         if not (happened or wanted):
             return (), happened
         self._saved_t = self._t
-        return (encode(self._site, self._t, to_arrays(self.known)),), happened
+        return (encode(self._site, self._fingerprint, self._t, to_arrays(self.known)),), happened
 
     # ---------------------------------------------------------------- to show
 

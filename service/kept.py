@@ -98,13 +98,13 @@ def fingerprint(site: Site) -> dict[str, str]:
     return {name: _digest(part) for name, part in parts.items()}
 
 
-def encode(site: Site, t: float, arrays: Mapping[str, Floats]) -> Kept:
+def encode(site: Site, now: Mapping[str, str], t: float, arrays: Mapping[str, Floats]) -> Kept:
     """Write a text.
 
     Parameters
     ----------
-    site
-        The feeder.
+    site, now
+        The feeder, and its fingerprint.
     t
         Unix time of the tick, s.
     arrays : of (p,)
@@ -112,17 +112,17 @@ def encode(site: Site, t: float, arrays: Mapping[str, Floats]) -> Kept:
     """
     name = site.feeder.name
     numbers = {key: [None if math.isnan(x) else x for x in value.tolist()] for key, value in arrays.items()}
-    record = Record(FORMAT, name, t, fingerprint(site), list(site.meter_ids), numbers)
+    record = Record(FORMAT, name, t, dict(now), list(site.meter_ids), numbers)
     return Kept(name, t, msgspec.json.encode(record).decode())
 
 
-def decode(site: Site, kept: Kept) -> dict[str, Floats]:
+def decode(site: Site, now: Mapping[str, str], kept: Kept) -> dict[str, Floats]:
     """Read a text for the feeder as it is now.
 
     Parameters
     ----------
-    site, kept
-        The feeder, and the text.
+    site, now, kept
+        The feeder, its fingerprint, and the text.
 
     Returns
     -------
@@ -143,7 +143,6 @@ def decode(site: Site, kept: Kept) -> dict[str, Floats]:
         raise KeptInvalid(f"it is damaged: {error}") from error
     if record.feeder != site.feeder.name:
         raise KeptInvalid(f"it is of feeder {record.feeder!r}")
-    now = fingerprint(site)
     changed = [name for name in now if record.fingerprint.get(name) != now[name]]
     if changed:
         raise KeptInvalid(f"the feeder has changed since ({', '.join(changed)})")

@@ -35,8 +35,9 @@ def _damaged(kept: Kept, **changes: Any) -> Kept:
 
 def test_damaged_or_newer_texts_are_refused_in_words(site: Site) -> None:
     arrays = {"a": np.array([0.1 + 0.2, np.nan, -1e-300, *range(10)])}
-    kept = encode(site, START, arrays)
-    np.testing.assert_array_equal(decode(site, kept)["a"], arrays["a"])
+    now = fingerprint(site)
+    kept = encode(site, now, START, arrays)
+    np.testing.assert_array_equal(decode(site, now, kept)["a"], arrays["a"])
     numbers = json.loads(kept.text)["arrays"]
     for bad, said in (
         (replace(kept, text="{"), "damaged"),
@@ -52,4 +53,4 @@ def test_damaged_or_newer_texts_are_refused_in_words(site: Site) -> None:
         (_damaged(kept, fingerprint={}), r"changed since \(meters, lines, customers"),
     ):
         with pytest.raises(KeptInvalid, match=said):
-            decode(site, bad)
+            decode(site, now, bad)
