@@ -50,7 +50,7 @@ class Lies:
     seen: tuple[float, float] = (4.0, 6.0)
     false: float = 3.0
     rate: float = 0.006
-    like: float = 1e3
+    like: float = 20.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -46,6 +46,9 @@ _MISFIT = 3.0
 _MOVES = 4
 # So many customers, those whose meters are most suspicious, are where a search with false powers may begin.
 _STARTS = 8
+# After so many starts, the rest only where the best explanation is implausible: many accused, or a bad fit.
+_BEGUN = 2
+_MANY = 0.25
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,13 +151,30 @@ def _explanations(problem: Problem, start: State, false: bool) -> list[State]:
     """Local minima of J from several starts, and their neighbours."""
     known: dict[bytes, State] = {start.key: start}
     first = _descend(problem, start, known, false)
-    if false and (first is start or first.fit > problem.size + _MISFIT * np.sqrt(2.0 * problem.size)):
-        for c in _doubtful(problem, start, anybody=first is not start):
+    if false and (first is start or _misfits(problem, first)):
+        for k, c in enumerate(_doubtful(problem, start, anybody=first is not start)):
+            if k >= _BEGUN and _plausible(problem, known):
+                break
             _descend(problem, _doubted(problem, start, c), known, false)
     if len(known) == 1:
         return [start]
+    if false and not _plausible(problem, known):
+        # False powers may lead astray: who lies if all powers are true, and only then whose are false.
+        apart: dict[bytes, State] = {}
+        _descend(problem, _descend(problem, start, apart, False), known, false)
+        known.update(apart)
     _exchange(problem, min(known.values(), key=problem.cost), known, false)
+    _more(problem, min(known.values(), key=problem.cost), known, false)
     return list(known.values())
+
+
+def _misfits(problem: Problem, at: State) -> bool:
+    return at.fit > problem.size + _MISFIT * float(np.sqrt(2.0 * problem.size))
+
+
+def _plausible(problem: Problem, known: dict[bytes, State]) -> bool:
+    best = min(known.values(), key=problem.cost)
+    return best.counts[0] <= _MANY * problem.size and not _misfits(problem, best)
 
 
 def _doubtful(problem: Problem, at: State, *, anybody: bool) -> list[int]:
@@ -175,7 +195,7 @@ def _doubtful(problem: Problem, at: State, *, anybody: bool) -> list[int]:
         rise, gain = problem.pairs(at, who)
         worth = (rise < 0.0) & (gain > problem.rare)
     order = np.argsort(rise)
-    return [int(c) for c in who[order][worth[order]][:_STARTS]]
+    return [int(c) for c in who[order][worth[order]]]
 
 
 def _doubted(problem: Problem, at: State, c: int) -> State:
@@ -246,6 +266,16 @@ def _exchange(problem: Problem, at: State, known: dict[bytes, State], false: boo
         after.liars[k] ^= True
         if new and cost - least <= within:
             problem.toggle(after, k)
+            _descend(problem, after, known, false)
+
+
+def _more(problem: Problem, at: State, known: dict[bytes, State], false: bool) -> None:
+    """Accuse one more, although that alone does not lower J, and go on from there."""
+    rise = np.where(at.liars, np.inf, problem.meters(at))
+    for j in np.flatnonzero(rise <= 2.0 * np.log(problem.lies.like)).tolist():
+        after = at.copy()
+        problem.toggle(after, j)
+        if after.key not in known:
             _descend(problem, after, known, false)
 
 
