@@ -16,6 +16,8 @@ from scipy.special import chdtri, ndtri
 
 from gridsec.arrays import Bools, Floats, Ints, frozen
 
+# Determinants are positive; rounding may make them less.
+_TINY = float(np.finfo(np.float64).tiny)
 Curved = Callable[[Floats, Bools], Floats]
 # How often an explanation is linearised about itself.
 _PASSES = 2
@@ -143,7 +145,7 @@ class Problem:
         """Rise of J by accusing each meter, or by trusting it again, (p,)."""
         on = at.liars
         delta = np.where(on, -self.a2, self.a2)
-        pivot = np.maximum(1.0 + delta * at.Q.diagonal(), np.finfo(np.float64).tiny)
+        pivot = np.maximum(1.0 + delta * at.Q.diagonal(), _TINY)
         k, _ = at.counts
         now = self.prices[k]
         more, less = self.prices[min(k + 1, self.size)] - now, self.prices[max(k - 1, 0)] - now
@@ -199,7 +201,7 @@ class Problem:
         """Accuse a meter, or trust it again."""
         delta = -self.a2 if at.liars[j] else self.a2
         q = at.Q[:, j].copy()
-        pivot = 1.0 + delta * q[j]
+        pivot = max(1.0 + delta * q[j], _TINY)
         at.fit -= delta * at.g[j] ** 2 / pivot
         at.logdet += float(np.log(pivot))
         at.g = at.g - q * (delta * at.g[j] / pivot)
@@ -211,7 +213,7 @@ class Problem:
         u = self._columns(np.array([c]))[:, 0]
         Qu, h = at.Q @ u, u.T @ at.g
         (a, b), (_, d) = sign * np.eye(2) + u.T @ Qu
-        det = a * d - b * b
+        det = max(a * d - b * b, _TINY)
         inverse = np.array([[d, -b], [-b, a]]) / det
         by = Qu @ inverse
         at.fit -= float(h @ inverse @ h)
@@ -237,5 +239,5 @@ def suspicious(g: Floats, diagonal: Floats) -> Bools:
 def _by_two(M: Floats, h: Floats, sign: float) -> tuple[Floats, Floats]:
     """``det(sign I + M)`` and ``h^T (sign I + M)^-1 h`` of many, (k, 2, 2) and (k, 2)."""
     a, b, c = M[:, 0, 0] + sign, M[:, 0, 1], M[:, 1, 1] + sign
-    det = np.maximum(a * c - b * b, np.finfo(np.float64).tiny)
+    det = np.maximum(a * c - b * b, _TINY)
     return det, (c * h[:, 0] ** 2 - 2.0 * b * h[:, 0] * h[:, 1] + a * h[:, 1] ** 2) / det
