@@ -200,7 +200,7 @@ def _amounts(design: SequentialDesign, state: SequentialState, seen: Examined) -
         if view is not None:
             weights = view.judged.weights
         elif now is not None:
-            weights = now.Q @ (state.window.sums[s] / np.maximum(state.window.counts[s], 1))
+            weights = now.weights(state.window.sums[s] / np.maximum(state.window.counts[s], 1))
         else:
             continue
         out[k] = float(book.std[k] ** 2 * book.along(weights)[k])

@@ -62,8 +62,8 @@ class Fit:
         Variance d of each meter's reading.
     trusted : (p,)
         Which meters it rests on.
-    Q : (p, p)
-        Inverse covariance of the trusted meters; zero elsewhere.
+    inverse : (t, t) or (p, p)
+        Inverse covariance of the trusted meters; where it is that of all meters, zero elsewhere.
     variance : (n,)
         Diagonal of M: what is left open at every bus.
     loose : (n, k)
@@ -75,10 +75,42 @@ class Fit:
     prior: Prior
     noise: Floats
     trusted: Bools
-    Q: Floats
+    inverse: Floats
     variance: Floats
     loose: Floats
     changes: int = 0
+
+    @property
+    def Q(self) -> Floats:  # noqa: N802  # its name in the theory
+        """Inverse covariance of the trusted meters, zero elsewhere, (p, p)."""
+        if len(self.inverse) == self.noise.size:
+            return self.inverse
+        at = np.flatnonzero(self.trusted)
+        out = np.zeros((self.noise.size, self.noise.size))
+        out[np.ix_(at, at)] = self.inverse
+        return out
+
+    def weights(self, m: Floats) -> Floats:
+        """Q m, (p,)."""
+        if len(self.inverse) == self.noise.size:
+            return np.asarray(self.inverse @ m)
+        out = np.zeros(self.noise.size)
+        out[self.trusted] = self.inverse @ m[self.trusted]
+        return out
+
+    def diagonal(self) -> Floats:
+        """Diagonal of Q, (p,)."""
+        if len(self.inverse) == self.noise.size:
+            return self.inverse.diagonal()
+        out = np.zeros(self.noise.size)
+        out[self.trusted] = self.inverse.diagonal()
+        return out
+
+    def shrink(self) -> None:
+        """Keep nothing about meters that are not trusted, where that saves much."""
+        at = np.flatnonzero(self.trusted)
+        if at.size**2 < _MUCH * len(self.inverse) ** 2:
+            self.inverse = self.inverse[np.ix_(at, at)]
 
     def copy(self) -> Fit:
         """A fit that can be changed without changing this one."""
@@ -86,11 +118,15 @@ class Fit:
             self.prior,
             self.noise,
             self.trusted.copy(),
-            self.Q.copy(),
+            self.inverse.copy(),
             self.variance.copy(),
             self.loose,
             self.changes,
         )
+
+
+# Part that a smaller matrix must have at most.
+_MUCH = 0.8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,18 +170,54 @@ def fit(prior: Prior, noise: Floats, trusted: Bools, loose: Floats | None = None
     """
     more = np.zeros((prior.variance.size, 0)) if loose is None else loose
     at = np.flatnonzero(trusted)
-    # Symmetric: its transpose is the same in the order of LAPACK, to be inverted where it is.
-    inverse = prior.of_meters[np.ix_(prior.meters[at], at)].T
-    if more.shape[1]:
-        inverse += more[prior.meters[at]] @ more[prior.meters[at]].T
-    inverse[np.diag_indices(at.size)] += noise[at]
+    inverse = _between(prior, noise[at], at, more)
     invert(inverse)
     now = Fit(prior, noise, trusted.copy(), inverse.T, _whole(prior, more), more)
-    if at.size < noise.size:
-        now.Q = np.zeros((noise.size, noise.size))
-        now.Q[np.ix_(at, at)] = inverse
     _narrow(now, at, inverse)
     return now
+
+
+def misfit(prior: Prior, noise: Floats, m: Floats, trusted: Bools, loose: Floats | None = None) -> float:
+    """``m^T Q m`` alone, in a third of the time of `fit`.
+
+    Parameters
+    ----------
+    prior, noise, trusted, loose
+        As in `fit`.
+    m : (p,)
+        As in `judge`.
+    """
+    at = np.flatnonzero(trusted)
+    if not at.size:
+        return 0.0
+    more = np.zeros((prior.variance.size, 0)) if loose is None else loose
+    return float(m[at] @ solved(_between(prior, noise[at], at, more), m[at]))
+
+
+def solved(matrix: Floats, right: Floats) -> Floats:
+    """Solution of a symmetric positive definite system.
+
+    Parameters
+    ----------
+    matrix : (k, k)
+        In the order of LAPACK (Fortran's); lost.
+    right : (k,)
+        Right-hand side.
+    """
+    _, out, failed = lapack.dposv(matrix, right, lower=True, overwrite_a=True)
+    if failed:
+        raise np.linalg.LinAlgError("the matrix is not positive definite")
+    return np.asarray(out)
+
+
+def _between(prior: Prior, noise: Floats, at: Ints, more: Floats) -> Floats:
+    """Covariance of the readings of meters `at`, in the order of LAPACK."""
+    # Symmetric: the transpose is the same in the order of LAPACK.
+    out = prior.of_meters[np.ix_(prior.meters[at], at)].T
+    if more.shape[1]:
+        out += more[prior.meters[at]] @ more[prior.meters[at]].T
+    out[np.diag_indices(at.size)] += noise
+    return out
 
 
 def _whole(prior: Prior, more: Floats) -> Floats:
@@ -220,7 +292,7 @@ def judge(now: Fit, m: Floats) -> Judged:
         Readings minus what the model explains, squared pu; any finite value where not trusted.
     """
     prior = now.prior
-    weights = now.Q @ m
+    weights = now.weights(m)
     w = prior.of_meters @ weights
     if now.loose.shape[1]:
         w += now.loose @ (weights @ now.loose[prior.meters])
@@ -228,7 +300,7 @@ def judge(now: Fit, m: Floats) -> Judged:
 
 
 def _judged(now: Fit, m: Floats, weights: Floats, w: Floats) -> Judged:
-    diagonal, at = now.Q.diagonal(), now.prior.meters
+    diagonal, at = now.diagonal(), now.prior.meters
     with np.errstate(divide="ignore", invalid="ignore"):
         offset = np.where(now.trusted, weights / diagonal, m - w[at])
         variance = np.where(now.trusted, 1.0 / diagonal, now.variance[at] + now.noise)
@@ -262,10 +334,11 @@ def drop(now: Fit, j: int) -> Move:
     j
         A trusted meter.
     """
-    q = now.Q[:, j].copy()
+    now.inverse = now.Q
+    q = now.inverse[:, j].copy()
     move = Move(-1.0 / q[j], q, _covariance(now, q))
     _change(now, move)
-    now.Q[j] = now.Q[:, j] = 0.0
+    now.inverse[j] = now.inverse[:, j] = 0.0
     now.trusted[j] = False
     return move
 
@@ -281,7 +354,8 @@ def admit(now: Fit, j: int) -> Move:
         A meter that is not trusted.
     """
     column = _column(now, j)
-    q = now.Q @ column[now.prior.meters]
+    now.inverse = now.Q
+    q = now.inverse @ column[now.prior.meters]
     open_ = column - _covariance(now, q)
     pivot = max(open_[now.prior.meters[j]], 0.0) + now.noise[j]
     q[j] -= 1.0
@@ -304,7 +378,8 @@ def loosen(now: Fit, direction: Floats, std: float) -> Move:
         Standard deviation of the amount, pu.
     """
     u = std * direction
-    q = now.Q @ u[now.prior.meters]
+    now.inverse = now.Q
+    q = now.inverse @ u[now.prior.meters]
     pivot = 1.0 + float(u[now.prior.meters] @ q)
     move = Move(-1.0 / pivot, q, _covariance(now, q) - u)
     _change(now, move)
@@ -314,7 +389,7 @@ def loosen(now: Fit, direction: Floats, std: float) -> Move:
 
 def _change(now: Fit, move: Move) -> None:
     # In place: Q is symmetric, and its transpose in the order of BLAS.
-    now.Q = blas.dger(move.factor, move.q, move.q, a=now.Q.T, overwrite_a=True).T
+    now.inverse = blas.dger(move.factor, move.q, move.q, a=now.inverse.T, overwrite_a=True).T
     now.variance -= move.factor * move.spread * move.spread
     np.maximum(now.variance, 0.0, out=now.variance)
     now.changes += 1

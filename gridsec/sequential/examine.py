@@ -14,7 +14,7 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.sequential import search
 from gridsec.sequential.commission import Learned
-from gridsec.sequential.conditional import Fit, Judged, Prior, admit, drop, fit, judge
+from gridsec.sequential.conditional import Fit, Judged, Prior, admit, drop, fit, judge, misfit
 from gridsec.sequential.decoder import Accused, Evidence
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.dictionary import Dictionary
@@ -443,11 +443,13 @@ class _Search:
         """What an explanation leaves unexplained on each scale."""
         trusted, out = self._trusted(found), []
         loose = _directions(self.book, (*self.accused, *((k, self.s) for k in found.loosened)))
-        for s, before in enumerate(self.fits):
+        for s in range(len(self.fits)):
             there = self.scales[s]
-            known = found.fit if s == self.s and isinstance(found, Solution) else None
-            now = known or adapt(before, self.scales.prior, there.noise, trusted & there.enough, loose)
-            out.append(judge(now, there.m).misfit)
+            if s == self.s and isinstance(found, Solution):
+                out.append(found.judged.misfit)
+            else:
+                wanted = trusted & there.enough
+                out.append(misfit(self.scales.prior, there.noise, there.m, wanted, loose))
         return out
 
     def _believe(self, best: Explanation) -> Trust:

@@ -28,10 +28,9 @@ from dataclasses import dataclass
 from functools import cache, partial
 
 import numpy as np
-from scipy.linalg import lapack
 
 from gridsec.arrays import Bools, Floats, Ints
-from gridsec.sequential.conditional import Fit, Judged, Move, Prior, admit, drop, follow, judge
+from gridsec.sequential.conditional import Fit, Judged, Move, Prior, admit, drop, follow, judge, solved
 from gridsec.sequential.dictionary import Dictionary, Powers, Step
 
 
@@ -203,6 +202,7 @@ def descend(
             break
         for step in steps:
             judged = follow(now, m, judged, step())
+    now.shrink()
     judged = judge(now, m)  # without what rounding has left
     dropped = int(np.count_nonzero(live & ~now.trusted))
     loosened = () if powers is None else powers.loosened
@@ -345,9 +345,8 @@ def robust(prior: Prior, noise: Floats, m: Floats, live: Bools, bound: Floats) -
     trusted = np.zeros(m.size, dtype=np.bool_)
     if not at.size:
         return trusted
-    K, d, y, limit = prior.of_meters[np.ix_(prior.meters[at], at)], noise[at], m[at], bound[at] ** 2
-    weight = np.ones(at.size)
-    rest = _residual(K, d, weight, y)
+    d, y, limit = noise[at], m[at], bound[at] ** 2
+    rest = _residual(prior, at, d, y)
     largest = float(np.max(rest * rest / limit))
     if largest <= 1.0:
         trusted[at] = True
@@ -357,7 +356,7 @@ def robust(prior: Prior, noise: Floats, m: Floats, live: Bools, bound: Floats) -
         ratio = np.maximum(rest * rest / limit, np.finfo(np.float64).tiny)
         soft = np.sqrt(hardness * (hardness + 1.0) / ratio) - hardness
         weight = np.clip(soft, 0.0, 1.0)
-        rest = _residual(K, d, np.maximum(weight, _FEATHER), y)
+        rest = _residual(prior, at, d / np.maximum(weight, _FEATHER), y)
         if np.all((weight == 0.0) | (weight == 1.0)):
             break
         hardness *= _HARDER
@@ -365,15 +364,11 @@ def robust(prior: Prior, noise: Floats, m: Floats, live: Bools, bound: Floats) -
     return trusted
 
 
-def _residual(K: Floats, d: Floats, weight: Floats, y: Floats) -> Floats:
-    """``y - w_hat`` for meters with noise ``d / weight``."""
-    noise = d / weight
-    whole: Floats = np.array(K, order="F")
-    whole[np.diag_indices_from(whole)] += noise
-    _, out, failed = lapack.dposv(whole, y, lower=True, overwrite_a=True)
-    if failed:
-        raise np.linalg.LinAlgError("the matrix is not positive definite")
-    return np.asarray(noise * out)
+def _residual(prior: Prior, at: Ints, noise: Floats, y: Floats) -> Floats:
+    """``y - w_hat`` for some meters with their noise."""
+    whole = prior.of_meters[np.ix_(prior.meters[at], at)].T
+    whole[np.diag_indices(at.size)] += noise
+    return np.asarray(noise * solved(whole, y))
 
 
 @dataclass(frozen=True, slots=True)
@@ -419,16 +414,16 @@ def swaps(found: Solution, live: Bools, within: float) -> list[Swap]:
     """
     now, judged = found.fit, found.judged
     prior, accused, out = now.prior, np.flatnonzero(live & ~now.trusted), []
-    inside, diagonal = now.loose[prior.meters], now.Q.diagonal()
+    inside, Q = now.loose[prior.meters], now.Q
     for first in range(0, accused.size, _COLUMNS):
         who = accused[first : first + _COLUMNS]
         columns = prior.of_meters[np.ix_(prior.meters, who)]
         if inside.shape[1]:
             columns += inside @ inside[who].T
-        v, s = now.Q @ columns, judged.std[who] ** 2
+        v, s = Q @ columns, judged.std[who] ** 2
         weights = judged.weights[:, None] - v * (judged.offset[who] / s)
         with np.errstate(divide="ignore", invalid="ignore"):
-            gain = weights**2 / (diagonal[:, None] + v**2 / s)
+            gain = weights**2 / (Q.diagonal()[:, None] + v**2 / s)
         gain[~now.trusted] = -np.inf
         best = gain.argmax(axis=0)
         worse = judged.offset[who] ** 2 / s - gain[best, np.arange(who.size)]

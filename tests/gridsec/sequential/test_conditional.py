@@ -7,7 +7,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gridsec.arrays import Bools, Floats
-from gridsec.sequential.conditional import Fit, Prior, admit, drop, fit, follow, inverted, judge, loosen
+from gridsec.sequential.conditional import (
+    Fit,
+    Prior,
+    admit,
+    drop,
+    fit,
+    follow,
+    inverted,
+    judge,
+    loosen,
+    misfit,
+)
 
 
 def problem(rng: np.random.Generator, buses: int, meters: int) -> tuple[Floats, Prior, Floats, Floats]:
@@ -135,3 +146,28 @@ def test_inverse_is_symmetric_and_an_inverse() -> None:
 def prior_between_is_symmetric(rng: np.random.Generator) -> bool:
     S, prior, _, _ = problem(rng, 7, 4)
     return bool(np.allclose(prior.between, S[np.ix_(prior.meters, prior.meters)]))
+
+
+@settings(max_examples=40)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_a_fit_that_keeps_less_says_the_same(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    S, prior, noise, m = problem(rng, 12, 10)
+    now = fit(prior, noise, np.ones(10, dtype=bool))
+    for j in rng.choice(10, int(rng.integers(2, 11)), replace=False).tolist():
+        drop(now, j)
+    Q = now.Q.copy()
+    now.shrink()
+    assert len(now.inverse) == np.count_nonzero(now.trusted)
+    np.testing.assert_array_equal(now.Q, Q)
+    agrees(now, S, m)
+    again = now.copy()
+    for j in np.flatnonzero(~now.trusted).tolist():
+        admit(again, j)
+    agrees(again, S, m)
+    direction = rng.normal(size=12)
+    loosen(now, direction, 0.5)
+    agrees(now, S + 0.25 * np.outer(direction, direction), m)
+    expected_misfit = judge(now, m).misfit
+    found = misfit(prior, noise, m, now.trusted, 0.5 * direction[:, None])
+    np.testing.assert_allclose(found, expected_misfit, rtol=1e-7, atol=1e-9)
