@@ -271,9 +271,14 @@ class Runtime:
         return self._rounds.store
 
     def feeders(self) -> list[dict[str, Any]]:
-        """Return the summary of every feeder, with the phase of its monitor."""
+        """Return the summary of every feeder, with the phase of its monitor and of the commissioning."""
         return [
-            {**describe.summary(watch.site), "phase": str(watch.phase), "problem": watch.problem or None}
+            {
+                **describe.summary(watch.site),
+                "phase": str(watch.phase),
+                "problem": watch.problem or None,
+                "commissioning": str(watch.commissioning.progress().state),
+            }
             for watch in self._rounds.watches.values()
         ]
 

@@ -158,6 +158,27 @@ class Memory:
         return self.kept - len(self.tail) - ROWS * len(self.blocks)
 
 
+def forget(memory: Memory, meters: Bools) -> Memory:
+    """Forget how calm some meters were, and that they repeated themselves.
+
+    Parameters
+    ----------
+    memory
+        So far; not changed.
+    meters : (p,)
+        Which.
+    """
+    none = ~meters
+    return replace(
+        memory,
+        count=memory.count * none,
+        run=memory.run * none,
+        longest=memory.longest * none,
+        stuck=memory.stuck & none,
+        lag=memory.lag * none,
+    )
+
+
 def rules(resolution: Floats, jitter: Floats, chance: float, step_s: float) -> Rules:
     """When repetition is evidence.
 

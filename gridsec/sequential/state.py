@@ -14,6 +14,7 @@ from gridsec.sequential.conditional import Fit, Prior
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.kinds import Kinds
 from gridsec.sequential.kinds import empty as no_kinds
+from gridsec.sequential.repeats import forget as forget_calm
 from gridsec.sequential.windows import Window, empty, forget
 
 
@@ -203,6 +204,7 @@ def renew(design: SequentialDesign, state: SequentialState, which: Bools) -> Seq
         learning=known.learning,
         window=forget(state.window, which),
         fits=(None,) * len(state.fits),
+        kinds=replace(state.kinds, memory=forget_calm(state.kinds.memory, which)),
         trust=replace(
             trust,
             trusted=trust.trusted | which,

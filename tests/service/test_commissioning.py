@@ -428,6 +428,8 @@ def test_rest_tells_what_was_learned(live: InProcess) -> None:
     one = live.get(f"/api/v1/feeders/{FEEDER}/meters/m03")
     assert one["commissioning"] == found["meters"][2]
     assert live.metric("gridsec_meters_learned", feeder=FEEDER) == 13.0
+    listed = {row["name"]: row["commissioning"] for row in live.get("/api/v1/feeders")["feeders"]}
+    assert listed == {FEEDER: "learned", "bank": "off"}
     off = live.get("/api/v1/feeders/bank/commissioning")
     assert (off["state"], off["meters"], off["estimator"]) == ("off", [], "exact-bank")
 

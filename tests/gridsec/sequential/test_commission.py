@@ -223,6 +223,29 @@ class TestStreets:
         _, answers = watch(street, design, 90, state=state, lies={4: change + np.copysign(0.006, -change)})
         assert list(np.flatnonzero(answers[-1][1].suspects)) == [4]
 
+    def test_nothing_of_a_replaced_meter_counts_any_more(self) -> None:
+        """A meter lied and was named; the new one is trusted at once, and nobody else changes."""
+        rng = np.random.default_rng(4)
+        plant = make_plant(rng, customers=8, drop=0.03)
+        design, street = prepare(plant, commission_s=3000.0), Street(plant, rng)
+        state, answers = watch(street, design, 40, lies={2: 0.05})
+        assert list(np.flatnonzero(answers[-1][1].suspects)) == [2]
+        which = np.arange(8) == 2
+        after = sequential.renew(design, state, which)
+        assert after.trust.trusted.all()
+        assert not after.trust.named.any()
+        assert (after.window.counts[:, 2] == 0).all()
+        np.testing.assert_array_equal(after.window.sums[:, ~which], state.window.sums[:, ~which])
+        for name in ("count", "run", "longest", "lag"):
+            now, was = getattr(after.kinds.memory, name), getattr(state.kinds.memory, name)
+            assert now[2] == 0
+            np.testing.assert_array_equal(now[~which], was[~which])
+        _, answers = watch(street, design, 60, state=after)
+        assert not any(verdict.suspects.any() for _, verdict in answers)
+        # Who goes on lying is named again.
+        _, answers = watch(street, design, 60, state=after, lies={2: 0.05})
+        assert list(np.flatnonzero(answers[-1][1].suspects)) == [2]
+
     def test_a_pause_of_the_frames_is_not_heard(self) -> None:
         rng = np.random.default_rng(1)
         plant = make_plant(rng, customers=6, drop=0.03)
