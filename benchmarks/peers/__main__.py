@@ -27,6 +27,7 @@ def main() -> int:
     parser.add_argument("--feeders", nargs="*", default=list(FEEDERS))
     parser.add_argument("--save", type=Path, help="keep the numbers in a file")
     parser.add_argument("--load", type=Path, nargs="*", help="take the numbers from files instead")
+    parser.add_argument("--speed", type=Path, help="the table that benchmarks.peers.speed printed")
     parser.add_argument("--write", type=Path, help="folder for peers.md and its figure")
     wanted = parser.parse_args()
     single, minute = report.load(wanted.load) if wanted.load else _run(wanted)
@@ -34,7 +35,8 @@ def main() -> int:
         report.save(wanted.save, single, minute)
     print(report.tables(single, minute))
     if wanted.write:
-        report.write(wanted.write, single, minute)
+        speed = wanted.speed.read_text(encoding="utf-8") if wanted.speed else "Not measured.\n"
+        report.write(wanted.write, single, minute, speed)
     clean_scores = [scores[OURS] for cell, scores in single.items() if cell.attack == "clean"]
     return int(
         sum(score.false for score in clean_scores) > 0.01 * sum(score.trials for score in clean_scores)

@@ -154,10 +154,10 @@ def load(paths: list[Path]) -> tuple[Scores, Scores]:
     return single, minute
 
 
-def write(folder: Path, single: Scores, minute: Scores) -> None:
-    """Write peers.md and the figures."""
+def write(folder: Path, single: Scores, minute: Scores, speed: str) -> None:
+    """Write peers.md and its figure."""
     text = (Path(__file__).parent / "text.md").read_text(encoding="utf-8")
-    text = text.replace("{tables}", tables(single, minute))
+    text = text.replace("{tables}", tables(single, minute)).replace("{speed}", speed.strip())
     (folder / "peers.md").write_text(text, encoding="utf-8")
     _draw(folder / "peers.png", single)
 
@@ -171,7 +171,7 @@ def _draw(path: Path, scores: Scores) -> None:
     attacked = [cell for cell in scores if cell.attack != "clean"]
     places = list(dict.fromkeys((cell.feeder, cell.std_v) for cell in attacked))
     names = list(next(iter(scores.values())))
-    figure, axes = plt.subplots(len(places), 1, figsize=(9, 2.3 * len(places)), sharex=True, squeeze=False)
+    figure, axes = plt.subplots(len(places), 1, figsize=(9, 0.5 + 1.9 * len(places)), squeeze=False)
     for axis, place in zip(axes[:, 0], places, strict=True):
         here = [cell for cell in attacked if (cell.feeder, cell.std_v) == place]
         x, width = np.arange(len(here)), 0.8 / len(names)
@@ -182,7 +182,9 @@ def _draw(path: Path, scores: Scores) -> None:
         axis.set_ylim(0, 100)
         axis.set_title(", ".join(_place(here[0])[:2]), fontsize=9)
         axis.set_xticks(x, [f"{cell.attack} {cell.liars}" for cell in here], fontsize=8)
-    axes[0, 0].legend(ncols=len(names), fontsize=7, loc="lower center")
-    figure.tight_layout()
+        axis.set_axisbelow(True)
+        axis.grid(axis="y", linewidth=0.4)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), ncols=len(names), fontsize=8, loc="upper center")
+    figure.tight_layout(rect=(0, 0, 1, 0.96))
     figure.savefig(path, dpi=80)
     plt.close(figure)
