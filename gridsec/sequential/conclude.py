@@ -133,9 +133,9 @@ _MILD = (Cause.AGREEMENT, Cause.AMBIGUOUS)
 
 def _contradicted(design: SequentialDesign, beyond: Bools, named: Bools, said: _Said) -> _Said:
     """The answer, unless with the meters named more than M are beyond what a decoder calls honest."""
-    more, most = int(np.count_nonzero(beyond)), design.most
     if design.decoder is None or said[1] is not Cause.RESIDUALS:
         return said
+    more, most = int(np.count_nonzero(beyond)), design.most
     if not more or int(np.count_nonzero(named)) + more <= most:
         return said
     sentence = f"{said[2][:-1]}; but so are {more} of the others, and at most {most} can be told apart."

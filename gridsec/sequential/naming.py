@@ -36,6 +36,8 @@ def name(design: SequentialDesign, before: Trust, seen: Examined) -> tuple[Trust
         What this tick brought.
     """
     trust = seen.trust
+    if trust.trusted.all() and not (trust.accused or before.named.any() or before.counted.any()):
+        return trust, ()
     quiet = np.where(trust.still.any(axis=0), 0, trust.quiet + 1)
     trusted = (trust.trusted & ~before.named) | (quiet >= design.options.release)
     age = np.where(trusted, 0, trust.age + 1)
