@@ -67,6 +67,30 @@ class Reconstruction:
     correction: Floats
 
 
+def known(frame: Frame) -> Frame:
+    """The frame with powers that are numbers: of all others nothing is known, and their errors say so.
+
+    Parameters
+    ----------
+    frame
+        Everything known at one tick.
+    """
+    p, p_error = _power(frame.p, frame.p_error)
+    q, q_error = _power(frame.q, frame.q_error)
+    told = (np.abs(frame.q_net) <= NO_POWER) & (frame.q_net_error >= 0.0) & (frame.q_net_error <= NO_POWER)
+    if p is frame.p and q is frame.q and bool((told | np.isnan(frame.q_net)).all()):
+        return frame
+    q_net = np.where(told, frame.q_net, np.nan)
+    return replace(frame, p=p, p_error=p_error, q=q, q_error=q_error, q_net=q_net)
+
+
+def _power(power: Floats, error: Floats) -> tuple[Floats, Floats]:
+    good, sure = np.abs(power) <= NO_POWER, (error >= 0.0) & (error <= NO_POWER)
+    if bool((good & sure).all()):
+        return power, error
+    return np.where(good, power, 0.0), np.where(good & sure, error, NO_POWER)
+
+
 def reconstruct(setting: Setting, frame: Frame, inputs: Inputs, q: Floats) -> Reconstruction:
     """Voltages for given injections, with the loss correction at just these; chong2020 (19).
 
@@ -103,7 +127,7 @@ def clean(setting: Setting, past: Past, frame: Frame) -> Inputs:
     plant, model, options = setting.plant, setting.model, setting.options
     at = plant.meters
     live = frame.seen & np.isfinite(frame.y)
-    y = np.where(live, frame.y, 0.0)
+    y = np.where(live, np.clip(frame.y, 0.0, NO_VOLTAGE), 0.0)
     low, high = options.v2_limits
     busbar = bool(np.isfinite(frame.v0_squared) and low <= frame.v0_squared <= high)
     # Without a busbar voltage the meters have to imply it, and then nobody's reactive power is believed.
@@ -133,6 +157,8 @@ def clean(setting: Setting, past: Past, frame: Frame) -> Inputs:
 _ROOM = 0.05
 # Errors of squared voltages end here: no voltage is above 2 pu.
 NO_VOLTAGE = 4.0
+# Powers beyond this many pu are none.
+NO_POWER = 1e4
 
 
 def _credible(setting: Setting, frame: Frame) -> Bools:

@@ -28,7 +28,7 @@ from gridsec.certificates import Certificate, certify, small_gain, verify
 from gridsec.detect import ErrorBound, Majorant, Motion
 from gridsec.errors import DesignInfeasible
 from gridsec.feeder import LinDistFlow, lindistflow
-from gridsec.frames import NO_VOLTAGE, Inputs, Past, clean, injections, reconstruct
+from gridsec.frames import NO_VOLTAGE, Inputs, Past, clean, injections, known, reconstruct
 from gridsec.judge import Situation, Tally, count, decide, residual_excess
 from gridsec.lmi import contraction
 from gridsec.lure import Lure, close_loop, rest
@@ -206,6 +206,7 @@ def step(design: MonitorDesign, state: MonitorState, frame: Frame) -> tuple[Moni
     late = state.bank is not None and not frame.t > state.t
     if late or not np.isfinite(frame.t):
         return _unusable(design, state, frame)
+    frame = known(frame)
     inputs = clean(design.setting, Past(state.x, state.v0_squared, state.tally.named), frame)
     h = 0.0 if state.bank is None else frame.t - state.t
     if state.bank is None:

@@ -48,7 +48,7 @@ from gridsec.decode.stacks import MOST_SUBSETS
 from gridsec.detect import Uncertainty
 from gridsec.errors import DesignInfeasible, NotObservable
 from gridsec.families.codeword import CodeWord, Parts, code_word, constants, observe, start
-from gridsec.frames import NO_VOLTAGE, Inputs, Past, Reconstruction, clean
+from gridsec.frames import NO_VOLTAGE, Inputs, Past, Reconstruction, clean, known
 from gridsec.judge import Situation, Tally, count, decide
 from gridsec.lure import close_loop
 from gridsec.observers import circle
@@ -216,7 +216,7 @@ def step(design: PartialDesign, state: PartialState, frame: Frame) -> tuple[Part
     """
     if (state.started and not frame.t > state.t) or not np.isfinite(frame.t):
         return _unusable(design, state, frame)
-    setting = design.setting
+    setting, frame = design.setting, known(frame)
     inputs = clean(setting, Past(state.parts.x, state.v0_squared, state.tally.named), frame)
     h = frame.t - state.t if state.started else 0.0
     alone, model, parts, at_rest = observe(setting, design.model, state.parts, frame, inputs, h)

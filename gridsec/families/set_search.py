@@ -48,7 +48,7 @@ from gridsec.families.switched import (
     lost,
     threshold_of,
 )
-from gridsec.frames import NO_VOLTAGE, Inputs, Past, clean
+from gridsec.frames import NO_VOLTAGE, Inputs, Past, clean, known
 from gridsec.judge import Situation, Tally, count, decide
 from gridsec.online import Cause, Decision, Estimate, Explanation, Frame, Verdict
 
@@ -75,6 +75,7 @@ def step(
     """
     if not np.isfinite(frame.t) or (state.bank is not None and not frame.t > state.t):
         return _unusable(design, state, frame)
+    frame = known(frame)
     inputs = clean(design.setting, Past(state.x, state.v0_squared, state.tally.named), frame)
     view = advance(design, state, frame, inputs)
     found = _Found(state.dropped, view.over & ~state.dropped, (), False)

@@ -34,7 +34,7 @@ from gridsec.families.pair_tick import Tick, UnknownInputDesign, UnknownInputSta
 from gridsec.families.pair_verdict import Found, answer, deaf_inverters, explain
 from gridsec.families.pairs import Trial, pairs, try_pair
 from gridsec.families.tubes import Doubt, spread
-from gridsec.frames import NO_VOLTAGE, reconstruct
+from gridsec.frames import NO_VOLTAGE, known, reconstruct
 from gridsec.judge import Tally, count
 from gridsec.online import Cause, Decision, Estimate, Frame, Verdict
 from gridsec.plant import Options, Plant, setting
@@ -136,7 +136,7 @@ def step(
     """
     if not np.isfinite(frame.t) or (state.tubes is not None and not frame.t > state.t):
         return _unusable(design, state, frame)
-    tick = observe(design, state, frame)
+    tick = observe(design, state, known(frame))
     after = replace(
         state,
         t=frame.t,
