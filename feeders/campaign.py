@@ -297,6 +297,8 @@ def _typical(site: Site) -> Loads:
 
 def present_loads(site: Site, scenario: Scenario, t: float) -> Loads:
     """What customers draw at time t, Unix s, without what readings do not show."""
-    customers = Customers(site, scenario.variation, scenario.seed, scenario.start, scenario.profile_s)
+    customers = Customers(
+        site, scenario.variation, scenario.seed, scenario.start, scenario.profile_s, season=scenario.season
+    )
     demand = customers.at(np.array([t]))
     return Loads(demand.p_kw[0], demand.q_kvar[0], float(demand.v0_volt[0]))

@@ -10,14 +10,14 @@ from __future__ import annotations
 import random
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any
 
 from feeders import convert_simbench
 from feeders.convert_pandapower import Fleet, from_pandapower
 from feeders.convert_source import feeder_source, profiles_source
-from feeders.profiles import ENVELOPES, FILE
+from feeders.profiles import ENVELOPES, Season
 from feeders.schema import validate, write
 from gridsec.errors import FeederInvalid, GridsecError
 
@@ -172,14 +172,11 @@ def _seeded(make: Callable[[], Any]) -> Any:
 def _convert_profiles(folder: Path) -> tuple[str, ...]:
     columns = convert_simbench.year()
     loads = convert_simbench.load_profiles(columns)
-    text = profiles_source(
-        "Monday 6 June 2016, 00:00",
-        convert_simbench.DAYS,
-        len(loads),
-        sum(n.startswith("PV") for n in columns),
-    )
+    stretches = [(season.file, *astuple(stretch)) for season, stretch in convert_simbench.STRETCHES.items()]
+    text = profiles_source(stretches, len(loads), sum(name.startswith("PV") for name in columns))
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / FILE).write_bytes(convert_simbench.library_csv(columns))
+    for season in Season:
+        (folder / season.file).write_bytes(convert_simbench.library_csv(columns, season))
     (folder / ENVELOPES).write_text(convert_simbench.envelopes_csv(columns), encoding="ascii", newline="\n")
     (folder / "SOURCE.md").write_text(text, encoding="utf-8", newline="\n")
     return ()

@@ -1,4 +1,4 @@
-"""SimBench data: grids with the profile of each load, and the slice of the profile library.
+"""SimBench data: grids with the profile of each load, and the slices of the profile library.
 
 Needs the optional extra `convert`; nothing here runs while a feeder is watched.
 """
@@ -9,6 +9,8 @@ import csv
 import gzip
 import io
 from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import date
 from math import ceil, floor
 from typing import Any
 
@@ -16,7 +18,7 @@ import numpy as np
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, QhullError
 
-from feeders.profiles import Envelope
+from feeders.profiles import Envelope, Season
 from gridsec.arrays import Floats
 from gridsec.errors import GridsecError
 
@@ -31,10 +33,43 @@ PROFILE_GRIDS = (
 )
 STEP_S = 900
 STEPS_PER_DAY = 96
-# Monday 6 June 2016, 00:00 local time; the year's clock goes forward by an hour in March.
-FIRST_SAMPLE = 157 * STEPS_PER_DAY - 4
-DAYS = 14
 DIGITS = 4
+
+NEW_YEAR = date(2016, 1, 1)
+SUMMER_TIME = (date(2016, 3, 27), date(2016, 10, 30))
+"""The year counts local time: its clock goes an hour forward on the first day, back on the other."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """Some days of the year.
+
+    Attributes
+    ----------
+    monday
+        The first, from 00:00 local time.
+    days
+        How many.
+    """
+
+    monday: date
+    days: int
+
+    @property
+    def rows(self) -> slice:
+        """Its samples within the year's."""
+        forward, back = SUMMER_TIME
+        first = (self.monday - NEW_YEAR).days * STEPS_PER_DAY - 4 * (forward < self.monday <= back)
+        return slice(first, first + self.days * STEPS_PER_DAY)
+
+
+# Weeks without public holidays in Germany, where SimBench's loads are from.
+STRETCHES = {
+    Season.WINTER: Stretch(date(2016, 1, 11), 7),
+    Season.SPRING: Stretch(date(2016, 4, 18), 7),
+    Season.SUMMER: Stretch(date(2016, 6, 6), 14),
+    Season.AUTUMN: Stretch(date(2016, 10, 17), 7),
+}
 
 
 def grid(code: str) -> Any:
@@ -75,9 +110,17 @@ def year() -> dict[str, Floats]:
     return columns
 
 
-def library_csv(columns: Mapping[str, Floats]) -> bytes:
-    """Return the slice of the library as gzipped CSV: t_s, then `<load>_p`, `<load>_q`, `<pv>`."""
-    rows = slice(FIRST_SAMPLE, FIRST_SAMPLE + DAYS * STEPS_PER_DAY)
+def library_csv(columns: Mapping[str, Floats], season: Season) -> bytes:
+    """Return a season of the library as gzipped CSV: t_s, then `<load>_p`, `<load>_q`, `<pv>`.
+
+    Parameters
+    ----------
+    columns
+        As `year` returns them.
+    season
+        Which slice of them.
+    """
+    rows = STRETCHES[season].rows
     names: list[tuple[str, str]] = []
     for load in load_profiles(columns):
         names += [(f"{load}_p", f"{load}_pload"), (f"{load}_q", f"{load}_qload")]
@@ -131,7 +174,7 @@ def envelope(p: Floats, q: Floats) -> Envelope:
     if not found.success or found.x is None:
         raise GridsecError(f"no envelope of the load profile: {found.message}")
     low, high, bottom = map(float, found.x)
-    # Rounded outwards, and wide enough for the rounded samples of the slice.
+    # Rounded outwards, and wide enough for the rounded samples of the slices.
     return Envelope(floor(low * 1e3) / 1e3, ceil(high * 1e3) / 1e3, ceil((bottom + 1e-3) * 1e3) / 1e3)
 
 

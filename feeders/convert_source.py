@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Iterable
+from datetime import date
 from importlib.metadata import PackageNotFoundError, version
 
 from feeders.schema import FeederTables
@@ -124,24 +126,28 @@ def feeder_source(
 """
 
 
-def profiles_source(first: str, days: int, loads: int, generators: int) -> str:
+def profiles_source(stretches: Iterable[tuple[str, date, int]], loads: int, generators: int) -> str:
     """Return the SOURCE.md of the profile library.
 
     Parameters
     ----------
-    first
-        Time of the first sample, in words.
-    days
-        Number of days.
+    stretches
+        Name, first day and number of days of each file.
     loads, generators
         Numbers of profiles.
     """
+    table = "\n".join(f"| `{file}` | {first:%Y-%m-%d} | {days} |" for file, first, days in stretches)
     return f"""# Load and generation profiles
 
-{days} days from {first}, one value every 15 minutes, of SimBench's low-voltage profiles:
-{loads} load profiles (`_p` active power as a fraction of the peak, `_q` reactive power as a fraction of the
-one at the peak) and {generators} generation profiles (fraction of the rating). `t_s` counts seconds from the
-first sample.
+Some days of every season, one value every 15 minutes, of SimBench's low-voltage profiles:
+
+| file | first day, a Monday | days |
+|---|---|---|
+{table}
+
+Each has {loads} load profiles (`_p` active power as a fraction of the peak, `_q` reactive power as a
+fraction of the one at the peak) and {generators} generation profiles (fraction of the rating). `t_s` counts
+seconds from the first sample, which is at 00:00 local time.
 
 `envelopes.csv` holds, for each load profile, the narrowest limits
 `q_low p - q_floor <= q <= q_high p + q_floor` that hold every point of SimBench's whole year.

@@ -1,4 +1,4 @@
-"""The library of load and generation profiles: fourteen days at 15 min, relative to the peak."""
+"""The library of load and generation profiles: some days of every season at 15 min, relative to the peak."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import csv
 import gzip
 import io
 from dataclasses import dataclass
+from enum import StrEnum
 from functools import cache
 from importlib import resources
 from importlib.resources.abc import Traversable
@@ -15,9 +16,22 @@ import numpy as np
 
 from gridsec.online import Floats
 
-FILE = "fourteen-days.csv.gz"
 ENVELOPES = "envelopes.csv"
 TIME = "t_s"
+
+
+class Season(StrEnum):
+    """The time of the year that profiles are from."""
+
+    WINTER = "winter"
+    SPRING = "spring"
+    SUMMER = "summer"
+    AUTUMN = "autumn"
+
+    @property
+    def file(self) -> str:
+        """Name of the season's file in data/profiles."""
+        return f"{self}.csv.gz"
 
 
 def data_root() -> Traversable:
@@ -71,10 +85,20 @@ def envelopes() -> dict[str, Envelope]:
     }
 
 
+def library(season: Season = Season.SUMMER) -> Profiles:
+    """Return one season of the library that comes with the project; see data/profiles/SOURCE.md.
+
+    Parameters
+    ----------
+    season
+        Which; summer has two weeks, the others have one.
+    """
+    return _read(season)
+
+
 @cache
-def library() -> Profiles:
-    """Return the library that comes with the project; see data/profiles/SOURCE.md."""
-    text = gzip.decompress((data_root() / "profiles" / FILE).read_bytes()).decode("ascii")
+def _read(season: Season) -> Profiles:
+    text = gzip.decompress((data_root() / "profiles" / season.file).read_bytes()).decode("ascii")
     header = next(csv.reader(io.StringIO(text)))
     table = np.loadtxt(io.StringIO(text), delimiter=",", skiprows=1, dtype=np.float64)
     table.setflags(write=False)

@@ -24,7 +24,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from feeders.meters import BUSBAR, Channel, MeterErrors, Silence
-from feeders.scenario import Reading, Sample, Scenario, simulate
+from feeders.scenario import Reading, Sample, Scenario, Season, simulate
 from feeders.variation import Variation
 from gridsec import attack as attacks
 from gridsec.arrays import Bools, Floats
@@ -273,6 +273,7 @@ def scenario_from_json(obj: dict[str, Any]) -> Scenario:
         for entry in given.get("inverter_attacks", ())
     )
     given["duration_s"] = float(given["duration_s"])
+    given["season"] = Season(given.get("season", Season.SUMMER))
     return Scenario(**given)
 
 

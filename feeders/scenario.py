@@ -18,6 +18,7 @@ import numpy as np
 from feeders.campaign import random_attacks
 from feeders.load import Snapshot
 from feeders.meters import BUSBAR, Channel, Delivery, MeterErrors, Meters, Registers
+from feeders.profiles import Season
 from feeders.truth import Block, net_reactive, truth
 from feeders.variation import Variation
 from gridsec.arrays import Bools, Floats, Ints
@@ -32,6 +33,7 @@ __all__ = [
     "Reading",
     "Sample",
     "Scenario",
+    "Season",
     "by_arrival",
     "random_attacks",
     "simulate",
@@ -42,7 +44,7 @@ START: Final = 1_780_272_000.0
 """Monday, 1 June 2026, 00:00 UTC."""
 
 SUNNY_NOON_S: Final = 216_000.0
-"""Noon of the first Wednesday of the profiles, a sunny day in June."""
+"""Noon of the first Wednesday of a season's profiles; in summer a sunny day in June."""
 
 LONGEST_LOOK_BACK_S: Final = 7 * 86_400.0
 
@@ -62,8 +64,8 @@ class Scenario:
     dt_s
         Interval between readings, s.
     profile_s
-        Position within the fourteen days of the profiles at `start`, s; they begin on a Monday at 00:00. By
-        default a sunny noon.
+        Position within the season's profiles at `start`, s; they begin on a Monday at 00:00, are two weeks in
+        summer and one in the other seasons, and repeat. By default the noon of a Wednesday.
     substep_s
         Longest step of the integrator, s; None: half the smallest time constant of the inverters, or one
         quasi-static step where a tick is more than ten of the largest.
@@ -73,6 +75,8 @@ class Scenario:
         Who lies, when and how, applied in this order. Meters are indices into `Site.meters`.
     inverter_attacks
         Which inverters inject a wrong reactive power; they add up. Inverters are indices into `Site.droop`.
+    season
+        The time of the year of loads and generation; the calendar of `start` plays no part.
     """
 
     seed: int = 0
@@ -86,10 +90,13 @@ class Scenario:
     channel: Channel = field(default_factory=Channel)
     attacks: tuple[Attack, ...] = ()
     inverter_attacks: tuple[InverterAttack, ...] = ()
+    season: Season = Season.SUMMER
 
     def __post_init__(self) -> None:
         if self.seed < 0:
             raise ValueError(f"seed must not be negative, got {self.seed}")
+        if not np.isfinite(self.profile_s):
+            raise ValueError(f"profile_s must be finite, got {self.profile_s}")
         if not (np.isfinite(self.start) and self.start >= 0.0):
             raise ValueError(f"start must be a Unix time, got {self.start}")
         if not self.duration_s > 0.0:

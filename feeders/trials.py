@@ -99,7 +99,7 @@ class Trial:
     lie
         Who lies; None: nobody.
     profile_s
-        Position within the fourteen days of the profiles, s.
+        Position within the fourteen days of the summer's profiles, s.
     variation
         What changes beside, known to all; `hidden_*` of it are those of `load_error`.
     report_q
@@ -212,7 +212,9 @@ def frames(trial: Trial) -> Iterator[tuple[Frame, Truth]]:
         When the lie cannot be told on this feeder, or the feeder not be solved.
     """
     site, scenario = trial.stated, trial.scenario
-    known = Customers(site, scenario.variation, scenario.seed, scenario.start, scenario.profile_s)
+    known = Customers(
+        site, scenario.variation, scenario.seed, scenario.start, scenario.profile_s, season=scenario.season
+    )
     samples = list(simulate(site, scenario))
     t = np.array([sample.t for sample in samples])
     demand = known.at(t)
@@ -227,10 +229,13 @@ def _powers(trial: Trial, site: Site, frame: Frame, p_kw: Floats, q_kvar: Floats
     """The frame with powers as told; those that nobody would believe stay what they are in any frame."""
     base, error = site.feeder.base_kva, trial.load_error
     believed = np.abs(p_kw) <= site.loads.credible * base
+    p_error = np.full(frame.p.size, error.half_width * error.p_kw / base)
+    # Registers are exact here, so that what a frame does not believe of them is what no connection carries.
+    p_error[site.meters] = np.maximum(p_error[site.meters], frame.p_error[site.meters])
     return replace(
         frame,
         p=np.where(believed, -p_kw / base, frame.p),
-        p_error=np.where(believed, error.half_width * error.p_kw / base, frame.p_error),
+        p_error=np.where(believed, p_error, frame.p_error),
         q=np.where(believed, -q_kvar / base, frame.q),
         q_error=np.where(believed, error.half_width * error.q_kvar / base, frame.q_error),
     )

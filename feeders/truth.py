@@ -70,7 +70,9 @@ class Block:
 
 def truth(site: Site, scenario: Scenario, first: int, end: float) -> Iterator[Block]:
     """The truth from tick `first` up to tick `end`, which may be infinite; begins in equilibrium."""
-    customers = Customers(site, scenario.variation, scenario.seed, scenario.start, scenario.profile_s)
+    customers = Customers(
+        site, scenario.variation, scenario.seed, scenario.start, scenario.profile_s, season=scenario.season
+    )
     loop = ClosedLoop(PowerFlow(site), site.droop, site.feeder.base_kva, site.feeder.base_volt)
     steps = substeps(site, scenario)
     course = _Course(loop, scenario.dt_s / steps)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from scipy.signal import lfilter
 
-from feeders.profiles import library
+from feeders.profiles import Season, library
 from gridsec.arrays import Floats
 
 if TYPE_CHECKING:
@@ -201,10 +201,21 @@ class Customers:
     start
         Unix time at which the profiles are at `profile_s`, s.
     profile_s
-        Position within the fourteen days of the profiles, s; they repeat.
+        Position within the season's profiles, s; they repeat.
+    season
+        Which of the profiles.
     """
 
-    def __init__(self, site: Site, variation: Variation, seed: int, start: float, profile_s: float) -> None:
+    def __init__(
+        self,
+        site: Site,
+        variation: Variation,
+        seed: int,
+        start: float,
+        profile_s: float,
+        *,
+        season: Season = Season.SUMMER,
+    ) -> None:
         count, base = len(site.tables.customers), site.feeder.base_kva
         self._variation = variation
         self._nominal = site.tables.meta.voltage_volt
@@ -216,7 +227,7 @@ class Customers:
         self._stagger = random.uniform(-STAGGER_S, STAGGER_S, count)
         self._tan = random.uniform(site.loads.tan_min, site.loads.tan_max)
         self._q_floor_kvar = random.uniform(-1.0, 1.0, count) * site.loads.q_floor * base
-        profiles = library()
+        profiles = library(season)
         self._profile_t = np.append(profiles.t_s, 2.0 * profiles.t_s[-1] - profiles.t_s[-2])
         self._load = [_curve(profiles.load_p, row.load_profile) for row in site.tables.customers]
         self._pv = [_curve(profiles.pv, row.pv_profile) for row in site.tables.customers]

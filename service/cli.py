@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from feeders.load import Site
-    from feeders.scenario import Scenario
+    from feeders.scenario import Scenario, Season
     from gridsec.attack import Attack
     from service.app import Running
 
@@ -285,6 +285,9 @@ def simulate(
         float | None, typer.Option(help="Interval between readings, s. [default: the tick]")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Chooses everything random.")] = 0,
+    season: Annotated[
+        str, typer.Option(help="Loads and generation of winter, spring, summer or autumn.")
+    ] = "summer",
     attack: Attacks = None,
     inverter_attack: InverterAttacks = None,
     start: Annotated[
@@ -317,6 +320,7 @@ def simulate(
         dt_s=tick,
         errors=MeterErrors(report_q=report_q),
         channel=Channel(loss=loss),
+        season=_season(season),
     )
     scenario = _with_attacks(site, scenario, attack or [])
     scenario = _with_inverter_attacks(site, scenario, inverter_attack or [])
@@ -327,6 +331,17 @@ def simulate(
         console.out.print(f"{recording.path}: {recording.count} readings of {site.feeder.name}")
         return
     _publish(site, scenario, tuple(connect or ("tcp/127.0.0.1:7447",)), prefix, (speed or math.inf, lockstep))
+
+
+def _season(text: str) -> Season:
+    from feeders.scenario import Season
+
+    try:
+        return Season(text)
+    except ValueError:
+        raise typer.BadParameter(
+            f"{text!r} is not known; expected one of {', '.join(Season)}", param_hint="--season"
+        ) from None
 
 
 def _with_attacks(site: Site, scenario: Scenario, texts: list[str]) -> Scenario:

@@ -21,7 +21,7 @@ from feeders.convert import RECIPES, SEED, convert
 from feeders.convert_pandapower import Fleet, from_pandapower
 from feeders.convert_simbench import envelope, envelopes_csv, library_csv
 from feeders.load import from_tables, load
-from feeders.profiles import data_root, envelopes
+from feeders.profiles import Season, data_root, envelopes
 from feeders.schema import read, validate
 from gridsec.errors import FeederInvalid, GridsecError
 from gridsec.feeder import lindistflow
@@ -327,21 +327,32 @@ def test_envelope_of_a_straight_profile() -> None:
 # --- the profile library ------------------------------------------------------------------------
 
 
-def test_library_is_the_right_fortnight() -> None:
+@pytest.mark.parametrize(
+    ("season", "monday", "days", "summer_time"),
+    [
+        (Season.WINTER, datetime.date(2016, 1, 11), 7, False),
+        (Season.SPRING, datetime.date(2016, 4, 18), 7, True),
+        (Season.SUMMER, datetime.date(2016, 6, 6), 14, True),
+        (Season.AUTUMN, datetime.date(2016, 10, 17), 7, True),
+    ],
+)
+def test_library_is_the_right_days(
+    season: Season, monday: datetime.date, days: int, summer_time: bool
+) -> None:
     """A year that counts its own quarters: the slice starts at the Monday's midnight."""
     clock = np.arange(366 * 96) / 1e5
     columns = {"H0-A_pload": clock, "H0-A_qload": clock / 2, "PV1": clock / 4}
-    text = gzip.decompress(library_csv(columns)).decode("ascii")
+    text = gzip.decompress(library_csv(columns, season)).decode("ascii")
     header, *rows = csv.reader(io.StringIO(text))
     assert header == ["t_s", "H0-A_p", "H0-A_q", "PV1"]
     table = np.array(rows, dtype=float)
-    np.testing.assert_array_equal(table[:, 0], np.arange(14 * 96) * 900.0)
-    # 1 January 2016 was a Friday; one hour is missing since the end of March.
-    first = ((datetime.date(2016, 6, 6) - datetime.date(2016, 1, 1)).days * 24 - 1) * 4
-    assert datetime.date(2016, 6, 6).weekday() == 0
-    np.testing.assert_allclose(table[:, 1], clock[first : first + 14 * 96], rtol=5e-4)
-    np.testing.assert_allclose(table[:, 3], clock[first : first + 14 * 96] / 4, rtol=5e-4)
-    assert library_csv(columns) == library_csv(columns)
+    np.testing.assert_array_equal(table[:, 0], np.arange(days * 96) * 900.0)
+    # 1 January 2016 was a Friday; one hour is missing from the end of March to the end of October.
+    first = ((monday - datetime.date(2016, 1, 1)).days * 24 - summer_time) * 4
+    assert monday.weekday() == 0
+    np.testing.assert_allclose(table[:, 1], clock[first : first + days * 96], rtol=5e-4)
+    np.testing.assert_allclose(table[:, 3], clock[first : first + days * 96] / 4, rtol=5e-4)
+    assert library_csv(columns, season) == library_csv(columns, season)
     assert envelopes_csv({**columns, "H0-A_qload": clock}).splitlines()[1].startswith("H0-A,1.0,1.0,")
 
 
@@ -349,6 +360,7 @@ def test_profiles_build_the_committed_library(tmp_path: Path) -> None:
     pytest.importorskip("simbench", reason="the extra `convert` is not installed")
     convert("profiles", tmp_path)
     committed = Path(str(data_root())) / "profiles"
+    assert {path.name for path in tmp_path.iterdir()} == {path.name for path in committed.iterdir()}
     for path in committed.iterdir():
         made = (tmp_path / path.name).read_bytes()
         if path.suffix == ".gz":  # compressed bytes depend on the version of zlib

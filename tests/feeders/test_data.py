@@ -13,6 +13,7 @@ import pytest
 from feeders import profiles
 from feeders.convert import RECIPES
 from feeders.load import Site, Snapshot, load, names, to_frame
+from feeders.profiles import Season
 from feeders.schema import examine, read
 from gridsec.certificates import certify, reactance, small_gain, verify
 from gridsec.feeder import lindistflow, loss_correction, model_error_bound, squared_voltages
@@ -158,9 +159,16 @@ def test_unknown_powers_leave_room_to_see_a_lie(name: str) -> None:
 # --- profiles -----------------------------------------------------------------------------------
 
 
-def test_library_is_fourteen_days_of_quarters() -> None:
-    library = profiles.library()
-    assert library.t_s.size == 14 * 96
+DAYS = {Season.WINTER: 7, Season.SPRING: 7, Season.SUMMER: 14, Season.AUTUMN: 7}
+DARK = {Season.WINTER: (7, 16), Season.SPRING: (5, 20), Season.SUMMER: (3, 22.5), Season.AUTUMN: (6, 18.5)}
+"""The sun of these weeks has not risen by the first hour, and has set by the second (Germany, local time)."""
+BRIGHT = {Season.WINTER: 0.2, Season.SPRING: 0.4, Season.SUMMER: 0.4, Season.AUTUMN: 0.3}
+
+
+@pytest.mark.parametrize("season", Season)
+def test_library_is_days_of_quarters(season: Season) -> None:
+    library = profiles.library(season)
+    assert library.t_s.size == DAYS[season] * 96
     np.testing.assert_array_equal(np.diff(library.t_s), 900.0)
     assert len(library.load_p) == len(library.load_q) == 16
     assert list(library.load_p) == list(library.load_q) == list(profiles.load_names())
@@ -168,26 +176,42 @@ def test_library_is_fourteen_days_of_quarters() -> None:
     for p in library.load_p.values():
         assert 0.0 <= p.min() <= p.max() <= 1.0
         assert p.max() > 0.3
-    assert (DATA / "profiles" / profiles.FILE).stat().st_size < 130_000
+    assert (DATA / "profiles" / season.file).stat().st_size < 9_000 * DAYS[season]
 
 
-def test_generation_is_dark_at_night_and_bright_at_noon() -> None:
-    library = profiles.library()
+@pytest.mark.parametrize("season", Season)
+def test_generation_is_dark_at_night_and_bright_at_noon(season: Season) -> None:
+    library = profiles.library(season)
     hour = library.t_s / 3600.0 % 24.0
+    rises, sets = DARK[season]
     for pv in library.pv.values():
-        assert pv[(hour < 3) | (hour > 22.5)].max() == 0.0
-        assert 0.4 < pv[(hour > 10) & (hour < 16)].max() <= 1.0
+        assert pv[(hour < rises) | (hour > sets)].max() == 0.0
+        assert BRIGHT[season] < pv[(hour > 10) & (hour < 16)].max() <= 1.0
 
 
-def test_first_day_is_a_monday() -> None:
+def test_winter_has_more_load_and_less_sun_than_summer() -> None:
+    winter, summer = profiles.library(Season.WINTER), profiles.library(Season.SUMMER)
+    assert list(winter.load_p) == list(summer.load_p)
+    assert list(winter.pv) == list(summer.pv)
+    for name, drawn in winter.load_p.items():
+        if name.startswith("H0"):
+            assert drawn.mean() > summer.load_p[name].mean(), name
+    for name, pv in winter.pv.items():
+        assert pv.mean() < 0.5 * summer.pv[name].mean()
+
+
+@pytest.mark.parametrize("season", Season)
+def test_first_day_is_a_monday(season: Season) -> None:
     """Trade stands still on Sundays: days 6 and 13 when day 0 is a Monday."""
-    trade = profiles.library().load_p["G1-A"].reshape(14, 96).mean(axis=1)
-    weekend = {5, 6, 12, 13}
-    assert max(trade[day] for day in weekend) < min(trade[day] for day in set(range(14)) - weekend)
+    trade = profiles.library(season).load_p["G1-A"].reshape(-1, 96).mean(axis=1)
+    days = set(range(DAYS[season]))
+    weekend = {day for day in days if day % 7 in {5, 6}}
+    assert max(trade[day] for day in weekend) < min(trade[day] for day in days - weekend)
 
 
-def test_envelopes_hold_the_library() -> None:
-    library, envelopes = profiles.library(), profiles.envelopes()
+@pytest.mark.parametrize("season", Season)
+def test_envelopes_hold_the_library(season: Season) -> None:
+    library, envelopes = profiles.library(season), profiles.envelopes()
     assert set(envelopes) == set(library.load_p)
     for name, envelope in envelopes.items():
         p, q = library.load_p[name], library.load_q[name]

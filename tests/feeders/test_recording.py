@@ -22,7 +22,7 @@ from feeders.recording import (
     scenario_to_json,
     truth_path,
 )
-from feeders.scenario import START, Scenario, by_arrival, simulate
+from feeders.scenario import START, Scenario, Season, by_arrival, simulate
 from feeders.variation import Variation
 from tests.feeders.villages import village
 
@@ -103,6 +103,10 @@ def test_scenarios_survive_json() -> None:
     assert [type(a) for a in back.attacks] == [type(a) for a in scenario.attacks]
     endless = scenario_from_json(json.loads(json.dumps(scenario_to_json(Scenario(duration_s=np.inf)))))
     assert endless.duration_s == np.inf
+    winter = scenario_to_json(Scenario(season=Season.WINTER))
+    assert scenario_from_json(json.loads(json.dumps(winter))).season is Season.WINTER
+    older = {name: value for name, value in winter.items() if name != "season"}
+    assert scenario_from_json(older).season is Season.SUMMER  # all there was
 
 
 def test_pandas_reads_it(tmp_path: Path) -> None:

@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from feeders.load import Site, from_tables
-from feeders.profiles import library
+from feeders.load import Site, from_tables, load
+from feeders.profiles import Season, library
+from feeders.scenario import SUNNY_NOON_S
 from feeders.variation import CHUNK_CORRELATIONS, STAGGER_S, Customers, Fluctuation, Stream, Variation
 from tests.feeders.villages import tables, village
 
@@ -87,32 +88,57 @@ def test_the_ratio_of_reactive_power_is_each_customers_own_and_constant() -> Non
     assert np.ptp(ratios) > 0.05
 
 
-def with_profiles(load: str, pv: str) -> Site:
+def with_profiles(wave: str, pv: str) -> Site:
     rows = tuple(
-        replace(row, load_profile=load, pv_profile=pv if row.pv_kw > 0 else "") for row in tables().customers
+        replace(row, load_profile=wave, pv_profile=pv if row.pv_kw > 0 else "") for row in tables().customers
     )
     return from_tables(replace(tables(), customers=rows))
 
 
-def test_without_fast_variation_the_profiles_come_back() -> None:
-    profiles = library()
-    load, pv = next(iter(profiles.load_p)), next(iter(profiles.pv))
-    site = with_profiles(load, pv)
+@pytest.mark.parametrize("season", Season)
+def test_without_fast_variation_the_profiles_come_back(season: Season) -> None:
+    profiles = library(season)
+    period = 900.0 * profiles.t_s.size
+    wave_name, pv = next(iter(profiles.load_p)), next(iter(profiles.pv))
+    site = with_profiles(wave_name, pv)
     profile_s = 3 * 86400.0
-    t = START + np.arange(-7200.0, 15 * 86400.0, 1800.0)  # beyond both ends of the fourteen days
-    demand = Customers(site, CALM, 0, START, profile_s).at(t)
-    place = np.mod(t - START + profile_s, 14 * 86400.0)
-    times = np.append(profiles.t_s, 14 * 86400.0)
+    t = START + np.arange(-7200.0, 15 * 86400.0, 1800.0)  # beyond both ends of the profiles
+    demand = Customers(site, CALM, 0, START, profile_s, season=season).at(t)
+    place = np.mod(t - START + profile_s, period)
+    times = np.append(profiles.t_s, period)
     sun = np.interp(place, times, np.append(profiles.pv[pv], profiles.pv[pv][0]))
-    wave = np.append(profiles.load_p[load], profiles.load_p[load][0])
+    wave = np.append(profiles.load_p[wave_name], profiles.load_p[wave_name][0])
     reach = np.linspace(-STAGGER_S, STAGGER_S, 61)
-    around = np.array([np.interp(np.mod(place + s, 14 * 86400.0), times, wave) for s in reach])
+    around = np.array([np.interp(np.mod(place + s, period), times, wave) for s in reach])
     for i, row in enumerate(site.tables.customers):
         drawn = demand.p_kw[:, i] + row.pv_kw * np.clip(sun, 0.0, 1.0)
         low, high = around.min(0) * row.load_kw, around.max(0) * row.load_kw
         slack = 0.02 * row.load_kw
         assert np.all(drawn >= low - slack)
         assert np.all(drawn <= np.minimum(high, row.load_kw) + slack)
+
+
+def test_numbers_of_the_default_season_have_not_changed() -> None:
+    """As they were when there was summer only."""
+    t = START + np.array([0.0, 3600.0, 43_200.0, 13 * 86_400.0])
+    demand = Customers(load("simbench-lv-rural1"), Variation(), 7, START, SUNNY_NOON_S).at(t)
+    then_kw = [-86.60834967445527, -72.64941094148463, 11.513360966594913, -27.216796056518046]
+    then_kvar = [8.067709383992423, 7.98264625735612, 2.601637945946422, 7.393853983083182]
+    np.testing.assert_allclose(demand.p_kw.sum(axis=1), then_kw, rtol=1e-12)
+    np.testing.assert_allclose(demand.q_kvar.sum(axis=1), then_kvar, rtol=1e-12)
+
+
+def test_a_season_changes_profiles_and_nothing_random() -> None:
+    """Same seed, same noise, same customers: only the curves differ."""
+    site, t = village(), START + np.arange(0.0, 86_400.0, 900.0)
+    summer = Customers(site, Variation(), 5, START, 0.0).at(t)
+    winter = Customers(site, Variation(), 5, START, 0.0, season=Season.WINTER).at(t)
+    again = Customers(site, Variation(), 5, START, 0.0, season=Season.WINTER).at(t)
+    np.testing.assert_array_equal(winter.p_kw, again.p_kw)
+    np.testing.assert_array_equal(winter.v0_volt, summer.v0_volt)
+    night = (t - START) / 3600.0 > 17.0
+    assert np.all(winter.p_kw[night] >= 0.0)  # no sun after five in January
+    assert summer.p_kw.sum() < 0.8 * winter.p_kw.sum()
 
 
 def test_readings_of_a_second_are_no_staircase() -> None:

@@ -192,6 +192,9 @@ def test_no_recording(gridsec: Run, tmp_path: Path) -> None:
 
 
 def test_wrong_usage(gridsec: Run) -> None:
+    done = gridsec("simulate", FEEDER, "--season", "monsoon", "--out", "x")
+    assert done.returncode == 2
+    assert "winter, spring, summer, autumn" in " ".join(done.stderr.split())
     done = gridsec("simulate", FEEDER, "--attack", "bias:2", "--out", "x")
     assert done.returncode == 2
     assert "kind:count:size:from:to" in done.stderr
@@ -245,6 +248,15 @@ def test_a_recording_replayed_names_the_liars(gridsec: Run, tmp_path: Path) -> N
     summary = gridsec("replay", str(file)).stdout
     assert "never arrived" in summary
     assert "attacked" in summary
+
+
+def test_a_recording_knows_its_season(gridsec: Run, tmp_path: Path) -> None:
+    file = tmp_path / "noon.parquet"
+    made = gridsec("simulate", FEEDER, "--out", str(file), "--duration", "3", "--season", "winter")
+    assert made.returncode == 0, made.stderr
+    scenario = read_recording(file).scenario
+    assert scenario is not None
+    assert scenario.season == "winter"
 
 
 def test_a_wrong_inverter_is_recorded_and_raises_its_alarm(gridsec: Run, tmp_path: Path) -> None:
