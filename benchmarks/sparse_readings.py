@@ -3,11 +3,11 @@
     python -m benchmarks.sparse_readings [seeds]
 
 Kerber Vorstadtnetz with 146 customers, loads known within 0.6 kW and 0.2 kvar (600 s), meters with white
-noise of 0.2 %. A third of the meters that report at all lies by 3 % with random signs. Intervals of 1 s, 60 s
-and 900 s; all meters, half of them (chosen at random, silent from the start), or every meter at random moments
-of its own, on average at every second tick. Counted are those named within the limit, of those who lie;
-honest meters ever named; the median delay in readings of the meter's own; and the 95th percentile of the error
-of the reconstructed voltage at lying and at silent meters, in % of nominal, of the worst seed.
+noise of 0.2 %. A third of the meters that report at all lies by 3 % with random signs. Intervals of 1 s,
+60 s and 900 s; all meters, half of them (chosen at random, silent from the start), or every meter at random
+moments of its own, on average at every second tick. Counted are those named within the limit, of those who
+lie; honest meters ever named; the median delay in readings of the meter's own; and the 95th percentile of the
+error of the reconstructed voltage at lying and at silent meters, in % of nominal, of the worst seed.
 """
 
 from __future__ import annotations
