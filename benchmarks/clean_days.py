@@ -6,9 +6,9 @@ Thirty days by default, shared evenly between all feeders of data/feeders and th
 has its own seed (meters, loads, clouds, busbar) and begins at an hour of the season's profiles drawn at
 random, so that weekdays and weekends, days and nights are all seen. The truth is full AC power flow with the
 droop inverters; readings go through the whole chain of the service (`service.replay`), with the alarm delays
-of the feeder's file, every 10 s up to 50 customers and every 30 s above. In half of the runs, of
-all feeders and seasons, the meters' fixed errors are learned over `commission_s` as the file has it, in the others over a
-quarter of the run; the rest is watched with what was learned.
+of the feeder's file, every 10 s up to 50 customers and every 30 s above. In half of the runs, of all feeders
+and seasons, the meters' fixed errors are learned over `commission_s` as the file has it, in the others over
+a quarter of the run; the rest is watched with what was learned.
 
 Counted are the ticks' verdicts after two minutes, meters suspected at any tick, and alarms. An alarm is a
 false one unless it is about a voltage that truly is outside the limits. They are held against
