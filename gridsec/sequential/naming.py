@@ -95,10 +95,11 @@ def _rivals(design: SequentialDesign, seen: Examined, fresh: Bools, new: Bools) 
     """All explanations about as likely as the best, where one leaves out somebody about to be named."""
     within = 2.0 * float(np.log(design.options.like))
     out: dict[bytes, tuple[Bools, Bools, float]] = {}
-    for found in seen.found.values():
-        best = found.best
+    for s, found in seen.found.items():
+        best, view = found.best, seen.views[s]
         near = [(~each.trusted, each.loosened, each.cost - best.cost) for each in (best, *found.others)]
-        for swap in swaps(best, np.isfinite(best.judged.offset), within):
+        exchanges = swaps(best, np.isfinite(best.judged.offset), within, view.limits) if view else []
+        for swap in exchanges:
             other = near[0][0].copy()
             other[swap.accused], other[swap.innocent] = False, True
             near.append((other, best.loosened, swap.worse))

@@ -392,11 +392,12 @@ class Swap:
 _COLUMNS = 64
 
 
-def swaps(found: Solution, live: Bools, within: float) -> list[Swap]:
+def swaps(found: Solution, live: Bools, within: float, limits: Limits) -> list[Swap]:
     """Exchanges of one accused meter for a trusted one that cost at most `within`; O(p^2) per accused.
 
     With accused k back, ``Q' = Q + v v^T / s`` with ``v = Q S_:k - e_k`` and ``s = M_kk + d_k``, and then
-    meter j gains ``(Q' m)_j^2 / Q'_jj``.
+    meter j gains ``(Q' m)_j^2 / Q'_jj``. Without j, k is off by ``(Q'' m)_k / Q''_kk`` with
+    ``Q'' = Q' - Q'_:j Q'_j: / Q'_jj``: if that is more than any honest meter is, it is no explanation.
 
     Parameters
     ----------
@@ -406,6 +407,8 @@ def swaps(found: Solution, live: Bools, within: float) -> list[Swap]:
         Which meters have a reading.
     within
         Largest rise of J.
+    limits
+        What is evidence.
 
     Returns
     -------
@@ -425,8 +428,13 @@ def swaps(found: Solution, live: Bools, within: float) -> list[Swap]:
         with np.errstate(divide="ignore", invalid="ignore"):
             gain = weights**2 / (Q.diagonal()[:, None] + v**2 / s)
         gain[~now.trusted] = -np.inf
-        best = gain.argmax(axis=0)
-        worse = judged.offset[who] ** 2 / s - gain[best, np.arange(who.size)]
-        near = np.flatnonzero(worse <= within)
+        best, each = gain.argmax(axis=0), np.arange(who.size)
+        worse = judged.offset[who] ** 2 / s - gain[best, each]
+        v, weight = v[best, each], weights[best, each]
+        pivot = Q.diagonal()[best] + v**2 / s
+        precision = 1.0 / s - (v / s) ** 2 / pivot
+        offset, std = (judged.offset[who] + v * weight / pivot) / (s * precision), np.ones(now.trusted.size)
+        std[who] = 1.0 / np.sqrt(precision)
+        near = np.flatnonzero((worse <= within) & (np.abs(offset) <= limits.of(std)[who]))
         out += [Swap(int(who[k]), int(best[k]), max(float(worse[k]), 0.0)) for k in near.tolist()]
     return sorted(out, key=lambda swap: swap.worse)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from itertools import combinations
-from math import comb, log
+from dataclasses import replace
+from itertools import combinations, product
 
 import numpy as np
 import pytest
@@ -158,12 +158,41 @@ def test_swaps_are_what_the_cost_rises_by() -> None:
     found = descend(fit(p, noise, live), m, live, limits(5), keep=none)
     accused = np.flatnonzero(~found.fit.trusted)
     assert accused.size >= 1
-    for swap in swaps(found, live, 50.0):
+    anybody, honest = replace(limits(5), sigmas=1e9), set()
+    everything = swaps(found, live, 50.0, anybody)
+    for swap in everything:
         trusted = found.fit.trusted.copy()
         trusted[swap.accused], trusted[swap.innocent] = True, False
-        now = judge(fit(p, noise, trusted), m).misfit
-        assert swap.worse == pytest.approx(max(now - found.judged.misfit, 0.0), rel=1e-6, abs=1e-9)
-    assert swaps(found, live, -1.0) == []
+        now = judge(fit(p, noise, trusted), m)
+        assert swap.worse == pytest.approx(max(now.misfit - found.judged.misfit, 0.0), rel=1e-6, abs=1e-9)
+        if abs(now.offset[swap.accused]) <= limits(5).of(now.std)[swap.accused]:
+            honest.add(swap.accused)
+    assert {swap.accused for swap in swaps(found, live, 50.0, limits(5))} == honest
+    assert swaps(found, live, -1.0, anybody) == []
+
+
+def test_nobody_is_exchanged_who_would_be_accused_again() -> None:
+    """Against an oracle, for lies of all sizes: who is taken back must be within what honest meters are."""
+    rng = np.random.default_rng(16)
+    columns, _ = street(rng, 8)
+    S = columns @ columns.T * 0.006**2
+    noise, live, none = np.full(9, 0.002**2), np.ones(9, dtype=bool), np.zeros(9, dtype=bool)
+    seen: set[bool] = set()
+    for size, alone in product(np.linspace(0.01, 0.05, 40), (True, False)):
+        at = np.array([3, 4, 5, 6, 7, 8, 2, 1, 0]) if alone else np.array([3, 3, 5, 6, 7, 7, 8, 2, 1])
+        p = Prior(S[:, at], at, S.diagonal().copy())
+        m = 0.002 * rng.normal(size=9)
+        m[[2, 4]] += size
+        found = descend(fit(p, noise, live), m, live, limits(9), keep=none)
+        told = {swap.accused for swap in swaps(found, live, 30.0, limits(9))}
+        for swap in swaps(found, live, 30.0, replace(limits(9), sigmas=1e9)):
+            trusted = found.fit.trusted.copy()
+            trusted[swap.accused], trusted[swap.innocent] = True, False
+            now = judge(fit(p, noise, trusted), m)
+            fine = abs(now.offset[swap.accused]) <= limits(9).of(now.std)[swap.accused]
+            assert fine == (swap.accused in told)
+            seen.add(bool(fine))
+    assert seen == {True, False}
 
 
 def test_swaps_with_a_loosened_direction() -> None:
@@ -176,7 +205,7 @@ def test_swaps_with_a_loosened_direction() -> None:
     loose = 0.05 * columns[:, [6]]
     found = descend(fit(p, noise, live, loose), m, live, limits(9), keep=none)
     assert list(np.flatnonzero(~found.fit.trusted)) == [4]
-    (swap,) = swaps(found, live, 1e9)
+    (swap,) = swaps(found, live, 1e9, replace(limits(9), sigmas=1e9))
     trusted = live.copy()
     trusted[swap.innocent] = False
     now = judge(fit(p, noise, trusted, loose), m).misfit

@@ -1,0 +1,377 @@
+"""The explanations that several starts lead to on one scale, and how rivals compare over all of them.
+
+References
+----------
+docs/theory-sequential.md, sections 3 to 5.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats
+from gridsec.sequential import search
+from gridsec.sequential.commission import Learned
+from gridsec.sequential.conditional import Fit, Judged, Prior, admit, drop, fit, judge, misfit
+from gridsec.sequential.design import SequentialDesign
+from gridsec.sequential.dictionary import Dictionary
+from gridsec.sequential.search import Explanation, Found, Limits, Solution, likelier
+from gridsec.sequential.state import Trust
+from gridsec.sequential.windows import Window
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """What one scale says. p meters.
+
+    Attributes
+    ----------
+    judged
+        Every meter, judged by the trusted others.
+    enough : (p,)
+        Meters with enough readings on this scale.
+    limit : (p,)
+        Largest honest offset, squared pu.
+    over : (p,)
+        Whose offset is larger.
+    limits, lower
+        How the limits come about, and the part of `sigmas` that is expected of a meter that is to be
+        trusted again.
+    """
+
+    judged: Judged
+    enough: Bools
+    limit: Floats
+    over: Bools
+    limits: Limits
+    lower: float
+
+    @property
+    def still(self) -> Bools:
+        """Whose offset is larger than what is expected of a meter that is to be trusted again, (p,)."""
+        judged = self.judged
+        return self.enough & (np.abs(judged.offset) > self.limits.of(judged.std, self.lower))
+
+
+# With more meters than this beyond their limits at once, moving one after the other is no good start.
+_FEW = 32
+# With no more suspects than this, whether each of them could be honest is looked into by a search.
+_CLOSE = 8
+# A fit is made anew when that part of its meters changed, or after so many changes (rounding).
+_ANEW = 6
+_MOST_CHANGES = 400
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scale:
+    """What one scale has to judge by. p meters.
+
+    Attributes
+    ----------
+    noise : (p,)
+        Variance of each meter's mean, squared pu^2.
+    m : (p,)
+        Mean residual, squared pu.
+    enough : (p,)
+        Meters with enough readings.
+    limits
+        What is evidence.
+    """
+
+    noise: Floats
+    m: Floats
+    enough: Bools
+    limits: Limits
+
+
+class Scales:
+    """All scales at one tick, by index.
+
+    Parameters
+    ----------
+    design
+        The design.
+    prior, window, learned
+        What the powers may do, the last residuals, and what is known of the meters' errors.
+    model : (p,)
+        What the model may be off, squared pu.
+    """
+
+    def __init__(
+        self, design: SequentialDesign, prior: Prior, window: Window, learned: Learned, model: Floats
+    ) -> None:
+        self.design, self.prior, self.window, self.model = design, prior, window, model
+        self.learned = learned
+
+    def __getitem__(self, s: int) -> Scale:
+        design, counts = self.design, self.window.counts[s]
+        need = max(1, int(np.ceil(design.options.enough * design.lengths[s])))
+        return Scale(
+            noise=design.white / need + self.learned.variance,
+            m=self.window.sums[s] / np.maximum(counts, 1),
+            enough=counts >= need,
+            limits=Limits(design.sigmas[s], self.model, self.learned.allowed, self.learned.variance),
+        )
+
+
+def view_of(design: SequentialDesign, here: Scale, now: Fit) -> View:
+    """What a scale says of every meter when it rests on a fit.
+
+    Parameters
+    ----------
+    design, here, now
+        The design, the scale, and the fit.
+    """
+    judged = judge(now, here.m)
+    limit = here.limits.of(judged.std)
+    over = here.enough & (np.abs(judged.offset) > limit)
+    return View(judged, here.enough, limit, over, here.limits, design.options.lower)
+
+
+def directions(book: Dictionary, accused: tuple[tuple[int, int], ...]) -> Floats | None:
+    """Loosened directions with their standard deviations, (n, k); None for none.
+
+    Parameters
+    ----------
+    book
+        What else but meters can be wrong.
+    accused
+        Its indices, each with a scale.
+    """
+    if not accused:
+        return None
+    which = np.array([k for k, _ in accused])
+    return np.asarray(book.columns(which) * book.std[which])
+
+
+def adapt(before: Fit | None, prior: Prior, noise: Floats, wanted: Bools, loose: Floats | None) -> Fit:
+    """A fit of the wanted meters, from the last one where that is cheaper.
+
+    Parameters
+    ----------
+    before
+        The last fit of this scale.
+    prior, noise
+        As in `conditional.fit`.
+    wanted : (p,)
+        The meters to rest on.
+    loose : (n, k)
+        Loosened directions.
+    """
+    if before is None or before.prior is not prior:
+        return fit(prior, noise, wanted, loose)
+    if before.loose.shape[1] if loose is None else not np.array_equal(before.loose, loose):
+        return fit(prior, noise, wanted, loose)
+    change = np.flatnonzero(before.trusted != wanted)
+    if not change.size:
+        return before
+    if change.size * _ANEW > wanted.size or before.changes + change.size > _MOST_CHANGES:
+        return fit(prior, noise, wanted, loose)
+    now = before.copy()
+    for j in change.tolist():
+        (admit if wanted[j] else drop)(now, j)
+    return now
+
+
+class Search:
+    """The explanations that several starts lead to on one scale.
+
+    The starts: what was believed, without what this scale and shorter ones suspect besides meters; where
+    several meters are suspected, a robust fit and all meters close to the model; and where any is, what was
+    believed with suspicions besides meters. Where few are, everybody is believed once more, and meters may
+    fall in pairs; then for each suspect the likeliest explanation in which it is honest. Longer means know
+    better, so they decide anew about what shorter ones suspected.
+
+    Meters against which other scales have evidence are not admitted, or lies that have just begun would
+    be believed again. Unless the explanation that does admit them is cheaper over all scales together.
+
+    Parameters
+    ----------
+    design, scales, book
+        The design, the scales, and what else but meters can be wrong now.
+    fits
+        The last fit of each scale.
+    trust
+        Who is believed.
+    s
+        The scale.
+    """
+
+    def __init__(  # noqa: PLR0917  # what is known, in the order it becomes known
+        self,
+        design: SequentialDesign,
+        scales: Scales,
+        book: Dictionary,
+        fits: tuple[Fit | None, ...],
+        trust: Trust,
+        s: int,
+    ) -> None:
+        self.design, self.scales, self.book = design, scales, book
+        self.fits, self.trust, self.s = fits, trust, s
+        here = scales[s]
+        sigmas = min(design.suspect, here.limits.sigmas)
+        self.here = replace(here, limits=replace(here.limits, sigmas=sigmas))
+        self.keep = _held(trust, s)
+        self.accused = tuple(suspicion for suspicion in trust.accused if suspicion[1] > s)
+
+    def __call__(self, now: Fit, view: View) -> tuple[Found, Trust]:
+        """What is found, and whom that leaves trusted.
+
+        Parameters
+        ----------
+        now, view
+            The fit of those who were believed, and what the scale says then.
+        """
+        start = now if len(self.accused) == len(self.trust.accused) else self._fit(now.trusted)
+        few = np.count_nonzero(view.over & now.trusted) <= _FEW
+        found = Found(self._descend(start, self.keep)) if few else None
+        free = None
+        if found is None or self._suspected(found) > self.design.options.several:
+            free = self._free()
+            if (free.best.trusted & self.keep).any():
+                held = self._fit(free.best.trusted & ~self.keep)
+                found = likelier(found, Found(self._descend(held, self.keep, fresh=True)))
+            else:
+                found, free = likelier(found, free), None
+        if few and self._suspected(found) > 0:
+            found = likelier(found, Found(self._descend(start, self.keep, self.book)))
+            if self._suspected(found) <= _CLOSE:
+                nobody, all_ = np.zeros_like(self.keep), self._fit(self.here.enough)
+                close = self._descend(all_, nobody, self.book, pairs=True, fresh=True)
+                free = likelier(free, Found(close))
+        best = found.best
+        if free is not None:
+            better = free.best.cost < best.cost and self._total(free.best) < self._total(best)
+            first, second = (free, found) if better else (found, free)
+            found = Found(first.best, (second.best.bare(), *first.others, *second.others))
+        rivals = (*found.others, *self._instead(found.best))
+        found = replace(found, others=tuple(self._compared(found.best, other) for other in rivals))
+        return found, self._believe(found.best)
+
+    def _instead(self, best: Solution) -> list[Explanation]:
+        """Explanations in which one of those who might be named is honest."""
+        fresh = self.here.enough & ~best.trusted & ~self.trust.named
+        if np.count_nonzero(fresh) > _CLOSE:
+            return []
+        out, keep = [], self.keep & self.trust.named
+        # Nobody is named by this: whatever makes an explanation cheaper is worth trying.
+        fair = float(np.sqrt(search.price(fresh.size, 1)))
+        limits = replace(self.here.limits, sigmas=min(self.here.limits.sigmas, fair))
+        for j in np.flatnonzero(fresh).tolist():
+            other = self._descend(best.fit, keep, self.book, innocent=j, pairs=True, limits=limits)
+            few = np.count_nonzero(self.here.enough & ~other.trusted) <= self.design.most
+            honest = self.scales[self.s].limits.of(other.judged.std)[j]
+            if few and abs(other.judged.offset[j]) <= honest:
+                charge = best.charge + other.charge
+                cost, loosened = best.charge + other.cost, best.loosened + other.loosened
+                out.append(Explanation(other.trusted, loosened, charge, cost))
+        return out
+
+    def _compared(self, best: Solution, other: Explanation) -> Explanation:
+        """A rival, at what it costs on the scale that speaks most against it.
+
+        Long means hardly know yet of a lie that has just begun, short ones hardly see a small one.
+        """
+        same = other.loosened == best.loosened and np.array_equal(other.trusted, best.trusted)
+        if same or other.cost - best.cost > 2.0 * np.log(self.design.options.like):
+            return other
+        prices = self._prices(other) - self._prices(best)
+        both = zip(self._misfits(other), self._misfits(best), strict=True)
+        return replace(other, cost=best.cost + prices + max(theirs - ours for theirs, ours in both))
+
+    def _suspected(self, found: Found) -> int:
+        """How many meters are suspected at least."""
+        enough = self.here.enough
+        return min(int(np.count_nonzero(enough & ~each.trusted)) for each in (found.best, *found.others))
+
+    def _free(self) -> Found:
+        """What is found from starts that owe nothing to what was believed."""
+        found: Found | None = None
+        for chosen in self._starts():
+            # A descent stays where another one has ended.
+            if found is None or not np.array_equal(chosen & self.here.enough, found.best.trusted):
+                new = self._descend(self._fit(chosen), np.zeros_like(chosen), fresh=True)
+                found = likelier(found, Found(new))
+        assert found is not None  # noqa: S101  # there is a start
+        return found
+
+    def _starts(self) -> tuple[Bools, Bools]:
+        """A robust fit, and the meters close to the model."""
+        here, prior = self.here, self.scales.prior
+        focus, std = self.design.options.focus, np.sqrt(here.noise)
+        chosen = search.robust(prior, here.noise, here.m, here.enough, here.limits.model + focus * std)
+        alone = np.sqrt(prior.variance[prior.meters] + here.noise)
+        return chosen, here.enough & (np.abs(here.m) <= here.limits.model + focus * alone)
+
+    def _descend(
+        self,
+        start: Fit,
+        keep: Bools,
+        book: Dictionary | None = None,
+        *,
+        innocent: int | None = None,
+        pairs: bool = False,
+        limits: Limits | None = None,
+        fresh: bool = False,
+    ) -> Solution:
+        here = self.here
+        return search.descend(
+            start,
+            here.m,
+            here.enough,
+            here.limits if limits is None else limits,
+            keep=keep,
+            dictionary=book,
+            innocent=innocent,
+            pairs=pairs,
+            fresh=fresh,
+        )
+
+    def _fit(self, trusted: Bools) -> Fit:
+        loose = directions(self.book, self.accused)
+        return fit(self.scales.prior, self.here.noise, trusted & self.here.enough, loose)
+
+    def _total(self, found: Explanation) -> float:
+        """The misfit on all scales and, once, what the accusations cost."""
+        return self._prices(found) + sum(self._misfits(found))
+
+    def _prices(self, found: Explanation) -> float:
+        suspects = int(np.count_nonzero(~self._trusted(found)))
+        return found.charge + search.price(self.keep.size, suspects)
+
+    def _trusted(self, found: Explanation) -> Bools:
+        return np.where(self.here.enough, found.trusted, self.trust.trusted)
+
+    def _misfits(self, found: Explanation) -> list[float]:
+        """What an explanation leaves unexplained on each scale."""
+        trusted, out = self._trusted(found), []
+        loose = directions(self.book, (*self.accused, *((k, self.s) for k in found.loosened)))
+        for s in range(len(self.fits)):
+            there = self.scales[s]
+            if s == self.s and isinstance(found, Solution):
+                out.append(found.judged.misfit)
+            else:
+                wanted = trusted & there.enough
+                out.append(misfit(self.scales.prior, there.noise, there.m, wanted, loose))
+        return out
+
+    def _believe(self, best: Explanation) -> Trust:
+        trust = self.trust
+        trusted = np.where(self.here.enough, best.trusted, trust.trusted)
+        fallen = trust.trusted & ~trusted
+        return replace(
+            trust,
+            trusted=trusted,
+            scale=np.where(fallen, self.s, trust.scale),
+            age=np.where(fallen, 0, trust.age),
+            quiet=np.where(fallen, 0, trust.quiet),
+            accused=(*self.accused, *((k, self.s) for k in best.loosened)),
+        )
+
+
+def _held(trust: Trust, s: int) -> Bools:
+    """Meters that must stay distrusted: named ones, and those other scales have evidence against."""
+    other = np.delete(trust.still, s, axis=0).any(axis=0)
+    return np.asarray(~trust.trusted & (other | (trust.named & trust.still[s])))
