@@ -1,18 +1,25 @@
 """Days without an attack on every low-voltage feeder: not one false alarm, not one suspect.
 
 The whole chain behind the wire runs, from readings to alarms; meters have the errors that their class
-allows, and the loads of two weeks' profiles with fast variation on top run through full AC power flow.
+allows, and the loads of all seasons' profiles with fast variation on top run through full AC power flow.
+`python -m benchmarks.clean_days` is the same at length.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
+from benchmarks.clean_days import Run, main, plan, play
+from feeders.campaign import Kind, random_attacks
 from feeders.load import from_tables, load
+from feeders.meters import MeterErrors
+from feeders.profiles import Season
 from feeders.scenario import START, Reading, Scenario, simulate
+from feeders.variation import Variation
 from gridsec.arrays import Floats
 from gridsec.online import Decision
 from service.conditions import AlarmKind
@@ -37,17 +44,19 @@ LOW_VOLTAGE = (
 @pytest.mark.parametrize("feeder", LOW_VOLTAGE)
 @pytest.mark.parametrize("hour", range(0, 24, 6))
 def test_a_day_without_an_attack_raises_no_alarm(feeder: str, hour: int) -> None:
-    """Four quarters of a day, each from another day of the profiles and with other meters."""
+    """Four quarters of a day, each from another season and day of the profiles and with other meters."""
     tables = load(feeder).tables
     tick_s = LARGE_TICK_S if len(tables.customers) > LARGE else SMALL_TICK_S
     settings = replace(tables.meta.monitor, tick_s=tick_s, on_delay_s=0.0, off_delay_s=0.0, silence_s=60.0)
     site = from_tables(replace(tables, meta=replace(tables.meta, monitor=settings)))
+    season = tuple(Season)[(hour // 6 + LOW_VOLTAGE.index(feeder)) % 4]
     day = hour // 6 + 4 * LOW_VOLTAGE.index(feeder) % 10
     scenario = Scenario(
         seed=1000 + hour,
         duration_s=DAY_S / 4,
         dt_s=settings.tick_s,
         profile_s=day * DAY_S + hour * 3600.0,
+        season=season,
     )
     truth: dict[float, Floats] = {}
 
@@ -70,3 +79,45 @@ def test_a_day_without_an_attack_raises_no_alarm(feeder: str, hour: int) -> None
             limits = tables.meta.limits
             assert not limits.v_min_pu <= true <= limits.v_max_pu, f"{alarm}: the truth is {true} pu"
     assert ticks == DAY_S / 4 / settings.tick_s
+
+
+def test_the_benchmark_counts_nothing_where_nothing_is() -> None:
+    run = plan("simbench-lv-rural1", Season.WINTER, 3, 3600.0, None)
+    assert run.site.tables.meta.monitor.commission_s == 900.0
+    seen = play(run)
+    assert (seen.ticks, seen.verdicts) == (360, {"clean": 348})
+    assert not seen.suspects
+    assert not seen.false
+    assert not seen.notes
+
+
+def test_the_benchmark_counts_alarms_and_tells_which_are_right() -> None:
+    """As many alarms as liars, and those about voltages that truly are too low are no false ones."""
+    run = plan("simbench-lv-rural1", Season.WINTER, 3, 600.0, None)
+    lies = random_attacks(run.site, 1, Kind.BIAS, 2, 0.05, t_on=START + 300.0, t_off=START + 500.0)
+    seen = play(replace(run, scenario=replace(run.scenario, attacks=lies)))
+    assert seen.false == {"meter-manipulated": 2}
+    assert len(seen.suspects) == 2
+    assert sum("is suspected" in note for note in seen.notes) == 2
+    assert seen.verdicts["attacked"] >= 20  # of 200 s, every 10 s
+
+    deep = replace(run.scenario, variation=Variation(busbar_pu=0.85, busbar_spread_pu=0.0, tap_step_pu=0.0))
+    seen = play(replace(run, scenario=deep))
+    assert seen.rightly == len(run.site.meter_ids)
+    assert not seen.false
+
+
+def test_the_benchmark_fails_where_there_are_more_alarms_than_asked_for(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Meters of six times their class: many are named, and the answer is 1."""
+    monkeypatch.setattr("benchmarks.clean_days.names", lambda: ("cigre-lv",))
+    assert main(0.02, None) == 0
+    assert "| cigre-lv | autumn |" in capsys.readouterr().out
+
+    def wrong(*args: Any) -> Run:
+        run = plan(*args)
+        return replace(run, scenario=replace(run.scenario, errors=MeterErrors(bias=6.0)))
+
+    monkeypatch.setattr("benchmarks.clean_days.plan", wrong)
+    assert main(0.02, None) == 1
