@@ -16,6 +16,7 @@ import resource
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 # Before NumPy loads its libraries.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
