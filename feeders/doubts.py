@@ -24,8 +24,9 @@ def load_doubt(site: Site) -> LoadDoubt:
     """What a feeder's files say about its customers' powers.
 
     Metered active power is as wrong as its register may be, the load's reactive power as the limits of its
-    power factor allow; taken as uniform within these. `p_std_kw` and `q_std_kvar` of a customer say it
-    directly and are believed as they are.
+    power factor allow; taken as uniform within these, and as lasting: a register and a power factor err in
+    the same direction all the time. `p_std_kw` and `q_std_kvar` say it directly, and then of errors that come
+    and go within `correlation_s`; they are believed as they are.
 
     Parameters
     ----------
@@ -39,11 +40,13 @@ def load_doubt(site: Site) -> LoadDoubt:
     told_p = np.array([np.nan if row.p_std_kw is None else row.p_std_kw for row in rows])
     told_q = np.array([np.nan if row.q_std_kvar is None else row.q_std_kvar for row in rows])
     by_factor = bool(np.isnan(told_q).any())
+    by_limits = by_factor or bool(np.isnan(told_p).any())
     return LoadDoubt(
         p=np.where(np.isnan(told_p), p, told_p / base),
         q=np.where(np.isnan(told_q), q, told_q / base),
         time_s=site.tables.meta.load.correlation_s,
         common_q=ALIKE if by_factor else 0.0,
+        lasting=1.0 if by_limits else 0.0,
     )
 
 

@@ -9,10 +9,11 @@ is its own. With B the prior variance of the fixed errors and M the long-run mea
 where ``c_ij`` says what the loads' errors, of correlation time tau, still contribute to two means over the
 last a and b >= a seconds (in units of tau):
 
-    c = (2 a + e^-a + e^-b - e^-(b - a) - 1) / (a b).
+    c = (2 a + e^-a + e^-b - e^-(b - a) - 1) / (a b)
 
-After that a meter counts as manipulated when it *changes*, even inside its class. A meter that is replaced
-is learned anew while the others stay; they then say what the loads did meanwhile, with B their P.
+and a share `lasting` of the variances stays whole (c = 1), since it is the same all the time. After that a
+meter counts as manipulated when it *changes*, even inside its class. A meter that is replaced is learned anew
+while the others stay; they then say what the loads did meanwhile, with B their P.
 
 References
 ----------
@@ -231,9 +232,10 @@ def conclude(
     B, n = known.variance[heard], gathered.count[heard]
     # One matrix of this size, inverted where it is.
     K = design.prior.of_meters[np.ix_(design.prior.meters[heard], heard)].T
-    time = gathered.time_s[heard] / design.doubt.time_s
+    time, lasting = gathered.time_s[heard] / design.doubt.time_s, design.doubt.lasting
     for first in range(0, heard.size, _COLUMNS):
-        K[:, first : first + _COLUMNS] *= _share(time, time[first : first + _COLUMNS])
+        share = _share(time, time[first : first + _COLUMNS])
+        K[:, first : first + _COLUMNS] *= lasting + (1.0 - lasting) * share
     K[np.diag_indices_from(K)] += B + design.white[heard] / n
     invert(K)
     bias, variance, allowed = known.bias.copy(), known.variance.copy(), known.allowed.copy()

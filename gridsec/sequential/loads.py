@@ -35,6 +35,9 @@ class LoadDoubt:
         Correlation time of these errors, s: means over much less time still contain all of them.
     common_p, common_q
         Shares of their variances that all customers have in common (weather, time of day), 0 to 1.
+    lasting
+        Share of their variances that no mean takes away, however long, 0 to 1: an unknown power factor is
+        wrong in the same direction for years, and grows and shrinks with the load.
     """
 
     p: Floats
@@ -42,6 +45,7 @@ class LoadDoubt:
     time_s: float
     common_p: float = 0.0
     common_q: float = 0.0
+    lasting: float = 0.0
 
     def __post_init__(self) -> None:
         problems = [
@@ -53,7 +57,7 @@ class LoadDoubt:
             problems.append(f"time_s is {self.time_s}; it must be positive")
         problems += [
             f"{name} is {getattr(self, name)}; it must be from 0 to 1"
-            for name in ("common_p", "common_q")
+            for name in ("common_p", "common_q", "lasting")
             if not 0 <= getattr(self, name) <= 1
         ]
         if problems:
