@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.intp]
+Phasors = NDArray[np.complex128]
 
 
 def frozen(values: Floats) -> Floats:

@@ -20,6 +20,7 @@ import numpy as np
 
 from gridsec.arrays import Floats, Ints, frozen, frozen_ints
 from gridsec.errors import FeederInvalid
+from gridsec.trees import below, from_root, walk
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,13 +88,10 @@ class Feeder:
         problems = _problems(self)
         if problems:
             raise FeederInvalid(problems)
-        start, stop, depth = _depth_first(self.parent)
-        enter = 2 * start - depth
-        leave = enter + 2 * (stop - start) - 1
-        names = ("start", "stop", "depth", "enter", "leave")
-        for name, value in zip(names, (start, stop, depth, enter, leave), strict=True):
-            object.__setattr__(self, name, frozen_ints(value))
-        half: Floats = np.zeros(start.size)
+        found = walk(self.parent)
+        for name in ("start", "stop", "depth", "enter", "leave"):
+            object.__setattr__(self, name, getattr(found, name))
+        half: Floats = np.zeros(found.start.size)
         np.add.at(half, self.parent, 0.5 * self.charging)
         half[1:] += 0.5 * self.charging
         object.__setattr__(self, "half", frozen(half))
@@ -142,30 +140,6 @@ def _shape_problems(feeder: Feeder) -> list[str]:
         ("bus", feeder.bus.shape, (len(feeder.customers),)),
     )
     return [f"{what} has shape {has}; expected {wants}" for what, has, wants in expected if has != wants]
-
-
-def _depth_first(parent: Ints) -> tuple[Ints, Ints, Ints]:
-    """Depth-first numbers `start`, `stop` and the depth of every bus.
-
-    Parameters
-    ----------
-    parent : (b,)
-        See `Feeder`.
-    """
-    count = parent.size + 1
-    size = np.ones(count, dtype=np.intp)
-    for k in range(count - 1, 0, -1):
-        size[parent[k - 1]] += size[k]
-    start = np.zeros(count, dtype=np.intp)
-    depth = np.zeros(count, dtype=np.intp)
-    free = np.ones(count, dtype=np.intp)  # next number to hand out among the children of a bus
-    for k in range(1, count):
-        above = parent[k - 1]
-        start[k] = free[above]
-        free[above] += size[k]
-        free[k] = start[k] + 1
-        depth[k] = depth[above] + 1
-    return start, start + size, depth
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -377,7 +351,7 @@ def _correction(feeder: Feeder, flows: _Flows, steps: int) -> Floats:
     for _ in range(steps):
         current = (P**2 + Q**2) / v2[..., 1:]
         loss_p, loss_q, drop = _losses(feeder, current, feeder.half * v2, sign=-1.0)
-        v2 = flows.v2 + _from_busbar(feeder, -drop)
+        v2 = flows.v2 + from_root(feeder, -drop)
         P, Q = flows.P + loss_p, flows.Q + loss_q
     return np.asarray(v2 - flows.v2)
 
@@ -408,11 +382,11 @@ def _remainder(feeder: Feeder, flows: _Flows) -> Floats:
         current = (flows.P**2 + flows.charged**2) / flows.v2[..., 1:]
         charge = feeder.half * flows.v2
         loss_p, loss_q, drop = _losses(feeder, current, charge, sign=-1.0)
-        v2 = flows.v2 + _from_busbar(feeder, -drop)
+        v2 = flows.v2 + from_root(feeder, -drop)
         later = ((flows.P + loss_p) ** 2 + (flows.Q + loss_q) ** 2) / v2[..., 1:]
-        first = _from_busbar(feeder, _losses(feeder, np.abs(current), np.abs(charge), sign=1.0)[2])
+        first = from_root(feeder, _losses(feeder, np.abs(current), np.abs(charge), sign=1.0)[2])
         change = np.abs(feeder.half * (v2 - flows.v2))
-        second = _from_busbar(feeder, _losses(feeder, np.abs(later - current), change, sign=1.0)[2])
+        second = from_root(feeder, _losses(feeder, np.abs(later - current), change, sign=1.0)[2])
         shrinks = np.max(second, axis=-1, keepdims=True) <= 0.5 * np.max(first, axis=-1, keepdims=True)
         shrinks &= np.all(v2 > 0, axis=-1, keepdims=True) & np.all(flows.v2 > 0, axis=-1, keepdims=True)
         bound = np.where(shrinks, 2.0 * second, np.inf)
@@ -437,10 +411,10 @@ def _linear_flows(feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats | flo
     """The linear power flow, from the injections of the customers."""
     both = np.empty((2, *np.broadcast(p, q).shape))
     both[0], both[1] = p, q
-    P, Q = -_below(feeder, _at_buses(feeder, both))[..., 1:]
+    P, Q = -below(feeder, _at_buses(feeder, both))[..., 1:]
     base = np.asarray(v0_squared, dtype=np.float64)[..., None]
-    v2 = base + _from_busbar(feeder, -2.0 * (feeder.r * P + feeder.x * Q))
-    charged = Q - _below(feeder, feeder.half * v2)[..., 1:] if feeder.half.any() else Q
+    v2 = base + from_root(feeder, -2.0 * (feeder.r * P + feeder.x * Q))
+    charged = Q - below(feeder, feeder.half * v2)[..., 1:] if feeder.half.any() else Q
     return _Flows(P, Q, charged, v2)
 
 
@@ -449,9 +423,9 @@ def _losses(feeder: Feeder, current: Floats, charge: Floats, *, sign: float) -> 
     own = np.zeros((2, *current.shape[:-1], current.shape[-1] + 1))
     np.multiply(feeder.r, current, out=own[0, ..., 1:])
     np.multiply(feeder.x, current, out=own[1, ..., 1:])
-    loss_p, loss_q = (_below(feeder, own) - own)[..., 1:]
+    loss_p, loss_q = (below(feeder, own) - own)[..., 1:]
     if feeder.half.any():
-        loss_q = loss_q + sign * _below(feeder, charge)[..., 1:]
+        loss_q = loss_q + sign * below(feeder, charge)[..., 1:]
     drop = 2.0 * (feeder.r * loss_p + feeder.x * loss_q) + (feeder.r**2 + feeder.x**2) * current
     return loss_p, loss_q, drop
 
@@ -462,21 +436,3 @@ def _at_buses(feeder: Feeder, values: Floats) -> Floats:
     first = np.arange(0, prod(shape), shape[-1])[:, None]
     total = np.bincount((first + feeder.bus).ravel(), weights=values.ravel(), minlength=prod(shape))
     return np.asarray(total.reshape(shape))
-
-
-def _below(feeder: Feeder, values: Floats) -> Floats:
-    """Sum of bus values (…, b + 1) over the subtree of each bus, itself included."""
-    total = np.zeros((*values.shape[:-1], values.shape[-1] + 1))
-    # Depth-first order makes a subtree one interval, and its sum the difference of two running sums.
-    total[..., feeder.start + 1] = values
-    total = total.cumsum(axis=-1)
-    return np.asarray(total[..., feeder.stop] - total[..., feeder.start])
-
-
-def _from_busbar(feeder: Feeder, values: Floats) -> Floats:
-    """Sum of branch values (…, b) over the path from the busbar to each bus, (…, b + 1)."""
-    # A branch counts from when its bus is entered until it is left.
-    tour = np.zeros((*values.shape[:-1], 2 * feeder.enter.size))
-    tour[..., feeder.enter[1:]] = values
-    tour[..., feeder.leave[1:]] = -values
-    return np.asarray(tour.cumsum(axis=-1)[..., feeder.enter])

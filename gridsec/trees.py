@@ -1,0 +1,117 @@
+"""Sums over the subtrees and the paths of a radial feeder, as running sums along a walk around its tree.
+
+Bus 0 is the root, and bus k + 1 hangs from bus `parent[k] <= k`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+import numpy as np
+
+from gridsec.arrays import Floats, Ints, Phasors, frozen_ints
+
+Values = TypeVar("Values", Floats, Phasors)
+
+
+class Walked(Protocol):
+    """A tree with the numbers of a `Walk`."""
+
+    @property
+    def start(self) -> Ints: ...  # noqa: D102
+    @property
+    def stop(self) -> Ints: ...  # noqa: D102
+    @property
+    def enter(self) -> Ints: ...  # noqa: D102
+    @property
+    def leave(self) -> Ints: ...  # noqa: D102
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Walk:
+    """A walk around a tree of b + 1 buses, children in order.
+
+    Attributes
+    ----------
+    start, stop : (b + 1,)
+        Depth-first numbering: the subtree of bus k is the buses whose `start` lies in `[start[k], stop[k])`.
+    depth : (b + 1,)
+        Number of branches between bus k and the root.
+    enter, leave : (b + 1,)
+        When the walk comes to a bus first, and when it has left it.
+    """
+
+    start: Ints
+    stop: Ints
+    depth: Ints
+    enter: Ints
+    leave: Ints
+
+
+def walk(parent: Ints) -> Walk:
+    """Walk around a tree.
+
+    Parameters
+    ----------
+    parent : (b,)
+        Bus from which bus k + 1 hangs, at most k.
+    """
+    count = parent.size + 1
+    size = np.ones(count, dtype=np.intp)
+    for k in range(count - 1, 0, -1):
+        size[parent[k - 1]] += size[k]
+    start = np.zeros(count, dtype=np.intp)
+    depth = np.zeros(count, dtype=np.intp)
+    free = np.ones(count, dtype=np.intp)  # next number to hand out among the children of a bus
+    for k in range(1, count):
+        above = parent[k - 1]
+        start[k] = free[above]
+        free[above] += size[k]
+        free[k] = start[k] + 1
+        depth[k] = depth[above] + 1
+    enter = 2 * start - depth
+    numbers = (start, start + size, depth, enter, enter + 2 * size - 1)
+    return Walk(*(frozen_ints(each) for each in numbers))
+
+
+def below(tree: Walked, values: Values) -> Values:
+    """Sum of bus values (…, b + 1) over the subtree of each bus, itself included; O(b)."""
+    total = np.zeros((*values.shape[:-1], values.shape[-1] + 1), dtype=values.dtype)
+    # Depth-first order makes a subtree one interval, and its sum the difference of two running sums.
+    total[..., tree.start + 1] = values
+    total = total.cumsum(axis=-1)
+    return np.asarray(total[..., tree.stop] - total[..., tree.start])
+
+
+def from_root(tree: Walked, values: Values) -> Values:
+    """Sum of branch values (…, b) over the path from the root to each bus, (…, b + 1); O(b)."""
+    # A branch counts from when its bus is entered until it is left.
+    tour = np.zeros((*values.shape[:-1], 2 * tree.enter.size), dtype=values.dtype)
+    tour[..., tree.enter[1:]] = values
+    tour[..., tree.leave[1:]] = -values
+    return np.asarray(tour.cumsum(axis=-1)[..., tree.enter])
+
+
+def meetings(parent: Ints, tree: Walked, buses: Ints) -> Ints:
+    """Bus at which the paths to the root of every bus and of each of `buses` meet; O(b k).
+
+    Parameters
+    ----------
+    parent : (b,)
+        See `walk`.
+    tree
+        Its walk.
+    buses : (k,)
+        The second bus of each pair.
+
+    Returns
+    -------
+    (b + 1, k)
+        The lowest bus that both have on their path, themselves included.
+    """
+    out = np.zeros((parent.size + 1, buses.size), dtype=np.intp)
+    at = tree.start[buses]
+    for k, above in enumerate(parent.tolist(), start=1):
+        out[k] = np.where((tree.start[k] <= at) & (at < tree.stop[k]), k, out[above])
+    return out
