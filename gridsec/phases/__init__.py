@@ -1,0 +1,30 @@
+"""Unbalanced feeders: three phases with mutual impedance, customers on one phase or on all.
+
+`ThreePhaseFeeder` is the radial tree of 3x3 blocks in per unit, `lindist3flow` its linear power flow of
+squared phase voltages, and `loss_correction` what that leaves out.
+"""
+
+from gridsec.phases.feeder import PHASES, ROTATION, ThreePhaseFeeder, sequence_matrix
+from gridsec.phases.flow import (
+    LinDist3Flow,
+    bus_voltages,
+    corrected,
+    lindist3flow,
+    loss_correction,
+    model_error_bound,
+    squared_voltages,
+)
+
+__all__ = [
+    "PHASES",
+    "ROTATION",
+    "LinDist3Flow",
+    "ThreePhaseFeeder",
+    "bus_voltages",
+    "corrected",
+    "lindist3flow",
+    "loss_correction",
+    "model_error_bound",
+    "sequence_matrix",
+    "squared_voltages",
+]

@@ -1,0 +1,83 @@
+"""Random three-phase feeders, and an AC power flow by nodal admittances independent of the package."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gridsec.arrays import Floats, Phasors
+from gridsec.phases import ThreePhaseFeeder
+
+
+def random_three_phase(seed: int, *, branches: int | None = None, charging: float = 0.0) -> ThreePhaseFeeder:
+    """A random tree with full impedance matrices and laterals of one or two phases."""
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(1, 14)) if branches is None else branches
+    parent = np.array([rng.integers(max(0, k - 3), k + 1) for k in range(count)])
+    phases = np.ones((count + 1, 3), dtype=bool)
+    z = np.zeros((count, 3, 3), dtype=complex)
+    b = np.zeros((count, 3, 3))
+    for k in range(count):
+        here = phases[parent[k]].copy()
+        if rng.random() < 0.4 and here.sum() > 1:
+            here[rng.choice(np.flatnonzero(here))] = False
+        phases[k + 1] = here
+        both = np.outer(here, here)
+        own = np.diag(rng.uniform(0.002, 0.03, 3) + 1j * rng.uniform(0.001, 0.03, 3))
+        earth = np.full((3, 3), rng.uniform(0.0, 0.01) + 1j * rng.uniform(0.0, 0.02))
+        z[k] = both * (own + earth)
+        b[k] = both * charging * (np.diag(rng.uniform(0.5, 1.0, 3)) - 0.1)
+    customers = int(rng.integers(1, 12))
+    bus = rng.integers(0, count + 1, customers)
+    connected = np.zeros((customers, 3), dtype=bool)
+    for j in range(customers):
+        if rng.random() < 0.3:
+            connected[j] = phases[bus[j]]
+        else:
+            connected[j, rng.choice(np.flatnonzero(phases[bus[j]]))] = True
+    return ThreePhaseFeeder(
+        name="random",
+        parent=parent,
+        z=z,
+        phases=phases,
+        bus=bus,
+        connected=connected,
+        customers=tuple(f"c{j}" for j in range(customers)),
+        buses=tuple(f"b{k}" for k in range(count + 1)),
+        base_volt=230.0,
+        base_kva=100.0,
+        charging=b,
+    )
+
+
+def power_flow(feeder: ThreePhaseFeeder, p: Floats, q: Floats, v0_squared: Floats) -> Phasors:
+    """Phasors (3, b + 1) from dense nodal admittances; NaN where a bus lacks the phase."""
+    count = len(feeder.buses)
+    Y = np.zeros((count, 3, count, 3), dtype=complex)
+    for k, above in enumerate(feeder.parent):
+        here = np.flatnonzero(feeder.phases[k + 1])
+        y = np.linalg.inv(feeder.z[k][np.ix_(here, here)])
+        for i, row in enumerate(here):
+            for j, column in enumerate(here):
+                half = 0.5j * feeder.charging[k][row, column]
+                Y[k + 1, row, k + 1, column] += y[i, j] + half
+                Y[above, row, above, column] += y[i, j] + half
+                Y[k + 1, row, above, column] -= y[i, j]
+                Y[above, row, k + 1, column] -= y[i, j]
+    power = np.zeros((count, 3), dtype=complex)
+    for j in range(feeder.of.size):
+        power[feeder.at[j], feeder.phase[j]] += p[j] + 1j * q[j]
+    free = feeder.phases.copy()
+    free[0] = False
+    v0 = np.sqrt(v0_squared) * np.exp(-2j * np.pi / 3 * np.arange(3))
+    inverse = np.linalg.inv(Y[free][:, free])
+    idle = -inverse @ (Y[free][:, 0] @ v0)
+    v = idle.copy()
+    for _ in range(200):
+        before, v = v, idle + inverse @ np.conj(power[free] / v)
+        if np.max(np.abs(v - before), initial=0.0) < 1e-15:
+            break
+    assert np.max(np.abs(v - before), initial=0.0) < 1e-13
+    out = np.full((count, 3), np.nan, dtype=complex)
+    out[0] = v0
+    out[free] = v
+    return out.T
