@@ -142,7 +142,7 @@ function verdict() {
   byId("facts").replaceChildren(
     fact("Meters heard", `${report.meters.filter((m) => m.seen).length} of ${report.meters.length}`),
     fact("Suspects", String(suspects.length + inverters.length)),
-    fact("Guaranteed up to", `${report.max_attacked} manipulated`),
+    fact("Tells apart up to", `${report.max_attacked} manipulated`),
     fact("Real voltages", range),
     fact("Tick", clock(report.t)));
 }
