@@ -7,8 +7,8 @@ a_psi`` (a = 1, e^{-j 2 pi / 3}, e^{j 2 pi / 3}), and without the ``|Z i|^2`` of
     v_phi^2 = v_parent,phi^2 - 2 sum_psi Re( W_phi,psi conj(S_psi) ),    W_phi,psi = Z_phi,psi a_psi / a_phi
 
 with ``S_psi = P_psi + j Q_psi`` what arrives in phase psi: per branch the matrices Re W and Im W are what r
-and x are on a balanced feeder. They are not symmetric, though Z is: through a mutual reactance active power that
-is injected in phase b raises phase a, and in phase a lowers phase b.
+and x are on a balanced feeder. They are not symmetric, though Z is: through a mutual reactance active power
+that is injected in phase b raises phase a, and in phase a lowers phase b.
 
 Powers, voltages and their axes: connections (…, C) of the feeder; buses (…, 3, b + 1), phase before bus.
 A voltage of a phase that a bus lacks is that of the place where the phase ends.
