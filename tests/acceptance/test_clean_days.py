@@ -11,11 +11,13 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from benchmarks.clean_days import Run, main, plan, play
 from feeders.campaign import Kind, random_attacks
-from feeders.load import from_tables, load
+from feeders.estimators import design
+from feeders.load import Snapshot, from_tables, load, to_frame
 from feeders.meters import MeterErrors
 from feeders.profiles import Season
 from feeders.scenario import START, Reading, Scenario, simulate
@@ -79,6 +81,29 @@ def test_a_day_without_an_attack_raises_no_alarm(feeder: str, hour: int) -> None
             limits = tables.meta.limits
             assert not limits.v_min_pu <= true <= limits.v_max_pu, f"{alarm}: the truth is {true} pu"
     assert ticks == DAY_S / 4 / settings.tick_s
+
+
+def test_a_meter_at_the_edge_of_its_class_is_learned_and_not_named() -> None:
+    """The busbar's meter is off by its class one way, m05 by its class the other way, for ever.
+
+    Nobody draws or generates anything. Taken for their own, what all meters seem to be off would leave m05
+    outside its class.
+    """
+    tables = load("cigre-lv").tables
+    settings = replace(tables.meta.monitor, tick_s=10.0, silence_s=60.0, commission_s=DAY_S / 4)
+    site = from_tables(replace(tables, meta=replace(tables.meta, monitor=settings)))
+    nominal, p, random = tables.meta.voltage_volt, len(site.meter_ids), np.random.default_rng(0)
+    off = np.where(np.array(site.meter_ids) == "m05", site.accuracy.class_fraction, 0.0)
+    watcher = design(site)
+    assert watcher.learner is not None
+    state = watcher.init(0.0)
+    for k in range(1, int(1.2 * settings.commission_s / settings.tick_s)):
+        v = nominal * (1.0 + off + site.accuracy.jitter * random.standard_normal(p))
+        v0 = nominal * (1.0 - site.accuracy.busbar_class)
+        frame = to_frame(site, Snapshot(10.0 * k, v, np.zeros(p), np.full(p, np.nan), v0))
+        state, _, verdict = watcher.step(state, frame)
+        assert k < 12 or verdict.decision is Decision.CLEAN, f"{10 * k} s: {verdict}"
+    assert watcher.learner.commission(state).learning is None
 
 
 def test_the_benchmark_counts_nothing_where_nothing_is() -> None:
