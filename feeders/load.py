@@ -10,11 +10,13 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib.resources.abc import Traversable
 from pathlib import Path
 
 import numpy as np
 
 from feeders.profiles import data_root
+from feeders.raw import CUSTOMERS_FILE, LINES_FILE, META_FILE
 from feeders.schema import CustomerRow, FeederTables, LineRow, read, to_json, validate
 from feeders.topology import Edge, Tree, tree
 from gridsec.arrays import Floats, Ints, frozen, frozen_ints
@@ -132,10 +134,25 @@ class Snapshot:
     v0_volt: float
 
 
-def names() -> list[str]:
-    """Return the feeders that come with the project."""
+def names(*, balanced: bool = True) -> list[str]:
+    """Return the feeders that come with the project.
+
+    Parameters
+    ----------
+    balanced
+        Only those that `load` takes; the others need `feeders.load_phases`.
+    """
     folder = data_root() / "feeders"
-    return sorted(entry.name for entry in folder.iterdir() if (entry / "feeder.toml").is_file())
+    found = (entry for entry in folder.iterdir() if (entry / META_FILE).is_file())
+    return sorted(entry.name for entry in found if not (balanced and _names_phases(entry)))
+
+
+def _names_phases(folder: Traversable) -> bool:
+    """Whether a folder of ours has single-phase lines or customers: the writer leaves out default columns."""
+    tables = (folder / name for name in (LINES_FILE, CUSTOMERS_FILE))
+    return any(
+        "phases" in table.read_text(encoding="utf-8").partition("\n")[0].split(",") for table in tables
+    )
 
 
 def load(path_or_name: Path | str) -> Site:
@@ -151,12 +168,17 @@ def load(path_or_name: Path | str) -> Site:
     FeederInvalid
         With every problem of the files, or if there is no such feeder.
     """
+    return from_tables(find(path_or_name))
+
+
+def find(path_or_name: Path | str) -> FeederTables:
+    """Read the tables of a feeder's folder, or of a feeder that comes with the project; raises as `load`."""
     path = Path(path_or_name)
     if path.is_dir():
-        return from_tables(read(path))
+        return read(path)
     bundled = data_root() / "feeders" / str(path_or_name)
     if len(path.parts) == 1 and path.name not in (".", "..") and bundled.is_dir():
-        return from_tables(read(Path(str(bundled))))
+        return read(Path(str(bundled)))
     raise FeederInvalid(
         [f"{path_or_name}: there is neither such a folder nor such a feeder; there are {', '.join(names())}"]
     )

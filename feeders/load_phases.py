@@ -1,0 +1,171 @@
+"""From a feeder's tables to the three-phase model in per unit.
+
+`feeders.load` makes the balanced model that the monitors run on, and refuses single-phase customers; here
+they are what the model is for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from feeders.load import find, names
+from feeders.schema import FeederTables, LineRow, validate
+from feeders.topology import Edge, Tree, tree
+from gridsec.arrays import Ints, Phasors, frozen_ints
+from gridsec.errors import FeederInvalid
+from gridsec.phases import PHASES, ThreePhaseFeeder, sequence_matrix
+
+if TYPE_CHECKING:
+    from gridsec.arrays import Bools
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ThreePhaseSite:
+    """A feeder in three phases. N customers, p meters, b + 1 buses.
+
+    Attributes
+    ----------
+    tables
+        The feeder in SI, as its files say it.
+    feeder
+        The radial tree, pu; powers of single phases in thirds of `base_kva`.
+    meters : (p,)
+        Index of each meter's customer, ascending.
+    meter_ids : (p,)
+        Ids of the meters.
+    bus_of_file
+        Fused bus index of every bus id of the files.
+    """
+
+    tables: FeederTables
+    feeder: ThreePhaseFeeder
+    meters: Ints
+    meter_ids: tuple[str, ...]
+    bus_of_file: Mapping[str, int]
+
+
+def load_three_phase(path_or_name: Path | str) -> ThreePhaseSite:
+    """Load a feeder in three phases.
+
+    Parameters
+    ----------
+    path_or_name
+        A folder, or the name of a feeder that comes with the project (`feeders.load.names`).
+
+    Raises
+    ------
+    FeederInvalid
+        With every problem of the files, or if there is no such feeder.
+    """
+    return three_phase(find(path_or_name))
+
+
+def three_phase_names() -> list[str]:
+    """Return the feeders of the project that only the three-phase model takes."""
+    return sorted(set(names(balanced=False)) - set(names()))
+
+
+def three_phase(tables: FeederTables) -> ThreePhaseSite:
+    """Turn a feeder's tables into the three-phase model.
+
+    A line of all phases is cyclically symmetric: `sequence_matrix` of its positive and zero sequence. That of
+    a single phase has the self-impedance ``(2 z1 + z0) / 3``, or without zero-sequence values
+    ``r_ohm + j x_ohm`` of the conductor and its return together. Charging is that of cores screened from each
+    other, ``b_us`` in each phase.
+
+    With ``z_base = 3 V^2 / (1000 S)`` ohm for V volts phase to neutral and S kVA of all three phases, as on
+    a balanced feeder; a single-phase customer's kW divide by ``S / 3``.
+
+    Parameters
+    ----------
+    tables
+        The feeder's tables.
+
+    Raises
+    ------
+    FeederInvalid
+        If the tables are not valid, or lack what three phases need.
+    """
+    problems = validate(tables) or _unsupported(tables)
+    if problems:
+        raise FeederInvalid(problems)
+    meta = tables.meta
+    closed = [line for line in tables.lines if line.closed]
+    edges = [Edge(row.line, row.from_bus, row.to_bus, _fuses(row)) for row in closed]
+    found = tree(meta.busbar, edges)
+    metered = [k for k, row in enumerate(tables.customers) if row.meter]
+    return ThreePhaseSite(
+        tables=tables,
+        feeder=_feeder(tables, [closed[k] for k in found.branch], found),
+        meters=frozen_ints(np.array(metered, dtype=np.intp)),
+        meter_ids=tuple(tables.customers[k].meter for k in metered),
+        bus_of_file=found.group,
+    )
+
+
+def _feeder(tables: FeederTables, lines: list[LineRow], found: Tree) -> ThreePhaseFeeder:
+    meta = tables.meta
+    z_base = 3.0 * meta.voltage_volt**2 / (1000.0 * meta.base_kva)
+    phases = np.array([(True,) * 3, *(_present(line.phases) for line in lines)])
+    both = phases[1:, :, None] & phases[1:, None, :]
+    charging = np.array([line.b_us for line in lines]) * (1e-6 * z_base)
+    return ThreePhaseFeeder(
+        name=meta.name,
+        parent=np.array(found.parent, dtype=np.intp),
+        z=np.where(both, np.array([_series(line) for line in lines]) / z_base, 0.0),
+        phases=phases,
+        bus=np.array([found.group[row.bus] for row in tables.customers], dtype=np.intp),
+        connected=np.array([_present(row.phases) for row in tables.customers]).reshape(-1, 3),
+        customers=tuple(row.customer for row in tables.customers),
+        buses=found.buses,
+        base_volt=meta.voltage_volt,
+        base_kva=meta.base_kva,
+        charging=np.where(both, charging[:, None, None] * np.eye(3), 0.0),
+    )
+
+
+def _series(line: LineRow) -> Phasors:
+    """Impedance of a line in phases, ohm."""
+    positive = np.array(complex(line.r_ohm, line.x_ohm))
+    if line.r0_ohm is None or line.x0_ohm is None:
+        return np.asarray(positive * np.eye(3))
+    return sequence_matrix(positive, np.array(complex(line.r0_ohm, line.x0_ohm)))
+
+
+def _present(phases: str) -> Bools:
+    return np.array([phase in phases for phase in PHASES])
+
+
+def _fuses(line: LineRow) -> bool:
+    return line.r_ohm == line.x_ohm == 0.0
+
+
+def _unsupported(tables: FeederTables) -> tuple[str, ...]:
+    """What the format can say and the three-phase model cannot do, or needs and does not find."""
+    problems = []
+    closed = [line for line in tables.lines if line.closed]
+    for line in closed:
+        where = f"lines, line {line.line!r}"
+        given = (line.r0_ohm is not None) + (line.x0_ohm is not None)
+        if line.tap != 1.0:
+            problems.append(
+                f"{where}: tap {line.tap:g}: the model takes no transformer in mid-feeder yet, only 1"
+            )
+        if _fuses(line):
+            if line.phases != "abc":
+                problems.append(
+                    f"{where}: phases {line.phases!r} without impedance; a switch must join all three"
+                )
+            if line.r0_ohm or line.x0_ohm:
+                problems.append(f"{where}: has an impedance only in the zero sequence; expected both or none")
+        elif given == 1 or (given == 0 and line.phases == "abc"):
+            missing = "r0_ohm" if line.r0_ohm is None else "x0_ohm"
+            problems.append(f"{where}, column {missing}: is missing; three phases need the zero sequence")
+    if all(map(_fuses, closed)):
+        problems.append("lines: no closed line has an impedance; there is nothing to watch below the busbar")
+    return tuple(problems)
