@@ -36,6 +36,18 @@ class Recipe:
     root: str | None = None
     fleet: Fleet | None = None
     max_attacked: int = 1
+    mend: Callable[[Any], str] | None = None
+    """Corrects what is wrong in the source, and says what."""
+
+
+def _reactive_powers(net: Any) -> str:
+    """Bring the reactive powers of two phases to the unit of the third."""
+    net.asymmetric_load[["q_b_mvar", "q_c_mvar"]] *= 1000.0
+    return (
+        "changed: the reactive powers of phases b and c are a thousandth of what they should be in "
+        "pandapower's file; they are taken 1000 times, which gives everybody the power factor 0.95 that "
+        "phase a has there"
+    )
 
 
 RECIPES: dict[str, Recipe] = {
@@ -71,6 +83,15 @@ RECIPES: dict[str, Recipe] = {
         "The radial 12.66 kV test feeder of M. E. Baran and F. F. Wu, IEEE Trans. Power Delivery 4(2), 1989, "
         "its five tie lines open.",
         fleet=Fleet(2, 0.0),
+    ),
+    "ieee-european-lv": Recipe(
+        "pandapower:ieee_european_lv_asymmetric",
+        "IEEE European low-voltage test feeder",
+        "The European low-voltage test feeder of the IEEE PES Distribution Test Feeder Working Group (2015):\n"
+        "55 customers of one phase each. load_kw is what they draw in the minute 566 of its day, 09:26, when\n"
+        "the feeder carries the most; it is not the peak of each.",
+        fleet=Fleet(3, 4.6),
+        mend=_reactive_powers,
     ),
     "simbench-lv-rural1": Recipe(
         "simbench:1-LV-rural1--0-sw",
@@ -129,10 +150,11 @@ def convert(
     recipe = RECIPES.get(source)
     origin = source if recipe is None else recipe.source
     net, package = _open(origin)
+    mended = (recipe.mend(net),) if recipe and recipe.mend else ()
     chosen = name or (
         source if recipe is not None else re.sub(r"[^A-Za-z0-9_-]+", "-", folder.resolve().name)
     )
-    tables, notes = from_pandapower(
+    tables, others = from_pandapower(
         net,
         chosen,
         title=recipe.title if recipe else "",
@@ -141,6 +163,7 @@ def convert(
         fleet=recipe.fleet if recipe else None,
         max_attacked=recipe.max_attacked if recipe else 1,
     )
+    notes = mended + others
     problems = validate(tables)
     if problems:
         raise FeederInvalid([*problems, *(f"while converting: {note}" for note in notes)])

@@ -1,0 +1,132 @@
+"""The three-phase loader: what it makes of the files, and what it refuses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from feeders.load import find, from_tables, load
+from feeders.load_phases import load_three_phase, three_phase, three_phase_names
+from feeders.schema import FeederTables, read
+from gridsec.errors import FeederInvalid
+from gridsec.feeder import lindistflow
+from gridsec.phases import lindist3flow
+
+CASE = Path(__file__).parent.parent / "cases" / "good" / "single-phase"
+EUROPEAN = "ieee-european-lv"
+
+
+def single_phase() -> FeederTables:
+    tables = read(CASE)
+    return replace(tables, lines=tuple(replace(line, tap=1.0) for line in tables.lines))
+
+
+def test_per_unit_of_a_small_feeder() -> None:
+    site = three_phase(single_phase())
+    feeder = site.feeder
+    base = 3 * 230.0**2 / (1000.0 * 100.0)
+    assert feeder.buses == ("0", "1", "2", "3")
+    own, mutual = (0.2 + 0.04j + 2 * (0.05 + 0.01j)) / 3, (0.15 + 0.03j) / 3
+    three = np.where(np.eye(3, dtype=bool), own, mutual)
+    np.testing.assert_allclose(feeder.z[:2] * base, [three, three], rtol=1e-14)
+    lateral = np.zeros((3, 3), dtype=complex)
+    lateral[1, 1] = 0.05 + 0.01j  # without zero sequence: conductor and return
+    np.testing.assert_allclose(feeder.z[2] * base, lateral, rtol=1e-14)
+    np.testing.assert_array_equal(feeder.phases[3], [False, True, False])
+    np.testing.assert_array_equal(feeder.connected, [[1, 0, 0], [1, 1, 1], [0, 1, 0]])
+    assert site.meter_ids == ("1", "2", "3")
+    assert site.bus_of_file == {"0": 0, "1": 1, "2": 2, "3": 3}
+
+
+def test_a_lateral_with_zero_sequence_has_its_self_impedance() -> None:
+    tables = single_phase()
+    lines = (*tables.lines[:2], replace(tables.lines[2], r0_ohm=0.2, x0_ohm=0.07))
+    feeder = three_phase(replace(tables, lines=lines)).feeder
+    base = 3 * 230.0**2 / (1000.0 * 100.0)
+    assert feeder.z[2, 1, 1] * base == pytest.approx((0.2 + 0.07j + 2 * (0.05 + 0.01j)) / 3)
+
+
+def test_a_balanced_feeder_has_the_matrices_of_the_balanced_loader() -> None:
+    tables = find("kerber-dorfnetz")
+    lines = tuple(replace(line, r0_ohm=4 * line.r_ohm, x0_ohm=3 * line.x_ohm) for line in tables.lines)
+    tables = replace(tables, lines=lines)
+    one, three = lindistflow(from_tables(tables).feeder), lindist3flow(three_phase(tables).feeder)
+    # The voltage of phase a by equal powers in the three phases of a customer.
+    count = one.R.shape[0]
+    for matrix, expected in ((three.R, one.R), (three.X, one.X)):
+        summed = matrix[::3].reshape(count, count, 3).sum(axis=2)
+        np.testing.assert_allclose(summed, expected, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("line", "changes", "said"),
+    [
+        (0, {"r0_ohm": None}, "line '1', column r0_ohm: is missing"),
+        (1, {"r0_ohm": None, "x0_ohm": None}, "line '2', column r0_ohm: is missing"),
+        (2, {"r0_ohm": 0.1}, "line '3', column x0_ohm: is missing"),
+        (1, {"tap": 1.05}, "line '2': tap 1.05"),
+        (2, {"r_ohm": 0.0, "x_ohm": 0.0}, "phases 'b' without impedance"),
+        (0, {"r_ohm": 0.0, "x_ohm": 0.0}, "has an impedance only in the zero sequence"),
+    ],
+)
+def test_what_three_phases_need(line: int, changes: dict[str, float | None], said: str) -> None:
+    tables = single_phase()
+    lines = list(tables.lines)
+    lines[line] = replace(lines[line], **changes)
+    with pytest.raises(FeederInvalid) as caught:
+        three_phase(replace(tables, lines=tuple(lines)))
+    assert any(said in problem for problem in caught.value.problems)
+
+
+def test_a_customer_needs_his_phases_at_his_bus() -> None:
+    tables = single_phase()
+    customers = (*tables.customers[:2], replace(tables.customers[2], phases="c"))
+    with pytest.raises(FeederInvalid, match="phases 'c' but bus '3' has only 'b'"):
+        three_phase(replace(tables, customers=customers))
+
+
+def test_a_switch_fuses_its_buses() -> None:
+    tables = single_phase()
+    switch = replace(tables.lines[1], r_ohm=0.0, x_ohm=0.0, r0_ohm=None, x0_ohm=None)
+    site = three_phase(replace(tables, lines=(tables.lines[0], switch, tables.lines[2])))
+    assert site.bus_of_file["2"] == site.bus_of_file["1"] == 1
+    assert len(site.feeder.buses) == 3
+
+
+def test_nothing_to_watch() -> None:
+    tables = single_phase()
+    lines = tuple(
+        replace(line, r_ohm=0.0, x_ohm=0.0, r0_ohm=None, x0_ohm=None, phases="abc") for line in tables.lines
+    )
+    with pytest.raises(FeederInvalid, match="no closed line has an impedance"):
+        three_phase(replace(tables, lines=lines))
+
+
+def test_the_european_feeder() -> None:
+    assert three_phase_names() == [EUROPEAN]
+    site = load_three_phase(EUROPEAN)
+    feeder = site.feeder
+    assert (len(feeder.buses), len(feeder.customers), len(site.meter_ids)) == (906, 55, 55)
+    assert feeder.of.size == 55
+    np.testing.assert_array_equal(np.bincount(feeder.phase), [21, 19, 15])
+    assert all(row.power_factor == 0.95 for row in site.tables.customers)
+    model = lindist3flow(feeder)
+    # Mutual impedance makes the matrices neither symmetric nor nonnegative.
+    assert np.abs(model.X - model.X.T).max() > 0.5 * np.abs(model.X).max()
+    assert 0.2 < (model.X < 0).mean() < 0.5
+    assert np.linalg.eigvalsh(model.X + model.X.T)[0] > 0.0
+
+
+def test_single_phase_customers_are_not_for_the_balanced_monitors() -> None:
+    with pytest.raises(FeederInvalid) as caught:
+        load(EUROPEAN)
+    assert len(caught.value.problems) == 55
+    assert "phases 'a': the model is balanced yet" in caught.value.problems[0]
+
+
+def test_there_is_no_such_feeder() -> None:
+    with pytest.raises(FeederInvalid, match="neither such a folder nor such a feeder"):
+        load_three_phase("no-such-feeder")
