@@ -88,8 +88,8 @@ RECIPES: dict[str, Recipe] = {
         "pandapower:ieee_european_lv_asymmetric",
         "IEEE European low-voltage test feeder",
         "The European low-voltage test feeder of the IEEE PES Distribution Test Feeder Working Group\n"
-        "(2015): 55 customers of one phase each. load_kw is what they draw in the minute 566 of its day, 09:26,\n"
-        "when the feeder carries the most; it is not the peak of each.",
+        "(2015): 55 customers of one phase each. load_kw is what they draw in the minute 566 of its day,\n"
+        "09:26, when the feeder carries the most; it is not the peak of each.",
         fleet=Fleet(3, 4.6),
         mend=_reactive_powers,
     ),
