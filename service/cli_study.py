@@ -11,19 +11,20 @@ from rich.markup import escape
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from service import console
+from service import cli_plan, console
 from service.console import Feeder
 
 if TYPE_CHECKING:
     from feeders.comparison import Plan, Row
     from feeders.load import Site
 
-app = typer.Typer(no_args_is_help=True, help="Study feeders and estimators in simulation.")
+app = typer.Typer(no_args_is_help=True, help="Study feeders and estimators.")
+app.command("redundancy")(cli_plan.redundancy)
 
 
 @app.callback()
 def study() -> None:
-    """Study feeders and estimators in simulation."""
+    """Study feeders and estimators."""
 
 
 @app.command("compare")

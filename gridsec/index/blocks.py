@@ -103,7 +103,13 @@ def span(columns: NDArray[Scalar], tol: float) -> NDArray[Scalar]:
 
 
 def fewest(
-    rows: Sequence[Matrix], space: Matrix, *, tol: float, most: int = MOST_NODES, below: float = 0.0
+    rows: Sequence[Matrix],
+    space: Matrix,
+    *,
+    tol: float,
+    most: int = MOST_NODES,
+    below: float = 0.0,
+    must: int | None = None,
 ) -> Sparsest:
     """Minimise, over the x != 0 of a space, the number of blocks that see x.
 
@@ -125,6 +131,8 @@ def fewest(
     below
         Only answer whether fewer blocks than this see some direction: the count found is below it if so,
         and otherwise any upper bound. Takes at most C(n + below, n) nodes. 0: find the minimum.
+    must
+        Only directions that this block sees; if there are none, the count is infinite. None: all.
 
     Returns
     -------
@@ -136,15 +144,17 @@ def fewest(
     DesignInfeasible
         If more than `most` nodes would be needed. The general problem is NP-hard.
     """
-    if space.shape[1] == 0:
-        return Sparsest(np.inf, np.zeros(0, dtype=np.intp), np.zeros(0))
     blocks = _padded(rows, space.shape[0])
+    if space.shape[1] == 0 or not _sees(blocks, must, space, tol):
+        return Sparsest(np.inf, np.zeros(0, dtype=np.intp), np.zeros(0))
     best, best_space, nodes = np.inf, space, 0
     todo = [(space, np.arange(len(rows)), 0)]
+    if must is not None:
+        todo = [(space, np.delete(np.arange(len(rows)), must), 1)]
     while todo:
         here, undecided, paid = todo.pop()
         enough = min(best, below) if below > 0 else best
-        if paid >= enough:
+        if paid >= enough or not _sees(blocks, must, here, tol):
             continue
         nodes += 1
         if nodes > most:
@@ -172,6 +182,11 @@ def fewest(
             # Pushed last, hence visited first: it lowers the bound soonest.
             todo.append((smaller, rest, paid))
     return _generic(blocks, best_space, tol)
+
+
+def _sees(blocks: Matrix, block: int | None, space: Matrix, tol: float) -> bool:
+    """Whether a block, if one is given, sees anything of a space."""
+    return block is None or bool(np.linalg.norm(blocks[block] @ space, 2) > tol)
 
 
 def _generic(blocks: Matrix, space: Matrix, tol: float) -> Sparsest:

@@ -1,0 +1,1 @@
+"""Offline studies of a feeder: each a function that returns a frozen result with DataFrames."""

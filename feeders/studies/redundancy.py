@@ -1,0 +1,231 @@
+"""How many lying meters a feeder withstands: as a whole, by meter, by part, and with meters missing.
+
+References
+----------
+lee2018, chapter 3; docs/theory-studies.md, section 2.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import pandas as pd
+
+from feeders.studies.hidden import Attack, Curves, Knowledge, knowledge
+from feeders.studies.journal import Journal, Progress, worked
+from gridsec.errors import DesignInfeasible
+from gridsec.index import Index
+from gridsec.studies.patterns import fewest_meters
+from gridsec.studies.redundancy import Part, meter_redundancy, part_redundancy, parts
+
+if TYPE_CHECKING:
+    from feeders.load import Site
+
+__all__ = ["ALL", "SILENT", "Redundancy", "redundancy"]
+
+ALL: Final = "all live"
+SILENT: Final = "silent"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Redundancy:
+    """What `redundancy` found.
+
+    Every table has a column `case`: "all live", or "silent" with the given meters missing. `index_persistent`
+    and `index_any`: the fewest liars that stay invisible while some voltage that is measured is not what
+    it seems, by an attack whose effect stays and by any; infinity where there are none, NaN where the
+    search gave up (`note` says why).
+
+    Attributes
+    ----------
+    feeder, digest
+        The feeder's name, and its content.
+    unknown, unknown_silent
+        Customers whose powers nobody knows, in the two cases.
+    silent
+        Meters that are missing in the second case.
+    curves
+        Where the inverters work.
+    summary
+        One row for each case and kind of attack: `patterns` (dimensions to hide in), `blind` (customers whose
+        voltage no meter tells, whoever lies), `index`, `detected` (most liars that cannot hide; if nobody is
+        blind, the pair is still detectable, or observable, after the loss of any so many meters),
+        `identified` (most liars that are identified), `liars`.
+    meters
+        One row for each case and meter: its own indices, `critical`, `identified_without` (what the others
+        identify, persistently, once it is silent).
+    parts
+        One row for each case and part: what liars inside it can do while all outside are honest.
+    """
+
+    feeder: str
+    digest: str
+    unknown: tuple[str, ...]
+    unknown_silent: tuple[str, ...]
+    silent: tuple[str, ...]
+    curves: Curves
+    summary: pd.DataFrame
+    meters: pd.DataFrame
+    parts: pd.DataFrame
+
+    @property
+    def changes(self) -> pd.DataFrame:
+        """Parts that identify fewer liars with the given meters missing: `identified` before and after."""
+        columns = ["bus", "meters", "identified"]
+        before = self.parts[self.parts["case"] == ALL][columns]
+        after = self.parts[self.parts["case"] == SILENT][["bus", "meters", "identified"]]
+        both = before.merge(after, on="bus", suffixes=("", "_silent"))
+        return both[both["identified_silent"] < both["identified"]].reset_index(drop=True)
+
+
+def redundancy(
+    site: Site,
+    *,
+    unknown: Sequence[str] | None = None,
+    silent: Sequence[str] = (),
+    busbar_known: bool = True,
+    curves: Curves = Curves.STEEPEST,
+    journal: Path | None = None,
+    progress: Progress | None = None,
+) -> Redundancy:
+    """Count liars that stay invisible to whoever knows the feeder, its honest loads and all readings.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    unknown, silent, busbar_known, curves
+        As in `feeders.studies.hidden.knowledge`.
+    journal
+        File in which finished work is kept; an interrupted study goes on from it.
+    progress
+        Told how far it is.
+
+    Raises
+    ------
+    ValueError
+        If there is no such customer or meter.
+    OtherStudy
+        If the journal is another study's.
+    """
+    subject = {
+        "study": "redundancy",
+        "digest": site.digest,
+        "unknown": None if unknown is None else sorted(unknown),
+        "silent": sorted(silent),
+        "busbar_known": busbar_known,
+        "curves": str(curves),
+    }
+    known = partial(knowledge, site, unknown=unknown, busbar_known=busbar_known, curves=curves)
+    cases = {ALL: known(silent=())}
+    if silent:
+        cases[SILENT] = known(silent=silent)
+    pieces = parts(site.feeder, site.feeder.bus[site.meters])
+    tasks = [task for case, what in cases.items() for task in _tasks(site, case, what, pieces)]
+    done = worked(Journal(journal, subject), tasks, progress)
+    return Redundancy(
+        feeder=site.feeder.name,
+        digest=site.digest,
+        unknown=cases[ALL].unknown,
+        unknown_silent=cases[SILENT].unknown if silent else cases[ALL].unknown,
+        silent=tuple(silent),
+        curves=curves,
+        summary=_table(done, "summary", site),
+        meters=_table(done, "meter", site),
+        parts=_table(done, "part", site),
+    )
+
+
+Task = tuple[str, Callable[[], Any]]
+
+
+def _tasks(site: Site, case: str, what: Knowledge, pieces: Sequence[Part]) -> list[Task]:
+    out: list[Task] = [
+        (f"summary|{case}|{attack}", partial(_summary, site, case, what, attack)) for attack in Attack
+    ]
+    live = np.flatnonzero(~what.silent).tolist()
+    out += [(f"meter|{case}|{j}", partial(_meter, site, case, what, j)) for j in live]
+    out += [(f"part|{case}|{piece.bus}", partial(_part, site, case, what, piece)) for piece in pieces]
+    return out
+
+
+def _summary(site: Site, case: str, what: Knowledge, attack: Attack) -> dict[str, Any]:
+    given = what.found[attack]
+    row = {"case": case, "attack": str(attack), "meters": int(np.count_nonzero(~what.silent))}
+    row["patterns"] = given.dimension
+    row["blind"] = [site.feeder.customers[k] for k in np.flatnonzero(what.blind(attack))]
+    found, note = _or_note(lambda: fewest_meters(given, silent=what.silent))
+    return row | {
+        "index": found.count,
+        "detected": found.detectable,
+        "identified": found.correctable,
+        "liars": found.sensors.tolist(),
+        "note": note,
+    }
+
+
+def _meter(site: Site, case: str, what: Knowledge, j: int) -> dict[str, Any]:
+    customer = int(site.meters[j])
+    row: dict[str, Any] = {
+        "case": case,
+        "meter": site.meter_ids[j],
+        "customer": site.feeder.customers[customer],
+        "bus": site.feeder.buses[int(site.feeder.bus[customer])],
+    }
+    notes = set()
+    for attack, given in what.found.items():
+        try:
+            found = meter_redundancy(given, j, what.silent)
+        except DesignInfeasible as error:
+            notes.add(str(error))
+            row |= {f"index_{attack}": math.nan}
+            continue
+        row[f"index_{attack}"] = found.own.count
+        if attack is Attack.PERSISTENT:
+            row["critical"], row["identified_without"] = found.critical, found.without.correctable
+            row["with"] = [k for k in found.own.sensors.tolist() if k != j]
+    row.setdefault("critical", None)
+    row.setdefault("identified_without", math.nan)
+    row.setdefault("with", [])
+    return row | {"note": "; ".join(sorted(notes))}
+
+
+def _part(site: Site, case: str, what: Knowledge, piece: Part) -> dict[str, Any]:
+    row: dict[str, Any] = {
+        "case": case,
+        "bus": site.feeder.buses[piece.bus],
+        "branch": piece.branch,
+        "meters": int(np.count_nonzero(~what.silent[piece.meters])),
+    }
+    notes = set()
+    for attack, given in what.found.items():
+        found, note = _or_note(partial(part_redundancy, given, piece, what.silent))
+        row[f"index_{attack}"] = found.count
+        notes.add(note)
+        if attack is Attack.PERSISTENT:
+            row |= {"detected": found.detectable, "identified": found.correctable}
+    return row | {"note": "; ".join(sorted(notes - {""}))}
+
+
+def _or_note(search: Callable[[], Index]) -> tuple[Index, str]:
+    """A search's answer, or why it gave up."""
+    try:
+        return search(), ""
+    except DesignInfeasible as error:
+        return Index(math.nan, np.zeros(0, dtype=np.intp), np.zeros(0)), str(error)
+
+
+def _table(done: dict[str, Any], kind: str, site: Site) -> pd.DataFrame:
+    frame = pd.DataFrame([row for key, row in done.items() if key.startswith(f"{kind}|")])
+    for column in ("liars", "with"):
+        if column in frame:
+            frame[column] = [" ".join(site.meter_ids[j] for j in row) for row in frame[column]]
+    if "blind" in frame:
+        frame["blind"] = [", ".join(row) for row in frame["blind"]]
+    return frame

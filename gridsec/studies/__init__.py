@@ -1,0 +1,1 @@
+"""What offline studies of a feeder compute: arrays in, frozen results out."""

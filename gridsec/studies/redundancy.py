@@ -1,0 +1,114 @@
+"""How many lying meters a feeder withstands, meter by meter and part by part.
+
+References
+----------
+lee2018, Definitions 3.1.1 and 3.1.3, Propositions 3.1.2, 3.1.9 and 3.2.2; docs/theory-studies.md, section 2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gridsec.arrays import Bools, Ints
+from gridsec.feeder import Feeder
+from gridsec.index import Index
+from gridsec.studies.patterns import Patterns, fewest_meters
+
+__all__ = ["Meter", "Part", "meter_redundancy", "part_redundancy", "parts"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Meter:
+    """What one meter means for all.
+
+    Attributes
+    ----------
+    own
+        The fewest liars, this meter among them, that imitate a pattern: its security index.
+    without
+        The index of all other meters, this one silent.
+    critical
+        Without it some pattern is invisible to all others: its own index is 1, its lies cannot be detected.
+    """
+
+    own: Index
+    without: Index
+    critical: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """A part of a feeder: what is fed through one bus.
+
+    Attributes
+    ----------
+    bus
+        The bus.
+    branch
+        Whether it hangs on the busbar directly.
+    meters : (k,)
+        The meters there.
+    """
+
+    bus: int
+    branch: bool
+    meters: Ints
+
+
+def meter_redundancy(given: Patterns, meter: int, silent: Bools) -> Meter:
+    """Security index of one meter, and the index of the others without it.
+
+    Parameters
+    ----------
+    given
+        The patterns.
+    meter
+        The meter; not a silent one.
+    silent : (p,)
+        Meters that are not there.
+    """
+    own = fewest_meters(given, silent=silent, must=meter)
+    gone = silent.copy()
+    gone[meter] = True
+    return Meter(own, fewest_meters(given, silent=gone), own.count == 1.0)
+
+
+def part_redundancy(given: Patterns, part: Part, silent: Bools) -> Index:
+    """The fewest liars inside one part that imitate a pattern, all meters outside being honest.
+
+    Up to `Index.correctable` liars, all of them in the part, are identified, and no more in general.
+
+    Parameters
+    ----------
+    given
+        The patterns.
+    part
+        From `parts`.
+    silent : (p,)
+        Meters that are not there.
+    """
+    honest = np.ones(silent.size, dtype=np.bool_)
+    honest[part.meters] = False
+    return fewest_meters(given, honest=honest, silent=silent)
+
+
+def parts(feeder: Feeder, buses: Ints) -> Sequence[Part]:
+    """All parts of a feeder that differ in their meters, those nearest the busbar first.
+
+    Parameters
+    ----------
+    feeder
+        The feeder.
+    buses : (p,)
+        Bus of each meter.
+    """
+    found: dict[tuple[int, ...], Part] = {}
+    for bus in range(1, len(feeder.buses)):
+        start = feeder.start[buses]
+        inside = np.flatnonzero((start >= feeder.start[bus]) & (start < feeder.stop[bus]))
+        if inside.size:
+            found.setdefault(tuple(inside.tolist()), Part(bus, bool(feeder.parent[bus - 1] == 0), inside))
+    return tuple(found.values())

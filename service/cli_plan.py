@@ -1,0 +1,137 @@
+"""`gridsec study redundancy`, `protect`, `detectable`: what a planner asks of a feeder's meters."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from service import console
+from service.console import Feeder
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from feeders.studies.journal import Progress as Tell
+
+Unknown = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="A customer whose powers nobody knows; may be repeated. [default: those without a meter]"
+    ),
+]
+Silent = Annotated[list[str] | None, typer.Option(help="A meter that is missing; may be repeated.")]
+BusbarUnknown = Annotated[bool, typer.Option("--busbar-unknown", help="The busbar's voltage is not metered.")]
+CurvesAt = Annotated[str, typer.Option(help="Where inverters work: steepest or deadband.")]
+Journal = Annotated[Path | None, typer.Option(help="Keep finished work in this file, and go on from it.")]
+Out = Annotated[Path | None, typer.Option(help="Write the tables into this folder, as CSV.")]
+
+
+def redundancy(
+    feeder: Feeder = "simbench-lv-rural1",
+    *,
+    unknown: Unknown = None,
+    silent: Silent = None,
+    busbar_unknown: BusbarUnknown = False,
+    curves: CurvesAt = "steepest",
+    journal: Journal = None,
+    out: Out = None,
+) -> None:
+    """How many lying meters stay invisible: in all, by meter, by part of the feeder, with meters missing."""
+    from feeders.load import load
+    from feeders.studies.redundancy import redundancy as study
+
+    site = load(feeder)
+    with _bar("searching for liars that stay invisible") as tell, _said():
+        found = study(
+            site,
+            unknown=unknown,
+            silent=silent or (),
+            busbar_known=not busbar_unknown,
+            curves=_curves(curves),
+            journal=journal,
+            progress=tell,
+        )
+    console.out.print(_unknowns(found.unknown, found.feeder))
+    _show("Liars that stay invisible", found.summary)
+    _show("By meter", found.meters)
+    _show("Liars inside one part", found.parts)
+    if found.silent:
+        _show(f"What changes without {', '.join(found.silent)}", found.changes)
+    _write(out, {"summary": found.summary, "meters": found.meters, "parts": found.parts})
+
+
+def _unknowns(names: Sequence[str], feeder: str) -> str:
+    who = ", ".join(names) if names else "nobody"
+    return escape(f"{feeder}: powers unknown of {who}")
+
+
+def _curves(name: str) -> Any:
+    from feeders.studies.hidden import Curves
+
+    if name not in tuple(Curves):
+        raise typer.BadParameter(f"{name!r}: expected one of {', '.join(Curves)}", param_hint="--curves")
+    return Curves(name)
+
+
+@contextmanager
+def _bar(what: str) -> Iterator[Tell]:
+    """A progress bar on the terminal."""
+    with Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        console=console.err,
+        transient=True,
+        disable=not console.err.is_terminal,
+    ) as bar:
+        task = bar.add_task(escape(what), total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+@contextmanager
+def _said() -> Iterator[None]:
+    """Say what is wrong with what was asked."""
+    try:
+        yield
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from error
+
+
+def _show(title: str, frame: pd.DataFrame) -> None:
+    """Print a table; columns that say nothing are left out."""
+    kept = [name for name in frame.columns if not all(_empty(cell) for cell in frame[name])]
+    table = Table(*(escape(name.replace("_", " ")) for name in kept), title=title, title_justify="left")
+    for row in frame[kept].itertuples(index=False):
+        table.add_row(*(escape(_cell(cell)) for cell in row))
+    console.out.print(table, soft_wrap=False)
+
+
+def _empty(cell: Any) -> bool:
+    return isinstance(cell, str) and not cell
+
+
+def _cell(cell: Any) -> str:
+    if cell is None or (isinstance(cell, float) and math.isnan(cell)):
+        return "-"
+    if isinstance(cell, bool):
+        return "yes" if cell else "no"
+    if isinstance(cell, float):
+        return "∞" if math.isinf(cell) else f"{cell:.4g}"
+    return str(cell)
+
+
+def _write(folder: Path | None, frames: dict[str, pd.DataFrame]) -> None:
+    if folder is None:
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, frame in frames.items():
+        frame.to_csv(folder / f"{name}.csv", index=False)

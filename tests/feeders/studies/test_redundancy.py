@@ -1,0 +1,74 @@
+"""The redundancy study on a real feeder: meters missing, work interrupted, wrong names."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from feeders.load import load
+from feeders.studies.hidden import Attack
+from feeders.studies.journal import Journal, OtherStudy
+from feeders.studies.redundancy import ALL, SILENT, redundancy
+
+RURAL = load("simbench-lv-rural1")
+
+
+def test_known_loads_let_no_lie_stay_and_a_missing_meter_does() -> None:
+    found = redundancy(RURAL, silent=["m04"])
+    table = found.summary.set_index(["case", "attack"])
+    assert table.loc[(ALL, Attack.PERSISTENT), "index"] == np.inf
+    # The load of m04's customer moves the two other meters of its street, and nobody else.
+    assert table.loc[(SILENT, Attack.PERSISTENT), "liars"] == "m05 m12"
+    assert found.unknown_silent == ("LV1.101 Load 4",)
+    assert found.changes["bus"].tolist() == ["LV1.101 Bus 2"]
+    assert found.changes["identified_silent"].tolist() == [0.0]
+    assert len(found.meters) == 13 + 12
+
+
+def test_a_customer_that_no_meter_sees_is_named() -> None:
+    silent = ["m04", "m05", "m12"]
+    found = redundancy(RURAL, silent=silent).summary.set_index(["case", "attack"])
+    blind = found.loc[(SILENT, Attack.PERSISTENT), "blind"]
+    assert blind == "LV1.101 Load 4, LV1.101 Load 5, LV1.101 Load 12"
+
+
+def test_an_interrupted_study_goes_on_and_does_nothing_twice(tmp_path: Path) -> None:
+    class Interrupted(Exception):
+        pass
+
+    def interrupt(done: int, total: int) -> None:
+        if done > total // 2:
+            raise Interrupted
+
+    journal = tmp_path / "journal.jsonl"
+    with pytest.raises(Interrupted):
+        redundancy(RURAL, silent=["m04"], journal=journal, progress=interrupt)
+    kept = journal.read_text(encoding="utf-8")
+    # The line that was being written when the power failed.
+    journal.write_text(kept + '["part|silent|3", {"ca', encoding="utf-8")
+    again = redundancy(RURAL, silent=["m04"], journal=journal)
+    assert journal.read_text(encoding="utf-8").startswith(kept)
+    whole = redundancy(RURAL, silent=["m04"])
+    for name in ("summary", "meters", "parts"):
+        pd.testing.assert_frame_equal(getattr(again, name), getattr(whole, name))
+    complete = journal.read_text(encoding="utf-8")
+    redundancy(RURAL, silent=["m04"], journal=journal)
+    assert journal.read_text(encoding="utf-8") == complete
+
+
+def test_the_journal_of_another_study_is_refused(tmp_path: Path) -> None:
+    journal = tmp_path / "journal.jsonl"
+    Journal(journal, {"study": "another"})
+    with pytest.raises(OtherStudy, match="not the journal of this study"):
+        redundancy(RURAL, journal=journal)
+    assert journal.read_text(encoding="utf-8") == '{"study": "another"}\n'
+
+
+def test_unknown_names_are_refused() -> None:
+    with pytest.raises(ValueError, match="no meter 'm99'"):
+        redundancy(RURAL, silent=["m99"])
+    with pytest.raises(ValueError, match="no customer 'nobody'"):
+        redundancy(RURAL, unknown=["nobody"])

@@ -1,0 +1,162 @@
+"""Hidden attacks against brute force over all sets of liars, by ranks of observability matrices."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from gridsec.arrays import Floats, Ints
+from gridsec.droop import fleet
+from gridsec.feeder import Feeder, lindistflow
+from gridsec.index import observable_rows, redundant_detectable, redundant_observable, unstable_subspace
+from gridsec.lure import Lure, close_loop
+from gridsec.studies.patterns import Patterns, fewest_meters, patterns, unknown_pair, unknown_voltages
+from gridsec.studies.redundancy import meter_redundancy, part_redundancy, parts
+
+TOL = 1e-9
+
+
+def tree(seed: int) -> tuple[Feeder, Lure, Ints, Ints]:
+    """A small feeder: 7 customers, 5 of them with meters, 2 inverters, 1 or 2 loads that nobody knows."""
+    rng = np.random.default_rng(seed)
+    branches = 7
+    feeder = Feeder(
+        name="small",
+        parent=np.array([rng.integers(max(0, k - 2), k + 1) for k in range(branches)]),
+        r=rng.uniform(0.01, 0.05, branches),
+        x=rng.uniform(0.01, 0.05, branches),
+        bus=rng.integers(1, branches + 1, 7),
+        customers=tuple(f"c{i}" for i in range(7)),
+        buses=tuple(f"b{i}" for i in range(branches + 1)),
+        base_volt=230.0,
+        base_kva=100.0,
+        charging=np.zeros(branches),
+    )
+    meters = np.sort(rng.choice(7, 5, replace=False))
+    own = np.sort(rng.choice(7, 2, replace=False))
+    droop = fleet(own, "ieee1547-b", np.array([5.0, 9.0]), 100.0, tau=np.array([2.0, 3.1]))
+    unknown = rng.choice(7, rng.integers(1, 3), replace=False)
+    return feeder, close_loop(feeder, droop, meters), meters, unknown
+
+
+def system(seed: int, *, busbar: bool = False) -> tuple[Floats, Floats]:
+    feeder, lure, _, unknown = tree(seed)
+    W = unknown_voltages(lindistflow(feeder), unknown, busbar=busbar, tol=TOL)
+    return unknown_pair(lure, lure.slope, W)
+
+
+def imitates(rows: tuple[Floats, ...], space: Floats, liars: tuple[int, ...], live: list[int]) -> Floats:
+    """What these liars see of the states in a space that no other live meter ever sees."""
+    others = [rows[j] @ space for j in live if j not in liars]
+    stack = np.vstack([*others, np.zeros((1, space.shape[1]))])
+    _, s, vh = np.linalg.svd(stack)
+    null = vh[int(np.count_nonzero(s > 1e-7)) :].T
+    return np.array([np.linalg.norm(rows[j] @ space @ null) for j in liars])
+
+
+def brute(
+    A: Floats, C: Floats, allowed: list[int], live: list[int], *, persistent: bool, must: int | None = None
+) -> float:
+    """The fewest liars, by trying all sets of the allowed."""
+    rows = observable_rows(A, C, tol=TOL)
+    space = unstable_subspace(A, discrete=False, tol=TOL) if persistent else np.eye(A.shape[0])
+    if not space.shape[1]:
+        return np.inf
+    for count in range(1, len(allowed) + 1):
+        for liars in combinations(allowed, count):
+            if must is not None and must not in liars:
+                continue
+            effect = imitates(rows, space, liars, live)
+            if effect.max() > 1e-7 and (must is None or effect[liars.index(must)] > 1e-7):
+                return float(count)
+    return np.inf
+
+
+def given(A: Floats, C: Floats, *, persistent: bool) -> Patterns:
+    return patterns(A, C, persistent=persistent, tol=TOL)
+
+
+@pytest.mark.parametrize("persistent", [True, False])
+@pytest.mark.parametrize("seed", range(25))
+def test_indices_of_all_and_of_each_meter_equal_brute_force(seed: int, persistent: bool) -> None:
+    A, C = system(seed, busbar=seed % 3 == 0)
+    found = given(A, C, persistent=persistent)
+    everybody = list(range(len(C)))
+    nobody = np.zeros(len(C), dtype=np.bool_)
+    assert fewest_meters(found).count == brute(A, C, everybody, everybody, persistent=persistent)
+    for j in everybody:
+        meter = meter_redundancy(found, j, nobody)
+        assert meter.own.count == brute(A, C, everybody, everybody, persistent=persistent, must=j)
+        assert meter.critical == (meter.own.count == 1)
+        if np.isfinite(meter.own.count):
+            assert j in meter.own.sensors
+            assert meter.own.sensors.size == meter.own.count
+        rest = [k for k in everybody if k != j]
+        assert meter.without.count == brute(A, C, rest, rest, persistent=persistent)
+
+
+@pytest.mark.parametrize("persistent", [True, False])
+@pytest.mark.parametrize("seed", range(25))
+def test_parts_and_silent_meters_equal_brute_force(seed: int, persistent: bool) -> None:
+    feeder, _, meters, _ = tree(seed)
+    A, C = system(seed)
+    found = given(A, C, persistent=persistent)
+    silent = np.arange(len(C)) == seed % len(C)
+    live = np.flatnonzero(~silent).tolist()
+    for part in parts(feeder, feeder.bus[meters]):
+        inside = [j for j in part.meters.tolist() if not silent[j]]
+        counted = part_redundancy(found, part, silent).count
+        assert counted == brute(A, C, inside, live, persistent=persistent)
+
+
+@pytest.mark.parametrize("seed", range(25))
+def test_index_is_redundant_observability_where_nobody_is_blind(seed: int) -> None:
+    A, C = system(seed)
+    live = np.ones(len(C), dtype=np.bool_)
+    for persistent in (True, False):
+        found = given(A, C, persistent=persistent)
+        index = fewest_meters(found).count
+        blind = found.blind(live).shape[1] > 0
+        for q in range(len(C)):
+            expected = not blind and q < index
+            if persistent:
+                assert redundant_detectable(A, C, q, discrete=False, tol=TOL, by="rank") == expected
+            else:
+                assert redundant_observable(A, C, q, tol=TOL, by="rank") == expected
+
+
+def test_the_liars_of_an_index_do_imitate_a_pattern() -> None:
+    A, C = system(3)
+    found = given(A, C, persistent=True)
+    index = fewest_meters(found)
+    reading = C @ np.real(index.direction)
+    others = np.delete(reading, index.sensors)
+    np.testing.assert_allclose(others, 0.0, atol=1e-8)
+    assert np.abs(reading[index.sensors]).min() > 1e-6
+    # It stays: the state of this direction does not move.
+    np.testing.assert_allclose(A @ index.direction, 0.0, atol=1e-8)
+
+
+def test_known_loads_leave_nothing_that_stays() -> None:
+    feeder, lure, _, _ = tree(1)
+    W = unknown_voltages(lindistflow(feeder), np.zeros(0, dtype=np.intp), busbar=False, tol=TOL)
+    A, C = unknown_pair(lure, lure.slope, W)
+    assert fewest_meters(given(A, C, persistent=True)).count == np.inf
+
+
+def test_an_unknown_busbar_moves_every_meter() -> None:
+    feeder, lure, _, _ = tree(1)
+    none = np.zeros(0, dtype=np.intp)
+    W = unknown_voltages(lindistflow(feeder), none, busbar=True, tol=TOL)
+    A, C = unknown_pair(lure, 0.0 * lure.slope, W)
+    found = fewest_meters(given(A, C, persistent=True))
+    assert found.count == len(C)
+
+
+def test_a_liar_must_be_there() -> None:
+    A, C = system(0)
+    found = given(A, C, persistent=False)
+    with pytest.raises(ValueError, match="meter 1 must lie"):
+        fewest_meters(found, silent=np.arange(len(C)) == 1, must=1)

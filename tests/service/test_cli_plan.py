@@ -1,0 +1,51 @@
+"""`gridsec study redundancy`, `protect`, `detectable` on the command line."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from service.cli import main
+
+
+def run(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: str
+) -> tuple[int, str, str]:
+    monkeypatch.setattr(sys, "argv", ["gridsec", "study", *arguments])
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as end:
+        main()
+    told = capsys.readouterr()
+    return int(end.value.code or 0), told.out, told.err
+
+
+def test_redundancy_prints_tables_and_writes_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, journal = tmp_path / "out", tmp_path / "journal"
+    code, told, _ = run(
+        monkeypatch,
+        capsys,
+        *("redundancy", "simbench-lv-rural1", "--silent", "m04"),
+        *("--out", str(folder), "--journal", str(journal)),
+    )
+    assert code == 0
+    assert "m05 m12" in told
+    assert "What changes without m04" in told
+    summary = pd.read_csv(folder / "summary.csv")
+    assert summary["liars"].tolist()[2] == "m05 m12"
+    assert journal.exists()
+
+
+def test_wrong_arguments_are_told(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, _, told = run(monkeypatch, capsys, "redundancy", "--silent", "m99")
+    assert code == 2
+    assert "no meter 'm99'" in told
+    code, _, told = run(monkeypatch, capsys, "redundancy", "--curves", "flat")
+    assert code == 2
+    assert "expected one of steepest, deadband" in " ".join(told.replace("│", " ").split())
