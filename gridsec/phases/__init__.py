@@ -12,6 +12,7 @@ from gridsec.phases.flow import (
     lindist3flow,
     loss_correction,
     model_error_bound,
+    sensitivities,
     squared_voltages,
 )
 
@@ -25,6 +26,7 @@ __all__ = [
     "lindist3flow",
     "loss_correction",
     "model_error_bound",
+    "sensitivities",
     "sequence_matrix",
     "squared_voltages",
 ]

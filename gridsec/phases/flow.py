@@ -79,6 +79,66 @@ def lindist3flow(feeder: ThreePhaseFeeder) -> LinDist3Flow:
     return LinDist3Flow(*(frozen(part) for part in (W.real, W.imag, W_bus.real, W_bus.imag)))
 
 
+def sensitivities(
+    feeder: ThreePhaseFeeder, p: Floats, q: Floats, v0_squared: Floats, *, steps: int = 2
+) -> LinDist3Flow:
+    """Derivatives of squared voltages at an operating point, halved: `lindist3flow` where there is load.
+
+    A power that changes by ds at one connection changes what all draw, because their powers are constant:
+
+        dv_k = -(sum of Z di over the path of k),   di = -conj(ds / v) + conj(s dv / v^2) + j B dv
+
+    Sweeps solve that by iteration, `steps` times after the first, which is the term in ds alone: every step
+    gains one order in the load. Re(conj(v) dv) is then half the derivative of v^2. Without load and charging
+    the first term is all, and is `lindist3flow`. O(b C) for each step.
+
+    Parameters
+    ----------
+    feeder
+        The feeder.
+    p, q : (C,)
+        Net active and reactive injection of each connection at the operating point, pu.
+    v0_squared : (3,)
+        Squared busbar voltage of each phase, pu.
+    steps
+        Number of sweeps, at least 1: for the operating point as for the derivatives.
+
+    Returns
+    -------
+    LinDist3Flow
+        The matrices; ``v^2`` then changes by ``2 R dp + 2 X dq``.
+    """
+    _check(steps)
+    start = _Start.of(feeder, p, q, v0_squared)
+    v = start.phasors
+    for _ in range(steps):
+        v = _sweep(feeder, start, v)
+    load = np.conj(start.s / v**2)
+    count, buses = feeder.of.size, len(feeder.buses)
+    found = np.empty((2, count, 3, buses))
+    together = max(1, _TOGETHER // (3 * buses))
+    for first in range(0, count, together):
+        some = slice(first, min(first + together, count))
+        phase, at = feeder.phase[some], feeder.at[some]
+        own = np.zeros((2, at.size, 3, buses), dtype=np.complex128)
+        for part, unit in enumerate((1.0, 1j)):
+            own[part, np.arange(at.size), phase, at] = -np.conj(unit / v[phase, at])
+        change = _forward(feeder, _NOTHING, own)
+        for _ in range(steps):
+            drawn = own + load * np.conj(change) + _charged(feeder, change)
+            change = _forward(feeder, _NOTHING, drawn)
+        found[:, some] = (np.conj(v) * change).real
+    R_bus, X_bus = np.moveaxis(found, 1, -1)
+    here = (feeder.phase, feeder.at)
+    return LinDist3Flow(*(frozen(part) for part in (R_bus[here], X_bus[here], R_bus, X_bus)))
+
+
+# Entries that are made together: as many as stay at hand for several sweeps.
+_TOGETHER = 65536
+
+_NOTHING: Phasors = np.zeros((3, 1), dtype=np.complex128)
+
+
 def squared_voltages(model: LinDist3Flow, p: Floats, q: Floats, v0_squared: Floats) -> Floats:
     """Squared voltage at every connection by the linear power flow.
 
@@ -251,10 +311,12 @@ def _sweep(feeder: ThreePhaseFeeder, start: _Start, phasors: Phasors) -> Phasors
 
 def _drawn(feeder: ThreePhaseFeeder, s: Phasors, phasors: Phasors) -> Phasors:
     """Currents that customers and charging draw from the buses, (…, 3, b + 1)."""
-    out = -np.conj(s / phasors)
-    if feeder.half.any():
-        out = out + 1j * np.einsum("kij,...jk->...ik", feeder.half, phasors)
-    return np.asarray(out)
+    return np.asarray(_charged(feeder, phasors) - np.conj(s / phasors))
+
+
+def _charged(feeder: ThreePhaseFeeder, phasors: Phasors) -> Phasors | float:
+    """Currents that the charging draws from the buses."""
+    return 1j * np.einsum("kij,...jk->...ik", feeder.half, phasors) if feeder.half.any() else 0.0
 
 
 def _forward(feeder: ThreePhaseFeeder, v0: Phasors, drawn: Phasors) -> Phasors:

@@ -18,6 +18,7 @@ from gridsec.phases import (
     lindist3flow,
     loss_correction,
     model_error_bound,
+    sensitivities,
     sequence_matrix,
     squared_voltages,
 )
@@ -73,6 +74,36 @@ def test_matrices_are_the_derivatives_of_the_power_flow_without_load(seed: int) 
             slope = (higher - lower) / (2 * step)
             there = ~np.isnan(slope)
             np.testing.assert_allclose(slope[there], 2 * matrix[..., c][there], rtol=0, atol=1e-8)
+
+
+@given(seeds, st.sampled_from([0.0, 0.05]))
+@settings(max_examples=30)
+def test_sensitivities_are_the_derivatives_under_load(seed: int, charging: float) -> None:
+    feeder = random_three_phase(seed, charging=charging)
+    p, q = powers(feeder, seed, 0.03)
+    v0, step = np.array([1.03, 1.0, 0.98]), 1e-5
+    model = sensitivities(feeder, p, q, v0, steps=25)
+    for c in range(feeder.of.size):
+        unit = step * (np.arange(feeder.of.size) == c)
+        for matrix, up, down in (
+            (model.R_bus, (p + unit, q), (p - unit, q)),
+            (model.X_bus, (p, q + unit), (p, q - unit)),
+        ):
+            higher, lower = (np.abs(power_flow(feeder, *at, v0)) ** 2 for at in (up, down))
+            slope = (higher - lower) / (2 * step)
+            there = ~np.isnan(slope)
+            np.testing.assert_allclose(slope[there], 2 * matrix[..., c][there], rtol=0, atol=1e-8)
+    np.testing.assert_array_equal(model.R, model.R_bus[feeder.phase, feeder.at])
+    np.testing.assert_array_equal(model.X, model.X_bus[feeder.phase, feeder.at])
+
+
+@given(seeds)
+def test_sensitivities_without_load_are_the_linear_flow(seed: int) -> None:
+    feeder = random_three_phase(seed)
+    none = np.zeros(feeder.of.size)
+    found, expected = sensitivities(feeder, none, none, np.full(3, 1.1), steps=1), lindist3flow(feeder)
+    for name in ("R", "X", "R_bus", "X_bus"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=0, atol=1e-14)
 
 
 @given(seeds)
@@ -213,6 +244,6 @@ def test_many_operating_points_at_once() -> None:
 def test_a_correction_has_a_step() -> None:
     feeder = random_three_phase(1)
     none = np.zeros(feeder.of.size)
-    for correct in (loss_correction, corrected):
+    for correct in (loss_correction, corrected, sensitivities):
         with pytest.raises(ValueError, match="steps is 0"):
             correct(feeder, none, none, np.ones(3), steps=0)
