@@ -222,7 +222,7 @@ def model_error_bound(feeder: ThreePhaseFeeder, p: Floats, q: Floats, v0_squared
     path, summed up without regard to sign or angle. The sweeps shrink geometrically, and ``2 e`` bounds the
     sum of all that follow while each is at most half its predecessor (in practice a few hundredths); on the
     squares that is ``2 e (2 |v| + 2 e)``. Where this sweep is *not* below half of the one before, near
-    voltage collapse, the bound is infinite.
+    voltage collapse, the bound is infinite. Busbar angles that are not balanced are not in it.
 
     Parameters
     ----------

@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 
 from feeders.load import find, from_tables, load
-from feeders.load_phases import load_three_phase, three_phase, three_phase_names
+from feeders.load_phases import ThreePhaseSite, load_three_phase, three_phase, three_phase_names
+from feeders.powerflow_unbalanced import UnbalancedPowerFlow
 from feeders.schema import FeederTables, read
+from gridsec import feeder as balanced
+from gridsec.arrays import Floats
 from gridsec.errors import FeederInvalid
 from gridsec.feeder import lindistflow
-from gridsec.phases import lindist3flow
+from gridsec.phases import bus_voltages, lindist3flow, sensitivities
 
 CASE = Path(__file__).parent.parent / "cases" / "good" / "single-phase"
 EUROPEAN = "ieee-european-lv"
@@ -130,3 +133,50 @@ def test_single_phase_customers_are_not_for_the_balanced_monitors() -> None:
 def test_there_is_no_such_feeder() -> None:
     with pytest.raises(FeederInvalid, match="neither such a folder nor such a feeder"):
         load_three_phase("no-such-feeder")
+
+
+# --- the models against the asymmetric AC power flow ----------------------------------------------
+
+
+def errors(site: ThreePhaseSite, p_kw: Floats, q_kvar: Floats) -> tuple[float, float, float]:
+    """Largest error of |v| of LinDist3Flow, with its correction, and of the single-phase equivalent, pu."""
+    feeder = site.feeder
+    truth = UnbalancedPowerFlow(site).solve(p_kw, q_kvar, 1.05 * feeder.base_volt)[1] / feeder.base_volt
+    third, v0 = feeder.base_kva / 3, np.full(3, 1.05**2)
+    plain, once = (
+        np.sqrt(bus_voltages(feeder, -p_kw / third, -q_kvar / third, v0, steps=n)).T for n in (0, 1)
+    )
+    everywhere = tuple(replace(row, phases="abc") for row in site.tables.customers)
+    single = from_tables(replace(site.tables, customers=everywhere)).feeder
+    one = np.sqrt(balanced.bus_voltages(single, -p_kw / 100, -q_kvar / 100, 1.05**2))
+    apart = np.abs(one[feeder.at] - truth[feeder.at, feeder.phase])
+    return float(np.abs(plain - truth).max()), float(np.abs(once - truth).max()), float(apart.max())
+
+
+def test_voltages_of_the_european_feeder_are_within_a_tenth_of_a_percent() -> None:
+    site = load_three_phase(EUROPEAN)
+    peak = np.array([row.load_kw for row in site.tables.customers])
+    tan = np.tan(np.arccos(0.95))
+    plain, once, single = errors(site, np.ones(55), np.full(55, tan))  # the source's nominal load
+    assert plain < 3e-4
+    assert once < 2e-5
+    assert single > 5e-3
+    plain, once, single = errors(site, peak, peak * tan)  # its fullest minute
+    assert plain < 1.5e-3
+    assert once < 2e-4
+    assert single > 0.03
+
+
+def test_sensitivities_of_the_european_feeder_are_within_two_percent() -> None:
+    site = load_three_phase(EUROPEAN)
+    feeder, flow = site.feeder, UnbalancedPowerFlow(site)
+    p = np.array([row.load_kw for row in site.tables.customers])
+    q, third = p * np.tan(np.arccos(0.95)), feeder.base_kva / 3
+    model = sensitivities(feeder, -p / third, -q / third, np.full(3, 1.05**2))
+    bump = 0.05 * np.vstack([np.eye(55), -np.eye(55)])
+    v0 = np.full(110, 1.05 * feeder.base_volt)
+    for matrix, at in ((model.R, (p + bump, q + 0 * bump)), (model.X, (p + 0 * bump, q + bump))):
+        squared = (flow.solve_batch(*at, v0)[0] / feeder.base_volt) ** 2
+        slope = (squared[55:] - squared[:55]).T / (0.2 / third)
+        largest = np.abs(slope).max(axis=1, keepdims=True)
+        assert (np.abs(matrix - slope) <= 0.02 * largest).all()
