@@ -24,6 +24,7 @@ from gridsec.droop import Droop
 from gridsec.errors import FeederInvalid
 from gridsec.feeder import Feeder, LinDistFlow, common_paths
 from gridsec.newton import Nonlinearity, settle
+from gridsec.phases import ThreePhaseFeeder, lindist3flow, per_customer
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,17 +85,18 @@ class Readout(Protocol):
     def D(self) -> Floats: ...  # noqa: D102, N802
 
 
-def close_loop(feeder: Feeder, droop: Droop, meters: Ints) -> Lure:
+def close_loop(feeder: Feeder | ThreePhaseFeeder, droop: Droop, meters: Ints) -> Lure:
     """The Lur'e system of a feeder with droop inverters and voltage meters.
 
     With `z = vbar^2 - v^2` as the output everywhere and `u = w` from `known_input`:
     `A = -T^-1`, `G = T^-1`, `H = -2 X[inverters, inverters]`, `C = -2 X[meters, inverters]`, `F` and `D`
     pick the inverters' and the meters' customers, `B = 0`. The slopes are those of K (G carries 1/tau).
+    On three phases X is that of `per_customer`, and neither symmetric nor nonnegative.
 
     Parameters
     ----------
     feeder
-        The feeder.
+        The feeder, balanced or not.
     droop
         The inverters.
     meters : (p,)
@@ -119,18 +121,25 @@ def close_loop(feeder: Feeder, droop: Droop, meters: Ints) -> Lure:
     if problems:
         raise FeederInvalid(problems)
     own, at = droop.customer, np.arange(count)
-    X = common_paths(feeder, feeder.x, feeder.bus[own])
+    X = _reactances(feeder, own)
     return Lure(
         A=-np.diag(1.0 / droop.tau),
         G=np.diag(1.0 / droop.tau),
-        H=-2.0 * X[feeder.bus[own]],
+        H=-2.0 * X[own],
         F=np.equal.outer(own, at).astype(np.float64),
         B=np.zeros((own.size, count)),
-        C=-2.0 * X[feeder.bus[meters]],
+        C=-2.0 * X[meters],
         D=np.equal.outer(meters, at).astype(np.float64),
         slope=droop.slope,
         phi=droop,
     )
+
+
+def _reactances(feeder: Feeder | ThreePhaseFeeder, own: Ints) -> Floats:
+    """From the reactive powers of the customers `own` to the squared voltage of everybody, (N, m)."""
+    if isinstance(feeder, Feeder):
+        return common_paths(feeder, feeder.x, feeder.bus[own])[feeder.bus]
+    return per_customer(feeder, lindist3flow(feeder)).X[:, own]
 
 
 def known_input(  # noqa: PLR0917  # every argument is a term of chong2020 (19), in its order

@@ -6,12 +6,14 @@ squared phase voltages, and `loss_correction` what that leaves out.
 
 from gridsec.phases.feeder import PHASES, ROTATION, ThreePhaseFeeder, sequence_matrix
 from gridsec.phases.flow import (
+    CustomerFlow,
     LinDist3Flow,
     bus_voltages,
     corrected,
     lindist3flow,
     loss_correction,
     model_error_bound,
+    per_customer,
     sensitivities,
     squared_voltages,
 )
@@ -19,6 +21,7 @@ from gridsec.phases.flow import (
 __all__ = [
     "PHASES",
     "ROTATION",
+    "CustomerFlow",
     "LinDist3Flow",
     "ThreePhaseFeeder",
     "bus_voltages",
@@ -26,6 +29,7 @@ __all__ = [
     "lindist3flow",
     "loss_correction",
     "model_error_bound",
+    "per_customer",
     "sensitivities",
     "sequence_matrix",
     "squared_voltages",

@@ -139,6 +139,45 @@ _TOGETHER = 65536
 _NOTHING: Phasors = np.zeros((3, 1), dtype=np.complex128)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class CustomerFlow:
+    """The linear power flow customer by customer, in the per unit of balanced feeders.
+
+    Attributes
+    ----------
+    R, X : (N, N)
+        From a customer's power in units of the three-phase base S to a customer's squared voltage, pu.
+    """
+
+    R: Floats
+    X: Floats
+
+
+def per_customer(feeder: ThreePhaseFeeder, model: LinDist3Flow) -> CustomerFlow:
+    """Matrices between customers instead of connections.
+
+    A customer's power is split evenly over his phases, and his voltage is the mean of their squares. Powers
+    are in kW / S as on a balanced feeder, so that droop curves and meters of `base_kva` fit: on a cable
+    without mutual impedance, a single-phase customer feels three times the impedance that one on all phases
+    does.
+
+    Parameters
+    ----------
+    feeder
+        The feeder.
+    model
+        From `lindist3flow` or `sensitivities`.
+    """
+    first = np.searchsorted(feeder.of, np.arange(len(feeder.customers)))
+
+    def joined(matrix: Floats) -> Floats:
+        columns = np.add.reduceat(matrix * feeder.share, first, axis=1) if first.size else matrix
+        both = np.add.reduceat(columns * feeder.share[:, None], first, axis=0) if first.size else columns
+        return frozen(3.0 * both)
+
+    return CustomerFlow(joined(model.R), joined(model.X))
+
+
 def squared_voltages(model: LinDist3Flow, p: Floats, q: Floats, v0_squared: Floats) -> Floats:
     """Squared voltage at every connection by the linear power flow.
 
