@@ -432,8 +432,10 @@ def swaps(found: Solution, live: Bools, within: float, limits: Limits) -> list[S
         worse = judged.offset[who] ** 2 / s - gain[best, each]
         v, weight = v[best, each], weights[best, each]
         pivot = Q.diagonal()[best] + v**2 / s
-        precision = 1.0 / s - (v / s) ** 2 / pivot
-        offset, std = (judged.offset[who] + v * weight / pivot) / (s * precision), np.ones(now.trusted.size)
+        with np.errstate(divide="ignore", invalid="ignore"):  # where nobody is trusted
+            precision = 1.0 / s - (v / s) ** 2 / pivot
+            offset = (judged.offset[who] + v * weight / pivot) / (s * precision)
+        std = np.ones(now.trusted.size)
         std[who] = 1.0 / np.sqrt(precision)
         near = np.flatnonzero((worse <= within) & (np.abs(offset) <= limits.of(std)[who]))
         out += [Swap(int(who[k]), int(best[k]), max(float(worse[k]), 0.0)) for k in near.tolist()]

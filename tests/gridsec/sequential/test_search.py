@@ -196,6 +196,15 @@ def test_nobody_is_exchanged_who_would_be_accused_again() -> None:
     assert seen == {True, False}
 
 
+def test_where_nobody_is_trusted_nobody_is_exchanged() -> None:
+    rng = np.random.default_rng(18)
+    _, p = street(rng, 4)
+    live, none = np.ones(4, dtype=bool), np.zeros(4, dtype=bool)
+    found = descend(fit(p, np.full(4, 0.002**2), none), np.full(4, 0.5), live, limits(4), keep=live)
+    assert not found.fit.trusted.any()
+    assert swaps(found, live, 1e9, limits(4)) == []
+
+
 def test_swaps_with_a_loosened_direction() -> None:
     rng = np.random.default_rng(7)
     columns, p = street(rng, 9)
