@@ -5,7 +5,7 @@
 Voltages of LinDist3Flow, plain and with one correction, and of the single-phase equivalent (every customer
 spread over three phases, losses corrected), at multiples of the load of the feeder's fullest minute and with
 1 kW for everybody, behind a stiff busbar and behind the feeder's transformer. Then sensitivities against
-differences of the power flow. Limits: corrected voltages within 0.1 %, sensitivities at the operating point
+differences of the power flow, and the certificates of a fleet of inverters. Limits: corrected voltages within 0.1 %, sensitivities at the operating point
 within 2 %, at the load of that minute.
 """
 
@@ -27,7 +27,11 @@ from feeders.load import from_tables
 from feeders.load_phases import ThreePhaseSite, load_three_phase
 from feeders.powerflow_unbalanced import UnbalancedPowerFlow, sequence_ohm
 from gridsec import feeder as balanced
-from gridsec.arrays import Floats, Phasors
+from gridsec.arrays import Floats, Phasors, spectral_radius
+from gridsec.certificates import reactance, small_gain
+from gridsec.droop import fleet
+from gridsec.errors import DesignInfeasible
+from gridsec.lure import close_loop
 from gridsec.phases import bus_voltages, corrected, lindist3flow, model_error_bound, sensitivities
 
 FEEDER = "ieee-european-lv"
@@ -146,6 +150,27 @@ def show_times(site: ThreePhaseSite, p_kw: Floats, tan: Floats) -> None:
     print("\nmilliseconds: " + ", ".join(f"{name} {value:.2f}" for name, value in times.items()))
 
 
+def show_certificates(site: ThreePhaseSite) -> None:
+    """Print which closed-form certificates hold with an inverter at every customer."""
+    print(
+        f"\n{'kVA each':>8s} {'rho(DS)':>8s} {'rho(D|S|)':>9s} {'reactance':>10s} {'small gain':>10s}", end=""
+    )
+    print("   rate times the largest time constant")
+    own = np.arange(len(site.feeder.customers))
+    tau = 2.0 * 2.0 ** np.random.default_rng(0).uniform(-0.5, 0.5, own.size)
+    for kva in (2.3, 4.6, 6.0, 10.0, 20.0):
+        droop = fleet(own, "ieee1547-b", np.full(own.size, kva), site.feeder.base_kva, tau=tau)
+        lure = close_loop(site.feeder, droop, own)
+        loop = lure.slope[:, None] * lure.H
+        line = f"{kva:8g} {spectral_radius(loop):8.2f} {spectral_radius(np.abs(loop)):9.2f}"
+        for attempt in (reactance, small_gain):
+            try:
+                line += f" {attempt(lure).rate * tau.max():10.2f}"
+            except DesignInfeasible:
+                line += f" {'none':>10s}"
+        print(line)
+
+
 def main() -> int:
     """Print all tables; 1 if a limit is missed."""
     site = load_three_phase(FEEDER)
@@ -153,6 +178,7 @@ def main() -> int:
     tan = np.array([np.tan(np.arccos(row.power_factor or 1.0)) for row in site.tables.customers])
     good = show_voltages(site, p_kw, tan)
     good &= show_sensitivities(site, p_kw, tan)
+    show_certificates(site)
     show_times(site, p_kw, tan)
     return 0 if good else 1
 

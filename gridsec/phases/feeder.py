@@ -146,7 +146,7 @@ def sequence_matrix(positive: Phasors | Floats, zero: Phasors | Floats) -> Phaso
 
     References
     ----------
-    Kersting 2012, equations (4.69) to (4.71), solved for the phase impedances.
+    Kersting 2012, chapter 4: the sequence impedances of a transposed line, solved for those of the phases.
     """
     one, none = (np.asarray(value, dtype=np.complex128)[..., None, None] for value in (positive, zero))
     return np.asarray(one * np.eye(3) + (none - one) / 3.0)

@@ -16,7 +16,7 @@ A voltage of a phase that a bus lacks is that of the place where the phase ends.
 References
 ----------
 .. [1] L. Gan, S. H. Low, "Convex relaxations and linear approximation for optimal power flow in multiphase
-   radial networks", Power Systems Computation Conference 2014, section IV.
+   radial networks", Power Systems Computation Conference 2014.
 .. [2] D. B. Arnold, M. Sankur, R. Dobbe, K. Brady, D. S. Callaway, A. von Meier, "Optimal dispatch of
    reactive power for voltage regulation and balancing in unbalanced distribution systems", IEEE PES General
    Meeting 2016.
@@ -66,8 +66,7 @@ def lindist3flow(feeder: ThreePhaseFeeder) -> LinDist3Flow:
 
     References
     ----------
-    Gan and Low 2014, section IV; Arnold et al. 2016, equations (12) to (14). Derivation: the module, and
-    docs/theory-three-phase.md.
+    Gan and Low 2014; Arnold et al. 2016. Derivation: docs/theory-three-phase.md.
     """
     rotated = _rotated(feeder)
     whole = np.zeros((len(feeder.buses), 3, 3), dtype=np.complex128)
