@@ -5,8 +5,8 @@
 Voltages of LinDist3Flow, plain and with one correction, and of the single-phase equivalent (every customer
 spread over three phases, losses corrected), at multiples of the load of the feeder's fullest minute and with
 1 kW for everybody, behind a stiff busbar and behind the feeder's transformer. Then sensitivities against
-differences of the power flow, and the certificates of a fleet of inverters. Limits: corrected voltages within 0.1 %, sensitivities at the operating point
-within 2 %, at the load of that minute.
+differences of the power flow, and the certificates of a fleet of inverters. Limits: corrected voltages
+within 0.1 %, sensitivities at the operating point within 2 %, at the load of that minute.
 """
 
 from __future__ import annotations
@@ -152,10 +152,8 @@ def show_times(site: ThreePhaseSite, p_kw: Floats, tan: Floats) -> None:
 
 def show_certificates(site: ThreePhaseSite) -> None:
     """Print which closed-form certificates hold with an inverter at every customer."""
-    print(
-        f"\n{'kVA each':>8s} {'rho(DS)':>8s} {'rho(D|S|)':>9s} {'reactance':>10s} {'small gain':>10s}", end=""
-    )
-    print("   rate times the largest time constant")
+    print(f"\n{'kVA each':>8s} {'rho(DS)':>8s} {'rho(D|S|)':>9s} {'reactance':>10s} {'small gain':>10s}")
+    print(f"{'':27s} rate times the largest time constant")
     own = np.arange(len(site.feeder.customers))
     tau = 2.0 * 2.0 ** np.random.default_rng(0).uniform(-0.5, 0.5, own.size)
     for kva in (2.3, 4.6, 6.0, 10.0, 20.0):
