@@ -46,12 +46,16 @@ class Learned:
         Largest honest change from it, squared pu.
     at : (p,)
         When it was learned, Unix s; NaN where only the class is known.
+    hidden : (p,)
+        What lasting errors of the loads leave open of the voltage at each learned meter, squared pu^2: these
+        errors and the meters' own are known as a sum only, and no averaging over meters takes them apart.
     """
 
     bias: Floats
     variance: Floats
     allowed: Floats
     at: Floats
+    hidden: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,7 +110,7 @@ def nothing(design: SequentialDesign) -> Learned:
         The design.
     """
     p = design.allowed.size
-    return Learned(np.zeros(p), design.fixed, design.allowed, np.full(p, np.nan))
+    return Learned(np.zeros(p), design.fixed, design.allowed, np.full(p, np.nan), np.zeros(p))
 
 
 def begin(which: Bools, t: float) -> Learning:
@@ -232,13 +236,16 @@ def conclude(
     B, n = known.variance[heard], gathered.count[heard]
     # One matrix of this size, inverted where it is.
     K = design.prior.of_meters[np.ix_(design.prior.meters[heard], heard)].T
-    time, lasting = gathered.time_s[heard] / design.doubt.time_s, design.doubt.lasting
+    time = gathered.time_s[heard] / design.doubt.time_s
     for first in range(0, heard.size, _COLUMNS):
-        share = _share(time, time[first : first + _COLUMNS])
-        K[:, first : first + _COLUMNS] *= lasting + (1.0 - lasting) * share
+        some = slice(first, first + _COLUMNS)
+        share = _share(time, time[some])
+        K[:, some] = share * K[:, some] + (1.0 - share) * _lasting(design, heard, some)
     K[np.diag_indices_from(K)] += B + design.white[heard] / n
     invert(K)
     bias, variance, allowed = known.bias.copy(), known.variance.copy(), known.allowed.copy()
+    hidden = np.zeros(known.at.size)
+    hidden[heard] = _hidden(design, heard, K)
     bias[heard] += B * (K @ (gathered.total[heard] / n))
     left = np.maximum(B - B * B * K.diagonal(), 0.0)
     aging = design.options.stability * design.allowed[heard]
@@ -251,6 +258,7 @@ def conclude(
         variance=np.where(done, variance, known.variance),
         allowed=np.where(done, allowed, known.allowed),
         at=np.where(done, t, known.at),
+        hidden=np.where(done, hidden, known.hidden),
     )
     rest = gathered.open & ~done
     if not rest.any():
@@ -261,6 +269,27 @@ def conclude(
         *(np.where(rest, getattr(gathered, f.name), getattr(start, f.name)) for f in fields(Learning))
     )
     return Commission(learned, left_open)
+
+
+def _lasting(design: SequentialDesign, heard: Ints, some: slice) -> Floats:
+    """Covariance at the meters of errors that no mean takes away, some columns, (h, k).
+
+    The fixed error of the busbar's meter is one of them, whatever is known of the loads.
+    """
+    of_loads = design.prior.of_meters[np.ix_(design.prior.meters[heard], heard[some])]
+    lasting = design.doubt.lasting
+    return lasting * of_loads + (1.0 - lasting) * design.busbar**2
+
+
+def _hidden(design: SequentialDesign, heard: Ints, inverse: Floats) -> Floats:
+    """``diag(L - L K^-1 L)``: what is left open of errors L that last, (h,)."""
+    out = np.empty(heard.size)
+    for first in range(0, heard.size, _COLUMNS):
+        some = slice(first, first + _COLUMNS)
+        L = _lasting(design, heard, some)
+        own = L[np.arange(heard.size)[some], np.arange(L.shape[1])]
+        out[some] = own - np.einsum("ij,ij->j", L, inverse @ L)
+    return np.maximum(out, 0.0)
 
 
 # Columns that are worked on together.

@@ -222,7 +222,15 @@ def _reconstructed(design: SequentialDesign, state: SequentialState, seen: Exami
     if now is None:
         return np.zeros_like(best), best
     m = state.window.sums[at] / np.maximum(state.window.counts[at], 1)
-    return (judge(now, m).w if view is None else view.judged.w), best
+    return (judge(now, m).w if view is None else view.judged.w), best + _hidden(state)
+
+
+def _hidden(state: SequentialState) -> Floats:
+    """What learning could not tell from errors of the loads that last, at every bus, (n,)."""
+    hidden, prior_ = state.learned.hidden, state.doubts.prior
+    out = np.full(prior_.variance.size, hidden.max(initial=0.0))
+    out[prior_.meters] = hidden
+    return np.asarray(np.minimum(out, prior_.variance))
 
 
 def _worst(design: SequentialDesign, seen: Examined, p: int) -> tuple[Floats, Floats, Bools]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -82,14 +84,40 @@ def test_a_replaced_meter_is_learned_by_what_the_others_say_of_the_loads() -> No
     B = np.diag(known.learned.variance)
     rho = 600.0 / 4000.0
     share = 2 * rho * (1 - rho * (1 - np.exp(-1 / rho)))
-    gain = B @ np.linalg.inv(share * design.prior.between + B + np.diag(design.white / 40))
+    S, fixed = design.prior.between, design.busbar**2
+    gain = B @ np.linalg.inv(share * S + (1.0 - share) * fixed + B + np.diag(design.white / 40))
     assert after.learned.bias[2] == pytest.approx((gain @ mean)[2], rel=1e-9)
     assert after.learned.variance[2] == pytest.approx((B - gain @ B)[2, 2], rel=1e-6)
     others = ~one(2)
-    for name in ("bias", "variance", "allowed", "at"):
+    for name in ("bias", "variance", "allowed", "at", "hidden"):
         found, was = getattr(after.learned, name), getattr(before.learned, name)
         np.testing.assert_array_equal(found[others], was[others])
     assert after.learned.at[2] == 9000.0
+
+
+@pytest.mark.parametrize("lasting", [0.0, 0.4, 1.0])
+def test_what_is_left_of_lasting_errors_is_in_the_standard_deviation(lasting: float) -> None:
+    """A Gaussian feeder: loads' errors of which a part lasts, a busbar meter with a fixed error, own errors.
+
+    The posterior is dense and exact; its claims are held against draws.
+    """
+    design, rng, every, draws = prepared(), np.random.default_rng(17), np.ones(P, dtype=np.bool_), 4000
+    design = replace(design, doubt=replace(design.doubt, lasting=lasting))
+    S, count = design.prior.between, 3600
+    L = lasting * S + (1.0 - lasting) * design.busbar**2
+    share = float(_share(np.array([6.0]), np.array([6.0]))[0, 0])
+    noise = share * (S - L) + np.diag(design.white / count)
+    inverse = np.linalg.inv(L + noise + np.diag(design.fixed))
+    root, rest = np.linalg.cholesky(L + 1e-15 * np.eye(P)), np.linalg.cholesky(noise)
+    errors = []
+    for _ in range(draws):
+        own, lasts = np.sqrt(design.fixed) * rng.normal(size=P), root @ rng.normal(size=P)
+        errors.append(lasts - L @ inverse @ (own + lasts + rest @ rng.normal(size=P)))
+    gathered = Learning(np.zeros(P), np.full(P, count), np.full(P, 3600.0), np.zeros(P))
+    found = conclude(design, nothing(design), gathered, every, 3600.0).learned
+    np.testing.assert_allclose(found.hidden, np.diag(L - L @ inverse @ L), rtol=1e-6, atol=1e-14)
+    np.testing.assert_allclose(found.hidden, np.var(errors, axis=0), rtol=0.1, atol=1e-14)
+    assert (nothing(design).hidden == 0.0).all()
 
 
 def test_a_silent_meter_is_waited_for_and_holds_up_nobody() -> None:
