@@ -68,6 +68,64 @@ def redundancy(
     _write(out, {"summary": found.summary, "meters": found.meters, "parts": found.parts})
 
 
+def protect(
+    feeder: Feeder = "simbench-lv-rural1",
+    *,
+    max_attacked: Annotated[int, typer.Option(help="How many of the other meters lie at most.", min=1)] = 2,
+    goal: Annotated[
+        str, typer.Option(help="identify: liars are named; notice: some lie is; bound: lies stay small.")
+    ] = "identify",
+    lie_volt: Annotated[
+        float | None, typer.Option(help="For bound: largest lie that may stay unnoticed, V.")
+    ] = None,
+    attack: Annotated[str, typer.Option(help="Attacks that count: persistent or any.")] = "persistent",
+    unknown: Unknown = None,
+    busbar_unknown: BusbarUnknown = False,
+    never: Annotated[
+        list[str] | None, typer.Option(help="A meter that cannot be protected; may be repeated.")
+    ] = None,
+    greedy: Annotated[
+        bool, typer.Option("--greedy", help="For large feeders: not proven the fewest; with its gap.")
+    ] = False,
+    journal: Journal = None,
+    out: Out = None,
+) -> None:
+    """The fewest meters to protect so that liars are named, are noticed, or can only lie a little."""
+    from feeders.load import load
+    from feeders.studies.hidden import Attack
+    from feeders.studies.protect import Goal
+    from feeders.studies.protect import protect as study
+
+    kinds = {"--goal": (goal, tuple(Goal)), "--attack": (attack, tuple(Attack))}
+    for option, (name, known) in kinds.items():
+        if name not in known:
+            raise typer.BadParameter(f"{name!r}: expected one of {', '.join(known)}", param_hint=option)
+    site = load(feeder)
+    with _bar("meters protected, against attacks") as tell, _said():
+        found = study(
+            site,
+            max_attacked=max_attacked,
+            goal=Goal(goal),
+            lie_volt=math.nan if lie_volt is None else lie_volt,
+            attack=Attack(attack),
+            unknown=unknown,
+            busbar_known=not busbar_unknown,
+            never=never or (),
+            exact=not greedy,
+            journal=journal,
+            progress=lambda known, done: tell(done, known),
+        )
+    count = len(found.meters)
+    proof = "no fewer suffice" if not found.gap else f"at least {found.least} are needed"
+    measure = "largest hidden lie, V" if found.goal is Goal.BOUND else "fewest liars that stay invisible"
+    console.out.print(escape(f"{found.feeder}: protect {count} of {len(site.meter_ids)} meters; {proof}"))
+    console.out.print(f"{measure}: {_cell(found.before)} before, {_cell(found.after)} after")
+    if count:
+        _show("Protect", found.meters)
+        _show("Attacks that ask for them", found.attacks)
+    _write(out, {"meters": found.meters, "attacks": found.attacks})
+
+
 def _unknowns(names: Sequence[str], feeder: str) -> str:
     who = ", ".join(names) if names else "nobody"
     return escape(f"{feeder}: powers unknown of {who}")

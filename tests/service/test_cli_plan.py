@@ -49,3 +49,25 @@ def test_wrong_arguments_are_told(
     code, _, told = run(monkeypatch, capsys, "redundancy", "--curves", "flat")
     assert code == 2
     assert "expected one of steepest, deadband" in " ".join(told.replace("│", " ").split())
+
+
+def test_protect_tells_the_meters_and_what_they_are_worth(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    some = ("--unknown", "LV1.101 Load 8", "--out", str(tmp_path / "out"))
+    code, told, _ = run(monkeypatch, capsys, "protect", *some)
+    assert code == 0
+    assert "protect 1 of 13 meters; no fewer suffice" in told
+    assert "fewest liars that stay invisible: 1 before, ∞ after" in told
+    assert pd.read_csv(tmp_path / "out" / "meters.csv")["meter"].tolist() == ["m08"]
+
+
+def test_an_infeasible_protection_is_an_error(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, _, told = run(monkeypatch, capsys, "protect", "--unknown", "LV1.101 Load 8", "--never", "m08")
+    assert code == 3
+    assert "m08 succeed together whatever else is protected" in " ".join(told.split())
+    code, _, told = run(monkeypatch, capsys, "protect", "--goal", "all")
+    assert code == 2
+    assert "expected one of identify, notice, bound" in " ".join(told.replace("│", " ").split())

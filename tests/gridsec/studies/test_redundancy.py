@@ -2,76 +2,15 @@
 
 from __future__ import annotations
 
-from itertools import combinations
-
 import numpy as np
 import pytest
 
-from gridsec.arrays import Floats, Ints
-from gridsec.droop import fleet
-from gridsec.feeder import Feeder, lindistflow
-from gridsec.index import observable_rows, redundant_detectable, redundant_observable, unstable_subspace
-from gridsec.lure import Lure, close_loop
+from gridsec.arrays import Floats
+from gridsec.feeder import lindistflow
+from gridsec.index import redundant_detectable, redundant_observable
 from gridsec.studies.patterns import Patterns, fewest_meters, patterns, unknown_pair, unknown_voltages
 from gridsec.studies.redundancy import meter_redundancy, part_redundancy, parts
-
-TOL = 1e-9
-
-
-def tree(seed: int) -> tuple[Feeder, Lure, Ints, Ints]:
-    """A small feeder: 7 customers, 5 of them with meters, 2 inverters, 1 or 2 loads that nobody knows."""
-    rng = np.random.default_rng(seed)
-    branches = 7
-    feeder = Feeder(
-        name="small",
-        parent=np.array([rng.integers(max(0, k - 2), k + 1) for k in range(branches)]),
-        r=rng.uniform(0.01, 0.05, branches),
-        x=rng.uniform(0.01, 0.05, branches),
-        bus=rng.integers(1, branches + 1, 7),
-        customers=tuple(f"c{i}" for i in range(7)),
-        buses=tuple(f"b{i}" for i in range(branches + 1)),
-        base_volt=230.0,
-        base_kva=100.0,
-        charging=np.zeros(branches),
-    )
-    meters = np.sort(rng.choice(7, 5, replace=False))
-    own = np.sort(rng.choice(7, 2, replace=False))
-    droop = fleet(own, "ieee1547-b", np.array([5.0, 9.0]), 100.0, tau=np.array([2.0, 3.1]))
-    unknown = rng.choice(7, rng.integers(1, 3), replace=False)
-    return feeder, close_loop(feeder, droop, meters), meters, unknown
-
-
-def system(seed: int, *, busbar: bool = False) -> tuple[Floats, Floats]:
-    feeder, lure, _, unknown = tree(seed)
-    W = unknown_voltages(lindistflow(feeder), unknown, busbar=busbar, tol=TOL)
-    return unknown_pair(lure, lure.slope, W)
-
-
-def imitates(rows: tuple[Floats, ...], space: Floats, liars: tuple[int, ...], live: list[int]) -> Floats:
-    """What these liars see of the states in a space that no other live meter ever sees."""
-    others = [rows[j] @ space for j in live if j not in liars]
-    stack = np.vstack([*others, np.zeros((1, space.shape[1]))])
-    _, s, vh = np.linalg.svd(stack)
-    null = vh[int(np.count_nonzero(s > 1e-7)) :].T
-    return np.array([np.linalg.norm(rows[j] @ space @ null) for j in liars])
-
-
-def brute(
-    A: Floats, C: Floats, allowed: list[int], live: list[int], *, persistent: bool, must: int | None = None
-) -> float:
-    """The fewest liars, by trying all sets of the allowed."""
-    rows = observable_rows(A, C, tol=TOL)
-    space = unstable_subspace(A, discrete=False, tol=TOL) if persistent else np.eye(A.shape[0])
-    if not space.shape[1]:
-        return np.inf
-    for count in range(1, len(allowed) + 1):
-        for liars in combinations(allowed, count):
-            if must is not None and must not in liars:
-                continue
-            effect = imitates(rows, space, liars, live)
-            if effect.max() > 1e-7 and (must is None or effect[liars.index(must)] > 1e-7):
-                return float(count)
-    return np.inf
+from tests.gridsec.studies.small import TOL, brute, system, tree
 
 
 def given(A: Floats, C: Floats, *, persistent: bool) -> Patterns:

@@ -1,0 +1,83 @@
+"""What honest loads and meters of a feeder can be off by at an operating point, as a box."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from feeders.load import Snapshot, to_frame
+from feeders.studies.hidden import Curves
+from gridsec.arrays import Floats
+from gridsec.detect import busbar_error, reading_error
+from gridsec.feeder import lindistflow
+from gridsec.studies.lies import Box
+
+if TYPE_CHECKING:
+    from feeders.load import Site
+
+__all__ = ["SHARE", "SIGMAS", "box", "squared", "volts_of_lie"]
+
+SHARE: Final = 0.5
+"""Share of its peak that every load draws where nothing else is said; nothing is generated."""
+
+SIGMAS: Final = 4.0
+"""Standard deviations of jitter that an honest reading may be off, as in `gridsec.plant.Options`."""
+
+
+def box(site: Site, *, share: float = SHARE, curves: Curves = Curves.DEADBAND) -> Box:
+    """The worst cases of the exact bank's thresholds, at nominal voltage.
+
+    Intervals of powers are those of a frame in which every metered load draws `share` of its peak and reports
+    active power only. Inverters answer along their droop curves, linearised.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    share
+        Of the peak load.
+    curves
+        Where the inverters work; at nominal voltage that is the deadband.
+    """
+    rows = site.tables.customers
+    drawn = np.array([share * (row.load_kw or 0.0) for row in rows])[site.meters]
+    nominal = np.full(site.meters.size, site.feeder.base_volt)
+    frame = to_frame(
+        site, Snapshot(0.0, nominal, drawn, np.full(drawn.size, np.nan), float(site.feeder.base_volt))
+    )
+    model, own = lindistflow(site.feeder), site.droop.customer
+    slope = site.droop.slope if curves is Curves.STEEPEST else np.zeros(own.size)
+    loop = np.eye(model.X.shape[0])
+    loop[:, own] += 2.0 * model.X[:, own] * slope
+    open_loop = np.hstack(
+        [
+            2.0 * model.R * frame.p_error,
+            2.0 * model.X * frame.q_error,
+            np.full((model.R.shape[0], 1), busbar_error(site.accuracy, 1.0, SIGMAS)),
+        ]
+    )
+    reading = reading_error(site.accuracy, np.ones(site.meters.size), SIGMAS)
+    return Box(np.linalg.solve(loop, open_loop), site.meters, reading)
+
+
+def volts_of_lie(site: Site, size: Floats | float) -> Floats:
+    """What a change of the squared voltage is in volts, at nominal voltage and downwards: the larger way, V.
+
+    Parameters
+    ----------
+    site, size
+        The feeder, and squared pu.
+    """
+    return np.asarray(site.feeder.base_volt * (1.0 - np.sqrt(np.maximum(1.0 - np.asarray(size), 0.0))))
+
+
+def squared(site: Site, volt: float) -> float:
+    """The reverse of `volts_of_lie`.
+
+    Parameters
+    ----------
+    site, volt
+        The feeder, and volts.
+    """
+    return 1.0 - max(1.0 - volt / site.feeder.base_volt, 0.0) ** 2

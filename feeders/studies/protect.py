@@ -1,0 +1,230 @@
+"""Which meters to protect: the fewest such that liars are identified, are noticed, or stay small.
+
+References
+----------
+docs/theory-studies.md, section 4.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+
+from feeders.studies.hidden import Attack, Curves, knowledge, meter_mask
+from feeders.studies.journal import Journal
+from feeders.studies.operating import SHARE, box, squared, volts_of_lie
+from gridsec.arrays import Bools, Ints
+from gridsec.errors import DesignInfeasible
+from gridsec.studies.lies import largest_lie
+from gridsec.studies.patterns import Patterns, fewest_meters
+from gridsec.studies.protect import Attacker, Unprotectable, fewest_protected, hides, lies_beyond
+
+if TYPE_CHECKING:
+    from feeders.load import Site
+
+__all__ = ["Goal", "Protect", "protect"]
+
+
+class Goal(StrEnum):
+    """What protection is for."""
+
+    IDENTIFY = "identify"
+    NOTICE = "notice"
+    BOUND = "bound"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Protect:
+    """What `protect` found.
+
+    Attributes
+    ----------
+    feeder, digest
+        The feeder's name, and its content.
+    goal, max_attacked, attack, lie_volt
+        What was asked: M, which attacks count, and the bound of lies (NaN where the goal is none).
+    before, after
+        Without and with protection: the fewest liars that stay invisible, or the largest hidden lie, V.
+    least
+        No fewer meters suffice. Equal to the number of meters where they are proven the fewest.
+    meters
+        One row for each meter to protect: `meter`, `customer`, `bus`, `attacks` (in how many of the attacks
+        below it takes part).
+    attacks
+        Attacks that rule out anything cheaper: `liars`.
+    """
+
+    feeder: str
+    digest: str
+    goal: Goal
+    max_attacked: int
+    attack: Attack
+    lie_volt: float
+    before: float
+    after: float
+    least: int
+    meters: pd.DataFrame
+    attacks: pd.DataFrame
+
+    @property
+    def gap(self) -> int:
+        """How many more than necessary there can be; 0: these are the fewest."""
+        return len(self.meters) - self.least
+
+
+def protect(
+    site: Site,
+    *,
+    max_attacked: int,
+    goal: Goal = Goal.IDENTIFY,
+    lie_volt: float = math.nan,
+    attack: Attack = Attack.PERSISTENT,
+    unknown: Sequence[str] | None = None,
+    busbar_known: bool = True,
+    curves: Curves | None = None,
+    share: float = SHARE,
+    never: Sequence[str] = (),
+    exact: bool = True,
+    journal: Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Protect:
+    """Find the fewest meters to protect; a protected meter cannot lie.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    max_attacked
+        M: how many of the other meters lie at most.
+    goal
+        `IDENTIFY`: the liars follow from the readings. `NOTICE`: some lie is noticed. Both as in
+        `feeders.studies.redundancy`. `BOUND`: no lie larger than `lie_volt` fits to an honest feeder.
+    lie_volt
+        Bound of the lie, V, at nominal voltage.
+    attack, unknown, busbar_known
+        For `IDENTIFY` and `NOTICE`: which attacks count, and what nobody knows.
+    curves
+        Where inverters work. By default on the steepest part for the first two, in the deadband for `BOUND`.
+    share
+        For `BOUND`: share of its peak that every load draws.
+    never
+        Meters that cannot be protected.
+    exact
+        Prove that there are no fewer; otherwise greedy, with `gap`.
+    journal
+        File in which attacks are kept; an interrupted study goes on from it.
+    progress
+        Told how many attacks are known, and how many meters are protected against them.
+
+    Raises
+    ------
+    DesignInfeasible
+        If no protection of the other meters is enough.
+    ValueError
+        If there is no such customer or meter, or no bound of the lie.
+    OtherStudy
+        If the journal is another study's.
+    """
+    if max_attacked < 1:
+        raise ValueError(f"max_attacked is {max_attacked}; it must be at least 1")
+    if goal is Goal.BOUND and not lie_volt > 0.0:
+        raise ValueError(f"lie_volt is {lie_volt}; to bound lies it must be a positive number of volts")
+    where = curves or (Curves.DEADBAND if goal is Goal.BOUND else Curves.STEEPEST)
+    subject = {
+        "study": "protect",
+        "digest": site.digest,
+        "goal": str(goal),
+        "max_attacked": max_attacked,
+        "lie_volt": lie_volt if goal is Goal.BOUND else None,
+        "attack": str(attack),
+        "unknown": None if unknown is None else sorted(unknown),
+        "busbar_known": busbar_known,
+        "curves": str(where),
+        "share": share,
+    }
+    count, fixed = site.meters.size, meter_mask(site, never)
+    kept = Journal(journal, subject)
+    if goal is Goal.BOUND:
+        asked, measure = _bounded(site, max_attacked, lie_volt, share, where)
+    else:
+        known = knowledge(site, unknown=unknown, silent=(), busbar_known=busbar_known, curves=where)
+        asked, measure = _hidden(known.found[attack], max_attacked, goal)
+    try:
+        found = fewest_protected(_kept(asked, kept), count, never=fixed, exact=exact, progress=progress)
+    except Unprotectable as error:
+        who = ", ".join(site.meter_ids[j] for j in error.liars)
+        raise DesignInfeasible(
+            f"protection of {site.feeder.name} ({goal}, M = {max_attacked})",
+            f"{who} succeed together whatever else is protected, and none of them can be",
+        ) from error
+    protected = np.zeros(count, dtype=np.bool_)
+    protected[found.meters] = True
+    return Protect(
+        feeder=site.feeder.name,
+        digest=site.digest,
+        goal=goal,
+        max_attacked=max_attacked,
+        attack=attack,
+        lie_volt=lie_volt if goal is Goal.BOUND else math.nan,
+        before=measure(np.zeros(count, dtype=np.bool_)),
+        after=measure(protected),
+        least=found.least,
+        meters=_meters(site, found.meters, found.attacks),
+        attacks=pd.DataFrame({"liars": [" ".join(site.meter_ids[j] for j in a) for a in found.attacks]}),
+    )
+
+
+Measure = Callable[[Bools], float]
+
+
+def _hidden(given: Patterns, max_attacked: int, goal: Goal) -> tuple[Attacker, Measure]:
+    """Who imitates a pattern, and the fewest who do."""
+    liars = 2 * max_attacked if goal is Goal.IDENTIFY else max_attacked
+    return hides(given, liars), lambda protected: fewest_meters(given, honest=protected).count
+
+
+def _bounded(
+    site: Site, max_attacked: int, lie_volt: float, share: float, curves: Curves
+) -> tuple[Attacker, Measure]:
+    """Whose lie is too large, and the largest there is, V."""
+    given = box(site, share=share, curves=curves)
+
+    def largest(protected: Bools) -> float:
+        sizes = [largest_lie(given, j, max_attacked, honest=protected).bound for j in range(protected.size)]
+        return float(volts_of_lie(site, max(sizes)))
+
+    return lies_beyond(given, max_attacked, squared(site, lie_volt)), largest
+
+
+def _kept(attacker: Attacker, journal: Journal) -> Attacker:
+    """Ask the journal first."""
+
+    def attack(protected: Bools) -> Ints | None:
+        def work() -> list[int] | None:
+            liars = attacker(protected)
+            return None if liars is None else liars.tolist()
+
+        key = " ".join(map(str, np.flatnonzero(protected)))
+        known = journal.get(key, work)
+        return None if known is None else np.array(known, dtype=np.intp)
+
+    return attack
+
+
+def _meters(site: Site, chosen: Ints, attacks: Sequence[Ints]) -> pd.DataFrame:
+    customer = site.meters[chosen]
+    return pd.DataFrame(
+        {
+            "meter": [site.meter_ids[j] for j in chosen],
+            "customer": [site.feeder.customers[k] for k in customer],
+            "bus": [site.feeder.buses[k] for k in site.feeder.bus[customer]],
+            "attacks": [sum(int(j in attack) for attack in attacks) for j in chosen],
+        }
+    )

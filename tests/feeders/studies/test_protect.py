@@ -1,0 +1,77 @@
+"""The protection study on a real feeder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from feeders.load import load
+from feeders.studies.hidden import Attack
+from feeders.studies.operating import box, squared, volts_of_lie
+from feeders.studies.protect import Goal, protect
+from gridsec.errors import DesignInfeasible
+from gridsec.studies.lies import largest_lie
+
+RURAL = load("simbench-lv-rural1")
+UNKNOWN = ("LV1.101 Load 4", "LV1.101 Load 8")
+
+
+def test_unknown_loads_ask_for_one_meter_of_each_street() -> None:
+    found = protect(RURAL, max_attacked=2, unknown=UNKNOWN)
+    # Load 8 has a street of its own, and Load 4 one with two other meters.
+    assert (found.before, found.after) == (1.0, np.inf)
+    assert len(found.meters) == 2
+    assert found.gap == 0
+    assert "m08" in found.meters["meter"].tolist()
+    assert set(found.meters["meter"]) & {"m04", "m05", "m12"}
+
+
+def test_to_notice_asks_for_no_more_than_to_identify() -> None:
+    seen = [
+        protect(RURAL, max_attacked=1, unknown=UNKNOWN, goal=goal) for goal in (Goal.NOTICE, Goal.IDENTIFY)
+    ]
+    assert [len(each.meters) for each in seen] == [1, 1]
+    # Two liars of Load 4's street cannot imitate it: it moves three meters.
+    assert seen[1].after == 3.0
+
+
+def test_lies_stay_below_the_bound_in_volts() -> None:
+    found = protect(RURAL, max_attacked=2, goal=Goal.BOUND, lie_volt=4.5)
+    assert found.before > 4.5 >= found.after > 0.0
+    # The two at the ends of the longest street.
+    assert found.meters["meter"].tolist() == ["m06", "m13"]
+    assert volts_of_lie(RURAL, squared(RURAL, 4.5)) == pytest.approx(4.5)
+    given = box(RURAL)
+    sizes = [volts_of_lie(RURAL, largest_lie(given, j, 2).size) for j in range(13)]
+    assert sorted(np.argsort(sizes)[-2:].tolist()) == [5, 12]
+
+
+def test_what_cannot_be_done_is_told_with_names() -> None:
+    with pytest.raises(DesignInfeasible, match="m08 succeed"):
+        protect(RURAL, max_attacked=2, unknown=UNKNOWN, never=["m08"])
+    with pytest.raises(ValueError, match="lie_volt is nan"):
+        protect(RURAL, max_attacked=2, goal=Goal.BOUND)
+    with pytest.raises(ValueError, match="max_attacked is 0"):
+        protect(RURAL, max_attacked=0)
+
+
+def test_attacks_are_kept_in_the_journal(tmp_path: Path) -> None:
+    class Interrupted(Exception):
+        pass
+
+    def interrupt(attacks: int, protected: int) -> None:
+        if attacks == 3:
+            raise Interrupted(protected)
+
+    journal = tmp_path / "journal"
+    arguments = {"max_attacked": 1, "attack": Attack.ANY, "unknown": RURAL.feeder.customers[:5]}
+    with pytest.raises(Interrupted):
+        protect(RURAL, **arguments, journal=journal, progress=interrupt)
+    kept = journal.read_text(encoding="utf-8")
+    again = protect(RURAL, **arguments, journal=journal)
+    assert journal.read_text(encoding="utf-8").startswith(kept)
+    whole = protect(RURAL, **arguments)
+    assert again.meters.equals(whole.meters)
+    assert again.attacks.equals(whole.attacks)
