@@ -205,29 +205,18 @@ def from_tables(tables: FeederTables) -> Site:
         [Edge(row.line, row.from_bus, row.to_bus, row.r_ohm == row.x_ohm == 0.0) for row in closed],
     )
     feeder = _feeder(tables, closed, found)
-    metered = [k for k, row in enumerate(tables.customers) if row.meter]
-    inverters = [k for k, row in enumerate(tables.customers) if row.inverter_kva > 0]
-    rows = [tables.customers[k] for k in inverters]
-    droop = fleet(
-        _indices(inverters),
-        [row.droop for row in rows],
-        np.array([row.inverter_kva for row in rows], dtype=np.float64),
-        meta.base_kva,
-        tau=np.array([np.nan if row.tau_s is None else row.tau_s for row in rows], dtype=np.float64),
-    )
+    metered = metered_customers(tables)
     return Site(
         tables=tables,
         feeder=feeder,
-        droop=droop,
-        meters=_indices(metered),
+        droop=inverters(tables),
+        meters=metered,
         meter_ids=tuple(tables.customers[k].meter for k in metered),
-        accuracy=_accuracy(tables, metered),
+        accuracy=accuracy(tables),
         bus_of_file=found.group,
-        xy=_positions(tables, found),
-        loads=_load_model(tables),
-        digest=hashlib.sha256(
-            json.dumps(to_json(tables), sort_keys=True, separators=(",", ":")).encode()
-        ).hexdigest(),
+        xy=positions(tables, found),
+        loads=load_model(tables),
+        digest=digest(tables),
     )
 
 
@@ -368,9 +357,34 @@ def _either(rows: list[CustomerRow], column: str, default: float) -> Floats:
     return np.array([default if cell is None else cell for cell in cells], dtype=np.float64)
 
 
-def _accuracy(tables: FeederTables, metered: list[int]) -> MeterAccuracy:
+def digest(tables: FeederTables) -> str:
+    """Return the SHA-256 of a feeder's content, see `Site`."""
+    text = json.dumps(to_json(tables), sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def metered_customers(tables: FeederTables) -> Ints:
+    """Return the indices of the customers with a meter, ascending."""
+    return _indices([k for k, row in enumerate(tables.customers) if row.meter])
+
+
+def inverters(tables: FeederTables) -> Droop:
+    """Return the inverters with a droop curve, in the order of the customers."""
+    own = [k for k, row in enumerate(tables.customers) if row.inverter_kva > 0]
+    rows = [tables.customers[k] for k in own]
+    return fleet(
+        _indices(own),
+        [row.droop for row in rows],
+        np.array([row.inverter_kva for row in rows], dtype=np.float64),
+        tables.meta.base_kva,
+        tau=np.array([np.nan if row.tau_s is None else row.tau_s for row in rows], dtype=np.float64),
+    )
+
+
+def accuracy(tables: FeederTables) -> MeterAccuracy:
+    """Return what the meters promise, pu."""
     meta = tables.meta
-    rows = [tables.customers[k] for k in metered]
+    rows = [tables.customers[k] for k in metered_customers(tables)]
     return MeterAccuracy(
         class_fraction=frozen(_either(rows, "class_percent", meta.meters.class_percent) / 100.0),
         resolution=frozen(_either(rows, "resolution_volt", meta.meters.resolution_volt) / meta.voltage_volt),
@@ -381,7 +395,8 @@ def _accuracy(tables: FeederTables, metered: list[int]) -> MeterAccuracy:
     )
 
 
-def _load_model(tables: FeederTables) -> LoadModel:
+def load_model(tables: FeederTables) -> LoadModel:
+    """Return what is known of the customers' powers, in units of `base_kva`."""
     meta, rows = tables.meta, list(tables.customers)
     base = meta.base_kva
     load = _either(rows, "load_kw", 0.0)
@@ -414,7 +429,8 @@ def _load_model(tables: FeederTables) -> LoadModel:
     return LoadModel(**{name: frozen(values) for name, values in fields.items()})
 
 
-def _positions(tables: FeederTables, found: Tree) -> Floats | None:
+def positions(tables: FeederTables, found: Tree) -> Floats | None:
+    """Return where the buses are (b + 1, 2), or None unless the files place every one of them."""
     xy = np.full((len(found.buses), 2), np.nan)
     for line in tables.lines:
         if line.to_x is not None and line.to_y is not None:

@@ -13,10 +13,22 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from feeders.load import find, names
+from feeders.load import (
+    LoadModel,
+    accuracy,
+    digest,
+    find,
+    inverters,
+    load_model,
+    metered_customers,
+    names,
+    positions,
+)
 from feeders.schema import FeederTables, LineRow, validate
 from feeders.topology import Edge, Tree, tree
-from gridsec.arrays import Ints, Phasors, frozen_ints
+from gridsec.arrays import Floats, Ints, Phasors
+from gridsec.detect import MeterAccuracy
+from gridsec.droop import Droop
 from gridsec.errors import FeederInvalid
 from gridsec.phases import PHASES, ThreePhaseFeeder, sequence_matrix
 
@@ -34,19 +46,20 @@ class ThreePhaseSite:
         The feeder in SI, as its files say it.
     feeder
         The radial tree, pu; powers of single phases in thirds of `base_kva`.
-    meters : (p,)
-        Index of each meter's customer, ascending.
-    meter_ids : (p,)
-        Ids of the meters.
-    bus_of_file
-        Fused bus index of every bus id of the files.
+    droop, meters, meter_ids, accuracy, bus_of_file, xy, loads, digest
+        As in `feeders.load.Site`, in units of `base_kva`: `gridsec.phases.per_customer` fits them.
     """
 
     tables: FeederTables
     feeder: ThreePhaseFeeder
+    droop: Droop
     meters: Ints
     meter_ids: tuple[str, ...]
+    accuracy: MeterAccuracy
     bus_of_file: Mapping[str, int]
+    xy: Floats | None
+    loads: LoadModel
+    digest: str
 
 
 def load_three_phase(path_or_name: Path | str) -> ThreePhaseSite:
@@ -98,13 +111,18 @@ def three_phase(tables: FeederTables) -> ThreePhaseSite:
     closed = [line for line in tables.lines if line.closed]
     edges = [Edge(row.line, row.from_bus, row.to_bus, _fuses(row)) for row in closed]
     found = tree(meta.busbar, edges)
-    metered = [k for k, row in enumerate(tables.customers) if row.meter]
+    metered = metered_customers(tables)
     return ThreePhaseSite(
         tables=tables,
         feeder=_feeder(tables, [closed[k] for k in found.branch], found),
-        meters=frozen_ints(np.array(metered, dtype=np.intp)),
+        droop=inverters(tables),
+        meters=metered,
         meter_ids=tuple(tables.customers[k].meter for k in metered),
+        accuracy=accuracy(tables),
         bus_of_file=found.group,
+        xy=positions(tables, found),
+        loads=load_model(tables),
+        digest=digest(tables),
     )
 
 

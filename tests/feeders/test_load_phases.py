@@ -16,7 +16,7 @@ from gridsec import feeder as balanced
 from gridsec.arrays import Floats
 from gridsec.errors import FeederInvalid
 from gridsec.feeder import lindistflow
-from gridsec.phases import bus_voltages, lindist3flow, sensitivities
+from gridsec.phases import bus_voltages, lindist3flow, per_customer, sensitivities
 
 CASE = Path(__file__).parent.parent / "cases" / "good" / "single-phase"
 EUROPEAN = "ieee-european-lv"
@@ -114,6 +114,9 @@ def test_the_european_feeder() -> None:
     feeder = site.feeder
     assert (len(feeder.buses), len(feeder.customers), len(site.meter_ids)) == (906, 55, 55)
     assert feeder.of.size == 55
+    assert site.droop.customer.size == 19
+    assert site.xy is not None
+    assert site.xy.shape == (906, 2)
     np.testing.assert_array_equal(np.bincount(feeder.phase), [21, 19, 15])
     assert all(row.power_factor == 0.95 for row in site.tables.customers)
     model = lindist3flow(feeder)
@@ -121,6 +124,24 @@ def test_the_european_feeder() -> None:
     assert np.abs(model.X - model.X.T).max() > 0.5 * np.abs(model.X).max()
     assert 0.2 < (model.X < 0).mean() < 0.5
     assert np.linalg.eigvalsh(model.X + model.X.T)[0] > 0.0
+
+
+def test_equipment_is_that_of_the_balanced_loader() -> None:
+    tables = find("kerber-dorfnetz")
+    lines = tuple(replace(line, r0_ohm=4 * line.r_ohm, x0_ohm=3 * line.x_ohm) for line in tables.lines)
+    tables = replace(tables, lines=lines)
+    one, three = from_tables(tables), three_phase(tables)
+    assert three.meter_ids == one.meter_ids
+    assert three.digest == one.digest != load("kerber-dorfnetz").digest
+    parts = {"droop": ("customer", "q", "tau", "slope"), "accuracy": ("class_fraction", "busbar_jitter")}
+    for part, fields in (parts | {"loads": ("load_peak", "pv_peak", "q_error")}).items():
+        for name in fields:
+            mine, theirs = (getattr(getattr(site, part), name) for site in (three, one))
+            np.testing.assert_array_equal(mine, theirs)
+    flow = per_customer(three.feeder, lindist3flow(three.feeder))
+    model = lindistflow(one.feeder)
+    np.testing.assert_allclose(flow.R, model.R, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(flow.X, model.X, rtol=0, atol=1e-13)
 
 
 def test_single_phase_customers_are_not_for_the_balanced_monitors() -> None:

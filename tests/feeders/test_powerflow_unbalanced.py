@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from pandapower import networks
 
 from feeders.convert_pandapower import from_pandapower
-from feeders.load_phases import three_phase
+from feeders.load import find, load
+from feeders.load_phases import three_phase, three_phase_names
 from feeders.powerflow import PowerFlow, PowerFlowDiverged
 from feeders.powerflow_unbalanced import UnbalancedGrid, UnbalancedPowerFlow, sequence_ohm
 from tests.feeders import asymmetric
@@ -46,9 +47,9 @@ def test_agrees_with_pandapower(scenario: str) -> None:
     np.testing.assert_allclose(volts / nominal, expected, rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", BUNDLED)
+@pytest.mark.parametrize("name", [*BUNDLED, *three_phase_names()])
 def test_agrees_with_power_grid_model(name: str) -> None:
-    tables = asymmetric.unbalanced(name)
+    tables = asymmetric.unbalanced(name) if name in BUNDLED else find(name)
     site = three_phase(tables)
     rng = np.random.default_rng(5)
     load = np.array([row.load_kw for row in tables.customers])
@@ -148,8 +149,6 @@ def test_laterals_and_full_matrices(seed: int, charging: float) -> None:
 
 @pytest.mark.parametrize("name", BUNDLED[:2])
 def test_balanced_customers_give_the_balanced_power_flow(name: str) -> None:
-    from feeders.load import load
-
     site = load(name)
     tables = asymmetric.unbalanced(name)
     everywhere = tuple(replace(row, phases="abc") for row in tables.customers)
