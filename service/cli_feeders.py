@@ -22,6 +22,7 @@ app = typer.Typer(no_args_is_help=True, help="List, show, check and design feede
 def feeders_list() -> None:
     """List the feeders that come with gridsec."""
     from feeders.load import load, names
+    from feeders.load_phases import three_phase_names
 
     table = Table("name", "title", "customers", "meters", "inverters", "M")
     for name in names():
@@ -30,6 +31,7 @@ def feeders_list() -> None:
         cells = (*map(str, counts), str(site.tables.meta.monitor.max_attacked))
         table.add_row(name, escape(site.tables.meta.title), *cells)
     out.print(table)
+    out.print(f"With single-phase customers, which no monitor takes yet: {', '.join(three_phase_names())}")
 
 
 @app.command("show")

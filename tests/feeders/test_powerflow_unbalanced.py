@@ -47,6 +47,43 @@ def test_agrees_with_pandapower(scenario: str) -> None:
     np.testing.assert_allclose(volts / nominal, expected, rtol=0, atol=1e-5)
 
 
+@pytest.mark.parametrize("name", ["kerber-landnetz", "kerber-dorfnetz", "cigre-lv"])
+def test_agrees_with_pandapower_on_other_feeders(name: str) -> None:
+    tables = asymmetric.unbalanced(name)
+    site = three_phase(tables)
+    nominal = tables.meta.voltage_volt
+    net = pp.create_empty_network(f_hz=50.0)
+    names = list(site.bus_of_file)
+    bus = {file_bus: pp.create_bus(net, nominal * np.sqrt(3.0) / 1e3) for file_bus in names}
+    pp.create_ext_grid(
+        net, bus[tables.meta.busbar], vm_pu=1.02, s_sc_max_mva=1e3, rx_max=0.1, r0x0_max=0.1, x0x_max=1.0
+    )
+    for line in (line for line in tables.lines if line.closed):
+        nf = line.b_us * 1e3 / (2 * np.pi * 50.0)
+        pp.create_line_from_parameters(
+            net, bus[line.from_bus], bus[line.to_bus], 1.0, line.r_ohm, line.x_ohm, nf, 1.0,
+            r0_ohm_per_km=line.r0_ohm, x0_ohm_per_km=line.x0_ohm, c0_nf_per_km=nf,
+        )  # fmt: skip
+    rng = np.random.default_rng(8)
+    p = np.array([row.load_kw for row in tables.customers]) * rng.uniform(0.0, 0.4, len(tables.customers))
+    q = 0.2 * p
+    for row, own_p, own_q in zip(tables.customers, p / 1e3, q / 1e3, strict=True):
+        share = {f"p_{phase}_mw": own_p / len(row.phases) for phase in row.phases}
+        share |= {f"q_{phase}_mvar": own_q / len(row.phases) for phase in row.phases}
+        pp.create_asymmetric_load(net, bus[row.bus], **share)
+    pp.runpp_3ph(net, tolerance_mva=1e-10, numba=False)
+    found = net.res_bus_3ph.loc[[bus[file_bus] for file_bus in names]]
+    size, angle = (
+        found[[f"{what}_{phase}_{unit}" for phase in "abc"]].to_numpy()
+        for what, unit in (("vm", "pu"), ("va", "degree"))
+    )
+    root = names.index(tables.meta.busbar)
+    v0 = nominal * size[root] * np.exp(1j * np.deg2rad(angle[root]))
+    volts = UnbalancedPowerFlow(site).solve(p, q, v0)[1][[site.bus_of_file[file_bus] for file_bus in names]]
+    assert np.ptp(size) > 5e-3
+    np.testing.assert_allclose(volts / nominal, size, rtol=0, atol=1e-5)
+
+
 @pytest.mark.parametrize("name", [*BUNDLED, *three_phase_names()])
 def test_agrees_with_power_grid_model(name: str) -> None:
     tables = asymmetric.unbalanced(name) if name in BUNDLED else find(name)

@@ -215,6 +215,8 @@ def test_conversion_of_nothing(gridsec: Run, tmp_path: Path) -> None:
 def test_feeders(gridsec: Run) -> None:
     listed = gridsec("feeders", "list").stdout
     assert all(name in listed for name in ("simbench-lv-rural1", "kerber-dorfnetz", "case33bw"))
+    assert "single-phase" in listed
+    assert "ieee-european-lv" in listed
     shown = gridsec("feeders", "show", FEEDER).stdout
     assert "13 customers, 13 meters" in shown
     valid = gridsec("feeders", "validate", str(CASES.parents[1] / "data/feeders" / FEEDER))
