@@ -41,7 +41,10 @@ ROWS = 64
 """Ticks of one block of the past."""
 
 BLOCKS = 60
-"""Blocks that are kept: a little more than an hour at one reading per second, 12 bytes per meter and tick."""
+"""Blocks that are kept: a little more than an hour at one reading per second."""
+
+MOST_BYTES = 36e6
+"""What the past may cost, at 12 bytes per meter and tick: very many meters are remembered for less long."""
 
 SPAN = 32
 """Ticks that a hash covers: one bit leaves it with every tick."""
@@ -134,7 +137,7 @@ class Memory:
     lag : (p,)
         Ticks after which the meter repeats itself, with evidence; 0 for none.
     blocks
-        The past, oldest first; at most BLOCKS.
+        The past, oldest first; at most BLOCKS, fewer where that would be more than MOST_BYTES.
     tail
         Rows (code, hash, model) after the last whole block.
     """
@@ -285,7 +288,13 @@ def keep(memory: Memory, model: Floats) -> Memory:
         return replace(memory, kept=memory.kept + 1, tail=tail)
     code, hashes, models = zip(*tail, strict=True)
     block = Block(np.stack(code), np.stack(hashes), np.stack(models))
-    return replace(memory, kept=memory.kept + 1, blocks=(*memory.blocks, block)[-BLOCKS:], tail=())
+    blocks = (*memory.blocks, block)[-_kept(memory.now.size) :]
+    return replace(memory, kept=memory.kept + 1, blocks=blocks, tail=())
+
+
+def _kept(meters: int) -> int:
+    """How many blocks are kept."""
+    return int(min(BLOCKS, max(1, MOST_BYTES // (12 * ROWS * max(meters, 1)))))
 
 
 def suspicious(memory: Memory) -> Bools:

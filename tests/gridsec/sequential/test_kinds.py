@@ -125,6 +125,17 @@ class TestMemory:
                 expected += 1
         assert got == expected
 
+    def test_very_many_meters_are_remembered_for_less_long(self) -> None:
+        meters, ticks = 3000, ROWS * 18
+        memory, rng = repeats.empty(meters), np.random.default_rng(2)
+        rule = law(meters=meters)
+        for _ in range(ticks):
+            memory = repeats.listen(rule, memory, rng.random(meters), np.ones(meters, dtype=np.bool_))
+            memory = repeats.keep(memory, np.zeros(meters))
+        size = sum(part.nbytes for block in memory.blocks for part in (block.code, block.hash, block.model))
+        assert 0.8 * repeats.MOST_BYTES < size <= repeats.MOST_BYTES
+        assert memory.kept - memory.first <= size / (12 * meters) + ROWS
+
     def test_the_past_is_what_was_heard_and_no_longer_than_promised(self) -> None:
         rng = np.random.default_rng(3)
         ticks = ROWS * (BLOCKS + 2) + 17
