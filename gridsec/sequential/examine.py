@@ -201,7 +201,6 @@ def _decoded(design: SequentialDesign, here: Scale, now: Fit, trust: Trust, s: i
         trust,
         trusted=trusted,
         scale=np.where(fallen, s, trust.scale),
-        age=np.where(fallen, 0, trust.age),
         quiet=np.where(fallen, 0, trust.quiet),
         accused=(),
     )

@@ -365,7 +365,6 @@ class Search:
             trust,
             trusted=trusted,
             scale=np.where(fallen, self.s, trust.scale),
-            age=np.where(fallen, 0, trust.age),
             quiet=np.where(fallen, 0, trust.quiet),
             accused=(*self.accused, *((k, self.s) for k in best.loosened)),
         )

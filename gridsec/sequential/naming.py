@@ -23,7 +23,9 @@ from gridsec.sequential.state import Trust
 _MOST_COUNTED = 12
 
 
-def name(design: SequentialDesign, before: Trust, seen: Examined) -> tuple[Trust, tuple[Explanation, ...]]:
+def name(
+    design: SequentialDesign, before: Trust, seen: Examined, live: Bools
+) -> tuple[Trust, tuple[Explanation, ...]]:
     """Who is named now; and explanations that fit about as well where somebody would have been named.
 
     Parameters
@@ -34,13 +36,16 @@ def name(design: SequentialDesign, before: Trust, seen: Examined) -> tuple[Trust
         From the last tick.
     seen
         What this tick brought.
+    live : (p,)
+        Which meters have a reading: silence clears nobody.
     """
     trust = seen.trust
     if trust.trusted.all() and not (trust.accused or before.named.any() or before.counted.any()):
         return trust, ()
-    quiet = np.where(trust.still.any(axis=0), 0, trust.quiet + 1)
+    quiet = np.where(trust.still.any(axis=0), 0, trust.quiet + live)
     trusted = (trust.trusted & ~before.named) | (quiet >= design.options.release)
-    age = np.where(trusted, 0, trust.age + 1)
+    # Who is caught again within the longest scale was never cleared.
+    age = np.where(trusted & (quiet > design.lengths[-1]), 0, trust.age + ~trusted)
     need = confirmed(design)[trust.scale]
     fresh = ~trusted & ~before.named & trust.bad.any(axis=0) & (age >= need) & _accused(seen, trusted.size)
     named = before.named & (quiet < design.options.release)

@@ -29,9 +29,9 @@ class Trust:
     scale : (p,)
         Scale on which each distrusted meter was caught.
     age : (p,)
-        Ticks since then.
+        Ticks under suspicion; forgotten after the longest scale without evidence.
     quiet : (p,)
-        Ticks without evidence against a distrusted meter.
+        Readings without evidence against a meter.
     bad : (s, p)
         Evidence at the last look on each scale.
     still : (s, p)
@@ -208,6 +208,7 @@ def renew(design: SequentialDesign, state: SequentialState, which: Bools) -> Seq
         trust=replace(
             trust,
             trusted=trust.trusted | which,
+            age=np.where(which, 0, trust.age),
             quiet=np.where(which, 0, trust.quiet),
             bad=trust.bad & ~which,
             still=trust.still & ~which,

@@ -76,7 +76,7 @@ def step(
     seen = examine(design, replace(state, trust=begun, window=window, doubts=doubts), model)
     over = ended(design, begun, seen, window)
     window = forget(window, over)
-    trust, rivals = name(design, begun, _acquit(seen, over))
+    trust, rivals = name(design, begun, _acquit(seen, over), heard.live)
     trust = _distrust(trust, copies)
     seen = replace(seen, trust=trust)
     after = replace(
@@ -92,7 +92,7 @@ def step(
         doubts=doubts,
         kinds=_kinds(design, state, kinds, seen, window, v2_bus[at]),
     )
-    after = _learn(design, after, residual, heard.live & trust.trusted, frame.t - state.t)
+    after = _learn(design, after, residual, heard.live, frame.t - state.t)
     tick = Tick(heard.y, heard.live, heard.v0_squared, heard.busbar, v2_bus, transient, seen, rivals)
     estimate, verdict = conclude(design, after, tick)
     return replace(after, last=(estimate, verdict)), estimate, verdict
@@ -152,16 +152,20 @@ def _kinds(  # noqa: PLR0917  # everything that lies are compared with
 
 
 def _learn(
-    design: SequentialDesign, state: SequentialState, residual: Floats, use: Bools, h: float
+    design: SequentialDesign, state: SequentialState, residual: Floats, live: Bools, h: float
 ) -> SequentialState:
     """Gather what the meters' fixed errors are, and from some time on rely on it."""
-    if state.learning is None or state.ticks == 1:
+    trust = state.trust
+    # While more than meters is suspected, what the others read is not their own error.
+    if state.learning is None or state.ticks == 1 or trust.accused:
         return state
     # A pause of the frames is no time in which anything was heard.
-    step_s = design.step_s
+    step_s, use = design.step_s, live & trust.trusted & _known(design, state.doubts)
     learning = gather(state.learning, residual, use, h if h <= _PAUSE * step_s else step_s)
-    ready = ripe(design, learning)
-    if not ready.any() or not state.trust.trusted.all():
+    # Whoever is named has no say; suspects that report may yet turn out to be right.
+    settled = trust.trusted | trust.named | (state.window.counts[-1] == 0)
+    ready = ripe(design, learning) & trust.trusted
+    if not ready.any() or not settled.all():
         return replace(state, learning=learning)
     known = learn(design, state.learned, learning, ready, state.t)
     window = shift(state.window, state.learned.bias - known.learned.bias)
@@ -169,6 +173,14 @@ def _learn(
     return replace(state, learning=known.learning, learned=known.learned, window=window, fits=fits)
 
 
+def _known(design: SequentialDesign, doubts: Doubts) -> Bools:
+    """Where what is not known is about as large as learning supposes, (p,)."""
+    variance, at = doubts.prior.variance, doubts.prior.meters
+    return np.asarray(variance[at] <= _WIDER**2 * design.prior.variance[at])
+
+
+# Voltages known this many times less well than the design supposes say nothing of a meter's own error.
+_WIDER = 2.0
 # Ticks without a frame after which there was a pause.
 _PAUSE = 60.0
 # The model's error is bounded anew every so many ticks.

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from gridsec import sequential
+from gridsec.arrays import Bools
 from gridsec.online import Decision, Frame, Verdict
 from gridsec.sequential import SequentialState
 from tests.gridsec.sequential.test_monitor import prepare, watch
@@ -97,3 +98,70 @@ class TestNumbersThatAreNone:
             given = replace(frame, p_error=np.full(12, error))
             state, _, _ = sequential.step(made, sequential.init(made, frame.t - 1.0), given)
             assert (state.doubts.prior.variance[1:] > made.prior.variance[1:]).all()
+
+
+class TestLiarsWhoComeAndGo:
+    """Nobody else is ever named, and who lies is not better off for being silent or honest in between."""
+
+    def watched(self, lies: Callable[[int], bool], heard: Callable[[int], bool], frames: int) -> Bools:
+        """Whether meter 4 is named at each frame."""
+        rng = np.random.default_rng(1)
+        plant = make_plant(rng, customers=12, drop=0.03)
+        design, street = prepare(plant), Street(plant, rng)
+        state, _ = watch(street, design, 40)
+        named = []
+        for k in range(frames):
+            lie, silent = {4: 0.05} if lies(k) else {}, () if heard(k) else (4,)
+            state, ((_, verdict),) = watch(street, design, 1, state=state, lies=lie, silent=silent)
+            assert not np.delete(verdict.suspects, 4).any()
+            named.append(bool(verdict.suspects[4]))
+        return np.array(named)
+
+    def test_silence_clears_nobody(self) -> None:
+        named = self.watched(lambda k: k < 5, lambda k: not 5 <= k < 100, 130)
+        assert named[2:104].all()
+        assert not named[110:].any()
+
+    def test_who_is_silent_but_for_lies_is_named(self) -> None:
+        named = self.watched(lambda _: True, lambda k: k % 8 == 0, 80)
+        assert named[8:].all()
+
+    def test_who_is_honest_for_as_long_as_it_takes_to_be_believed_is_named(self) -> None:
+        named = self.watched(lambda k: k % 7 == 0, lambda _: True, 140)
+        assert np.mean(named[7:]) > 0.3
+
+
+class TestWhatIsLearnedUnderDifficulties:
+    LEARN_S = 400
+
+    def learned(self, change: Change, lies: dict[int, float], seed: int) -> tuple[SequentialState, Street]:
+        rng = np.random.default_rng(seed)
+        plant = make_plant(rng, customers=12, drop=0.03)
+        design, street = prepare(plant, commission_s=self.LEARN_S), Street(plant, rng)
+        state, _ = watch(street, design, self.LEARN_S, lies=lies, change=change)
+        state, answers = watch(street, design, self.LEARN_S + 30, state=state, lies=lies)
+        honest = np.setdiff1d(np.arange(12), list(lies))
+        assert not any(verdict.suspects[honest].any() for _, verdict in answers)
+        return state, street
+
+    @pytest.mark.parametrize("name", ["v0_squared", "p"])
+    @pytest.mark.parametrize("seed", range(3))
+    def test_time_in_which_little_is_known_does_not_count(self, name: str, seed: int) -> None:
+        """A busbar that is silent, or loads that are guessed, would all be learned as the meters' errors."""
+
+        def change(frame: Frame) -> Frame:
+            if name == "p":
+                return replace(frame, p=np.full(12, frame.p.mean()), p_error=np.full(12, 0.2))
+            return replace(frame, v0_squared=np.nan)
+
+        state, street = self.learned(change, {}, seed)
+        assert np.isfinite(state.learned.at).all()
+        off = np.abs(state.learned.bias - 2.0 * street.bias)
+        assert (off < 3.0 * np.sqrt(state.learned.variance)).all()
+
+    def test_a_broken_meter_does_not_keep_the_others_from_being_learned(self) -> None:
+        state, street = self.learned(lambda frame: frame, {3: 0.05}, 0)
+        honest = np.arange(12) != 3
+        np.testing.assert_array_equal(np.isfinite(state.learned.at), honest)
+        off = np.abs(state.learned.bias - 2.0 * street.bias)
+        assert (off < 3.0 * np.sqrt(state.learned.variance))[honest].all()
