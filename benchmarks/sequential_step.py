@@ -113,7 +113,8 @@ def measure(customers: int) -> tuple[float, float, float, float]:
     none, zero = np.full(customers, np.nan), np.zeros(customers)
     seen = np.ones(customers, dtype=np.bool_)
     took: list[float] = []
-    quiet, attack = (200, 60) if customers <= 1000 else (60, 20)
+    # The largest is watched until all it remembers is there.
+    quiet, attack = (200, 60) if customers <= 1000 else (1700, 20)
     for k in range(60 + quiet + attack):
         if k == 60 + quiet:
             lies[liars] = 0.03 * rng.choice([-1.0, 1.0], liars.size)
