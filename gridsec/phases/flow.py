@@ -326,14 +326,15 @@ class _Start:
 
     @classmethod
     def of(cls, feeder: ThreePhaseFeeder, p: Floats, q: Floats, v0_squared: Floats) -> _Start:
-        s = _at_buses(feeder, p + 1j * np.asarray(q))
-        squared = np.asarray(v0_squared, dtype=np.float64)[..., None]
-        v0 = np.sqrt(squared) * ROTATION[:, None]
-        flow = below(feeder, s)[..., 1:]
-        gain = np.einsum("bij,...jb->...ib", _rotated(feeder), np.conj(flow)).real
-        linear = squared + 2.0 * from_root(feeder, gain)
-        flat = _drawn(feeder, s, np.broadcast_to(v0, s.shape))
-        return cls(s, v0, flat, _forward(feeder, v0, flat), linear)
+        with np.errstate(all="ignore"):  # what is no number gets no finite bound, and no complaint
+            s = _at_buses(feeder, p + 1j * np.asarray(q))
+            squared = np.asarray(v0_squared, dtype=np.float64)[..., None]
+            v0 = np.sqrt(squared) * ROTATION[:, None]
+            flow = below(feeder, s)[..., 1:]
+            gain = np.einsum("bij,...jb->...ib", _rotated(feeder), np.conj(flow)).real
+            linear = squared + 2.0 * from_root(feeder, gain)
+            flat = _drawn(feeder, s, np.broadcast_to(v0, s.shape))
+            return cls(s, v0, flat, _forward(feeder, v0, flat), linear)
 
 
 def _sweeps(feeder: ThreePhaseFeeder, start: _Start, steps: int) -> Floats:
@@ -344,7 +345,8 @@ def _sweeps(feeder: ThreePhaseFeeder, start: _Start, steps: int) -> Floats:
 
 
 def _sweep(feeder: ThreePhaseFeeder, start: _Start, phasors: Phasors) -> Phasors:
-    return _forward(feeder, start.v0, _drawn(feeder, start.s, phasors))
+    with np.errstate(all="ignore"):
+        return _forward(feeder, start.v0, _drawn(feeder, start.s, phasors))
 
 
 def _drawn(feeder: ThreePhaseFeeder, s: Phasors, phasors: Phasors) -> Phasors:

@@ -18,6 +18,7 @@ from gridsec.phases import (
     lindist3flow,
     loss_correction,
     model_error_bound,
+    per_customer,
     sensitivities,
     sequence_matrix,
     squared_voltages,
@@ -200,6 +201,48 @@ def test_no_bound_near_collapse() -> None:
     feeder = replace(random_three_phase(3, branches=6))
     p, q = np.full((2, feeder.of.size), -30.0)
     assert np.isinf(model_error_bound(feeder, p, q, np.ones(3))).any()
+
+
+@pytest.mark.parametrize(("power", "v0"), [(np.nan, 1.0), (np.inf, 1.0), (-0.1, 0.0), (-0.1, np.nan)])
+def test_nothing_is_claimed_where_nothing_is_known(power: float, v0: float) -> None:
+    """No exception, no warning, and no finite bound."""
+    feeder = random_three_phase(3, branches=6, charging=0.01)
+    p = np.full(feeder.of.size, -0.01)
+    p[0] = power
+    away = feeder.at > 0
+    assert away.any()
+    correction, bound = corrected(feeder, p, 0.1 * p, np.full(3, v0))
+    assert np.isinf(bound[away]).all()
+    assert correction.shape == (3, len(feeder.buses))
+
+
+def test_feeders_without_branches_or_without_customers() -> None:
+    bare = ThreePhaseFeeder(
+        name="bare",
+        parent=np.zeros(0, dtype=np.intp),
+        z=np.zeros((0, 3, 3)),
+        phases=np.ones((1, 3), dtype=bool),
+        bus=np.array([0]),
+        connected=np.array([[1, 1, 1]], dtype=bool),
+        customers=("kiosk",),
+        buses=("busbar",),
+        base_volt=230.0,
+        base_kva=100.0,
+        charging=np.zeros((0, 3, 3)),
+    )
+    np.testing.assert_array_equal(lindist3flow(bare).R, np.zeros((3, 3)))
+    np.testing.assert_allclose(bus_voltages(bare, -np.ones(3), np.zeros(3), np.ones(3)), np.ones((3, 1)))
+    nobody = replace(
+        random_three_phase(5),
+        bus=np.zeros(0, dtype=np.intp),
+        connected=np.zeros((0, 3), dtype=bool),
+        customers=(),
+    )
+    model = lindist3flow(nobody)
+    assert per_customer(nobody, model).R.shape == model.R.shape == (0, 0)
+    assert sensitivities(nobody, np.zeros(0), np.zeros(0), np.ones(3)).X.shape == (0, 0)
+    idle = bus_voltages(nobody, np.zeros(0), np.zeros(0), np.full(3, 1.1))
+    np.testing.assert_allclose(idle, np.full((3, len(nobody.buses)), 1.1))
 
 
 def test_a_single_phase_lateral_in_closed_form() -> None:
