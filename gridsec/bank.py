@@ -20,6 +20,9 @@ import numpy as np
 from gridsec import slot_steps, slots, stacked
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import DesignInfeasible
+from gridsec.gains import CircleOptions
+from gridsec.gains import stacked as in_one
+from gridsec.lmi.circle_criterion import solve_many
 from gridsec.lure import Lure, StepPolicy
 from gridsec.slots import SlotState
 from gridsec.stacked import Gains, StackedState, direct_gains
@@ -30,11 +33,13 @@ __all__ = [
     "Bank",
     "BankState",
     "Gains",
+    "believe",
     "consistency",
     "design",
     "direct_gains",
     "estimate",
     "init",
+    "lmi_gains",
     "select",
     "spread",
     "step",
@@ -132,6 +137,34 @@ def design(
         return Bank(lure, sets, masks, sizes, True, None, lay, base, policy)
     _check_gains(lure, masks, gains)
     return Bank(lure, sets, masks, sizes, False, gains, None, None, policy)
+
+
+def lmi_gains(
+    lure: Lure, max_attacked: int, options: CircleOptions, *, workers: int = 1, most: int = MOST_OBSERVERS
+) -> Gains:
+    """Gains of all observers of a bank by the corrected matrix inequality (12), for `design`.
+
+    Parameters
+    ----------
+    lure, max_attacked, most
+        As in `design`.
+    options
+        From `gridsec.lmi.options_for`.
+    workers
+        Processes, as in `gridsec.lmi.solve_many`.
+
+    Raises
+    ------
+    NotObservable, DesignInfeasible
+        As in `design`, or if an observer cannot be designed.
+
+    References
+    ----------
+    chong2020 (12); docs/theory-observers.md.
+    """
+    masks = subsets(len(lure.C), max_attacked, most=most).masks()
+    made = solve_many(lure, [np.flatnonzero(mask).tolist() for mask in masks], options, workers=workers)
+    return Gains(*in_one(made, len(lure.C)))
 
 
 def _check_gains(lure: Lure, masks: Bools, gains: Gains) -> None:
@@ -311,6 +344,30 @@ def select(
         return best
     equal = value <= value[best] + tie
     return int(np.argmin(np.where(equal, penalty, np.inf)))
+
+
+def believe(bank: Bank, state: BankState) -> tuple[Floats, Bools]:
+    """The estimate of the large set that agrees best with its small subsets, and its meters.
+
+    Parameters
+    ----------
+    bank, state
+        Design and state.
+
+    Returns
+    -------
+    x, trusted : (n,), (p,)
+        NaN and nobody while 2M or fewer meters are alive.
+
+    References
+    ----------
+    chong2020 (7), (8).
+    """
+    best = select(consistency(bank, state))
+    if best < 0:
+        n, p = len(bank.lure.A), len(bank.lure.C)
+        return np.full(n, np.nan), np.zeros(p, dtype=np.bool_)
+    return estimate(bank, state, best), bank.masks[best]
 
 
 def spread(bank: Bank, state: BankState, index: int) -> Floats:

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.linalg import expm
 
 from gridsec.arrays import Floats, Ints, exponential_integrals, frozen, perron_bound
@@ -71,6 +72,38 @@ class Lure:
         if wrong:
             raise ValueError("; ".join(wrong))
 
+    @classmethod
+    def of(
+        cls,
+        A: ArrayLike,
+        C: ArrayLike,
+        *,
+        G: ArrayLike,
+        H: ArrayLike,
+        phi: Nonlinearity,
+        slope: ArrayLike,
+        F: ArrayLike | None = None,
+        B: ArrayLike | None = None,
+        D: ArrayLike | None = None,
+    ) -> Lure:
+        """A system from nested lists or arrays; inputs do nothing where no matrix says what.
+
+        Parameters
+        ----------
+        A, C, G, H, phi, F, B, D
+            As in the class. Without any of F, B and D there are no inputs, l = 0.
+        slope
+            Likewise; one number for all entries of phi.
+
+        Raises
+        ------
+        ValueError
+            If shapes do not fit; names every problem.
+        """
+        a, c, g, h = as_floats(A, C, G, H)
+        f, b, d = input_matrices((len(h), len(a), len(c)), F, B, D)
+        return cls(a, g, h, f, b, c, d, np.broadcast_to(as_floats(slope)[0], len(h)), phi)
+
 
 class Readout(Protocol):
     """What `z = H x + F u` and `y = C x + D u` are read from: a `Lure`, or a system in discrete time."""
@@ -83,6 +116,29 @@ class Readout(Protocol):
     def C(self) -> Floats: ...  # noqa: D102, N802
     @property
     def D(self) -> Floats: ...  # noqa: D102, N802
+
+
+def as_floats(*given: ArrayLike) -> tuple[Floats, ...]:
+    """Nested lists as arrays of floats."""
+    return tuple(np.asarray(one, dtype=np.float64) for one in given)
+
+
+def input_matrices(
+    heights: tuple[int, int, int], F: ArrayLike | None, B: ArrayLike | None, D: ArrayLike | None
+) -> tuple[Floats, ...]:
+    """F, B and D as arrays, zero where they are not given; all of them decide on l.
+
+    Parameters
+    ----------
+    heights
+        Their rows: the numbers of nonlinearities, states and meters.
+    F, B, D
+        Matrices or nested lists, or None.
+    """
+    found = [None if one is None else np.asarray(one, dtype=np.float64) for one in (F, B, D)]
+    inputs = max((one.shape[-1] for one in found if one is not None and one.ndim), default=0)
+    rows = zip(found, heights, strict=True)
+    return tuple(np.zeros((count, inputs)) if one is None else one for one, count in rows)
 
 
 def close_loop(feeder: Feeder | ThreePhaseFeeder, droop: Droop, meters: Ints) -> Lure:

@@ -14,10 +14,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.linalg import expm
 
 from gridsec.arrays import Floats, exponential_integrals, frozen, spectral_radius
-from gridsec.lure import Lure
+from gridsec.lure import Lure, as_floats, input_matrices
 from gridsec.newton import Nonlinearity
 
 
@@ -75,6 +76,41 @@ class DiscreteLure:
             wrong.append(f"h is {self.h}; the time between steps must be positive")
         if wrong:
             raise ValueError("; ".join(wrong))
+
+    @classmethod
+    def of(
+        cls,
+        A: ArrayLike,
+        C: ArrayLike,
+        *,
+        G: ArrayLike,
+        H: ArrayLike,
+        phi: Nonlinearity,
+        lower: ArrayLike,
+        upper: ArrayLike,
+        F: ArrayLike | None = None,
+        B: ArrayLike | None = None,
+        D: ArrayLike | None = None,
+        h: float = 1.0,
+    ) -> DiscreteLure:
+        """A system from nested lists or arrays; inputs do nothing where no matrix says what.
+
+        Parameters
+        ----------
+        A, C, G, H, phi, F, B, D, h
+            As in the class. Without any of F, B and D there are no inputs, l = 0.
+        lower, upper
+            Likewise; one number for all entries of phi.
+
+        Raises
+        ------
+        ValueError
+            If shapes do not fit; names every problem.
+        """
+        a, c, g, hh, low, high = as_floats(A, C, G, H, lower, upper)
+        f, b, d = input_matrices((len(hh), len(a), len(c)), F, B, D)
+        low, high = (np.broadcast_to(bound, len(hh)) for bound in (low, high))
+        return cls(a, g, hh, f, b, c, d, low, high, phi, h)
 
     @property
     def slope(self) -> Floats:

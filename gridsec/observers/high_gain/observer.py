@@ -27,7 +27,7 @@ from gridsec.observers.high_gain.constants import (
 )
 from gridsec.observers.high_gain.field import Field, Transition, advance, field, gains, transition
 from gridsec.observers.high_gain.form import System, slopes
-from gridsec.observers.high_gain.inverse import Inverse, check, corners_and_interior
+from gridsec.observers.high_gain.inverse import Inverse, check, corners_and_interior, nearest
 from gridsec.observers.high_gain.lipschitz import kappa_detect, upper_proven
 from gridsec.observers.high_gain.outcome import Outcome, verdict
 from gridsec.observers.high_gain.redundancy import groups
@@ -119,7 +119,7 @@ class HighGainState:
 
 def design(
     system: System,
-    inverses: Sequence[Inverse],
+    inverses: Sequence[Inverse] | None = None,
     *,
     theta: Floats | float,
     noise: Floats | float,
@@ -142,7 +142,8 @@ def design(
     system
         The system and its decomposition.
     inverses
-        A left inverse for each set of p - q sensors, in the order of the search.
+        A left inverse for each set of p - q sensors, in the order of the search. None: the nearest
+        points, for these sets and for `whole`.
     theta
         High-gain parameters, 1/s, at least 1; scalar or (p,).
     noise
@@ -179,23 +180,23 @@ def design(
     wanted = set(groups(p, max_attacked)) if p > 2 * max_attacked >= 0 else set()
     if not wanted:
         raise NotObservable(range(p), p, f"{p} sensors, {max_attacked} attacked: more than twice are needed")
+    thetas = np.broadcast_to(np.asarray(theta, dtype=np.float64), (p,))
+    noises = np.broadcast_to(np.asarray(noise, dtype=np.float64), (p,))
+    decays = _constants(system, thetas, noises, decay)
+    if inverses is None:
+        # Below every threshold that it will be compared to, so that it only saves time.
+        accept = min(one.epsilon for one in decays)
+        inverses = [nearest(system, group, accept=accept) for group in groups(p, max_attacked)]
+        whole = nearest(system, range(p), accept=accept) if whole is None else whole
     if len(inverses) != len(wanted) or {inverse.sensors for inverse in inverses} != wanted:
         raise NotObservable(
             range(p), p, f"a left inverse for each set of {p - max_attacked} sensors is needed"
         )
-    thetas = np.broadcast_to(np.asarray(theta, dtype=np.float64), (p,))
-    noises = np.broadcast_to(np.asarray(noise, dtype=np.float64), (p,))
     low, high = (np.broadcast_to(np.asarray(end, dtype=np.float64), (m,)) for end in (u_low, u_high))
     margins, proven = _margins(system, thetas, low, high)
     points = corners_and_interior(system, samples=100)
     for inverse in (*inverses, *(() if whole is None else (whole,))):
         check(system, inverse, points, tolerance=tolerance)
-    if isinstance(decay, str):
-        rule = _DECAYS[decay]
-        parts = zip(system.partials, thetas, noises, strict=True)
-        decays = tuple(rule(part.size, float(th), float(v)) for part, th, v in parts)
-    else:
-        decays = tuple(decay)
     eta, rest = (np.array([getattr(d, name) for d in decays]) for name in ("eta", "epsilon"))
     limit = np.maximum(2.0 * eta * system.z_bound, rest) + system.z_bound if reset else np.full(p, np.inf)
     steep = [
@@ -219,6 +220,15 @@ def design(
         move=transition(system, K, step_s / substeps),
         substeps=substeps,
     )
+
+
+def _constants(
+    system: System, theta: Floats, noise: Floats, decay: str | Sequence[Decay]
+) -> tuple[Decay, ...]:
+    if not isinstance(decay, str):
+        return tuple(decay)
+    rule, parts = _DECAYS[decay], zip(system.partials, theta, noise, strict=True)
+    return tuple(rule(part.size, float(th), float(v)) for part, th, v in parts)
 
 
 def _margins(system: System, theta: Floats, low: Floats, high: Floats) -> tuple[Floats, bool]:

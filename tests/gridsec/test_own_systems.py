@@ -1,0 +1,128 @@
+"""Short ways to one's own system: they give what the long ways give, and refuse what does not fit."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gridsec import bank
+from gridsec.errors import NotObservable
+from gridsec.lmi import circle, options_for
+from gridsec.lmi.sampled import DiscreteLure
+from gridsec.lmi.sampled import advance as advance_discrete
+from gridsec.lure import Lure, advance
+from gridsec.observers import high_gain
+from gridsec.observers.high_gain import groups, nearest
+from gridsec.online import Decision
+from tests.gridsec.observers.bent import bent, truth
+
+A, C = [[0, 1], [0, -1]], [[1, 0], [1, 0], [1, 0], [1, 1], [1, 1]]
+ALL = np.ones(5, dtype=np.bool_)
+
+
+def curve(z: Any) -> Any:
+    return z + np.sin(z)
+
+
+def pendulum() -> Lure:
+    return Lure.of(A, C, G=[[0], [-1]], H=[[1, 0]], B=[[0], [1]], phi=curve, slope=2)
+
+
+def test_inputs_that_are_not_given_do_nothing() -> None:
+    own = pendulum()
+    assert own.F.shape == (1, 1)
+    assert own.D.shape == (5, 1)
+    assert not own.F.any()
+    assert not own.D.any()
+    assert own.slope.tolist() == [2.0]
+    alone = Lure.of(A, C, G=[[0], [-1]], H=[[1, 0]], phi=curve, slope=[2])
+    x = np.array([0.4, -0.2])
+    assert np.array_equal(advance(alone, x, np.zeros(0), 0.1), advance(own, x, np.zeros(1), 0.1))
+
+
+def test_a_discrete_system_moves_as_its_equation_says() -> None:
+    own = DiscreteLure.of(
+        [[0.8, 0.1], [0, 0.7]],
+        C,
+        G=[[0], [0.2]],
+        H=[[1, 1]],
+        D=np.ones((5, 2)),
+        phi=np.sin,
+        lower=-1,
+        upper=1,
+    )
+    assert own.B.shape == (2, 2)
+    assert (own.lower.tolist(), own.upper.tolist()) == ([-1.0], [1.0])
+    after = advance_discrete(own, np.array([1.0, 2.0]), np.ones(2))
+    assert after == pytest.approx([1.0, 1.4 + 0.2 * np.sin(3.0)], abs=1e-15)
+
+
+def test_what_does_not_fit_is_refused_by_name() -> None:
+    with pytest.raises(ValueError, match=r"G has shape .*; B has shape"):
+        Lure.of(A, C, G=[[1]], H=[[1, 0]], B=[[1]], phi=curve, slope=2)
+    with pytest.raises(ValueError, match="D has shape"):
+        DiscreteLure.of(A, C, G=[[0], [1]], H=[[1, 0]], D=[[1]], phi=curve, lower=0, upper=2)
+
+
+def test_gains_of_a_bank_are_those_of_its_single_observers() -> None:
+    own = pendulum()
+    wish: Any = {"rate": 0.2, "noise": 0.1, "load": np.zeros((1, 1)), "weight": np.eye(2)}
+    gains = bank.lmi_gains(own, 1, options_for(own, **wish))
+    masks = bank.subsets(5, 1, most=100).masks()
+    assert gains.L.shape == (len(masks), 2, 5)
+    for k in (0, len(masks) - 1):
+        J = np.flatnonzero(masks[k])
+        one = circle(own, J, **wish)
+        assert np.allclose(gains.L[k][:, J], one.L, rtol=1e-4, atol=1e-4)
+        assert np.allclose(gains.K[k][:, J], one.K, rtol=1e-4, atol=1e-4)
+        assert not gains.L[k][:, ~masks[k]].any()
+
+
+def test_the_believed_estimate_is_right_and_leaves_the_liar_out() -> None:
+    own = pendulum()
+    wish = options_for(own, rate=0.2, noise=0.1, load=np.zeros((1, 1)), weight=np.eye(2))
+    made = bank.design(own, 1, gains=bank.lmi_gains(own, 1, wish))
+    x, u = np.array([1.0, 0.0]), np.ones(1)
+    state = bank.init(made, own.C @ x, u, ALL)
+    for _ in range(600):
+        state = bank.step(made, state, own.C @ x + [0, 0, 0, 2.0, 0], u, ALL, h=0.01)
+        x = advance(own, x, u, 0.01)
+    estimate, trusted = bank.believe(made, state)
+    assert estimate == pytest.approx(x, abs=1e-3)
+    assert np.flatnonzero(~trusted).tolist() == [3]
+    # Two live meters confirm nobody.
+    state = bank.step(made, state, own.C @ x, u, np.arange(5) < 2, h=0.01)
+    estimate, trusted = bank.believe(made, state)
+    assert np.isnan(estimate).all()
+    assert not trusted.any()
+
+
+def test_without_inverses_the_nearest_points_are_taken_for_all_sets_and_the_whole() -> None:
+    model, wish = bent(), {"theta": 12.0, "noise": 2e-4, "max_attacked": 1, "u_low": -0.4, "u_high": 0.4}
+    short = high_gain.design(model, **wish, step_s=0.02)  # type: ignore[arg-type]  # a mixed dictionary
+    accept = min(one.epsilon for one in short.decays)
+    long = high_gain.design(
+        model,
+        [nearest(model, group, accept=accept) for group in groups(3, 1)],
+        whole=nearest(model, range(3), accept=accept),
+        **wish,  # type: ignore[arg-type]  # likewise
+        step_s=0.02,
+    )
+    t, x, u = truth(3.0)
+    y = x[:, [0, 0, 0]] + np.outer(t > 2.0, [0.5, 0.0, 0.0])
+    states = [high_gain.init(made, 0.0) for made in (short, long)]
+    answers: list[Any] = [None, None]
+    for k in range(1, len(t)):
+        for i, made in enumerate((short, long)):
+            states[i], answers[i] = high_gain.step(made, states[i], y[k], u[k : k + 1], ALL[:3], 0.02)
+        assert np.array_equal(answers[0].x, answers[1].x)
+        assert answers[0].decision is answers[1].decision
+    assert answers[0].decision is Decision.ATTACKED
+    assert np.flatnonzero(answers[0].suspects).tolist() == [0]
+
+
+def test_too_few_sensors_are_refused_without_inverses_too() -> None:
+    with pytest.raises(NotObservable, match="more than twice"):
+        high_gain.design(bent(), theta=12.0, noise=2e-4, max_attacked=2, u_low=-0.4, u_high=0.4, step_s=0.02)
