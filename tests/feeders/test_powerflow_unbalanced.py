@@ -257,3 +257,24 @@ def test_a_customer_needs_his_phase() -> None:
     all_three = replace(lame, connected=np.ones_like(grid.connected), customer_bus=grid.customer_bus * 0 + 5)
     with pytest.raises(ValueError, match="phase that its bus does not have"):
         UnbalancedPowerFlow.of(all_three)
+
+
+def test_a_feeder_without_customers_is_at_the_voltage_of_its_busbar() -> None:
+    grid = of_model(3, branches=5)
+    idle = replace(grid, customer_bus=np.zeros(0, dtype=np.intp), connected=np.zeros((0, 3), dtype=bool))
+    for source in (None, sequence_ohm(0.02 + 0.03j, 0.05 + 0.01j)):
+        flow = UnbalancedPowerFlow.of(replace(idle, source_ohm=source))
+        connections, buses = flow.solve(np.zeros(0), np.zeros(0), 231.0)
+        assert connections.shape == (0,)
+        np.testing.assert_allclose(buses[~np.isnan(buses)], 231.0, rtol=1e-12)
+    nothing = slice(0)
+    alone = replace(
+        idle,
+        ends=idle.ends[nothing],
+        present=idle.present[nothing],
+        z_ohm=idle.z_ohm[nothing],
+        b_siemens=idle.b_siemens[nothing],
+        bus_count=1,
+    )
+    _, buses = UnbalancedPowerFlow.of(alone).solve(np.zeros(0), np.zeros(0), 231.0)
+    np.testing.assert_allclose(buses, np.full((1, 3), 231.0), rtol=1e-14)
