@@ -8,12 +8,19 @@ import pytest
 from hypothesis import given, settings
 
 from feeders.load_phases import load_three_phase
+from feeders.powerflow_unbalanced import UnbalancedPowerFlow
 from gridsec.arrays import Floats
 from gridsec.certificates import Certificate, reactance, small_gain, verify
 from gridsec.droop import Droop, fleet
 from gridsec.errors import DesignInfeasible
-from gridsec.lure import Lure, close_loop
-from gridsec.phases import ThreePhaseFeeder, lindist3flow, per_customer, squared_voltages
+from gridsec.lure import Lure, close_loop, equilibrium
+from gridsec.phases import (
+    ThreePhaseFeeder,
+    lindist3flow,
+    loss_correction,
+    per_customer,
+    squared_voltages,
+)
 from tests.gridsec.unbalanced import random_three_phase
 
 
@@ -122,3 +129,36 @@ def test_too_large_a_fleet_has_no_certificate() -> None:
     for attempt in (reactance, small_gain):
         with pytest.raises(DesignInfeasible):
             attempt(lure)
+
+
+@pytest.mark.parametrize(("sun", "busbar"), [(0.9, 1.04), (0.5, 1.05), (0.0, 0.95)])
+def test_inverters_rest_where_the_asymmetric_power_flow_rests(sun: float, busbar: float) -> None:
+    """Single-phase inverters on the European feeder: equilibrium of the model and of the AC equations."""
+    site = load_three_phase("ieee-european-lv")
+    feeder, droop, flow = site.feeder, site.droop, UnbalancedPowerFlow(site)
+    base, own = feeder.base_kva, site.droop.customer
+    load, pv = site.loads.load_peak, site.loads.pv_peak
+    p, q_load = 0.7 * load - sun * pv, 0.2 * load  # import, in units of the three-phase base
+
+    def volts(x: Floats) -> Floats:
+        q = q_load - np.bincount(own, weights=x, minlength=load.size)
+        return flow.solve(p * base, q * base, busbar * feeder.base_volt)[0] / feeder.base_volt
+
+    x: Floats = np.zeros(own.size)
+    for _ in range(60):
+        x = 0.5 * x + 0.5 * droop(droop.vbar**2 - volts(x)[own] ** 2)
+    assert np.abs(x).max() > 0.2 * droop.limit.max()  # the curves are at work
+
+    lure = close_loop(feeder, droop, site.meters)
+    model = per_customer(feeder, lindist3flow(feeder))
+    v0 = np.full(3, busbar**2)
+    found: Floats = np.zeros(own.size)
+    for _ in range(4):  # the correction belongs to the injections that come out
+        q = np.bincount(own, weights=found, minlength=load.size) - q_load
+        p_phase, q_phase = feeder.connections(-3 * p), feeder.connections(3 * q)
+        correction = loss_correction(feeder, p_phase, q_phase, v0)[feeder.phase, feeder.at]
+        w = droop.vbar**2 - busbar**2 - 2 * (model.R @ -p + model.X @ -q_load) - correction
+        found = equilibrium(lure, w, tol=1e-12, max_iter=200)
+    np.testing.assert_allclose(found, x, rtol=0, atol=2e-3 * droop.limit.max())
+    z = lure.H @ found + lure.F @ w
+    np.testing.assert_allclose(np.sqrt(droop.vbar**2 - z), volts(x)[own], rtol=0, atol=1e-4)
