@@ -25,7 +25,7 @@ from gridsec.droop import Droop
 from gridsec.errors import FeederInvalid
 from gridsec.feeder import Feeder, LinDistFlow, common_paths
 from gridsec.newton import Nonlinearity, settle
-from gridsec.phases import ThreePhaseFeeder, lindist3flow, per_customer
+from gridsec.phases import CustomerFlow, ThreePhaseFeeder, lindist3flow, per_customer
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -199,7 +199,7 @@ def _reactances(feeder: Feeder | ThreePhaseFeeder, own: Ints) -> Floats:
 
 
 def known_input(  # noqa: PLR0917  # every argument is a term of chong2020 (19), in its order
-    model: LinDistFlow,
+    model: LinDistFlow | CustomerFlow,
     vbar: float,
     p: Floats,
     q: Floats,
@@ -214,7 +214,7 @@ def known_input(  # noqa: PLR0917  # every argument is a term of chong2020 (19),
     Parameters
     ----------
     model
-        From `lindistflow`.
+        From `lindistflow`, or from `per_customer` on three phases.
     vbar
         Reference voltage of the droop, pu.
     p, q : (…, N)

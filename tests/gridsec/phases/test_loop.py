@@ -13,7 +13,7 @@ from gridsec.arrays import Floats
 from gridsec.certificates import Certificate, reactance, small_gain, verify
 from gridsec.droop import Droop, fleet
 from gridsec.errors import DesignInfeasible
-from gridsec.lure import Lure, close_loop, equilibrium
+from gridsec.lure import Lure, close_loop, equilibrium, known_input
 from gridsec.phases import (
     ThreePhaseFeeder,
     lindist3flow,
@@ -157,7 +157,7 @@ def test_inverters_rest_where_the_asymmetric_power_flow_rests(sun: float, busbar
         q = np.bincount(own, weights=found, minlength=load.size) - q_load
         p_phase, q_phase = feeder.connections(-3 * p), feeder.connections(3 * q)
         correction = loss_correction(feeder, p_phase, q_phase, v0)[feeder.phase, feeder.at]
-        w = droop.vbar**2 - busbar**2 - 2 * (model.R @ -p + model.X @ -q_load) - correction
+        w = known_input(model, droop.vbar, -p, -q_load, busbar**2, correction)
         found = equilibrium(lure, w, tol=1e-12, max_iter=200)
     np.testing.assert_allclose(found, x, rtol=0, atol=2e-3 * droop.limit.max())
     z = lure.H @ found + lure.F @ w
