@@ -17,7 +17,7 @@ from gridsec.judge import Situation, decide
 from gridsec.online import Cause, Decision, Estimate, Explanation, Frame, Verdict
 from gridsec.sequential.conditional import judge
 from gridsec.sequential.design import SequentialDesign
-from gridsec.sequential.examine import Examined, suspicions
+from gridsec.sequential.examine import Examined
 from gridsec.sequential.state import SequentialState
 
 
@@ -71,7 +71,7 @@ def conclude(design: SequentialDesign, state: SequentialState, tick: Tick) -> tu
     live, beyond = judged & tick.live, score > threshold
     at = plant.feeder.bus[plant.meters]
     attack = np.where(trust.named & tick.live, tick.y - state.learned.bias - estimate.v2_bus[at], 0.0)
-    amounts = _amounts(design, state, tick.seen)
+    amounts = _amounts(state, tick.seen)
     settled = bool((tick.transient <= design.options.settled * threshold).all())
     said = decide(
         Situation(
@@ -188,13 +188,13 @@ def _way(design: SequentialDesign, explanation: Explanation) -> str:
     return " and ".join(parts) if parts else "nobody"
 
 
-def _amounts(design: SequentialDesign, state: SequentialState, seen: Examined) -> dict[int, float]:
+def _amounts(state: SequentialState, seen: Examined) -> dict[int, float]:
     """How much of each suspicion besides meters there is, by index of the book, pu.
 
     With prior variance s^2 and direction a the posterior mean is ``s^2 a^T Q m``.
     """
     out: dict[int, float] = {}
-    book = suspicions(design, state.doubts)
+    book = state.doubts.book
     for k, s in state.trust.accused:
         view, now = seen.views[s], state.fits[s]
         if view is not None:

@@ -15,10 +15,9 @@ from gridsec.arrays import Bools, Floats, Ints
 from gridsec.sequential.conditional import Fit, drop, judge
 from gridsec.sequential.decoder import Accused, Evidence
 from gridsec.sequential.design import SequentialDesign
-from gridsec.sequential.dictionary import Dictionary
 from gridsec.sequential.explain import Scale, Scales, Search, View, adapt, directions, view_of
 from gridsec.sequential.search import Explanation, Found, Solution
-from gridsec.sequential.state import Doubts, SequentialState, Trust
+from gridsec.sequential.state import SequentialState, Trust
 from gridsec.sequential.windows import Window
 
 
@@ -65,7 +64,7 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats) -> 
     after: list[Fit | None] = []
     found: dict[int, Found] = {}
     scales = Scales(design, prior, window, state.learned, model)
-    book = suspicions(design, state.doubts)
+    book = state.doubts.book
     for s, length in enumerate(design.lengths):
         before = fits[s]
         stale = before is None or bool((before.trusted & ~trust.trusted).any())
@@ -90,18 +89,6 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats) -> 
         views.append(view)
         after.append(now)
     return Examined(trust, tuple(after), tuple(views), found)
-
-
-def suspicions(design: SequentialDesign, doubts: Doubts) -> Dictionary:
-    """What else but meters can be wrong now: false powers are of the size of what is claimed.
-
-    Parameters
-    ----------
-    design, doubts
-        The design, and what the frame claims.
-    """
-    rest = design.book.std[design.customers :]
-    return replace(design.book, std=np.concatenate([doubts.claims, rest]))
 
 
 def ended(design: SequentialDesign, trust: Trust, seen: Examined, window: Window) -> Bools:

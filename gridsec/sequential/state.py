@@ -12,6 +12,7 @@ from gridsec.sequential.commission import Commission, Learned, Learning, fresh
 from gridsec.sequential.commission import renew as learn_anew
 from gridsec.sequential.conditional import Fit, Prior
 from gridsec.sequential.design import SequentialDesign
+from gridsec.sequential.dictionary import Dictionary
 from gridsec.sequential.kinds import Kinds
 from gridsec.sequential.kinds import empty as no_kinds
 from gridsec.sequential.repeats import forget as forget_calm
@@ -70,15 +71,16 @@ class Doubts:
         Whether there is a busbar voltage.
     prior
         What follows.
-    claims : (N,)
-        How large the customers say that their active powers are, rounded up, pu: what may be false.
+    book
+        What else but meters can be wrong: as that of the design, with false powers of the size of what the
+        customers claim, rounded up.
     """
 
     p: Floats
     q: Floats
     busbar: bool
     prior: Prior
-    claims: Floats
+    book: Dictionary
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -177,7 +179,7 @@ def init(
             np.zeros(m, dtype=np.bool_),
         ),
         fits=(None,) * s,
-        doubts=Doubts(one, one, True, design.prior, design.book.std[:customers]),
+        doubts=Doubts(one, one, True, design.prior, design.book),
         learning=known.learning,
         learned=known.learned,
         model_error=np.zeros(p),

@@ -14,6 +14,7 @@ from gridsec.sequential.commission import conclude as learn
 from gridsec.sequential.commission import gather, ripe
 from gridsec.sequential.conclude import Tick, conclude, unusable
 from gridsec.sequential.design import SequentialDesign
+from gridsec.sequential.dictionary import Dictionary
 from gridsec.sequential.drive import drive
 from gridsec.sequential.examine import Examined, ended, examine
 from gridsec.sequential.kinds import Kinds, describe, listen, suspicious
@@ -248,10 +249,10 @@ def _doubts(design: SequentialDesign, before: Doubts, frame: Frame, busbar: bool
             (frame.q_error, design.doubt.q, before.q),
         )
     )
-    claims = _claims(np.abs(frame.p), design.options.hidden_power, before.claims)
+    book = _claims(np.abs(frame.p), design.options.hidden_power, before.book)
     same = (new is old or np.array_equal(new, old) for new, old in ((p, before.p), (q, before.q)))
     if busbar == before.busbar and all(same):
-        return before if claims is before.claims else replace(before, claims=claims)
+        return before if book is before.book else replace(before, book=book)
     doubt = replace(
         design.doubt,
         p=np.where(p > 1.0, np.maximum(design.doubt.p, _EXACT) * p, design.doubt.p),
@@ -269,15 +270,17 @@ def _doubts(design: SequentialDesign, before: Doubts, frame: Frame, busbar: bool
             inverters=design.injections,
         )
     )
-    return Doubts(p, q, busbar, found, claims)
+    return Doubts(p, q, busbar, found, book)
 
 
-def _claims(power: Floats, least: float, old: Floats) -> Floats:
-    """Powers rounded up to powers of two, and kept while they are close to that."""
+def _claims(power: Floats, least: float, book: Dictionary) -> Dictionary:
+    """False powers as large as what is claimed, in powers of two, and kept while they are close to that."""
+    old = book.std[: power.size]
     fine = (power <= old) & ((old <= least) | (4.0 * power >= old))
     if fine.all():
-        return old
-    return np.where(fine, old, np.maximum(np.exp2(np.ceil(np.log2(np.maximum(power, least)))), least))
+        return book
+    new = np.where(fine, old, np.exp2(np.ceil(np.log2(np.maximum(power, least)))))
+    return replace(book, std=np.concatenate([np.maximum(new, least), book.std[power.size :]]))
 
 
 # Powers are known no better than this, pu.
