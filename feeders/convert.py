@@ -168,18 +168,18 @@ def convert(
     if problems:
         raise FeederInvalid([*problems, *(f"while converting: {note}" for note in notes)])
     write(tables, folder)
-    options = (
-        [f"--root {root!r}"] * bool(root)
-        + [f"--name {name}"] * bool(name)
-        + [f"--droop {droop}"] * bool(droop)
-    )
-    command = " ".join(
-        ["gridsec convert", source, f"data/feeders/{chosen}" if recipe else str(out), *options]
-    )
+    target = f"data/feeders/{chosen}" if recipe else str(out)
+    command = " ".join(["gridsec convert", source, target, *_options(root, name, droop)])
     about = recipe.about if recipe else "A converted network."
     text = feeder_source(tables, about=about, origin=origin, package=package, command=command, notes=notes)
     (folder / "SOURCE.md").write_text(text, encoding="utf-8", newline="\n")
     return notes
+
+
+def _options(root: str | None, name: str | None, droop: str | None) -> list[str]:
+    """Return the options of the command line that were given."""
+    given = ((f"--root {root!r}", root), (f"--name {name}", name), (f"--droop {droop}", droop))
+    return [text for text, value in given if value]
 
 
 def _seeded(make: Callable[[], Any]) -> Any:

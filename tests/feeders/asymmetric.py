@@ -85,5 +85,4 @@ def solve(
     result = PowerGridModel(parts).calculate_power_flow(
         symmetric=False, error_tolerance=1e-11, max_iterations=60
     )
-    found = [*names, "source"] if transformer is not None else names
-    return dict(zip(found, result[ComponentType.node]["u_pu"], strict=True))
+    return dict(zip([*names, "source"], result[ComponentType.node]["u_pu"], strict=False))
