@@ -126,6 +126,38 @@ def protect(
     _write(out, {"meters": found.meters, "attacks": found.attacks})
 
 
+def detectable(
+    feeder: Feeder = "simbench-lv-rural1",
+    *,
+    max_attacked: Annotated[int, typer.Option(help="How many meters lie together at most.", min=1)] = 2,
+    share: Annotated[float, typer.Option(help="Share of its peak that every load draws.", min=0.0)] = 0.5,
+    risk: Annotated[float, typer.Option(help="Probability left out of account, at one moment.")] = 1e-3,
+    trials: Annotated[int, typer.Option(help="Simulate so many lies of each size.", min=0)] = 0,
+    seed: Annotated[int, typer.Option(help="Chooses what is random in simulated lies.")] = 0,
+    journal: Journal = None,
+    out: Out = None,
+) -> None:
+    """The smallest lies that are surely named, the largest that stay unnoticed, and what they spoil; in V."""
+    from feeders.load import load
+    from feeders.studies.detectable import detectable as study
+    from feeders.studies.rehearsal import rehearse
+
+    site = load(feeder)
+    with _bar("lies of meters, errors of customers") as tell, _said():
+        found = study(site, max_attacked=max_attacked, share=share, risk=risk, journal=journal, progress=tell)
+    _show(f"Lies, V: each alone, and with {found.max_attacked - 1} more", found.meters)
+    _show(f"Errors of the voltage with {found.max_attacked} unnoticed liars, V", found.customers)
+    _write(out, {"meters": found.meters, "customers": found.customers})
+    if trials:
+        with _bar("simulated lies") as tell:
+            seen = rehearse(site, found, trials=trials, seed=seed, share=share, progress=tell)
+        console.out.print(
+            f"{seen.trials} lies up to the hidden size: {seen.hidden_named} led to a name\n"
+            f"{seen.trials} lies from the named size on: {seen.large_missed} missed, "
+            f"{seen.honest_named} with an honest meter named"
+        )
+
+
 def _unknowns(names: Sequence[str], feeder: str) -> str:
     who = ", ".join(names) if names else "nobody"
     return escape(f"{feeder}: powers unknown of {who}")

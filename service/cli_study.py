@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 app = typer.Typer(no_args_is_help=True, help="Study feeders and estimators.")
 app.command("redundancy")(cli_plan.redundancy)
 app.command("protect")(cli_plan.protect)
+app.command("detectable")(cli_plan.detectable)
 
 
 @app.callback()

@@ -71,3 +71,14 @@ def test_an_infeasible_protection_is_an_error(
     code, _, told = run(monkeypatch, capsys, "protect", "--goal", "all")
     assert code == 2
     assert "expected one of identify, notice, bound" in " ".join(told.replace("│", " ").split())
+
+
+def test_detectable_tells_sizes_and_keeps_its_word(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    some = ("--max-attacked", "1", "--trials", "3", "--out", str(tmp_path / "out"))
+    code, told, _ = run(monkeypatch, capsys, "detectable", "cigre-lv", *some)
+    assert code == 0
+    assert "3 lies up to the hidden size: 0 led to a name" in told
+    assert "3 lies from the named size on: 0 missed, 0 with an honest meter named" in told
+    assert len(pd.read_csv(tmp_path / "out" / "meters.csv")) == 6

@@ -1,0 +1,177 @@
+"""Whether the sequential monitor keeps what `detectable` promises: many short simulated attacks on itself.
+
+Every trial draws errors of loads, meters and busbar anew, Gaussian in even trials and as bounded as their
+standard deviations allow in odd ones, solves the feeder with its inverters at rest, and lets the monitor
+watch a few honest frames and then the lie.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from feeders.studies.detectable import Detectable, monitor_rule
+from feeders.studies.journal import Progress
+from feeders.studies.operating import SHARE, squared
+from gridsec import sequential
+from gridsec.arrays import Bools, Floats
+from gridsec.feeder import bus_voltages
+from gridsec.online import Frame
+from gridsec.studies.quiet import Rule, largest_shift
+
+if TYPE_CHECKING:
+    from feeders.load import Site
+
+__all__ = ["Rehearsal", "rehearse"]
+
+_HONEST, _LYING = 4, 16
+"""Frames before and after a lie begins."""
+_SETTLING = 25
+"""Rounds in which inverters come to rest; their loop gain is below one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rehearsal:
+    """What became of lies of the promised sizes.
+
+    Attributes
+    ----------
+    trials
+        How many of each kind.
+    hidden_named
+        Trials with a lie of at most the hidden size after which somebody was named.
+    large_missed
+        Trials with a lie of at least the named size in which its meter was not named.
+    honest_named
+        Of the latter, those in which a meter that did not lie was named.
+    """
+
+    trials: int
+    hidden_named: int
+    large_missed: int
+    honest_named: int
+
+
+def rehearse(
+    site: Site,
+    found: Detectable,
+    *,
+    trials: int,
+    seed: int = 0,
+    share: float = SHARE,
+    progress: Progress | None = None,
+) -> Rehearsal:
+    """Let the monitor watch lies at the limits that were found, by M meters and by one.
+
+    Hidden lies are the worst of their size: those of the mixed-integer program. Large ones are told by one
+    meter beyond its size; in every second trial M - 1 others lie as well, by anything up to twice of that.
+
+    Parameters
+    ----------
+    site, found
+        The feeder, and what was found for it.
+    trials
+        How many of each kind.
+    seed
+        Chooses everything random.
+    share
+        As `found` was made with.
+    progress
+        Told how many trials are done.
+    """
+    given = monitor_rule(site, risk=found.risk, share=share)
+    p = site.meters.size
+    worst = [
+        largest_shift(given, np.eye(p)[j], found.max_attacked, seen=False, must=j).lies for j in range(p)
+    ]
+    caught, missed, wronged = 0, 0, 0
+    for k in range(trials):
+        if progress is not None:
+            progress(k, trials)
+        rng = np.random.default_rng([seed, k])
+        sign, j = rng.choice([-1.0, 1.0]), int(rng.integers(p))
+        caught += int(_named(given, site, share, rng, sign * rng.uniform(0.5, 1.0) * worst[j]).any())
+        lies = _large(site, found, rng, j, together=k % 2 == 0)
+        named = _named(given, site, share, rng, sign * lies)
+        missed += int(not named[j])
+        wronged += int((named & (lies == 0.0)).any())
+    if progress is not None:
+        progress(trials, trials)
+    return Rehearsal(trials, caught, missed, wronged)
+
+
+def _large(site: Site, found: Detectable, rng: np.random.Generator, j: int, *, together: bool) -> Floats:
+    """A lie of meter j beyond its named size, and others in collusion; squared pu."""
+    column = "named" if together else "named_alone"
+    sizes = np.array([squared(site, volt) for volt in found.meters[column]])
+    lies = np.zeros(sizes.size)
+    if together and found.max_attacked > 1:
+        others = rng.choice(np.delete(np.arange(sizes.size), j), found.max_attacked - 1, replace=False)
+        lies[others] = rng.uniform(-2.0, 2.0, others.size) * sizes[others]
+    lies[j] = rng.uniform(1.0, 1.2) * sizes[j]
+    return lies
+
+
+def _named(given: Rule, site: Site, share: float, rng: np.random.Generator, lies: Floats) -> Bools:
+    """Who is named in one trial."""
+    design = given.design
+    frame = _world(given, site, share, rng)
+    state = sequential.init(design, 0.0)
+    named = np.zeros(lies.size, dtype=np.bool_)
+    for tick in range(_HONEST + _LYING):
+        state, _, verdict = sequential.step(
+            design, state, frame(tick, lies if tick >= _HONEST else 0.0 * lies)
+        )
+        named |= verdict.suspects
+    return named
+
+
+def _world(given: Rule, site: Site, share: float, rng: np.random.Generator) -> Callable[[int, Floats], Frame]:
+    """Frames of a feeder at rest whose true powers, busbar and meters are off by fixed errors."""
+    design, doubt, loads = given.design, given.design.doubt, site.loads
+    accuracy, own = site.accuracy, site.droop.customer
+    draw = _bounded if rng.integers(2) else _gaussian
+    p = -share * loads.load_peak
+    q = 0.5 * (loads.tan_min + loads.tan_max) * p
+    off_p, off_q = (
+        std * (np.sqrt(1.0 - common) * draw(rng, std.size) + np.sqrt(common) * draw(rng, 1))
+        for std, common in ((doubt.p, doubt.common_p), (doubt.q, doubt.common_q))
+    )
+    x = np.zeros(own.size)
+    for _ in range(_SETTLING):
+        injected = q + off_q + np.bincount(own, weights=x, minlength=q.size)
+        v2 = bus_voltages(site.feeder, p + off_p, injected, 1.0, steps=3)[site.feeder.bus]
+        x = 0.5 * x + 0.5 * site.droop(site.droop.vbar**2 - v2[own])
+    v = np.sqrt(v2[site.meters]) * (1.0 + accuracy.class_fraction * rng.uniform(-1.0, 1.0, site.meters.size))
+    busbar = 1.0 + design.busbar / 2.0 * float(draw(rng, 1)[0])
+    root3 = np.sqrt(3.0)
+
+    def frame(tick: int, lies: Floats) -> Frame:
+        reading = v + accuracy.jitter * rng.standard_normal(v.size)
+        step = np.maximum(accuracy.resolution, 1e-9)
+        reading = np.round(reading / step) * step
+        return Frame(
+            t=(tick + 1) * design.step_s,
+            y=reading**2 + lies,
+            seen=np.ones(v.size, dtype=np.bool_),
+            v0_squared=busbar**2,
+            p=p,
+            p_error=root3 * doubt.p,
+            q=q,
+            q_error=root3 * doubt.q,
+            q_net=np.full(q.size, np.nan),
+            q_net_error=np.zeros(q.size),
+        )
+
+    return frame
+
+
+def _gaussian(rng: np.random.Generator, size: int) -> Floats:
+    return rng.standard_normal(size)
+
+
+def _bounded(rng: np.random.Generator, size: int) -> Floats:
+    return np.asarray(np.sqrt(3.0) * rng.uniform(-1.0, 1.0, size))

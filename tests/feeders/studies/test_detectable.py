@@ -1,0 +1,74 @@
+"""Sizes of lies on real feeders, and the monitor itself watching lies of these sizes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from feeders.load import load
+from feeders.studies.detectable import Detectable, detectable
+from feeders.studies.rehearsal import Rehearsal, rehearse
+
+CIGRE = load("cigre-lv")
+RURAL = load("simbench-lv-rural1")
+
+
+@pytest.fixture(scope="module")
+def cigre() -> Detectable:
+    return detectable(CIGRE, max_attacked=2)
+
+
+def test_sizes_are_in_order(cigre: Detectable) -> None:
+    table = cigre.meters
+    assert len(table) == 6
+    for suffix in ("_alone", ""):
+        assert (table[f"hidden{suffix}"] > 0.0).all()
+        assert (table[f"hidden{suffix}"] < table[f"noticed{suffix}"]).all()
+        assert (table[f"noticed{suffix}"] <= table[f"named{suffix}"]).all()
+        assert (table[f"fits{suffix}"] <= table[f"identified{suffix}"] + 1e-6).all()
+    for name in ("hidden", "noticed", "named", "fits", "identified"):
+        assert (table[f"{name}_alone"] <= table[name] * (1 + 1e-4)).all()
+    assert (cigre.customers[["error", "error_fits"]] > 0.0).all(axis=None)
+
+
+def test_the_monitor_keeps_what_is_promised_on_a_small_feeder(cigre: Detectable) -> None:
+    assert rehearse(CIGRE, cigre, trials=40, seed=3) == Rehearsal(40, 0, 0, 0)
+
+
+@pytest.mark.slow
+def test_the_monitor_keeps_what_is_promised() -> None:
+    found = detectable(RURAL, max_attacked=2)
+    assert rehearse(RURAL, found, trials=300, seed=1) == Rehearsal(300, 0, 0, 0)
+
+
+def test_lies_half_as_large_as_the_noticed_are_mostly_not_named(cigre: Detectable) -> None:
+    """The rehearsal can fail: with sizes that are too small, lies are missed."""
+    table = cigre.meters.copy()
+    table["named"] = table["named_alone"] = 0.5 * table["noticed_alone"]
+    wrong = Detectable(cigre.feeder, cigre.digest, 1, cigre.risk, table, cigre.customers)
+    assert rehearse(CIGRE, wrong, trials=10, seed=3).large_missed > 5
+
+
+def test_an_interrupted_study_goes_on(cigre: Detectable, tmp_path: Path) -> None:
+    class Interrupted(Exception):
+        pass
+
+    def interrupt(done: int, total: int) -> None:
+        if done > total // 2:
+            raise Interrupted
+
+    journal = tmp_path / "journal"
+    with pytest.raises(Interrupted):
+        detectable(CIGRE, max_attacked=2, journal=journal, progress=interrupt)
+    again = detectable(CIGRE, max_attacked=2, journal=journal)
+    pd.testing.assert_frame_equal(again.meters, cigre.meters)
+    pd.testing.assert_frame_equal(again.customers, cigre.customers)
+
+
+def test_arguments_are_checked() -> None:
+    with pytest.raises(ValueError, match="max_attacked is 0"):
+        detectable(CIGRE, max_attacked=0)
+    with pytest.raises(ValueError, match="risk is 1"):
+        detectable(CIGRE, max_attacked=1, risk=1.0)
