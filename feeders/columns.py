@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Final
 
+from feeders import outside
+
 NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 WORDS_NO_NUMBER = {"nan", "inf", "+inf", "-inf", "infinity", "-infinity", "null", "none", "na", "n/a", "-"}
 NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
@@ -165,7 +167,7 @@ CUSTOMER_COLUMNS: tuple[Column, ...] = (
     ),
 )
 
-ESTIMATORS = (
+OWN_ESTIMATORS = (
     "sequential",
     "exact-bank",
     "exact-bank-lmi",
@@ -178,6 +180,7 @@ ESTIMATORS = (
     "set-search",
     "unknown-input",
 )
+ESTIMATORS = (*OWN_ESTIMATORS, *outside.names(OWN_ESTIMATORS))
 SUSPICIONS = ("voltage", "impedance", "ratio", "rating", "load", "class")
 
 META_COLUMNS: dict[str, tuple[Column, ...]] = {

@@ -19,6 +19,7 @@ import numpy as np
 from feeders.campaign import NoSuchAttack
 from feeders.estimators import FAMILIES, Watcher, choose, design
 from feeders.lies import Lie, Trick
+from feeders.outside import EstimatorUnusable
 from feeders.trials import LoadError, Meters, Outcome, Trial, frames, judge
 from feeders.variation import Variation
 from gridsec.arrays import Floats
@@ -252,7 +253,7 @@ def _design(site: Site, name: str, plan: Plan, tell: Callable[[str], None]) -> W
             workers=plan.workers,
             progress=lambda done, total: tell(f"design of {name}: {done} of {total}"),
         )
-    except (NotObservable, DesignInfeasible) as error:
+    except (NotObservable, DesignInfeasible, EstimatorUnusable) as error:
         return str(error)
 
 

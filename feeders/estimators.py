@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
 
+from feeders import outside
 from feeders.columns import ESTIMATORS
 from feeders.design_cache import bank_gains
 from feeders.doubts import load_doubt
@@ -381,74 +381,95 @@ def _unknown_input(site: Site, _: Job) -> unknown_input.UnknownInputDesign:
     return unknown_input.design(plant(site), max_attacked=settings.max_attacked, step_s=settings.tick_s)
 
 
-FAMILIES: Final[Mapping[str, Family]] = MappingProxyType(
-    {
-        family.name: family
-        for family in (
-            Family(
-                SEQUENTIAL,
-                "one switched observer, correlated loads, evidence on several time scales",
-                _sequential,
-                sequential.init,
-                sequential.step,
-                lambda d: int(d.observers),
-                _certificate,
-                lambda d: int(d.most),
-                Learner(
-                    needed_s=lambda d: float(d.options.commission_s),
-                    init=lambda d, t, known: sequential.init(d, t, known.learned, known.learning),
-                    commission=lambda state: state.commission,
-                    renew=sequential.renew,
-                    read=sequential.from_arrays,
-                ),
+class Families(Mapping[str, Family]):
+    """Our families, and those of other packages, each loaded when it is first asked for.
+
+    Parameters
+    ----------
+    own
+        Ours.
+    """
+
+    def __init__(self, own: Iterable[Family]) -> None:
+        self._known = {family.name: family for family in own}
+
+    def __getitem__(self, name: str) -> Family:
+        if name not in self._known and name in ESTIMATORS:
+            self._known[name] = outside.load(name, Family)
+        return self._known[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(ESTIMATORS)
+
+    def __len__(self) -> int:
+        return len(ESTIMATORS)
+
+
+FAMILIES: Final = Families(
+    (
+        Family(
+            SEQUENTIAL,
+            "one switched observer, correlated loads, evidence on several time scales",
+            _sequential,
+            sequential.init,
+            sequential.step,
+            lambda d: int(d.observers),
+            _certificate,
+            lambda d: int(d.most),
+            Learner(
+                needed_s=lambda d: float(d.options.commission_s),
+                init=lambda d, t, known: sequential.init(d, t, known.learned, known.learning),
+                commission=lambda state: state.commission,
+                renew=sequential.renew,
+                read=sequential.from_arrays,
             ),
-            _bank(DIRECT, "banks of circle-criterion observers, direct injection (chong2020)", _direct_bank),
-            _bank(LMI, "the same banks, gains by matrix inequality (chong2020)", _lmi_bank),
-            Family(
-                "windowed-bank",
-                "windows of consistency of discrete-time observers (yang2019)",
-                _windowed,
-                windowed.init,
-                windowed.step,
-                lambda d: int(d.observers),
-                lambda d: _certificate(d.chain),
-            ),
-            _ticks(
-                "weighted-least-squares",
-                "chi-square test and largest normalised residual (lee2018, 2)",
-                decoders.least_squares,
-            ),
-            _ticks("l0-decoder", "the smallest set that explains a tick (lee2018, 2)", decoders.fewest),
-            _ticks("basis-pursuit", "the attack of smallest l1 norm (lee2018, 2)", decoders.pursue),
-            _ticks("matching-pursuit", "orthogonal matching pursuit (lee2018, 2)", decoders.match),
-            Family(
-                "partial-observers",
-                "one observer per meter, l0 decoding of their stack (lee2018, 4)",
-                _partial,
-                partial.init,
-                partial.step,
-                lambda d: int(d.observers),
-                lambda d: _certificate(d.model),
-            ),
-            Family(
-                "set-search",
-                "one switched observer, a new set when its test fails (kim2018, lee2018, 5)",
-                _set_search,
-                set_search.init,
-                set_search.step,
-                lambda d: int(d.observers),
-                _certificate,
-            ),
-            Family(
-                "unknown-input",
-                "meters and inverters at once; suspected injections are unknown inputs (yang2021)",
-                _unknown_input,
-                unknown_input.init,
-                unknown_input.step,
-                lambda d: int(d.observers),
-                lambda d: f"intervals of honest inverters; {len(d.missing)} pairs have no observer",
-            ),
-        )
-    }
+        ),
+        _bank(DIRECT, "banks of circle-criterion observers, direct injection (chong2020)", _direct_bank),
+        _bank(LMI, "the same banks, gains by matrix inequality (chong2020)", _lmi_bank),
+        Family(
+            "windowed-bank",
+            "windows of consistency of discrete-time observers (yang2019)",
+            _windowed,
+            windowed.init,
+            windowed.step,
+            lambda d: int(d.observers),
+            lambda d: _certificate(d.chain),
+        ),
+        _ticks(
+            "weighted-least-squares",
+            "chi-square test and largest normalised residual (lee2018, 2)",
+            decoders.least_squares,
+        ),
+        _ticks("l0-decoder", "the smallest set that explains a tick (lee2018, 2)", decoders.fewest),
+        _ticks("basis-pursuit", "the attack of smallest l1 norm (lee2018, 2)", decoders.pursue),
+        _ticks("matching-pursuit", "orthogonal matching pursuit (lee2018, 2)", decoders.match),
+        Family(
+            "partial-observers",
+            "one observer per meter, l0 decoding of their stack (lee2018, 4)",
+            _partial,
+            partial.init,
+            partial.step,
+            lambda d: int(d.observers),
+            lambda d: _certificate(d.model),
+        ),
+        Family(
+            "set-search",
+            "one switched observer, a new set when its test fails (kim2018, lee2018, 5)",
+            _set_search,
+            set_search.init,
+            set_search.step,
+            lambda d: int(d.observers),
+            _certificate,
+        ),
+        Family(
+            "unknown-input",
+            "meters and inverters at once; suspected injections are unknown inputs (yang2021)",
+            _unknown_input,
+            unknown_input.init,
+            unknown_input.step,
+            lambda d: int(d.observers),
+            lambda d: f"intervals of honest inverters; {len(d.missing)} pairs have no observer",
+        ),
+    )
 )
 """All families by name; the same names as `feeders.columns.ESTIMATORS`."""

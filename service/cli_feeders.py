@@ -58,10 +58,15 @@ def feeders_show(feeder: Feeder) -> None:
 def feeders_estimators() -> None:
     """List the estimators a feeder can be watched with."""
     from feeders.estimators import FAMILIES
+    from feeders.outside import EstimatorUnusable
 
     table = Table("name", "what it is")
-    for family in FAMILIES.values():
-        table.add_row(family.name, escape(family.summary))
+    for name in FAMILIES:
+        try:
+            what = FAMILIES[name].summary
+        except EstimatorUnusable as problem:
+            what = str(problem)
+        table.add_row(name, escape(what))
     out.print(table)
 
 

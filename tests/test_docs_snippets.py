@@ -4,17 +4,30 @@ from __future__ import annotations
 
 import ast
 import io
+import os
 import re
+import subprocess
+import sys
+import tomllib
 import warnings
 from contextlib import redirect_stdout
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
+from feeders.estimators import Job
+from feeders.load import load
+from gridsec.online import Decision
+from tests.acceptance.live import serve
+from tests.feeders.test_bad_frames import BEFORE, frames, put
+
 DOCS = Path(__file__).resolve().parents[1] / "docs"
-PAGES = ("your-own-system.md",)
 BLOCK = re.compile(r"```python\n(.*?)```(?:\n```text\n(.*?)```)?", re.DOTALL)
 LINES, WIDTH = 10, 110
+GRIDSEC = "from service.cli import main; main()"
 
 
 def blocks(page: str) -> list[tuple[str, str, str | None]]:
@@ -24,11 +37,8 @@ def blocks(page: str) -> list[tuple[str, str, str | None]]:
     return [(re.findall(r"^##+ (.*)$", text[:at], re.MULTILINE)[-1], code, out) for at, code, out in found]
 
 
-EVERY = [
-    pytest.param(code, out, id=f"{page.removesuffix('.md')}: {head}")
-    for page in PAGES
-    for head, code, out in blocks(page)
-]
+EVERY = [pytest.param(code, out, id=head) for head, code, out in blocks("your-own-system.md")]
+MODULE, WATCH = blocks("your-own-estimator.md")
 
 
 @pytest.mark.parametrize(("code", "printed"), EVERY)
@@ -36,7 +46,7 @@ def test_a_block_prints_what_stands_below_it(code: str, printed: str | None) -> 
     out = io.StringIO()
     with warnings.catch_warnings(), redirect_stdout(out):
         warnings.simplefilter("error")
-        exec(compile(code, "block", "exec"), {"__name__": "block"})
+        exec(compile(code, "block", "exec", dont_inherit=True), {"__name__": "block"})
     assert out.getvalue() == printed
 
 
@@ -55,3 +65,76 @@ def test_every_paper_and_method_has_a_block() -> None:
     for name in ("lee2018", "kim2018", "yang2019", "yang2021", "chong2020", "Algorithm 4.1", "Algorithm 4.2"):
         assert name in text
     assert len(blocks("your-own-system.md")) == text.count("\n### ")
+
+
+@pytest.fixture
+def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The estimator of the page as an installed package with its entry point, for new processes."""
+    (table,) = re.findall(r"```toml\n(.*?)```", (DOCS / "your-own-estimator.md").read_text(), re.DOTALL)
+    point = tomllib.loads(table)["project"]["entry-points"]["gridsec.estimators"]
+    (tmp_path / "neighbours.py").write_text(MODULE[1])
+    about = tmp_path / "neighbours-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: neighbours\nVersion: 1.0\n")
+    lines = [f"{name} = {where}" for name, where in point.items()]
+    (about / "entry_points.txt").write_text("\n".join(["[gridsec.estimators]", *lines, ""]))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    return tmp_path
+
+
+def run(*command: str) -> str:
+    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "COLUMNS": "200"}
+    done = subprocess.run(
+        [sys.executable, "-W", "error", *command],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+        env=environment,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.usefixtures("installed")
+def test_the_estimator_watches_a_simulated_feeder_as_the_page_says() -> None:
+    assert run("-c", WATCH[1]) == WATCH[2]
+
+
+@pytest.mark.usefixtures("installed")
+def test_the_estimator_is_compared_with_ours() -> None:
+    told = run("-c", GRIDSEC, "feeders", "estimators")
+    assert re.search(r"neighbours +│ every meter against the median", told)
+    quick = ("--seeds", "1", "--duration", "80", "--max-attacked", "1", "--case", "bias")
+    told = run("-c", GRIDSEC, "study", "compare", "simbench-lv-rural1", "--family", "neighbours", *quick)
+    (row,) = (line for line in told.splitlines() if line.startswith("│ neighbours "))
+    assert row.split("│")[2].strip().endswith("of 1")
+
+
+def test_the_estimator_serves(installed: Path) -> None:
+    with serve("simbench-lv-rural1", installed, "--estimator", "neighbours") as live:
+        assert live.get("/api/v1/feeders/simbench-lv-rural1/commissioning")["estimator"] == "neighbours"
+
+
+def test_the_estimator_owes_what_the_page_says() -> None:
+    space: dict[str, Any] = {"__name__": "neighbours"}
+    exec(compile(MODULE[1], "neighbours", "exec", dont_inherit=True), space)
+    family = space["FAMILY"]
+    made, t = family.design(load("simbench-lv-rural1"), Job()), frames()[0].t - 1.0
+    last = frames()[-1]
+    silent = replace(last, y=np.full(last.y.shape, np.nan), seen=np.zeros(last.seen.shape, dtype=np.bool_))
+    lost = [silent, replace(last, v0_squared=np.nan)]
+    lost += [put(last, name, value) for name in "pq" for value in (np.nan, np.inf, -np.inf, 1e300)]
+    for bad in (*lost, put(last, "y", 1e300), put(last, "y", -1.0)):
+        state = family.init(made, t)
+        for frame in frames()[:BEFORE]:
+            state, estimate, verdict = family.step(made, state, frame)
+        assert verdict.decision is Decision.CLEAN
+        for _ in range(4):
+            state, estimate, verdict = family.step(made, state, bad)
+            assert verdict.decision is not Decision.CLEAN
+            for numbers in (estimate.v2, estimate.bound, estimate.v2_bus, estimate.x, verdict.threshold):
+                assert np.isfinite(numbers).all()
+        assert verdict.decision is (
+            Decision.UNDECIDED if any(bad is one for one in lost) else Decision.ATTACKED
+        )
