@@ -145,8 +145,10 @@ def detectable(
     site = load(feeder)
     with _bar("lies of meters, errors of customers") as tell, _said():
         found = study(site, max_attacked=max_attacked, share=share, risk=risk, journal=journal, progress=tell)
-    _show(f"Lies, V: each alone, and with {found.max_attacked - 1} more", found.meters)
-    _show(f"Errors of the voltage with {found.max_attacked} unnoticed liars, V", found.customers)
+    more = found.max_attacked - 1
+    places = ["customer", "bus"]
+    _show(f"Lies, V: each alone, and with {more} more", found.meters.drop(columns=places).round(2))
+    _show(f"Errors of the voltage with {more + 1} unnoticed liars, V", found.customers.round(2))
     _write(out, {"meters": found.meters, "customers": found.customers})
     if trials:
         with _bar("simulated lies") as tell:

@@ -172,26 +172,33 @@ def largest_shift(
     upper = np.ones(p) if honest is None else (~honest).astype(np.float64)
     if must is not None:
         least[must] = upper[must]
-    gain = along * most
+    reach = most / _PART
+    gain = along * reach
     unit = float(np.abs(gain).max()) or 1.0
-    none = np.zeros((p, p))
+    one = np.eye(p)
     found = milp(
         np.concatenate([-gain / unit, np.zeros(p)]),
         constraints=[
-            LinearConstraint(np.hstack([rows * most, np.zeros((s * p, p))]), lb=-1.0, ub=1.0),
-            LinearConstraint(np.hstack([np.eye(p), -np.eye(p)]), ub=0.0),
-            LinearConstraint(np.hstack([-np.eye(p), -np.eye(p)]), ub=0.0),
-            LinearConstraint(np.hstack([none[:1], np.ones((1, p))]), ub=float(liars)),
+            LinearConstraint(np.hstack([rows * reach, np.zeros((s * p, p))]), lb=-1.0, ub=1.0),
+            LinearConstraint(np.hstack([one, -_PART * one]), ub=0.0),
+            LinearConstraint(np.hstack([-one, -_PART * one]), ub=0.0),
+            LinearConstraint(np.concatenate([np.zeros(p), np.ones(p)])[None, :], ub=float(liars)),
         ],
-        bounds=Bounds(np.concatenate([-np.ones(p), least]), np.concatenate([np.ones(p), upper])),
-        integrality=np.concatenate([np.zeros(p, dtype=np.intp), np.ones(p, dtype=np.intp)]),
+        bounds=Bounds(
+            np.concatenate([np.full(p, -_PART), least]), np.concatenate([np.full(p, _PART), upper])
+        ),
+        integrality=np.repeat(np.arange(2), p),
         options={"mip_rel_gap": 1e-6},
     )
     if found.x is None:
         raise DesignInfeasible("largest lie that the monitor does not see", found.message)
-    lies = np.where(found.x[p:] > 0.5, found.x[:p] * most, 0.0)
+    lies = np.where(found.x[p:] > 0.5, found.x[:p] * reach, 0.0)
     reached = float(along @ lies)
     return Shift(reached, max(reached, float(-found.mip_dual_bound) * unit), lies)
+
+
+# HiGHS takes binaries within 1e-6 for integers: in larger units, what that frees is within its tolerance.
+_PART = 0.1
 
 
 def named_size(given: Rule, meter: int, liars: int, *, claims: Floats) -> float:

@@ -95,9 +95,9 @@ def test_hidden_lies_are_within_the_limits_and_noticeable_ones_are_not(seed: int
         assert (np.abs(offsets(given, m, s)) > given.limit[s]).any(axis=1).all()
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(4))
 def test_no_explanation_that_believes_a_large_liar_is_a_rival(seed: int) -> None:
-    """All sets of accused meters, and a loosened power with each, in 20 draws of errors and of other lies."""
+    """All sets of accused meters, and a loosened power with each, in ten draws of errors and of other lies."""
     given, rng = made(seed), np.random.default_rng(seed)
     monitor, p = given.design, given.model.size
     claims = np.full(monitor.customers, monitor.options.hidden_power)
@@ -106,7 +106,7 @@ def test_no_explanation_that_believes_a_large_liar_is_a_rival(seed: int) -> None
     like = 2.0 * np.log(monitor.options.like)
     for k in range(p):
         size = named_size(given, k, 2, claims=claims)
-        for _ in range(20):
+        for _ in range(10):
             other = int(rng.choice(np.delete(np.arange(p), k)))
             lies = np.zeros(p)
             lies[other] = rng.uniform(-3.0, 3.0) * size
