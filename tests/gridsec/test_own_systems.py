@@ -15,7 +15,7 @@ from gridsec.lmi.sampled import advance as advance_discrete
 from gridsec.lure import Lure, advance
 from gridsec.observers import high_gain
 from gridsec.observers.high_gain import groups, nearest
-from gridsec.online import Decision
+from gridsec.online import Cause, Decision
 from tests.gridsec.observers.bent import bent, truth
 
 A, C = [[0, 1], [0, -1]], [[1, 0], [1, 0], [1, 0], [1, 1], [1, 1]]
@@ -126,3 +126,24 @@ def test_without_inverses_the_nearest_points_are_taken_for_all_sets_and_the_whol
 def test_too_few_sensors_are_refused_without_inverses_too() -> None:
     with pytest.raises(NotObservable, match="more than twice"):
         high_gain.design(bent(), theta=12.0, noise=2e-4, max_attacked=2, u_low=-0.4, u_high=0.4, step_s=0.02)
+
+
+def test_a_sensor_that_nothing_has_tested_is_not_called_clean() -> None:
+    model = bent()
+    sets = [nearest(model, group, accept=1e-4) for group in groups(3, 1)]
+    made = high_gain.design(
+        model, sets, theta=12.0, noise=2e-4, max_attacked=1, u_low=-0.4, u_high=0.4, step_s=0.02
+    )
+    t, x, u = truth(8.0)
+    y = x[:, [0, 0, 0]] + np.outer(t > 6.0, [0.5, 0.0, 0.0])
+    state, answers = high_gain.init(made, 0.0), []
+    for k in range(1, len(t)):
+        state, answer = high_gain.step(made, state, y[k], u[k : k + 1], ALL[:3], 0.02)
+        answers.append(answer)
+    # Sensors 1 and 2 are in use from the beginning, so that the lie of sensor 0 is in no residual.
+    assert all(one.decision is Decision.UNDECIDED for one in answers)
+    assert answers[-1].cause is Cause.AMBIGUOUS
+    assert answers[-1].x == pytest.approx(x[-1], abs=0.02)
+    # Nothing else is heard: what is heard is tested.
+    state, answer = high_gain.step(made, state, y[-1], u[-1:], np.array([False, True, True]), 0.02)
+    assert answer.decision is Decision.CLEAN

@@ -46,7 +46,8 @@ class HighGainDesign:
     inverses
         Psi of the sets Lambda(1), …, Lambda(s), in the order of the search.
     whole
-        Psi of all sensors, for the test of Corollary 1; None: no such test.
+        Psi of all sensors, for the test of Corollary 1; None: no such test, and no CLEAN unless `lowest`
+        is known.
     theta : (p,)
         High-gain parameters, 1/s.
     decays
@@ -391,11 +392,13 @@ def _judge(  # noqa: PLR0917  # one place that sees the whole state
     nothing = np.full(design.system.n, np.nan)
     passed = trial is not None and trial.passed
     # Lemma 1: an honest observer never reaches its limit.
-    bound, named = np.inf, large.copy()
+    bound, named, tested = np.inf, large.copy(), trusted
     if trial is not None and passed:
         bound = kappa_detect(design.inverses[sigma].factor, design.lowest) * trial.delta
         named |= _unhealthy(design, z, trial.x, delta, bound) & live
-        if design.whole is not None and live.all():
+        whole = design.whole is not None and bool(live.all())
+        tested = live if whole or np.isfinite(bound) else trusted
+        if design.whole is not None and whole:
             alarm |= not _test(design, design.whole, z, delta).passed
     settled = bool(np.all(delta[live] <= _rest(design)[live]))
     decision, cause, reason = verdict(
@@ -404,6 +407,7 @@ def _judge(  # noqa: PLR0917  # one place that sees the whole state
         passed=None if trial is None else trial.passed,
         alarm=alarm or bool(named.any()),
         settled=settled,
+        untested=int(np.count_nonzero(live & ~tested)),
         search=design.search,
     )
     guessed = live & ~trusted if alarm and passed and not named.any() else named

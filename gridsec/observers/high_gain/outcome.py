@@ -66,6 +66,7 @@ def verdict(
     passed: bool | None,
     alarm: bool,
     settled: bool,
+    untested: int,
     search: Literal["all", "one"],
 ) -> tuple[Decision, Cause, str]:
     """Decision, its cause, and one sentence.
@@ -82,6 +83,8 @@ def verdict(
         Whether some test failed or some sensor is named.
     settled
         Whether the bounds of all observers that are heard have come to rest.
+    untested
+        Number of sensors with a reading that no test has looked at.
     search
         As in the design: with "one", other sets may still pass later.
     """
@@ -96,4 +99,7 @@ def verdict(
         return Decision.ATTACKED, Cause.RESIDUALS, "estimates disagree by more than honest sensors can"
     if not settled:
         return Decision.UNDECIDED, Cause.SETTLING, "the observers have not settled yet"
+    if untested:
+        reason = f"the sensors in use agree within their bounds; {untested} more were not tested"
+        return Decision.UNDECIDED, Cause.AMBIGUOUS, reason
     return Decision.CLEAN, Cause.AGREEMENT, "all sensors agree within their bounds"
