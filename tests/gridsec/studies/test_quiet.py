@@ -97,7 +97,7 @@ def test_hidden_lies_are_within_the_limits_and_noticeable_ones_are_not(seed: int
 
 @pytest.mark.parametrize("seed", range(4))
 def test_no_explanation_that_believes_a_large_liar_is_a_rival(seed: int) -> None:
-    """All sets of accused meters, and a loosened power with each, in ten draws of errors and of other lies."""
+    """All sets of accused meters, a loosened power with each, in ten draws of errors and of other lies."""
     given, rng = made(seed), np.random.default_rng(seed)
     monitor, p = given.design, given.model.size
     claims = np.full(monitor.customers, monitor.options.hidden_power)
