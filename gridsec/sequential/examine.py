@@ -43,6 +43,8 @@ class Examined:
 
 # A long scale hardly changes from tick to tick: it is looked at this many times per length.
 _LOOKS = 8
+# Ticks after which it is asked again who could be honest of those who could be before.
+_AGAIN = 8
 
 
 def examine(design: SequentialDesign, state: SequentialState, model: Floats) -> Examined:
@@ -68,7 +70,7 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats) -> 
     for s, length in enumerate(design.lengths):
         before = fits[s]
         stale = before is None or bool((before.trusted & ~trust.trusted).any())
-        if tick % max(1, round(length / _LOOKS)) and not stale:
+        if tick % _every(length) and not stale:
             views.append(None)
             after.append(before)
             continue
@@ -126,17 +128,25 @@ def ended(design: SequentialDesign, trust: Trust, seen: Examined, window: Window
 def _due(design: SequentialDesign, trust: Trust, view: View, s: int, tick: int) -> bool:
     """Whether what is believed is looked into again, though nothing new speaks against it.
 
-    Before a meter is named; while more is suspected than meters; and from time to time.
+    Before a meter is named, and now and then while that is in doubt; while more is suspected than meters;
+    and from time to time.
     """
     if any(scale <= s for _, scale in trust.accused):
         return True
     if trust.trusted.all():
         return False
-    about = ~trust.trusted & ~trust.named & view.over
-    if (about & (trust.age + 1 >= confirmed(design)[trust.scale])).any():
+    since = trust.age + 1 - confirmed(design)[trust.scale]
+    about = ~trust.trusted & ~trust.named & view.over & (since >= 0)
+    first = (since < _every(design.lengths[s])) | ~trust.bad[s]
+    if (about & first).any() or (tick % _AGAIN == 0 and about.any()):
         return True
     last = len(design.lengths) - 1
     return s == last and tick % design.lengths[last] == 0
+
+
+def _every(length: int) -> int:
+    """Ticks from one look at a scale to the next."""
+    return max(1, round(length / _LOOKS))
 
 
 def confirm(length: int) -> int:

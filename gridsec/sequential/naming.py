@@ -40,7 +40,8 @@ def name(
         Which meters have a reading: silence clears nobody.
     """
     trust = seen.trust
-    if trust.trusted.all() and not (trust.accused or before.named.any() or before.counted.any()):
+    open_ = trust.accused or trust.age.any() or before.named.any() or before.counted.any()
+    if trust.trusted.all() and not open_:
         return trust, ()
     quiet = np.where(trust.still.any(axis=0), 0, trust.quiet + live)
     trusted = (trust.trusted & ~before.named) | (quiet >= design.options.release)

@@ -9,7 +9,7 @@ import numpy as np
 from gridsec.arrays import Bools, Floats
 from gridsec.feeder import bus_voltages, model_error_bound
 from gridsec.frames import NO_VOLTAGE
-from gridsec.online import Estimate, Frame, Verdict
+from gridsec.online import Estimate, Explanation, Frame, Verdict
 from gridsec.sequential.commission import conclude as learn
 from gridsec.sequential.commission import gather, ripe
 from gridsec.sequential.conclude import Tick, conclude, unusable
@@ -79,6 +79,7 @@ def step(
     window = forget(window, over)
     trust, rivals = name(design, begun, _acquit(seen, over), heard.live)
     trust = _distrust(trust, copies)
+    rivals = rivals or _undecided(design, state, trust)
     seen = replace(seen, trust=trust)
     after = replace(
         state,
@@ -103,6 +104,18 @@ def _transient(design: SequentialDesign, age: float) -> Floats:
     """What is left of the unknown initial state at each meter, (p,)."""
     # Without inverters the rate is infinite, and times no time at all it would be no number.
     return np.asarray(design.reach * (np.exp(-design.certificate.rate * age) if age > 0 else 1.0))
+
+
+def _undecided(design: SequentialDesign, state: SequentialState, trust: Trust) -> tuple[Explanation, ...]:
+    """The last explanations, as long as the same are suspected: they are not looked for at every tick."""
+    before = state.trust
+    same = all(
+        np.array_equal(getattr(trust, name), getattr(before, name))
+        for name in ("trusted", "named", "inverters")
+    )
+    if state.last is None or design.decoder is not None or not same or trust.trusted.all():
+        return ()
+    return state.last[1].explanations
 
 
 def _acquit(seen: Examined, over: Bools) -> Examined:

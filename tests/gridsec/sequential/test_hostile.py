@@ -130,6 +130,10 @@ class TestLiarsWhoComeAndGo:
         named = self.watched(lambda k: k % 7 == 0, lambda _: True, 140)
         assert np.mean(named[7:]) > 0.3
 
+    def test_after_minutes_of_honesty_one_reading_names_nobody(self) -> None:
+        named = self.watched(lambda k: k in {0, 100, 200}, lambda _: True, 230)
+        assert not named.any()
+
 
 class TestWhatIsLearnedUnderDifficulties:
     LEARN_S = 400
