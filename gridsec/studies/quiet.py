@@ -85,7 +85,7 @@ class Shift:
     size
         How far, squared pu; reached by `lies`.
     bound
-        Nothing moves it further, by the solver's bound.
+        Nothing moves it further, by the solver's bound; far above `size` where the search was cut short.
     lies : (p,)
         a.
     """
@@ -188,7 +188,7 @@ def largest_shift(
             np.concatenate([np.full(p, -_PART), least]), np.concatenate([np.full(p, _PART), upper])
         ),
         integrality=np.repeat(np.arange(2), p),
-        options={"mip_rel_gap": 1e-6},
+        options={"mip_rel_gap": 1e-6, "node_limit": max(1, _WORK // (s * p * p))},
     )
     if found.x is None:
         raise DesignInfeasible("largest lie that the monitor does not see", found.message)
@@ -199,6 +199,8 @@ def largest_shift(
 
 # HiGHS takes binaries within 1e-6 for integers: in larger units, what that frees is within its tolerance.
 _PART = 0.1
+# Nodes of a search times entries of its constraints: beyond, the bound is what was proven until then.
+_WORK = 200_000
 
 
 def named_size(given: Rule, meter: int, liars: int, *, claims: Floats) -> float:
