@@ -56,7 +56,7 @@ class Kind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """One way to explain the readings. p meters, m inverters.
+    """One way to explain the readings. p meters, m inverters, N customers.
 
     Attributes
     ----------
@@ -66,11 +66,14 @@ class Explanation:
         Which inverters would be.
     probability
         Its share among the explanations given, from 0 to 1.
+    powers : (N,)
+        Whose powers would not be what they are said to be; empty where that is never supposed.
     """
 
     meters: Bools
     inverters: Bools
     probability: float
+    powers: Bools = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
 
 
 def _none() -> Bools:

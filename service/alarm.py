@@ -138,7 +138,10 @@ def from_json(data: Mapping[str, Any]) -> Alarm:
     evidence = dict(data["evidence"])
     shown = evidence.pop("explanations", ())
     explanations = tuple(
-        ExplanationReport(tuple(e["meters"]), tuple(e["inverters"]), e["probability"]) for e in shown
+        ExplanationReport(
+            tuple(e["meters"]), tuple(e["inverters"]), e["probability"], tuple(e.get("powers", ()))
+        )
+        for e in shown
     )
     fields["evidence"] = Evidence(**evidence, explanations=explanations)
     return Alarm(**fields)

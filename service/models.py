@@ -85,6 +85,9 @@ class ExplanationModel(BaseModel):
 
     meters: list[str] = Field(description="Which meters would lie.")
     inverters: list[str] = Field(description="Whose inverters would inject a wrong reactive power.")
+    powers: list[str] = Field(
+        default=[], description="Whose powers would not be what they are said to be; accuses nobody."
+    )
     probability: float = Field(description="Its share among the explanations given.")
 
 

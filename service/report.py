@@ -129,11 +129,14 @@ class ExplanationReport:
         Whose inverters would inject a wrong reactive power, by customer.
     probability
         Its share among the explanations given, from 0 to 1.
+    powers
+        Whose powers would not be what they are said to be, by customer.
     """
 
     meters: tuple[str, ...]
     inverters: tuple[str, ...]
     probability: float
+    powers: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -326,6 +329,7 @@ def _explanations(site: Site, verdict: Verdict) -> tuple[ExplanationReport, ...]
             tuple(site.meter_ids[k] for k in np.flatnonzero(e.meters)),
             tuple(owners[i] for i in np.flatnonzero(e.inverters)),
             float(e.probability),
+            tuple(site.feeder.customers[c] for c in np.flatnonzero(e.powers)),
         )
         for e in verdict.explanations
     )
@@ -340,7 +344,10 @@ def _reason(site: Site, tick: Tick, max_attacked: int, verdict: Verdict) -> str:
         who = _who(site, verdict.suspects, verdict.inverters)
         return f"Manipulated: {who}; further off than meter accuracy and load uncertainty allow."
     if verdict.cause is Cause.AMBIGUOUS and verdict.explanations:
-        ways = [f"{_who(site, e.meters, e.inverters)} ({e.probability:.0%})" for e in verdict.explanations]
+        ways = [
+            f"{_who(site, e.meters, e.inverters, e.powers)} ({e.probability:.0%})"
+            for e in verdict.explanations
+        ]
         more = f" or {len(ways) - _SHOWN} more" if len(ways) > _SHOWN else ""
         return f"Several explanations fit: {' or else '.join(ways[:_SHOWN])}{more}."
     if verdict.cause is Cause.TOO_MANY_SUSPECTS and suspects:
@@ -361,14 +368,16 @@ def _meters(site: Site, which: Sequence[int]) -> str:
     return ", ".join(site.meter_ids[k] for k in which[:_SHOWN]) + rest
 
 
-def _who(site: Site, meters: Bools, inverters: Bools) -> str:
-    """Meters by their ids and inverters by their customers, as in alarms; the first few of many."""
+def _who(site: Site, meters: Bools, inverters: Bools, powers: Bools | None = None) -> str:
+    """Meters by their ids, all else by its customers, as in alarms; the first few of many."""
     found = np.flatnonzero(meters).tolist()
     parts = [_meters(site, found)] if found else []
-    owners = [site.feeder.customers[int(site.droop.customer[i])] for i in np.flatnonzero(inverters)]
-    rest = f" and {len(owners) - _SHOWN} more" if len(owners) > _SHOWN else ""
-    if owners:
-        parts.append(f"the inverter{'s' if len(owners) > 1 else ''} of {', '.join(owners[:_SHOWN])}{rest}")
+    doubted = () if powers is None else np.flatnonzero(powers)
+    for what, customers in (("inverter", site.droop.customer[inverters]), ("reported power", doubted)):
+        names = [site.feeder.customers[int(c)] for c in customers]
+        rest = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+        if names:
+            parts.append(f"the {what}{'s' if len(names) > 1 else ''} of {', '.join(names[:_SHOWN])}{rest}")
     return " and ".join(parts) or "nobody"
 
 
@@ -479,7 +488,8 @@ def to_json(report: FeederReport) -> dict[str, Any]:
             for i in report.inverters
         ],
         "explanations": [
-            {"meters": list(e.meters), "inverters": list(e.inverters), "probability": e.probability}
+            {name: list(getattr(e, name)) for name in ("meters", "inverters", "powers")}
+            | {"probability": e.probability}
             for e in report.explanations
         ],
         "buses": [{"bus": bus, "v_volt": v} for bus, v in report.bus_v_volt],

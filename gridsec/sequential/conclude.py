@@ -160,8 +160,7 @@ def _beside_meters(
         return Decision.ATTACKED, Cause.RESIDUALS, sentence
     sentence = ""
     if tick.rivals:
-        ways = " or ".join(_way(design, each) for each in tick.rivals)
-        sentence = f"Manipulated is either {ways}; both explain the readings."
+        sentence = _ways(design, tick.rivals)
     elif amounts:
         sentence = _doubt(design, *next(iter(amounts.items())))
     return (Decision.UNDECIDED, Cause.AMBIGUOUS, sentence) if sentence else said
@@ -178,14 +177,34 @@ def _doubt(design: SequentialDesign, k: int, amount: float) -> str:
     return f"The inverter of {who} may inject {power} kvar that its curve does not ask for."
 
 
+# So many explanations, and so many names in each, are told in a sentence.
+_SHOWN = 5
+
+
+def _ways(design: SequentialDesign, explanations: tuple[Explanation, ...]) -> str:
+    """What may be the case, in one sentence."""
+    ways = [_way(design, each) for each in explanations[:_SHOWN]]
+    more = len(explanations) - len(ways)
+    each = "both explain" if len(explanations) == 2 else "each of these explains"
+    return (
+        f"Wrong are either {' or else '.join(ways)}{f' or {more} more' if more else ''}; {each} the readings."
+    )
+
+
 def _way(design: SequentialDesign, explanation: Explanation) -> str:
-    plant = design.plant
-    meters = [name for name, bad in zip(design.names, explanation.meters, strict=True) if bad]
-    owners = [plant.feeder.customers[c] for c in plant.droop.customer[explanation.inverters]]
-    parts = [
-        f"the {what} of {', '.join(who)}" for what, who in (("meters", meters), ("inverters", owners)) if who
-    ]
-    return " and ".join(parts) if parts else "nobody"
+    customers, owner = design.plant.feeder.customers, design.plant.droop.customer
+    accused = (
+        ("meter", [name for name, bad in zip(design.names, explanation.meters, strict=True) if bad]),
+        ("inverter", [customers[c] for c in owner[explanation.inverters]]),
+        ("reported power", [customers[c] for c in np.flatnonzero(explanation.powers)]),
+    )
+    parts = [f"the {what}{'s' * (len(who) > 1)} of {_list(who)}" for what, who in accused if who]
+    return " and ".join(parts) if parts else "none of them"
+
+
+def _list(names: list[str]) -> str:
+    rest = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    return ", ".join(names[:_SHOWN]) + rest
 
 
 def _amounts(state: SequentialState, seen: Examined) -> dict[int, float]:

@@ -97,10 +97,25 @@ def inverters_of(design: SequentialDesign, accused: Sequence[int]) -> Bools:
     return out
 
 
+def powers_of(design: SequentialDesign, accused: Sequence[int]) -> Bools:
+    """Whose powers are among other suspicions, (N,).
+
+    Parameters
+    ----------
+    design
+        The design.
+    accused
+        Indices of its book.
+    """
+    out = np.zeros(design.customers, dtype=np.bool_)
+    out[[k for k in accused if k < design.customers]] = True
+    return out
+
+
 def _rivals(design: SequentialDesign, seen: Examined, fresh: Bools, new: Bools) -> tuple[Explanation, ...]:
     """All explanations about as likely as the best, where one leaves out somebody about to be named."""
     within = 2.0 * float(np.log(design.options.like))
-    out: dict[bytes, tuple[Bools, Bools, float]] = {}
+    out: dict[bytes, tuple[Bools, Bools, float, tuple[int, ...]]] = {}
     for s, found in seen.found.items():
         best, view = found.best, seen.views[s]
         near = [(~each.trusted, each.loosened, each.cost - best.cost) for each in (best, *found.others)]
@@ -115,9 +130,12 @@ def _rivals(design: SequentialDesign, seen: Examined, fresh: Bools, new: Bools) 
             if not k or (worse <= within and differs):
                 who, weight = meters.tobytes() + inverters.tobytes(), float(np.exp(-0.5 * worse))
                 if who not in out or out[who][2] < weight:
-                    out[who] = (meters, inverters, weight)
+                    out[who] = (meters, inverters, weight, loosened)
     ways = sorted(out.values(), key=lambda way: -way[2])
-    if not any((fresh & ~meters).any() or (new & ~inverters).any() for meters, inverters, _ in ways):
+    if not any((fresh & ~meters).any() or (new & ~inverters).any() for meters, inverters, *_ in ways):
         return ()
-    total = sum(weight for _, _, weight in ways)
-    return tuple(Explanation(meters, inverters, weight / total) for meters, inverters, weight in ways)
+    total = sum(way[2] for way in ways)
+    return tuple(
+        Explanation(meters, inverters, weight / total, powers_of(design, loosened))
+        for meters, inverters, weight, loosened in ways
+    )

@@ -557,7 +557,7 @@ def test_json_and_back() -> None:
     assert data["kind"] == "meter-manipulated"
     assert type(data["state"]) is str
     assert from_json({**data, "unknown": 1}) == alarm
-    shown = (ExplanationReport(("m1", "m2"), ("Miller",), 0.5),)
+    shown = (ExplanationReport(("m1", "m2"), ("Miller",), 0.5, ("Smith",)),)
     rich = replace(alarm, customer="Miller", evidence=Evidence(kind="stuck", explanations=shown))
     assert from_json(json.loads(json.dumps(to_json(rich)))) == rich
 

@@ -215,7 +215,7 @@ def test_an_inverter_and_an_ambiguity_are_shown(setup: Setup) -> None:
     inverter = InverterReport("H7", "drop-7", None, True, True, 4.5, -6.0)
     explanations = (
         ExplanationReport(("H3",), (), 0.75),
-        ExplanationReport((), ("H7",), 0.25),
+        ExplanationReport((), ("H7",), 0.25, ("H5",)),
     )
     for k in range(4):
         report = setup.village.report(T0 + k, cause=Cause.RESIDUALS)
@@ -238,8 +238,8 @@ def test_an_inverter_and_an_ambiguity_are_shown(setup: Setup) -> None:
     undecided, held = setup.get("/alarms").json()["alarms"]
     assert (undecided["kind"], held["state"]) == ("undecided", "acknowledged")
     assert undecided["evidence"]["explanations"] == [
-        {"meters": ["H3"], "inverters": [], "probability": 0.75},
-        {"meters": [], "inverters": ["H7"], "probability": 0.25},
+        {"meters": ["H3"], "inverters": [], "powers": [], "probability": 0.75},
+        {"meters": [], "inverters": ["H7"], "powers": ["H5"], "probability": 0.25},
     ]
 
 

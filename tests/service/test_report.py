@@ -196,22 +196,29 @@ def test_ambiguity_is_one_sentence_and_a_list(site: Site) -> None:
     estimate, verdict = judged(site, 6.0, 3)
     p, m = len(site.meter_ids), site.droop.tau.size
     nobody, none = np.zeros(p, dtype=bool), np.zeros(m, dtype=bool)
+    customers = np.arange(len(site.feeder.customers))
     verdict = replace(
         verdict,
         decision=Decision.UNDECIDED,
         cause=Cause.AMBIGUOUS,
         suspects=nobody,
         explanations=(
-            Explanation(np.arange(p) == 1, none, 0.7),
-            Explanation(nobody, np.arange(m) == 1, 0.3),
+            Explanation(np.arange(p) == 1, none, 0.7, customers == 2),
+            Explanation(nobody, np.arange(m) == 1, 0.2),
+            Explanation(nobody, none, 0.1, customers < 2),
         ),
     )
     report = build(site, tick(site), 2, estimate, verdict)
     owner = site.feeder.customers[site.droop.customer[1]]
-    assert report.reason == f"Several explanations fit: m02 (70%) or else the inverter of {owner} (30%)."
+    a, b, c = site.feeder.customers[:3]
+    assert report.reason == (
+        f"Several explanations fit: m02 and the reported power of {c} (70%) or else the inverter of {owner} "
+        f"(20%) or else the reported powers of {a}, {b} (10%)."
+    )
     assert report.explanations == (
-        ExplanationReport(("m02",), (), 0.7),
-        ExplanationReport((), (owner,), 0.3),
+        ExplanationReport(("m02",), (), 0.7, (c,)),
+        ExplanationReport((), (owner,), 0.2),
+        ExplanationReport((), (), 0.1, (a, b)),
     )
     (found,) = [c for c in conditions(report) if c.kind is AlarmKind.UNDECIDED]
     assert found.evidence.explanations == report.explanations

@@ -1,0 +1,80 @@
+"""What an operator is told where several explanations fit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gridsec import sequential
+from gridsec.online import Cause, Decision, Explanation
+from gridsec.plant import Plant
+from gridsec.sequential import LoadDoubt, SequentialDesign, SequentialOptions
+from gridsec.sequential.conclude import _ways
+from tests.gridsec.sequential.test_monitor import prepare, watch
+from tests.gridsec.street import BASE_KVA, Street, accuracy, make_plant
+
+
+@pytest.fixture(scope="module")
+def design() -> SequentialDesign:
+    return prepare(make_plant(np.random.default_rng(1), customers=12, drop=0.03))
+
+
+def way(
+    meters: tuple[int, ...] = (), inverters: tuple[int, ...] = (), powers: tuple[int, ...] = ()
+) -> Explanation:
+    every = np.arange(12)
+    return Explanation(np.isin(every, meters), np.isin(every, inverters), 0.5, np.isin(every, powers))
+
+
+def test_every_explanation_is_told_as_what_it_is(design: SequentialDesign) -> None:
+    assert _ways(design, (way((1,)), way())) == (
+        "Wrong are either the meter of c1 or else none of them; both explain the readings."
+    )
+    three = _ways(design, (way((1, 2)), way((3,), (4,)), way(powers=(5,))))
+    assert three == (
+        "Wrong are either the meters of c1, c2 or else the meter of c3 and the inverter of c4 or else the "
+        "reported power of c5; each of these explains the readings."
+    )
+    assert "c11" not in _ways(design, (way(tuple(range(12))), way()))
+    assert "or 3 more; each of these" in _ways(design, (way((1,)),) * 8)
+
+
+def twins() -> Plant:
+    """Two customers at the end of a long cable, about whose load nobody knows much."""
+    rng = np.random.default_rng(4)
+    plant = make_plant(rng, customers=14, drop=0.03, inverters=np.arange(10))
+    feeder = plant.feeder
+    parent, r = feeder.parent.copy(), feeder.r.copy()
+    parent[12], r[12] = 6, 1.8
+    bus = feeder.bus.copy()
+    bus[13] = bus[12] = 13
+    leaf = np.arange(13)
+    feeder = replace(
+        feeder,
+        parent=parent[leaf],
+        r=r[leaf],
+        x=feeder.x[leaf],
+        charging=feeder.charging[leaf],
+        buses=feeder.buses[:14],
+        bus=bus,
+    )
+    return replace(plant, feeder=feeder, accuracy=accuracy(14))
+
+
+def test_one_of_two_at_the_same_bus_lies_and_that_is_said_at_every_tick() -> None:
+    """Though who could be honest is looked for now and then only."""
+    plant = twins()
+    doubt = LoadDoubt(np.full(14, 0.6 / BASE_KVA), np.full(14, 0.2 / BASE_KVA), 600.0)
+    made = sequential.design(plant, doubt=doubt, step_s=1.0, options=SequentialOptions(commission_s=0.0))
+    street = Street(plant, np.random.default_rng(5), load_kw=0.5)
+    street.bias[12:] = 0.0
+    state, _ = watch(street, made, 30)
+    _, answers = watch(street, made, 40, state=state, lies={12: -0.045})
+    for _, verdict in answers[1:]:
+        assert (verdict.decision, verdict.cause) == (Decision.UNDECIDED, Cause.AMBIGUOUS)
+        accused = {tuple(np.flatnonzero(each.meters)) for each in verdict.explanations}
+        assert {(12,), (13,)} <= accused
+        assert sum(each.probability for each in verdict.explanations) == pytest.approx(1.0)
+        assert verdict.reason.startswith("Wrong are either the meter of c1")
