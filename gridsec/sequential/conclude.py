@@ -71,7 +71,7 @@ def conclude(design: SequentialDesign, state: SequentialState, tick: Tick) -> tu
     live, beyond = judged & tick.live, score > threshold
     at = plant.feeder.bus[plant.meters]
     attack = np.where(trust.named & tick.live, tick.y - state.learned.bias - estimate.v2_bus[at], 0.0)
-    amounts = _amounts(state, tick.seen)
+    amounts = _amounts(design, state, tick.seen)
     settled = bool((tick.transient <= design.options.settled * threshold).all())
     said = decide(
         Situation(
@@ -207,13 +207,13 @@ def _list(names: list[str]) -> str:
     return ", ".join(names[:_SHOWN]) + rest
 
 
-def _amounts(state: SequentialState, seen: Examined) -> dict[int, float]:
+def _amounts(design: SequentialDesign, state: SequentialState, seen: Examined) -> dict[int, float]:
     """How much of each suspicion besides meters there is, by index of the book, pu.
 
     With prior variance s^2 and direction a the posterior mean is ``s^2 a^T Q m``.
     """
     out: dict[int, float] = {}
-    book = state.doubts.book
+    book, std = design.book, state.doubts.sizes
     for k, s in state.trust.accused:
         view, now = seen.views[s], state.fits[s]
         if view is not None:
@@ -222,7 +222,7 @@ def _amounts(state: SequentialState, seen: Examined) -> dict[int, float]:
             weights = now.weights(state.window.sums[s] / np.maximum(state.window.counts[s], 1))
         else:
             continue
-        out[k] = float(book.std[k] ** 2 * book.along(weights)[k])
+        out[k] = float(std[k] ** 2 * book.along(weights)[k])
     return out
 
 

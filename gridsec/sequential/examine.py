@@ -66,7 +66,7 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats) -> 
     after: list[Fit | None] = []
     found: dict[int, Found] = {}
     scales = Scales(design, prior, window, state.learned, model)
-    book = state.doubts.book
+    book = replace(design.book, std=state.doubts.sizes)
     for s, length in enumerate(design.lengths):
         before = fits[s]
         stale = before is None or bool((before.trusted & ~trust.trusted).any())

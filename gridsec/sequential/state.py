@@ -12,7 +12,6 @@ from gridsec.sequential.commission import Commission, Learned, Learning, fresh
 from gridsec.sequential.commission import renew as learn_anew
 from gridsec.sequential.conditional import Fit, Prior
 from gridsec.sequential.design import SequentialDesign
-from gridsec.sequential.dictionary import Dictionary
 from gridsec.sequential.kinds import Kinds
 from gridsec.sequential.kinds import empty as no_kinds
 from gridsec.sequential.repeats import forget as forget_calm
@@ -71,16 +70,16 @@ class Doubts:
         Whether there is a busbar voltage.
     prior
         What follows.
-    book
-        What else but meters can be wrong: as that of the design, with false powers of the size of what the
-        customers claim, rounded up.
+    sizes : (k,)
+        How much there may be of whatever else is in the book of the design, pu: false powers are of the size
+        of what the customers claim, rounded up.
     """
 
     p: Floats
     q: Floats
     busbar: bool
     prior: Prior
-    book: Dictionary
+    sizes: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -179,7 +178,7 @@ def init(
             np.zeros(m, dtype=np.bool_),
         ),
         fits=(None,) * s,
-        doubts=Doubts(one, one, True, design.prior, design.book),
+        doubts=Doubts(one, one, True, design.prior, design.book.std),
         learning=known.learning,
         learned=known.learned,
         model_error=np.zeros(p),

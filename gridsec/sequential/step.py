@@ -14,7 +14,6 @@ from gridsec.sequential.commission import conclude as learn
 from gridsec.sequential.commission import gather, ripe
 from gridsec.sequential.conclude import Tick, conclude, unusable
 from gridsec.sequential.design import SequentialDesign
-from gridsec.sequential.dictionary import Dictionary
 from gridsec.sequential.drive import drive
 from gridsec.sequential.examine import Examined, ended, examine
 from gridsec.sequential.kinds import Kinds, describe, listen, suspicious
@@ -262,10 +261,10 @@ def _doubts(design: SequentialDesign, before: Doubts, frame: Frame, busbar: bool
             (frame.q_error, design.doubt.q, before.q),
         )
     )
-    book = _claims(np.abs(frame.p), design.options.hidden_power, before.book)
+    sizes = _claims(np.abs(frame.p), design.options.hidden_power, before.sizes)
     same = (new is old or np.array_equal(new, old) for new, old in ((p, before.p), (q, before.q)))
     if busbar == before.busbar and all(same):
-        return before if book is before.book else replace(before, book=book)
+        return before if sizes is before.sizes else replace(before, sizes=sizes)
     doubt = replace(
         design.doubt,
         p=np.where(p > 1.0, np.maximum(design.doubt.p, _EXACT) * p, design.doubt.p),
@@ -283,17 +282,17 @@ def _doubts(design: SequentialDesign, before: Doubts, frame: Frame, busbar: bool
             inverters=design.injections,
         )
     )
-    return Doubts(p, q, busbar, found, book)
+    return Doubts(p, q, busbar, found, sizes)
 
 
-def _claims(power: Floats, least: float, book: Dictionary) -> Dictionary:
+def _claims(power: Floats, least: float, before: Floats) -> Floats:
     """False powers as large as what is claimed, in powers of two, and kept while they are close to that."""
-    old = book.std[: power.size]
+    old = before[: power.size]
     fine = (power <= old) & ((old <= least) | (4.0 * power >= old))
     if fine.all():
-        return book
+        return before
     new = np.where(fine, old, np.exp2(np.ceil(np.log2(np.maximum(power, least)))))
-    return replace(book, std=np.concatenate([np.maximum(new, least), book.std[power.size :]]))
+    return np.concatenate([new, before[power.size :]])
 
 
 # Powers are known no better than this, pu.

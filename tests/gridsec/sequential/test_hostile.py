@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -169,3 +170,25 @@ class TestWhatIsLearnedUnderDifficulties:
         np.testing.assert_array_equal(np.isfinite(state.learned.at), honest)
         off = np.abs(state.learned.bias - 2.0 * street.bias)
         assert (off < 3.0 * np.sqrt(state.learned.variance))[honest].all()
+
+
+@pytest.mark.parametrize("inverters", [0, 12])
+def test_states_are_values(inverters: int) -> None:
+    """A step leaves the state that it begins from as it was, and one that was kept goes on just the same."""
+    rng = np.random.default_rng(3)
+    plant = make_plant(rng, customers=12, drop=0.03, inverters=np.arange(inverters))
+    design, street = prepare(plant), Street(plant, rng)
+    state, _ = watch(street, design, 30)
+    for k in range(60):
+        street.advance(1.0)
+        frame = street.frame({2: 0.03, 7: -0.02, 8: 0.01} if 5 <= k < 40 else {}, (4,) if k % 3 == 0 else ())
+        frame = replace(frame, v0_squared=np.nan) if k % 20 > 14 else frame
+        kept = pickle.dumps(state)
+        after, estimate, verdict = sequential.step(design, state, frame)
+        assert pickle.dumps(state) == kept
+        again, once_more = sequential.step(design, pickle.loads(kept), frame)[1:]
+        np.testing.assert_allclose(again.v2_bus, estimate.v2_bus, rtol=1e-9)
+        np.testing.assert_allclose(once_more.score, verdict.score, rtol=1e-6, atol=1e-12)
+        np.testing.assert_array_equal(once_more.suspects, verdict.suspects)
+        assert once_more.reason == verdict.reason
+        state = after
