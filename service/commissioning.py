@@ -126,7 +126,8 @@ class Progress:
     since, expected, learned_at
         The earliest begin, the latest expected end, and when the last one was learned, Unix s.
     held
-        Time enough has gone by, but somebody is suspected, and while that is so nothing is learned.
+        Time enough has gone by, but somebody is suspected: such a meter is not learned, and as long as it is
+        not named nobody is.
     restored
         Whether this goes on from what was kept by an earlier run.
     note
