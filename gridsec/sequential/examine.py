@@ -43,7 +43,7 @@ class Examined:
 
 # A long scale hardly changes from tick to tick: it is looked at this many times per length.
 _LOOKS = 8
-# Ticks after which it is asked again who could be honest of those who could be before.
+# For so many ticks it is asked at each who could be honest, after that once in so many.
 _AGAIN = 8
 
 
@@ -137,7 +137,7 @@ def _due(design: SequentialDesign, trust: Trust, view: View, s: int, tick: int) 
         return False
     since = trust.age + 1 - confirmed(design)[trust.scale]
     about = ~trust.trusted & ~trust.named & view.over & (since >= 0)
-    first = (since < _every(design.lengths[s])) | ~trust.bad[s]
+    first = (since < max(_every(design.lengths[s]), _AGAIN)) | ~trust.bad[s]
     if (about & first).any() or (tick % _AGAIN == 0 and about.any()):
         return True
     last = len(design.lengths) - 1
