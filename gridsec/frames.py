@@ -11,7 +11,7 @@ from gridsec.arrays import Bools, Floats
 from gridsec.detect import Uncertainty
 from gridsec.feeder import corrected, loss_correction
 from gridsec.lure import known_input
-from gridsec.online import Frame
+from gridsec.online import Cause, Decision, Estimate, Frame, Verdict
 from gridsec.plant import Plant, Setting
 
 
@@ -65,6 +65,34 @@ class Reconstruction:
     v2_bus: Floats
     v2: Floats
     correction: Floats
+
+
+def nothing_new(  # noqa: PLR0917  # what there was, and what there is to say without it
+    plant: Plant, frame: Frame, t: float, last: tuple[Estimate, Verdict] | None, v0_squared: float, x: Floats
+) -> tuple[Estimate, Verdict]:
+    """The answer to a frame that is not later than the last one: nothing new, and certainly not CLEAN.
+
+    Parameters
+    ----------
+    plant, frame
+        What is watched, and the frame.
+    t
+        Time of the last frame that was used, Unix s.
+    last
+        What was answered then; None: there was none.
+    v0_squared, x
+        Squared busbar voltage and injections, pu, to be answered without one.
+    """
+    reason = f"A frame of time {frame.t} is not later than the last one, {t}; it was not used."
+    if last is not None:
+        estimate, verdict = last
+        return estimate, replace(verdict, decision=Decision.UNDECIDED, cause=Cause.SETTLING, reason=reason)
+    at, p = plant.feeder.bus, plant.meters.size
+    v2_bus, nobody = np.full(len(plant.feeder.buses), v0_squared), np.zeros(p, dtype=np.bool_)
+    estimate = Estimate(t, v2_bus[at], np.full(at.size, NO_VOLTAGE), v2_bus, nobody, x)
+    score, threshold = np.full(p, np.nan), np.full(p, NO_VOLTAGE)
+    verdict = Verdict(Decision.UNDECIDED, Cause.SETTLING, reason, nobody, score, threshold, np.zeros(p))
+    return estimate, verdict
 
 
 def known(frame: Frame) -> Frame:

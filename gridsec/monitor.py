@@ -28,11 +28,11 @@ from gridsec.certificates import Certificate, certify, small_gain, verify
 from gridsec.detect import ErrorBound, Majorant, Motion
 from gridsec.errors import DesignInfeasible
 from gridsec.feeder import LinDistFlow, lindistflow
-from gridsec.frames import NO_VOLTAGE, Inputs, Past, clean, injections, known, reconstruct
+from gridsec.frames import Inputs, Past, clean, injections, known, nothing_new, reconstruct
 from gridsec.judge import Situation, Tally, count, decide, residual_excess
 from gridsec.lmi import contraction
 from gridsec.lure import Lure, close_loop, rest
-from gridsec.online import Cause, Decision, Estimate, Frame, Verdict
+from gridsec.online import Estimate, Frame, Verdict
 from gridsec.plant import MonitorDesign, MonitorState, Options, Plant
 from gridsec.stacked import StackedState
 
@@ -205,7 +205,7 @@ def step(design: MonitorDesign, state: MonitorState, frame: Frame) -> tuple[Moni
     """
     late = state.bank is not None and not frame.t > state.t
     if late or not np.isfinite(frame.t):
-        return _unusable(design, state, frame)
+        return state, *nothing_new(design.plant, frame, state.t, state.last, state.v0_squared, state.x)
     frame = known(frame)
     inputs = clean(design.setting, Past(state.x, state.v0_squared, state.tally.named), frame)
     h = 0.0 if state.bank is None else frame.t - state.t
@@ -413,32 +413,3 @@ def _saturated(design: MonitorDesign, inputs: Inputs, frame: Frame, x: Floats) -
     told = np.where(inputs.now.told, 2.0 * frame.q_error[design.plant.meters], 0.0)
     far = detect.widest(errors, None if design.bank.direct else x).free
     return np.asarray(inputs.now.base + errors.inverters @ far + errors.reach @ told)
-
-
-def _unusable(
-    design: MonitorDesign, state: MonitorState, frame: Frame
-) -> tuple[MonitorState, Estimate, Verdict]:
-    """The answer to a frame that is not later than the last one: nothing new, and certainly not CLEAN."""
-    plant = design.plant
-    p, b = plant.meters.size, len(plant.feeder.buses)
-    if state.last is None:
-        v2_bus = np.full(b, state.v0_squared)
-        estimate = Estimate(
-            t=state.t,
-            v2=v2_bus[plant.feeder.bus],
-            bound=np.full(plant.feeder.bus.size, NO_VOLTAGE),
-            v2_bus=v2_bus,
-            trusted=np.zeros(p, dtype=np.bool_),
-            x=state.x,
-        )
-        score, threshold = np.full(p, np.nan), np.full(p, NO_VOLTAGE)
-        named, attack = state.tally.named, np.zeros(p)
-    else:
-        estimate, verdict = state.last
-        score, threshold, named, attack = verdict.score, verdict.threshold, verdict.suspects, verdict.attack
-    reason = f"A frame of time {frame.t} is not later than the last one, {state.t}; it was not used."
-    return (
-        state,
-        estimate,
-        Verdict(Decision.UNDECIDED, Cause.SETTLING, reason, named, score, threshold, attack),
-    )

@@ -48,7 +48,7 @@ from gridsec.decode.stacks import MOST_SUBSETS
 from gridsec.detect import Uncertainty
 from gridsec.errors import DesignInfeasible, NotObservable
 from gridsec.families.codeword import CodeWord, Parts, code_word, constants, observe, start
-from gridsec.frames import NO_VOLTAGE, Inputs, Past, Reconstruction, clean, known
+from gridsec.frames import Inputs, Past, Reconstruction, clean, known, nothing_new
 from gridsec.judge import Situation, Tally, count, decide
 from gridsec.lure import close_loop
 from gridsec.observers import circle
@@ -215,7 +215,8 @@ def step(design: PartialDesign, state: PartialState, frame: Frame) -> tuple[Part
         is named is decided by all fits and all rows: a small lie may be named below this threshold.
     """
     if (state.started and not frame.t > state.t) or not np.isfinite(frame.t):
-        return _unusable(design, state, frame)
+        plant = design.setting.plant
+        return state, *nothing_new(plant, frame, state.t, state.last, state.v0_squared, state.parts.x)
     setting, frame = design.setting, known(frame)
     inputs = clean(setting, Past(state.parts.x, state.v0_squared, state.tally.named), frame)
     h = frame.t - state.t if state.started else 0.0
@@ -365,32 +366,3 @@ def _explanations(found: Fits) -> tuple[Explanation, ...]:
     if not 1 < len(sets) <= _SHOWN:
         return ()
     return tuple(Explanation(meters, np.zeros(0, dtype=np.bool_), 1.0 / len(sets)) for meters in sets)
-
-
-def _unusable(
-    design: PartialDesign, state: PartialState, frame: Frame
-) -> tuple[PartialState, Estimate, Verdict]:
-    """The answer to a frame that is not later than the last one: nothing new, and certainly not CLEAN."""
-    reason = f"A frame of time {frame.t} is not later than the last one, {state.t}; it was not used."
-    if state.last is not None:
-        estimate, said = state.last
-        return (
-            state,
-            estimate,
-            replace(said, decision=Decision.UNDECIDED, cause=Cause.SETTLING, reason=reason),
-        )
-    plant = design.setting.plant
-    p, buses = plant.meters.size, len(plant.feeder.buses)
-    v2_bus = np.full(buses, state.v0_squared)
-    v2, nobody = v2_bus[plant.feeder.bus], np.zeros(p, dtype=np.bool_)
-    estimate = Estimate(state.t, v2, np.full(v2.size, NO_VOLTAGE), v2_bus, nobody, state.parts.x)
-    verdict = Verdict(
-        Decision.UNDECIDED,
-        Cause.SETTLING,
-        reason,
-        nobody,
-        np.full(p, np.nan),
-        np.full(p, NO_VOLTAGE),
-        np.zeros(p),
-    )
-    return state, estimate, verdict

@@ -48,7 +48,7 @@ from gridsec.families.switched import (
     lost,
     threshold_of,
 )
-from gridsec.frames import NO_VOLTAGE, Inputs, Past, clean, known
+from gridsec.frames import Inputs, Past, clean, known, nothing_new
 from gridsec.judge import Situation, Tally, count, decide
 from gridsec.online import Cause, Decision, Estimate, Explanation, Frame, Verdict
 
@@ -74,7 +74,8 @@ def step(
         As every estimator's step; see `gridsec.online`.
     """
     if not np.isfinite(frame.t) or (state.bank is not None and not frame.t > state.t):
-        return _unusable(design, state, frame)
+        plant = design.setting.plant
+        return state, *nothing_new(plant, frame, state.t, state.last, state.v0_squared, state.x)
     frame = known(frame)
     inputs = clean(design.setting, Past(state.x, state.v0_squared, state.tally.named), frame)
     view = advance(design, state, frame, inputs)
@@ -208,27 +209,3 @@ def _verdict(  # noqa: PLR0917  # everything one tick brought
         attack,
         explanations=tuple(Explanation(meters, none, share) for meters in found.rivals),
     )
-
-
-def _unusable(
-    design: SetSearchDesign, state: SetSearchState, frame: Frame
-) -> tuple[SetSearchState, Estimate, Verdict]:
-    """The answer to a frame that is not later than the last one: nothing new, and certainly not CLEAN."""
-    plant = design.setting.plant
-    p, n = plant.meters.size, plant.feeder.bus.size
-    reason = f"A frame of time {frame.t} is not later than the last one, {state.t}; it was not used."
-    if state.last is not None:
-        estimate, verdict = state.last
-        return (
-            state,
-            estimate,
-            replace(verdict, decision=Decision.UNDECIDED, cause=Cause.SETTLING, reason=reason),
-        )
-    v2 = np.full(len(plant.feeder.buses), state.v0_squared)
-    nobody = np.zeros(p, dtype=np.bool_)
-    estimate = Estimate(state.t, v2[plant.feeder.bus], np.full(n, NO_VOLTAGE), v2, nobody, state.x)
-    far = np.full(p, NO_VOLTAGE)
-    verdict = Verdict(
-        Decision.UNDECIDED, Cause.SETTLING, reason, nobody, np.full(p, np.nan), far, np.zeros(p)
-    )
-    return state, estimate, verdict

@@ -34,9 +34,9 @@ from gridsec.families.pair_tick import Tick, UnknownInputDesign, UnknownInputSta
 from gridsec.families.pair_verdict import Found, answer, deaf_inverters, explain
 from gridsec.families.pairs import Trial, pairs, try_pair
 from gridsec.families.tubes import Doubt, spread
-from gridsec.frames import NO_VOLTAGE, known, reconstruct
+from gridsec.frames import NO_VOLTAGE, known, nothing_new, reconstruct
 from gridsec.judge import Tally, count
-from gridsec.online import Cause, Decision, Estimate, Frame, Verdict
+from gridsec.online import Estimate, Frame, Verdict
 from gridsec.plant import Options, Plant, setting
 
 __all__ = ["UnknownInputDesign", "UnknownInputState", "design", "init", "step"]
@@ -135,7 +135,12 @@ def step(
         the last estimate again, and UNDECIDED.
     """
     if not np.isfinite(frame.t) or (state.tubes is not None and not frame.t > state.t):
-        return _unusable(design, state, frame)
+        plant = design.setting.plant
+        estimate, verdict = nothing_new(plant, frame, state.t, state.last, state.v0_squared, state.x)
+        if state.last is None:
+            none = np.zeros(plant.droop.tau.size)
+            verdict = replace(verdict, inverters=none.astype(np.bool_), inverter_attack=none)
+        return state, estimate, verdict
     tick = observe(design, state, known(frame))
     after = replace(
         state,
@@ -256,32 +261,3 @@ def _scores(tick: Tick, meters: Bools, inverters: Bools, trial: Trial) -> tuple[
         found = tick.trial(others, inverters)
         score[j], threshold[j] = found.score[j], found.threshold[j]
     return score, np.minimum(threshold, NO_VOLTAGE)
-
-
-def _unusable(
-    design: UnknownInputDesign, state: UnknownInputState, frame: Frame
-) -> tuple[UnknownInputState, Estimate, Verdict]:
-    """The answer to a frame that is not later than the last one: nothing new, and certainly not CLEAN."""
-    plant = design.setting.plant
-    p, m, b = plant.meters.size, plant.droop.tau.size, len(plant.feeder.buses)
-    reason = f"A frame of time {frame.t} is not later than the last one, {state.t}; it was not used."
-    if state.last is not None:
-        estimate, verdict = state.last
-        changed = replace(verdict, decision=Decision.UNDECIDED, cause=Cause.SETTLING, reason=reason)
-        return state, estimate, changed
-    v2_bus = np.full(b, state.v0_squared)
-    nobody = np.zeros(p, dtype=np.bool_)
-    nothing = np.full(plant.feeder.bus.size, NO_VOLTAGE)
-    estimate = Estimate(state.t, v2_bus[plant.feeder.bus], nothing, v2_bus, nobody, state.x)
-    verdict = Verdict(
-        Decision.UNDECIDED,
-        Cause.SETTLING,
-        reason,
-        nobody,
-        np.full(p, np.nan),
-        np.full(p, NO_VOLTAGE),
-        np.zeros(p),
-        np.zeros(m, dtype=np.bool_),
-        np.zeros(m),
-    )
-    return state, estimate, verdict

@@ -7,14 +7,13 @@ docs/theory-sequential.md, sections 5 and 7.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from gridsec.arrays import Bools, Floats
-from gridsec.frames import NO_VOLTAGE
 from gridsec.judge import Situation, decide
-from gridsec.online import Cause, Decision, Estimate, Explanation, Frame, Verdict
+from gridsec.online import Cause, Decision, Estimate, Explanation, Verdict
 from gridsec.sequential.conditional import judge
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.examine import Examined
@@ -267,45 +266,3 @@ def _worst(design: SequentialDesign, seen: Examined, p: int) -> tuple[Floats, Fl
         score, threshold = np.where(more, offset, score), np.where(more, view.limit, threshold)
         ratio = np.maximum(ratio, now)
     return np.where(judged, score, np.nan), threshold, judged
-
-
-def unusable(
-    design: SequentialDesign, state: SequentialState, frame: Frame
-) -> tuple[SequentialState, Estimate, Verdict]:
-    """The answer to a frame that is not later than the last one: nothing new, and certainly not CLEAN.
-
-    Parameters
-    ----------
-    design, state, frame
-        As in `step`.
-    """
-    plant = design.plant
-    p, n, m = plant.meters.size, len(plant.feeder.buses), plant.droop.tau.size
-    reason = f"A frame of time {frame.t} is not later than the last one, {state.t}; it was not used."
-    if state.last is not None:
-        estimate, verdict = state.last
-        return (
-            state,
-            estimate,
-            replace(verdict, decision=Decision.UNDECIDED, cause=Cause.SETTLING, reason=reason),
-        )
-    v2_bus = np.full(n, state.v0_squared)
-    estimate = Estimate(
-        t=state.t,
-        v2=v2_bus[plant.feeder.bus],
-        bound=np.full(plant.feeder.bus.size, NO_VOLTAGE),
-        v2_bus=v2_bus,
-        trusted=np.zeros(p, dtype=np.bool_),
-        x=np.zeros(m),
-        std=np.full(plant.feeder.bus.size, NO_VOLTAGE),
-    )
-    verdict = Verdict(
-        Decision.UNDECIDED,
-        Cause.SETTLING,
-        reason,
-        np.zeros(p, dtype=np.bool_),
-        np.full(p, np.nan),
-        np.full(p, NO_VOLTAGE),
-        np.zeros(p),
-    )
-    return state, estimate, verdict

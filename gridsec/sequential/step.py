@@ -8,11 +8,11 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats
 from gridsec.feeder import bus_voltages, model_error_bound
-from gridsec.frames import NO_VOLTAGE
+from gridsec.frames import NO_VOLTAGE, nothing_new
 from gridsec.online import Estimate, Explanation, Frame, Verdict
 from gridsec.sequential.commission import conclude as learn
 from gridsec.sequential.commission import gather, ripe
-from gridsec.sequential.conclude import Tick, conclude, unusable
+from gridsec.sequential.conclude import Tick, conclude
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.drive import drive
 from gridsec.sequential.examine import Examined, ended, examine
@@ -54,7 +54,11 @@ def step(
         As every estimator's step; see `gridsec.online`.
     """
     if not np.isfinite(frame.t) or (state.x is not None and not frame.t > state.t):
-        return unusable(design, state, frame)
+        none = np.zeros(design.plant.droop.tau.size)
+        estimate, verdict = nothing_new(design.plant, frame, state.t, state.last, state.v0_squared, none)
+        if state.last is None:
+            estimate = replace(estimate, std=estimate.bound)
+        return state, estimate, verdict
     at = design.plant.feeder.bus[design.plant.meters]
     frame = _powers(design, frame)
     heard = _clean(design, state, frame)
