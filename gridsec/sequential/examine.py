@@ -15,7 +15,7 @@ from gridsec.arrays import Bools, Floats, Ints
 from gridsec.sequential.conditional import Fit, drop, judge
 from gridsec.sequential.decoder import Accused, Evidence
 from gridsec.sequential.design import SequentialDesign
-from gridsec.sequential.explain import Scale, Scales, Search, View, adapt, directions, view_of
+from gridsec.sequential.explain import Scale, Scales, Search, View, adapt, believe, directions, view_of
 from gridsec.sequential.search import Explanation, Found, Solution
 from gridsec.sequential.state import SequentialState, Trust
 from gridsec.sequential.windows import Window
@@ -192,15 +192,7 @@ def _decoded(design: SequentialDesign, here: Scale, now: Fit, trust: Trust, s: i
     best = answers[0]
     others = (Explanation(here.enough & ~each.meters, (), 0.0, each.worse) for each in answers[1:])
     found = Found(_solution(here, whole, best), tuple(others))
-    trusted = np.where(here.enough, ~best.meters, trust.trusted)
-    fallen = trust.trusted & ~trusted
-    return found, replace(
-        trust,
-        trusted=trusted,
-        scale=np.where(fallen, s, trust.scale),
-        quiet=np.where(fallen, 0, trust.quiet),
-        accused=(),
-    )
+    return found, believe(trust, np.where(here.enough, ~best.meters, trust.trusted), s, ())
 
 
 def _solution(here: Scale, whole: Fit, answer: Accused) -> Solution:

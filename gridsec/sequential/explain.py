@@ -175,6 +175,25 @@ def adapt(before: Fit | None, prior: Prior, noise: Floats, wanted: Bools, loose:
     return now
 
 
+def believe(trust: Trust, trusted: Bools, s: int, accused: tuple[tuple[int, int], ...]) -> Trust:
+    """Whom an explanation leaves trusted.
+
+    Parameters
+    ----------
+    trust
+        Who was believed.
+    trusted : (p,)
+        Who is.
+    s
+        The scale that it was found on.
+    accused
+        What else is suspected, each with a scale.
+    """
+    fallen = trust.trusted & ~trusted
+    scale, quiet = np.where(fallen, s, trust.scale), np.where(fallen, 0, trust.quiet)
+    return replace(trust, trusted=trusted, scale=scale, quiet=quiet, accused=accused)
+
+
 class Search:
     """The explanations that several starts lead to on one scale.
 
@@ -247,8 +266,7 @@ class Search:
             first, second = (free, found) if better else (found, free)
             found = Found(first.best, (second.best.bare(), *first.others, *second.others))
         rivals = (*found.others, *self._instead(found.best))
-        found = replace(found, others=tuple(self._compared(found.best, other) for other in rivals))
-        return found, self._believe(found.best)
+        return replace(found, others=self._compared(found.best, rivals)), self._believe(found.best)
 
     def _instead(self, best: Solution) -> list[Explanation]:
         """Explanations in which one of those who might be named is honest."""
@@ -269,17 +287,21 @@ class Search:
                 out.append(Explanation(other.trusted, loosened, charge, cost))
         return out
 
-    def _compared(self, best: Solution, other: Explanation) -> Explanation:
-        """A rival, at what it costs on the scale that speaks most against it.
+    def _compared(self, best: Solution, rivals: tuple[Explanation, ...]) -> tuple[Explanation, ...]:
+        """Rivals, each at what it costs on the scale that speaks most against it.
 
         Long means hardly know yet of a lie that has just begun, short ones hardly see a small one.
         """
-        same = other.loosened == best.loosened and np.array_equal(other.trusted, best.trusted)
-        if same or other.cost - best.cost > 2.0 * np.log(self.design.options.like):
-            return other
-        prices = self._prices(other) - self._prices(best)
-        both = zip(self._misfits(other), self._misfits(best), strict=True)
-        return replace(other, cost=best.cost + prices + max(theirs - ours for theirs, ours in both))
+        within, ours, out = 2.0 * np.log(self.design.options.like), None, []
+        for other in rivals:
+            same = other.loosened == best.loosened and np.array_equal(other.trusted, best.trusted)
+            if same or other.cost - best.cost > within:
+                out.append(other)
+                continue
+            ours = self._misfits(best) if ours is None else ours
+            worse = max(theirs - own for theirs, own in zip(self._misfits(other), ours, strict=True))
+            out.append(replace(other, cost=best.cost + self._prices(other) - self._prices(best) + worse))
+        return tuple(out)
 
     def _suspected(self, found: Found) -> int:
         """How many meters are suspected at least."""
@@ -358,16 +380,8 @@ class Search:
         return out
 
     def _believe(self, best: Explanation) -> Trust:
-        trust = self.trust
-        trusted = np.where(self.here.enough, best.trusted, trust.trusted)
-        fallen = trust.trusted & ~trusted
-        return replace(
-            trust,
-            trusted=trusted,
-            scale=np.where(fallen, self.s, trust.scale),
-            quiet=np.where(fallen, 0, trust.quiet),
-            accused=(*self.accused, *((k, self.s) for k in best.loosened)),
-        )
+        accused = (*self.accused, *((k, self.s) for k in best.loosened))
+        return believe(self.trust, self._trusted(best), self.s, accused)
 
 
 def _held(trust: Trust, s: int) -> Bools:
