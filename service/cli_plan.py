@@ -15,6 +15,7 @@ from rich.table import Table
 
 from service import console
 from service.console import Feeder
+from service.tables import write_tables
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -31,7 +32,7 @@ Silent = Annotated[list[str] | None, typer.Option(help="A meter that is missing;
 BusbarUnknown = Annotated[bool, typer.Option("--busbar-unknown", help="The busbar's voltage is not metered.")]
 CurvesAt = Annotated[str, typer.Option(help="Where inverters work: steepest or deadband.")]
 Journal = Annotated[Path | None, typer.Option(help="Keep finished work in this file, and go on from it.")]
-Out = Annotated[Path | None, typer.Option(help="Write the tables into this folder, as CSV.")]
+Out = Annotated[Path | None, typer.Option(help="Write the tables into this folder, as CSV and Parquet.")]
 
 
 def redundancy(
@@ -65,7 +66,7 @@ def redundancy(
     _show("Liars inside one part", found.parts)
     if found.silent:
         _show(f"What changes without {', '.join(found.silent)}", found.changes)
-    _write(out, {"summary": found.summary, "meters": found.meters, "parts": found.parts})
+    write_tables(out, found.tables)
 
 
 def protect(
@@ -123,7 +124,7 @@ def protect(
     if count:
         _show("Protect", found.meters)
         _show("Attacks that ask for them", found.attacks)
-    _write(out, {"meters": found.meters, "attacks": found.attacks})
+    write_tables(out, found.tables)
 
 
 def detectable(
@@ -149,7 +150,7 @@ def detectable(
     places = ["customer", "bus"]
     _show(f"Lies, V: each alone, and with {more} more", found.meters.drop(columns=places).round(2))
     _show(f"Errors of the voltage with {more + 1} unnoticed liars, V", found.customers.round(2))
-    _write(out, {"meters": found.meters, "customers": found.customers})
+    write_tables(out, found.tables)
     if trials:
         with _bar("simulated lies") as tell:
             seen = rehearse(site, found, trials=trials, seed=seed, share=share, progress=tell)
@@ -219,11 +220,3 @@ def _cell(cell: Any) -> str:
     if isinstance(cell, float):
         return "∞" if math.isinf(cell) else f"{cell:.4g}"
     return str(cell)
-
-
-def _write(folder: Path | None, frames: dict[str, pd.DataFrame]) -> None:
-    if folder is None:
-        return
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, frame in frames.items():
-        frame.to_csv(folder / f"{name}.csv", index=False)

@@ -74,6 +74,11 @@ class Detectable:
     meters: pd.DataFrame
     customers: pd.DataFrame
 
+    @property
+    def tables(self) -> dict[str, pd.DataFrame]:
+        """All tables by name."""
+        return {"meters": self.meters, "customers": self.customers}
+
 
 def detectable(
     site: Site,

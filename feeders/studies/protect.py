@@ -78,6 +78,11 @@ class Protect:
         """How many more than necessary there can be; 0: these are the fewest."""
         return len(self.meters) - self.least
 
+    @property
+    def tables(self) -> dict[str, pd.DataFrame]:
+        """All tables by name."""
+        return {"meters": self.meters, "attacks": self.attacks}
+
 
 def protect(
     site: Site,

@@ -83,6 +83,12 @@ class Redundancy:
         both = before.merge(after, on="bus", suffixes=("", "_silent"))
         return both[both["identified_silent"] < both["identified"]].reset_index(drop=True)
 
+    @property
+    def tables(self) -> dict[str, pd.DataFrame]:
+        """All tables by name; `changes` where there are missing meters."""
+        found = {"summary": self.summary, "meters": self.meters, "parts": self.parts}
+        return found | ({"changes": self.changes} if self.silent else {})
+
 
 def redundancy(
     site: Site,

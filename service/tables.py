@@ -1,0 +1,59 @@
+"""Tables of studies as files: CSV for people and spreadsheets, Parquet with the types kept."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+__all__ = ["write_tables"]
+
+
+def write_tables(folder: Path | None, tables: Mapping[str, pd.DataFrame]) -> None:
+    """Write every table into a folder, as `NAME.csv` and `NAME.parquet`.
+
+    A file is replaced when its new content is complete: an interruption leaves the old one.
+
+    Parameters
+    ----------
+    folder
+        Where to; it is made if it does not exist. None: nothing is written.
+    tables
+        Table by name. Names are those of files, without ending.
+
+    Raises
+    ------
+    ValueError
+        If a name is not that of a file in the folder.
+    OSError
+        If the folder cannot be written.
+    """
+    if folder is None:
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, frame in tables.items():
+        if Path(name).name != name or name in ("", ".."):
+            raise ValueError(f"{name!r} is no name of a table's file")
+        _replace(folder / f"{name}.csv", partial(frame.to_csv, index=False))
+        _replace(folder / f"{name}.parquet", partial(_for_parquet(frame).to_parquet, index=False))
+
+
+def _replace(path: Path, write: Callable[[Path], object]) -> None:
+    new = path.with_name(f".{path.name}.new")
+    write(new)
+    os.replace(new, path)
+
+
+def _for_parquet(frame: pd.DataFrame) -> pd.DataFrame:
+    """Parquet has one type for each column: values of several types become text, as CSV shows them."""
+    mixed = [
+        name
+        for name in frame.columns
+        if frame[name].dtype == object and len({type(cell) for cell in frame[name].dropna()}) > 1
+    ]
+    return frame.assign(**{name: frame[name].map(str, na_action="ignore") for name in mixed})

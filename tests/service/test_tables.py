@@ -1,0 +1,46 @@
+"""Tables of studies as files."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from service.tables import write_tables
+
+
+def test_both_files_hold_the_table(tmp_path: Path) -> None:
+    frame = pd.DataFrame(
+        {"meter": ["m,1", 'm"2'], "lie": [0.1 + 0.2, math.inf], "critical": [True, None], "n": [1, 2]}
+    )
+    write_tables(tmp_path / "new" / "out", {"meters": frame})
+    kept = pd.read_parquet(tmp_path / "new" / "out" / "meters.parquet")
+    pd.testing.assert_frame_equal(kept, frame)
+    read = pd.read_csv(tmp_path / "new" / "out" / "meters.csv", float_precision="round_trip")
+    assert read["meter"].tolist() == ["m,1", 'm"2']
+    assert read["lie"].tolist() == [0.1 + 0.2, math.inf]
+    assert sorted(path.name for path in (tmp_path / "new" / "out").iterdir()) == [
+        "meters.csv",
+        "meters.parquet",
+    ]
+
+
+def test_values_of_several_types_are_text_in_parquet(tmp_path: Path) -> None:
+    write_tables(tmp_path, {"mixed": pd.DataFrame({"value": [1, "unknown", None]})})
+    kept = pd.read_parquet(tmp_path / "mixed.parquet")["value"]
+    assert kept.tolist()[:2] == ["1", "unknown"]
+    assert pd.isna(kept[2])
+
+
+def test_no_folder_and_no_rows(tmp_path: Path) -> None:
+    write_tables(None, {"nothing": pd.DataFrame()})
+    write_tables(tmp_path, {"empty": pd.DataFrame({"liars": []})})
+    assert pd.read_parquet(tmp_path / "empty.parquet").columns.tolist() == ["liars"]
+
+
+@pytest.mark.parametrize("name", ["", "../up", "a/b", ".."])
+def test_a_table_stays_in_its_folder(tmp_path: Path, name: str) -> None:
+    with pytest.raises(ValueError, match="no name of a table"):
+        write_tables(tmp_path / "in", {name: pd.DataFrame({"a": [1]})})
