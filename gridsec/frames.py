@@ -11,6 +11,7 @@ from gridsec.arrays import Bools, Floats
 from gridsec.detect import Uncertainty
 from gridsec.feeder import corrected, loss_correction
 from gridsec.lure import known_input
+from gridsec.network import by_place
 from gridsec.online import Cause, Decision, Estimate, Frame, Verdict
 from gridsec.plant import Plant, Setting
 
@@ -68,7 +69,12 @@ class Reconstruction:
 
 
 def nothing_new(  # noqa: PLR0917  # what there was, and what there is to say without it
-    plant: Plant, frame: Frame, t: float, last: tuple[Estimate, Verdict] | None, v0_squared: float, x: Floats
+    plant: Plant,
+    frame: Frame,
+    t: float,
+    last: tuple[Estimate, Verdict] | None,
+    v0_squared: Floats | float,
+    x: Floats,
 ) -> tuple[Estimate, Verdict]:
     """The answer to a frame that is not later than the last one: nothing new, and certainly not CLEAN.
 
@@ -81,14 +87,14 @@ def nothing_new(  # noqa: PLR0917  # what there was, and what there is to say wi
     last
         What was answered then; None: there was none.
     v0_squared, x
-        Squared busbar voltage and injections, pu, to be answered without one.
+        Squared busbar voltage (or one for each phase) and injections, pu, to be answered without one.
     """
     reason = f"A frame of time {frame.t} is not later than the last one, {t}; it was not used."
     if last is not None:
         estimate, verdict = last
         return estimate, replace(verdict, decision=Decision.UNDECIDED, cause=Cause.SETTLING, reason=reason)
     at, p = plant.feeder.bus, plant.meters.size
-    v2_bus, nobody = np.full(len(plant.feeder.buses), v0_squared), np.zeros(p, dtype=np.bool_)
+    v2_bus, nobody = by_place(plant.feeder, v0_squared), np.zeros(p, dtype=np.bool_)
     estimate = Estimate(t, v2_bus[at], np.full(at.size, NO_VOLTAGE), v2_bus, nobody, x)
     score, threshold = np.full(p, np.nan), np.full(p, NO_VOLTAGE)
     verdict = Verdict(Decision.UNDECIDED, Cause.SETTLING, reason, nobody, score, threshold, np.zeros(p))
@@ -133,7 +139,7 @@ def reconstruct(setting: Setting, frame: Frame, inputs: Inputs, q: Floats) -> Re
     if plant.loss_correction:
         with np.errstate(all="ignore"):
             correction = loss_correction(
-                plant.feeder, frame.p, q, inputs.v0_squared, steps=plant.loss_correction
+                plant.balanced, frame.p, q, inputs.v0_squared, steps=plant.loss_correction
             )
         correction = np.where(np.isfinite(correction), correction, inputs.correction)
     v2_bus = inputs.v0_squared + 2.0 * (model.R_bus @ frame.p + model.X_bus @ q) + correction
@@ -215,7 +221,7 @@ def _losses(
     plant: Plant, p: Floats, q: Floats, v0: float, *, p_error: Floats, q_error: Floats
 ) -> tuple[Floats, Floats]:
     """Loss correction (b + 1,), and how far it can be from the truth at each customer (N,)."""
-    feeder, steps = plant.feeder, plant.loss_correction
+    feeder, steps = plant.balanced, plant.loss_correction
     # The correction is nearly quadratic in the loads: its ends are where all of them err the same way.
     ends = np.array([0.0, -1.0, 1.0])[:, None]
     with np.errstate(all="ignore"):

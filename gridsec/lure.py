@@ -23,7 +23,8 @@ from scipy.linalg import expm
 from gridsec.arrays import Floats, Ints, exponential_integrals, frozen, perron_bound
 from gridsec.droop import Droop
 from gridsec.errors import FeederInvalid
-from gridsec.feeder import Feeder, LinDistFlow, common_paths
+from gridsec.feeder import LinDistFlow
+from gridsec.network import Network, Power, columns
 from gridsec.newton import Nonlinearity, settle
 from gridsec.phases import CustomerFlow, ThreePhaseFeeder, lindist3flow, per_customer
 
@@ -141,7 +142,7 @@ def input_matrices(
     return tuple(np.zeros((count, inputs)) if one is None else one for one, count in rows)
 
 
-def close_loop(feeder: Feeder | ThreePhaseFeeder, droop: Droop, meters: Ints) -> Lure:
+def close_loop(feeder: Network | ThreePhaseFeeder, droop: Droop, meters: Ints) -> Lure:
     """The Lur'e system of a feeder with droop inverters and voltage meters.
 
     With `z = vbar^2 - v^2` as the output everywhere and `u = w` from `known_input`:
@@ -191,11 +192,11 @@ def close_loop(feeder: Feeder | ThreePhaseFeeder, droop: Droop, meters: Ints) ->
     )
 
 
-def _reactances(feeder: Feeder | ThreePhaseFeeder, own: Ints) -> Floats:
+def _reactances(feeder: Network | ThreePhaseFeeder, own: Ints) -> Floats:
     """From the reactive powers of the customers `own` to the squared voltage of everybody, (N, m)."""
-    if isinstance(feeder, Feeder):
-        return common_paths(feeder, feeder.x, feeder.bus[own])[feeder.bus]
-    return per_customer(feeder, lindist3flow(feeder)).X[:, own]
+    if isinstance(feeder, ThreePhaseFeeder):
+        return per_customer(feeder, lindist3flow(feeder)).X[:, own]
+    return 0.5 * columns(feeder, Power.REACTIVE, own)[feeder.bus]
 
 
 def known_input(  # noqa: PLR0917  # every argument is a term of chong2020 (19), in its order

@@ -93,8 +93,8 @@ def design(
         raise ValueError(f"step_s is {step_s}; it must be a positive number of seconds")
     if options is None:
         options = Options() if step_s <= 30.0 else Options(release=4)
-    lure = close_loop(plant.feeder, plant.droop, meters)
-    model = lindistflow(plant.feeder)
+    lure = close_loop(plant.balanced, plant.droop, meters)
+    model = lindistflow(plant.balanced)
     bank = banks.design(lure, max_attacked, gains=gains, reactive=_reactive(model, meters, gains))
     errors = detect.error_model(plant.droop, model, meters, max_attacked)
     proven = lure

@@ -97,7 +97,7 @@ class Frame:
     seen : (p,)
         Whether a usable reading of the meter belongs to this tick.
     v0_squared
-        Squared busbar voltage as metered, pu; NaN if there is none.
+        Squared busbar voltage as metered, pu; NaN if there is none. In three phases the mean of them.
     p : (N,)
         Net active injection of each customer (generation positive), pu; always finite.
     p_error : (N,)
@@ -110,6 +110,8 @@ class Frame:
         Metered net reactive injection, inverter included, pu; NaN where not reported.
     q_net_error : (N,)
         Half-width for `q_net`, pu; ignored where `q_net` is NaN.
+    v0_phases : (3,) or None
+        Squared busbar voltage of each phase, pu, NaN where there is none; None on a balanced feeder.
     """
 
     t: float
@@ -122,6 +124,7 @@ class Frame:
     q_error: Floats
     q_net: Floats
     q_net_error: Floats
+    v0_phases: Floats | None = None
 
 
 @dataclass(frozen=True, slots=True)

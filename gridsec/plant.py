@@ -9,9 +9,11 @@ from gridsec.arrays import Floats, Ints
 from gridsec.certificates import Certificate
 from gridsec.detect import ErrorBound, ErrorModel, MeterAccuracy, error_model
 from gridsec.droop import Droop
+from gridsec.errors import DesignInfeasible
 from gridsec.feeder import Feeder, LinDistFlow, lindistflow
 from gridsec.judge import Tally
 from gridsec.lure import Lure
+from gridsec.network import Network
 from gridsec.online import Estimate, Verdict
 
 
@@ -22,7 +24,7 @@ class Plant:
     Attributes
     ----------
     feeder
-        Radial tree with its customers.
+        The feeder with its customers, balanced or in three phases.
     droop
         The customers' inverters and their curves.
     meters : (p,)
@@ -33,11 +35,18 @@ class Plant:
         DistFlow fixed-point steps that correct LinDistFlow for branch losses; 0 leaves it linear.
     """
 
-    feeder: Feeder
+    feeder: Network
     droop: Droop
     meters: Ints
     accuracy: MeterAccuracy
     loss_correction: int = 1
+
+    @property
+    def balanced(self) -> Feeder:
+        """The feeder, for estimators that take only balanced ones; raises DesignInfeasible for others."""
+        if isinstance(self.feeder, Feeder):
+            return self.feeder
+        raise DesignInfeasible(f"estimator for {self.feeder.name}", "it cannot watch single phases")
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +122,7 @@ def setting(
     plant, max_attacked, options, believes_q
         As in `Setting`; the options' defaults by default.
     """
-    model = lindistflow(plant.feeder)
+    model = lindistflow(plant.balanced)
     errors = error_model(plant.droop, model, plant.meters, max_attacked)
     return Setting(plant, model, errors, Options() if options is None else options, max_attacked, believes_q)
 

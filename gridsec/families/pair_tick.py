@@ -243,7 +243,7 @@ def _without_inverters(
         customers[np.arange(plant.droop.customer.size), plant.droop.customer] = 1.0
         with np.errstate(all="ignore"):
             found = loss_correction(
-                plant.feeder,
+                plant.balanced,
                 frame.p,
                 frame.q + ends @ customers,
                 inputs.v0_squared,

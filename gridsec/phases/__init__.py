@@ -1,7 +1,7 @@
 """Unbalanced feeders: three phases with mutual impedance, customers on one phase or on all.
 
 `ThreePhaseFeeder` is the radial tree of 3x3 blocks in per unit, `lindist3flow` its linear power flow of
-squared phase voltages, and `loss_correction` what that leaves out.
+squared phase voltages, `loss_correction` what that leaves out, and `PhasedFeeder` what monitors run on.
 """
 
 from gridsec.phases.feeder import PHASES, ROTATION, ThreePhaseFeeder, sequence_matrix
@@ -17,12 +17,14 @@ from gridsec.phases.flow import (
     sensitivities,
     squared_voltages,
 )
+from gridsec.phases.places import PhasedFeeder
 
 __all__ = [
     "PHASES",
     "ROTATION",
     "CustomerFlow",
     "LinDist3Flow",
+    "PhasedFeeder",
     "ThreePhaseFeeder",
     "bus_voltages",
     "corrected",

@@ -28,6 +28,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints
+from gridsec.network import one_busbar
 from gridsec.sequential.conditional import invert
 from gridsec.sequential.design import SequentialDesign
 
@@ -274,11 +275,14 @@ def conclude(
 def _lasting(design: SequentialDesign, heard: Ints, some: slice) -> Floats:
     """Covariance at the meters of errors that no mean takes away, some columns, (h, k).
 
-    The fixed error of the busbar's meter is one of them, whatever is known of the loads.
+    The fixed error of the busbar's meter is one of them, whatever is known of the loads; phases have their
+    own.
     """
     of_loads = design.prior.of_meters[np.ix_(design.prior.meters[heard], heard[some])]
     lasting = design.doubt.lasting
-    return lasting * of_loads + (1.0 - lasting) * design.busbar**2
+    places, feeder = design.prior.meters, design.plant.feeder
+    same = one_busbar(feeder, places[heard], places[heard[some]])
+    return lasting * of_loads + (1.0 - lasting) * design.busbar**2 * same
 
 
 def _hidden(design: SequentialDesign, heard: Ints, inverse: Floats) -> Floats:

@@ -13,6 +13,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats
 from gridsec.judge import Situation, decide
+from gridsec.network import busbar_places
 from gridsec.online import Cause, Decision, Estimate, Explanation, Verdict
 from gridsec.sequential.conditional import judge
 from gridsec.sequential.design import SequentialDesign
@@ -30,10 +31,8 @@ class Tick:
         Squared voltages; any finite value where there is none.
     live : (p,)
         Which meters have a reading.
-    v0_squared
-        Squared busbar voltage.
-    busbar
-        Whether it is metered.
+    v0_squared, busbar
+        Squared busbar voltage, and whether it is metered; in three phases (3,) each.
     v2_bus : (n,)
         Squared voltages that the model alone says.
     transient : (p,)
@@ -46,8 +45,8 @@ class Tick:
 
     y: Floats
     live: Bools
-    v0_squared: float
-    busbar: bool
+    v0_squared: Floats | float
+    busbar: Bools | bool
     v2_bus: Floats
     transient: Floats
     seen: Examined
@@ -111,7 +110,8 @@ def _estimate(design: SequentialDesign, state: SequentialState, tick: Tick) -> E
     plant = design.plant
     w, variance = _reconstructed(design, state, tick.seen)
     v2_bus = tick.v2_bus + w
-    v2_bus[0] = tick.v0_squared if tick.busbar else v2_bus[0]
+    first = busbar_places(plant.feeder)
+    v2_bus[first] = np.where(tick.busbar, tick.v0_squared, v2_bus[first])
     v2, std = v2_bus[plant.feeder.bus], np.sqrt(variance[plant.feeder.bus])
     far = float(np.max(state.model_error + tick.transient, initial=0.0))
     return Estimate(

@@ -16,15 +16,15 @@ from gridsec.arrays import Floats, Ints
 from gridsec.certificates import Certificate, certify, verify
 from gridsec.detect import busbar_error
 from gridsec.errors import DesignInfeasible, NotObservable
-from gridsec.feeder import Feeder, bus_voltages, common_paths, path_sums
 from gridsec.lmi import contraction
 from gridsec.lure import Lure, close_loop
+from gridsec.network import Network, Power, along, columns, own, sizes
 from gridsec.plant import Plant
 from gridsec.sequential.conditional import Prior
 from gridsec.sequential.decoder import Decoder
 from gridsec.sequential.dictionary import Dictionary
 from gridsec.sequential.kinds import Shapes, Traces
-from gridsec.sequential.loads import LoadDoubt, injection_doubt, prior, squares
+from gridsec.sequential.loads import LoadDoubt, injection_doubt, prior
 from gridsec.sequential.repeats import rules
 
 YEAR_S = 365.25 * 86400.0
@@ -236,8 +236,8 @@ def design(
         book=_suspicions(plant, options),
         shapes=_shapes(plant, options.alarms_per_year, step_s, lengths),
         most=meters.size // 3 if max_attacked is None else max_attacked,
-        most_p=_most_power(plant.feeder, plant.feeder.r),
-        most_q=_most_power(plant.feeder, plant.feeder.x),
+        most_p=_most_power(plant.feeder, Power.ACTIVE),
+        most_q=_most_power(plant.feeder, Power.REACTIVE),
         step_s=step_s,
         options=options,
     )
@@ -247,9 +247,8 @@ def design(
 _COLLAPSE, _NO_POWER = 1.0, 1e4
 
 
-def _most_power(feeder: Feeder, branch: Floats) -> Floats:
-    own = path_sums(feeder, branch)[feeder.bus]
-    return np.asarray(_COLLAPSE / np.maximum(2.0 * own, _COLLAPSE / _NO_POWER))
+def _most_power(feeder: Network, power: Power) -> Floats:
+    return np.asarray(_COLLAPSE / np.maximum(2.0 * own(feeder, power), _COLLAPSE / _NO_POWER))
 
 
 # Voltage at which a meter's relative errors are turned into squared ones, in parts of the nominal.
@@ -321,32 +320,28 @@ def _shapes(plant: Plant, rate: float, step_s: float, lengths: tuple[int, ...]) 
 
 def _suspicions(plant: Plant, options: SequentialOptions) -> Dictionary:
     """Columns of 2R for the customers' active powers, and of 2X for the inverters; made when asked for."""
-    feeder, own = plant.feeder, plant.droop.customer
+    feeder, meters, owner = plant.feeder, plant.meters, plant.droop.customer
     customers = feeder.bus.size
-    of, metered = np.concatenate([np.arange(customers), own]), np.zeros(customers)
-    metered[plant.meters] = 1.0
+    of = np.concatenate([np.arange(customers), owner])
 
-    def columns(which: Ints) -> Floats:
+    def changes(which: Ints) -> Floats:
         out = np.empty((len(feeder.buses), which.size))
-        for branch, some in ((feeder.r, which < customers), (feeder.x, which >= customers)):
-            out[:, some] = 2.0 * common_paths(feeder, branch, feeder.bus[of[which[some]]])
+        for power, some in ((Power.ACTIVE, which < customers), (Power.REACTIVE, which >= customers)):
+            out[:, some] = columns(feeder, power, of[which[some]])
         return out
 
-    def along(weights: Floats) -> Floats:
-        # What a power here does there it does here if it is there.
-        power = np.zeros((2, 2, customers))
-        power[0, 0, plant.meters] = power[1, 1, plant.meters] = weights
-        volts = bus_voltages(feeder, power[0], power[1], 0.0, steps=0)[:, feeder.bus]
-        return np.concatenate([volts[0], volts[1][own]])
+    def towards(weights: Floats) -> Floats:
+        load = along(feeder, Power.ACTIVE, meters, weights)
+        return np.concatenate([load, along(feeder, Power.REACTIVE, meters, weights)[owner]])
 
-    load, injection = (squares(feeder, branch, metered)[feeder.bus] for branch in (feeder.r, feeder.x))
+    load, injection = (sizes(feeder, power, meters) for power in Power)
     return Dictionary(
         std=np.concatenate([np.full(customers, options.hidden_power), 2.0 * plant.droop.limit]),
-        charge=np.repeat([options.hidden_charge, 1.0], [customers, own.size]),
-        size=np.concatenate([load, injection[own]]),
-        meter=np.concatenate([_meter_at(plant), np.full(own.size, -1)]),
-        columns=columns,
-        along=along,
+        charge=np.repeat([options.hidden_charge, 1.0], [customers, owner.size]),
+        size=np.concatenate([load, injection[owner]]),
+        meter=np.concatenate([_meter_at(plant), np.full(owner.size, -1)]),
+        columns=changes,
+        along=towards,
     )
 
 

@@ -26,7 +26,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from gridsec.arrays import Bools, Floats, Ints
-from gridsec.feeder import Feeder, common_paths
+from gridsec.network import Network, Power, columns
 from gridsec.online import Kind
 from gridsec.sequential import repeats
 from gridsec.sequential.repeats import Memory, Rules
@@ -65,23 +65,21 @@ class Traces:
         Bus of each meter.
     """
 
-    feeder: Feeder
+    feeder: Network
     at: Ints
 
     def of(self, meters: Ints) -> Iterator[Floats]:
         """All traces at some meters, (k, …) each, in parts that are small."""
-        feeder = self.feeder
-        for branch in (feeder.r, feeder.x):
-            for first in range(0, feeder.bus.size, _PART):
-                there = common_paths(feeder, branch, feeder.bus[first : first + _PART])
-                yield 2.0 * there[self.at[meters]]
+        every = np.arange(self.feeder.bus.size)
+        for power in Power:
+            for first in range(0, every.size, _PART):
+                yield columns(self.feeder, power, every[first : first + _PART])[self.at[meters]]
 
     def trace(self, which: int) -> Floats:
         """One of them, (p,)."""
-        feeder, customers = self.feeder, self.feeder.bus.size
-        branch = feeder.r if which < customers else feeder.x
-        there = common_paths(feeder, branch, feeder.bus[which % customers, None])
-        return np.asarray(2.0 * there[self.at, 0])
+        customers = self.feeder.bus.size
+        power = Power.ACTIVE if which < customers else Power.REACTIVE
+        return np.asarray(columns(self.feeder, power, np.array([which % customers]))[self.at, 0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -439,11 +437,12 @@ def traced(traces: Traces, who: Ints, lies: Floats, variance: Floats) -> bool:
     most = min(_quantile(who.size - 1), same - 2.0 * np.log(2 * traces.feeder.bus.size))
     if most < 0.0:
         return False
-    parts = [(misfit(part), part.min(axis=0)) for part in traces.of(who)]
+    # In three phases a load lowers its own phase and moves the others either way: how much counts.
+    parts = [(misfit(part), np.abs(part).min(axis=0)) for part in traces.of(who)]
     fits, weakest = (np.concatenate(values) for values in zip(*parts, strict=True))
     for k in np.flatnonzero((fits <= most) & (weakest > 0.0)).tolist():
         # Meters beyond the same branch feel it alike: only those that feel more are counted.
-        if np.count_nonzero(traces.trace(k) > weakest[k] * (1.0 + _SAME)) <= 2 * who.size:
+        if np.count_nonzero(np.abs(traces.trace(k)) > weakest[k] * (1.0 + _SAME)) <= 2 * who.size:
             return True
     return False
 

@@ -18,7 +18,7 @@ import numpy as np
 from gridsec.arrays import Floats, Ints
 from gridsec.detect import MeterAccuracy
 from gridsec.droop import Droop
-from gridsec.feeder import Feeder, bus_voltages, common_paths, path_sums
+from gridsec.network import Network, Power, bus_voltages, by_place, covariance, one_busbar, variances
 from gridsec.sequential.conditional import Prior
 
 
@@ -65,11 +65,12 @@ class LoadDoubt:
 
 
 def prior(
-    feeder: Feeder, at: Ints, doubt: LoadDoubt, *, busbar: float, inverters: Floats | None = None
+    feeder: Network, at: Ints, doubt: LoadDoubt, *, busbar: Floats | float, inverters: Floats | None = None
 ) -> Prior:
     """Covariance of the buses' squared voltages without any meter.
 
-    ``S = 4 R V_p R^T + 4 X V_q X^T + busbar^2 1 1^T`` with ``V = (1 - common) diag(s^2) + common s s^T``.
+    ``S = 4 R V_p R^T + 4 X V_q X^T + busbar^2 1 1^T`` with ``V = (1 - common) diag(s^2) + common s s^T``. In
+    three phases places stand for buses, and only those of the same phase share an error of the busbar's.
 
     Parameters
     ----------
@@ -80,70 +81,25 @@ def prior(
     doubt
         How wrong the powers may be.
     busbar
-        Standard deviation of the squared busbar voltage, squared pu.
+        Standard deviation of the squared busbar voltage, squared pu; in three phases one or (3,).
     inverters : (N,)
         Standard deviation of the injections that observers attribute to the customers' inverters, pu.
     """
     q = doubt.q if inverters is None else np.hypot(doubt.q, inverters)
-    of_meters = np.full((len(feeder.buses), at.size), busbar**2)
-    variance = np.full(len(feeder.buses), busbar**2)
+    variance = by_place(feeder, busbar**2)
+    of_meters: Floats = np.repeat(variance[:, None], at.size, axis=1)
+    of_meters *= one_busbar(feeder, np.arange(variance.size), at)
     none = np.zeros_like(q)
-    for branch, std, common, shared in (
-        (feeder.r, doubt.p, doubt.common_p, bus_voltages(feeder, doubt.p, none, 0.0, steps=0)),
-        (feeder.x, q, doubt.common_q, bus_voltages(feeder, none, q, 0.0, steps=0)),
+    for power, std, common, shared in (
+        (Power.ACTIVE, doubt.p, doubt.common_p, bus_voltages(feeder, doubt.p, none, 0.0, steps=0)),
+        (Power.REACTIVE, q, doubt.common_q, bus_voltages(feeder, none, q, 0.0, steps=0)),
     ):
-        of_meters += _own(feeder, at, branch, (1.0 - common) * std**2)
-        variance += squares(feeder, branch, (1.0 - common) * std**2)
+        of_meters += covariance(feeder, power, at, (1.0 - common) * std**2)
+        variance += variances(feeder, power, (1.0 - common) * std**2)
         if common:
             of_meters += np.multiply.outer(common * shared, shared[at])
             variance += common * shared**2
     return Prior(of_meters, at, variance)
-
-
-def _own(feeder: Feeder, at: Ints, branch: Floats, variance: Floats) -> Floats:
-    """Columns `at` of ``4 R V R^T`` for diagonal V, (n, p); O(n p).
-
-    A voltage is that of the bus above less what the branch between takes off, and this depends on the flow,
-    the sum of the powers below. So covariances with flows are summed up the tree, those with voltages down.
-
-    Parameters
-    ----------
-    feeder, at
-        As in `prior`.
-    branch : (b,)
-        Resistance or reactance of each branch.
-    variance : (N,)
-        Diagonal of V.
-    """
-    there = np.bincount(feeder.bus, weights=variance, minlength=len(feeder.buses))
-    parent, double = feeder.parent.tolist(), (2.0 * branch).tolist()
-    out: Floats = np.multiply(common_paths(feeder, branch, at), 2.0 * there[:, None], order="C")
-    for k in range(len(parent), 0, -1):
-        out[parent[k - 1]] += out[k]
-    out[0] = 0.0
-    for k, (above, factor) in enumerate(zip(parent, double, strict=True), 1):
-        out[k] *= factor
-        out[k] += out[above]
-    return out
-
-
-def squares(feeder: Feeder, branch: Floats, weight: Floats) -> Floats:
-    """Diagonal of ``4 R V R^T`` for diagonal V, (n,): whoever is below a bus shares all of its path.
-
-    Parameters
-    ----------
-    feeder
-        The feeder.
-    branch : (b,)
-        Resistance or reactance of each branch.
-    weight : (N,)
-        Diagonal of V.
-    """
-    below = np.bincount(feeder.bus, weights=weight, minlength=len(feeder.buses))
-    for k in range(feeder.parent.size, 0, -1):
-        below[feeder.parent[k - 1]] += below[k]
-    whole = path_sums(feeder, branch)
-    return path_sums(feeder, 4.0 * below[1:] * (whole[1:] ** 2 - whole[feeder.parent] ** 2))
 
 
 def injection_doubt(droop: Droop, accuracy: MeterAccuracy, meters: Ints, customers: int) -> Floats:

@@ -67,7 +67,7 @@ class Doubts:
     p, q : (N,)
         Factors, powers of two, on the standard deviations of the design.
     busbar
-        Whether there is a busbar voltage.
+        Whether there is a busbar voltage; in three phases (3,).
     prior
         What follows.
     sizes : (k,)
@@ -77,7 +77,7 @@ class Doubts:
 
     p: Floats
     q: Floats
-    busbar: bool
+    busbar: Bools | bool
     prior: Prior
     sizes: Floats
 
@@ -95,7 +95,7 @@ class SequentialState:
     x : (m,) or None
         Injections, pu; None before the first frame.
     v0_squared
-        Last squared busbar voltage, pu.
+        Last squared busbar voltage, pu; in three phases (3,).
     window
         The last residuals.
     trust
@@ -120,7 +120,7 @@ class SequentialState:
     since: float
     ticks: int
     x: Floats | None
-    v0_squared: float
+    v0_squared: Floats | float
     window: Window
     trust: Trust
     fits: tuple[Fit | None, ...]

@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gridsec.arrays import Bools, Floats
-from gridsec.feeder import bus_voltages, model_error_bound
+from gridsec.feeder import Feeder
 from gridsec.frames import NO_VOLTAGE, nothing_new
+from gridsec.network import bus_voltages, by_place, model_error_bound
 from gridsec.online import Estimate, Explanation, Frame, Verdict
 from gridsec.sequential.commission import conclude as learn
 from gridsec.sequential.commission import gather, ripe
@@ -31,8 +32,8 @@ class _Heard:
     y: Floats  # (p,) 0 where not live
     q: Floats  # (N,) of the loads, or metered net where told
     told: Bools  # (N,)
-    v0_squared: float
-    busbar: bool
+    v0_squared: Floats | float  # in three phases (3,), and so whether it is metered
+    busbar: Bools | bool
 
 
 def step(
@@ -138,7 +139,7 @@ def _voltages(design: SequentialDesign, frame: Frame, heard: _Heard, x: Floats) 
     with np.errstate(all="ignore"):
         v2_bus = bus_voltages(plant.feeder, frame.p, q, heard.v0_squared, steps=plant.loss_correction)
         v2_bus = np.clip(v2_bus, 0.0, NO_VOLTAGE)
-    return q, np.where(np.isnan(v2_bus), heard.v0_squared, v2_bus)
+    return q, np.where(np.isnan(v2_bus), by_place(plant.feeder, heard.v0_squared), v2_bus)
 
 
 def _distrust(trust: Trust, copies: Bools) -> Trust:
@@ -224,8 +225,7 @@ def _possible(power: Floats, error: Floats, most: Floats) -> tuple[Floats, Float
 def _clean(design: SequentialDesign, state: SequentialState, frame: Frame) -> _Heard:
     plant = design.plant
     live = frame.seen & np.isfinite(frame.y)
-    low, high = design.options.v2_limits
-    busbar = bool(np.isfinite(frame.v0_squared) and low <= frame.v0_squared <= high)
+    v0_squared, busbar = _busbar(design, state, frame)
     told = np.zeros(frame.q.size, dtype=np.bool_)
     # As `_possible` has it: who is sure of nothing tells nothing.
     reported = (np.abs(frame.q_net) <= design.most_q) & (np.abs(frame.q_net_error) <= design.most_q)
@@ -245,9 +245,23 @@ def _clean(design: SequentialDesign, state: SequentialState, frame: Frame) -> _H
         y=np.clip(np.where(live, frame.y, 0.0), 0.0, NO_VOLTAGE),
         q=np.where(told, frame.q_net, frame.q),
         told=told,
-        v0_squared=frame.v0_squared if busbar else state.v0_squared,
+        v0_squared=v0_squared,
         busbar=busbar,
     )
+
+
+def _busbar(
+    design: SequentialDesign, state: SequentialState, frame: Frame
+) -> tuple[Floats | float, Bools | bool]:
+    """Squared voltage of the busbar, the last one where there is none now, and whether it is metered."""
+    low, high = design.options.v2_limits
+    if isinstance(design.plant.feeder, Feeder):
+        metered = bool(np.isfinite(frame.v0_squared) and low <= frame.v0_squared <= high)
+        return frame.v0_squared if metered else state.v0_squared, metered
+    # Who gives one voltage for all phases says that they are equal.
+    given = np.broadcast_to(frame.v0_squared if frame.v0_phases is None else frame.v0_phases, 3)
+    phases = (low <= given) & (given <= high)  # False for NaN
+    return np.where(phases, given, state.v0_squared), phases
 
 
 # Frames that claim to know loads so much less well than the design assumes are believed.
@@ -256,7 +270,7 @@ _MUCH_LESS = 4.0
 _UNMETERED = 0.1
 
 
-def _doubts(design: SequentialDesign, before: Doubts, frame: Frame, busbar: bool) -> Doubts:
+def _doubts(design: SequentialDesign, before: Doubts, frame: Frame, busbar: Bools | bool) -> Doubts:
     """What this frame does not know; a new prior only where that changed."""
     p, q = (
         _factor(error, std, old)
@@ -267,14 +281,14 @@ def _doubts(design: SequentialDesign, before: Doubts, frame: Frame, busbar: bool
     )
     sizes = _claims(np.abs(frame.p), design.options.hidden_power, before.sizes)
     same = (new is old or np.array_equal(new, old) for new, old in ((p, before.p), (q, before.q)))
-    if busbar == before.busbar and all(same):
+    if np.array_equal(busbar, before.busbar) and all(same):
         return before if sizes is before.sizes else replace(before, sizes=sizes)
     doubt = replace(
         design.doubt,
         p=np.where(p > 1.0, np.maximum(design.doubt.p, _EXACT) * p, design.doubt.p),
         q=np.where(q > 1.0, np.maximum(design.doubt.q, _EXACT) * q, design.doubt.q),
     )
-    plain = busbar and bool((p == 1.0).all() and (q == 1.0).all())
+    plain = bool(np.all(busbar) and (p == 1.0).all() and (q == 1.0).all())
     found = (
         design.prior
         if plain
@@ -282,7 +296,7 @@ def _doubts(design: SequentialDesign, before: Doubts, frame: Frame, busbar: bool
             design.plant.feeder,
             design.prior.meters,
             doubt,
-            busbar=design.busbar if busbar else _UNMETERED,
+            busbar=design.busbar if np.all(busbar) else np.where(busbar, design.busbar, _UNMETERED),
             inverters=design.injections,
         )
     )
@@ -318,7 +332,8 @@ def _inverters(design: SequentialDesign, state: SequentialState, frame: Frame, h
     droop, meter = design.plant.droop, design.meter_of
     believed = state.trust.trusted & heard.live
     driven = (meter >= 0) & believed[meter]
-    y = np.where(driven, heard.y[meter], heard.v0_squared) if meter.size else np.zeros(0)
+    here = by_place(design.plant.feeder, heard.v0_squared)[design.plant.feeder.bus[droop.customer]]
+    y = np.where(driven, heard.y[meter], here) if meter.size else np.zeros(0)
     if state.x is None:
         return np.asarray(droop(droop.vbar**2 - y))
     w = None
@@ -338,7 +353,7 @@ def _linear(design: SequentialDesign, frame: Frame, x: Floats, heard: _Heard) ->
     return np.asarray(bus_voltages(feeder, frame.p, q, heard.v0_squared, steps=0)[feeder.bus])
 
 
-def _model_error(design: SequentialDesign, p: Floats, q: Floats, v0_squared: float) -> Floats:
+def _model_error(design: SequentialDesign, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:
     """What the loss-corrected model may be off at each meter, (p,)."""
     plant = design.plant
     with np.errstate(all="ignore"):

@@ -1,0 +1,234 @@
+"""What estimators ask of a feeder, in the same words whether it is balanced or in three phases.
+
+A *place* has one squared voltage: a bus of a balanced feeder, a phase of a bus of another. The linear power
+flow is ``v^2 = v0^2 + 2 R p + 2 X q`` with rows for places and columns for customers. On a balanced feeder
+its entries are those of common paths, so that it is symmetric between customers, and everything is a sum
+over the tree; in three phases it is neither symmetric nor nonnegative, and rows are not columns.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+import numpy as np
+
+from gridsec import feeder as balanced
+from gridsec.arrays import Floats, Ints
+from gridsec.feeder import Feeder, common_paths, path_sums
+from gridsec.phases import PhasedFeeder, places
+
+Network = Feeder | PhasedFeeder
+"""A feeder that an estimator can watch."""
+
+
+class Power(StrEnum):
+    """Which power moves a voltage: active through resistances, reactive through reactances."""
+
+    ACTIVE = "p"
+    REACTIVE = "q"
+
+
+def busbar_places(feeder: Network) -> slice:
+    """Places of the busbar: one, or one for each phase.
+
+    Parameters
+    ----------
+    feeder
+        The feeder.
+    """
+    return slice(0, 1 if isinstance(feeder, Feeder) else 3)
+
+
+def one_busbar(feeder: Network, some: Ints, others: Ints) -> Floats | float:
+    """1 where two places hang on the same voltage of the busbar, else 0; (j, k), or 1 for all.
+
+    Parameters
+    ----------
+    feeder
+        The feeder.
+    some, others : (j,), (k,)
+        The places.
+    """
+    if isinstance(feeder, Feeder):
+        return 1.0
+    return np.equal.outer(some % 3, others % 3).astype(np.float64)
+
+
+def by_place(feeder: Network, of_busbar: Floats | float) -> Floats:
+    """What the busbar has, for every place that hangs on it, (n,).
+
+    Parameters
+    ----------
+    feeder
+        The feeder.
+    of_busbar
+        One number, or in three phases one for each.
+    """
+    if isinstance(feeder, Feeder):
+        return np.full(len(feeder.buses), of_busbar)
+    return np.tile(np.broadcast_to(np.asarray(of_busbar, dtype=np.float64), 3), len(feeder.tree.buses))
+
+
+def bus_voltages(
+    feeder: Network, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1
+) -> Floats:
+    """Squared voltage of every place, losses corrected; O(n).
+
+    Parameters
+    ----------
+    feeder
+        The feeder.
+    p, q : (…, N)
+        Net active and reactive injection of each customer (generation positive), pu.
+    v0_squared
+        Squared busbar voltage, pu; in three phases scalar or (3,).
+    steps
+        Corrections of the linear power flow; with none it alone.
+
+    Returns
+    -------
+    (…, n)
+        Squared voltages, pu.
+    """
+    if isinstance(feeder, Feeder):
+        return balanced.bus_voltages(feeder, p, q, v0_squared, steps=steps)
+    return places.bus_voltages(feeder, p, q, v0_squared, steps=steps)
+
+
+def model_error_bound(feeder: Network, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:
+    """How far `v^2` after one correction can be from the AC power flow, for every customer, (…, N).
+
+    Parameters
+    ----------
+    feeder, p, q, v0_squared
+        As in `bus_voltages`.
+    """
+    if isinstance(feeder, Feeder):
+        return balanced.model_error_bound(feeder, p, q, v0_squared)
+    return places.model_error_bound(feeder, p, q, v0_squared)
+
+
+def columns(feeder: Network, power: Power, customers: Ints) -> Floats:
+    """What some customers' powers do to the squared voltage of every place: columns of 2 R or 2 X, (n, k).
+
+    Parameters
+    ----------
+    feeder, power
+        The feeder, and which power.
+    customers : (k,)
+        The customers.
+    """
+    if isinstance(feeder, Feeder):
+        return 2.0 * common_paths(feeder, _branch(feeder, power), feeder.bus[customers])
+    return 2.0 * _matrix(feeder, power)[:, customers]
+
+
+def along(feeder: Network, power: Power, customers: Ints, weights: Floats) -> Floats:
+    """What each customer's power does to the weighted sum of some customers' voltages, (N,).
+
+    Parameters
+    ----------
+    feeder, power
+        The feeder, and which power.
+    customers, weights : (p,)
+        The customers whose voltages are summed, each once, and their weights.
+    """
+    if not isinstance(feeder, Feeder):
+        return 2.0 * (weights @ _matrix(feeder, power)[feeder.bus[customers]])
+    # What a power here does there it does here if it is there.
+    injected = np.zeros((2, feeder.bus.size))
+    injected[0, customers] = weights
+    p, q = injected if power is Power.ACTIVE else injected[::-1]
+    return np.asarray(balanced.bus_voltages(feeder, p, q, 0.0, steps=0)[feeder.bus])
+
+
+def sizes(feeder: Network, power: Power, customers: Ints) -> Floats:
+    """Sum over some customers' voltages of the squares of what each customer's power does there, (N,).
+
+    Parameters
+    ----------
+    feeder, power
+        The feeder, and which power.
+    customers : (p,)
+        The customers whose voltages count.
+    """
+    if not isinstance(feeder, Feeder):
+        return np.asarray(4.0 * (_matrix(feeder, power)[feeder.bus[customers]] ** 2).sum(axis=0))
+    weight = np.zeros(feeder.bus.size)
+    weight[customers] = 1.0
+    return variances(feeder, power, weight)[feeder.bus]
+
+
+def own(feeder: Network, power: Power) -> Floats:
+    """Resistance or reactance that a customer's own power meets: the diagonal of R or X, (N,).
+
+    Parameters
+    ----------
+    feeder, power
+        The feeder, and which power.
+    """
+    if isinstance(feeder, Feeder):
+        return path_sums(feeder, _branch(feeder, power))[feeder.bus]
+    return np.asarray(_matrix(feeder, power)[feeder.bus, np.arange(feeder.bus.size)])
+
+
+def covariance(feeder: Network, power: Power, at: Ints, variance: Floats) -> Floats:
+    """Columns `at` of ``4 R V R^T``, or of ``4 X V X^T``, for diagonal V, (n, p).
+
+    On a balanced feeder O(n p): a voltage is that of the bus above less what the branch between takes off,
+    and this depends on the flow, the sum of the powers below. So covariances with flows are summed up the
+    tree, those with voltages down.
+
+    Parameters
+    ----------
+    feeder, power
+        The feeder, and which power.
+    at : (p,)
+        Places.
+    variance : (N,)
+        Diagonal of V.
+    """
+    if not isinstance(feeder, Feeder):
+        matrix = _matrix(feeder, power)
+        return np.asarray(4.0 * (matrix @ (variance * matrix[at]).T))
+    branch = _branch(feeder, power)
+    there = np.bincount(feeder.bus, weights=variance, minlength=len(feeder.buses))
+    parent, double = feeder.parent.tolist(), (2.0 * branch).tolist()
+    out: Floats = np.multiply(common_paths(feeder, branch, at), 2.0 * there[:, None], order="C")
+    for k in range(len(parent), 0, -1):
+        out[parent[k - 1]] += out[k]
+    out[0] = 0.0
+    for k, (above, factor) in enumerate(zip(parent, double, strict=True), 1):
+        out[k] *= factor
+        out[k] += out[above]
+    return out
+
+
+def variances(feeder: Network, power: Power, variance: Floats) -> Floats:
+    """Diagonal of ``4 R V R^T``, or of ``4 X V X^T``, for diagonal V, (n,).
+
+    On a balanced feeder O(n): whoever is below a bus shares all of its path.
+
+    Parameters
+    ----------
+    feeder, power
+        The feeder, and which power.
+    variance : (N,)
+        Diagonal of V.
+    """
+    if not isinstance(feeder, Feeder):
+        return np.asarray(4.0 * (_matrix(feeder, power) ** 2 @ variance))
+    below = np.bincount(feeder.bus, weights=variance, minlength=len(feeder.buses))
+    for k in range(feeder.parent.size, 0, -1):
+        below[feeder.parent[k - 1]] += below[k]
+    branch = _branch(feeder, power)
+    whole = path_sums(feeder, branch)
+    return path_sums(feeder, 4.0 * below[1:] * (whole[1:] ** 2 - whole[feeder.parent] ** 2))
+
+
+def _branch(feeder: Feeder, power: Power) -> Floats:
+    return feeder.r if power is Power.ACTIVE else feeder.x
+
+
+def _matrix(feeder: PhasedFeeder, power: Power) -> Floats:
+    return feeder.R if power is Power.ACTIVE else feeder.X

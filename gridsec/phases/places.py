@@ -1,0 +1,128 @@
+"""A three-phase feeder as monitors see it: customers of one phase, and a place for each phase of each bus.
+
+What `gridsec.feeder` says of the buses of a balanced feeder is said here of places, in the same per unit:
+powers in units of the three-phase base S. Place ``3 k + phi`` is phase phi of bus k, and the busbar has the
+first three. R and X are not symmetric, and their entries have either sign.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gridsec.arrays import Floats, Ints, frozen, frozen_ints
+from gridsec.errors import FeederInvalid
+from gridsec.phases import flow
+from gridsec.phases.feeder import PHASES, ThreePhaseFeeder
+from gridsec.phases.flow import lindist3flow
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PhasedFeeder:
+    """A feeder of single-phase customers. N customers, b + 1 buses, n = 3 (b + 1) places.
+
+    Attributes
+    ----------
+    tree
+        The feeder in three phases; each of its customers is connected to one of them.
+    bus : (N,)
+        Derived. Place of each customer.
+    buses : (n,)
+        Derived. Identifiers of the places, the busbar's three first.
+    R, X : (n, N)
+        Derived. The linear power flow ``v^2 = v0^2 + 2 R p + 2 X q``: from a customer's power, in units of
+        S, to the squared voltage of every place, pu. Where a phase is absent, it is that of its end.
+
+    Raises
+    ------
+    FeederInvalid
+        If a customer has several phases; names them all.
+    """
+
+    tree: ThreePhaseFeeder
+    bus: Ints = field(init=False, repr=False)
+    buses: tuple[str, ...] = field(init=False, repr=False)
+    R: Floats = field(init=False, repr=False)
+    X: Floats = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        tree, several = self.tree, self.tree.connected.sum(axis=1) > 1
+        if several.any():
+            raise FeederInvalid(
+                [
+                    f"customer {tree.customers[k]!r} has several phases; expected one customer for each"
+                    for k in np.flatnonzero(several).tolist()
+                ]
+            )
+        model = lindist3flow(tree)
+        names = tuple(f"{bus}.{phase}" for bus in tree.buses for phase in PHASES)
+        object.__setattr__(self, "bus", frozen_ints(len(PHASES) * tree.at + tree.phase))
+        object.__setattr__(self, "buses", names)
+        for name, found in (("R", model.R_bus), ("X", model.X_bus)):
+            # 1 pu of the power of a phase is a third of S.
+            by_place = 3.0 * np.moveaxis(found, 0, 1).reshape(len(names), tree.at.size)
+            object.__setattr__(self, name, frozen(by_place))
+
+    @property
+    def name(self) -> str:
+        """Name of the feeder."""
+        return self.tree.name
+
+    @property
+    def customers(self) -> tuple[str, ...]:
+        """Identifiers of the customers, (N,)."""
+        return self.tree.customers
+
+    @property
+    def base_volt(self) -> float:
+        """Nominal phase-to-neutral voltage (1 pu), V."""
+        return self.tree.base_volt
+
+    @property
+    def base_kva(self) -> float:
+        """Three-phase base power (1 pu), kVA."""
+        return self.tree.base_kva
+
+
+def bus_voltages(
+    feeder: PhasedFeeder, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1
+) -> Floats:
+    """Squared voltage of every place, losses, charging and unequal phases corrected.
+
+    Parameters
+    ----------
+    feeder
+        The feeder.
+    p, q : (…, N)
+        Net active and reactive injection of each customer (generation positive), pu.
+    v0_squared : (3,) or scalar
+        Squared busbar voltage of each phase, pu.
+    steps
+        As in `gridsec.phases.loss_correction`; with no steps LinDist3Flow alone.
+
+    Returns
+    -------
+    (…, n)
+        Squared voltages, pu.
+    """
+    v0 = np.broadcast_to(np.asarray(v0_squared, dtype=np.float64), len(PHASES))
+    by_phase = flow.bus_voltages(feeder.tree, 3.0 * p, 3.0 * q, v0, steps=steps)
+    return np.moveaxis(by_phase, -2, -1).reshape(*by_phase.shape[:-2], len(feeder.buses))
+
+
+def model_error_bound(feeder: PhasedFeeder, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:
+    """How far `v^2` after one correction can be from the AC power flow, for every customer.
+
+    Parameters
+    ----------
+    feeder, p, q, v0_squared
+        As in `bus_voltages`.
+
+    Returns
+    -------
+    (…, N)
+        `gridsec.phases.model_error_bound`, pu.
+    """
+    v0 = np.broadcast_to(np.asarray(v0_squared, dtype=np.float64), len(PHASES))
+    return flow.model_error_bound(feeder.tree, 3.0 * p, 3.0 * q, v0)
