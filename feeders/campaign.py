@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from feeders.inverters import ClosedLoop, Loads
-from feeders.powerflow import PowerFlow, PowerFlowDiverged
+from feeders.powerflow import PowerFlowDiverged
+from feeders.powerflow_unbalanced import power_flow
 from feeders.variation import Customers, Stream, generator
 from gridsec.arrays import Floats, Ints
 from gridsec.attack import (
@@ -31,7 +32,7 @@ from gridsec.attack import (
     most_affected,
 )
 from gridsec.errors import GridsecError
-from gridsec.feeder import lindistflow
+from gridsec.network import Power, columns
 
 if TYPE_CHECKING:
     from feeders.load import Site
@@ -174,12 +175,13 @@ def fake_load(
         When no load moves the meters that far, or only one that is absurd at first sight.
     """
     loads = _typical(site) if loads is None else loads
-    loop = ClosedLoop(PowerFlow(site), site.droop, site.feeder.base_kva, site.feeder.base_volt)
+    loop = ClosedLoop(power_flow(site), site.droop, site.feeder.base_kva, site.feeder.base_volt)
     without = loop.equilibrium(loads)
     ratio = 0.5 * float(site.loads.tan_min[customer] + site.loads.tan_max[customer])
-    model = lindistflow(site.feeder)
+    one = np.array([customer])
+    R, X = (0.5 * columns(site.feeder, power, one)[site.feeder.bus] for power in Power)
     v = without.v_volt / site.feeder.base_volt
-    pattern = load_pattern(model.R, model.X, customer, ratio, v)[site.meters]
+    pattern = load_pattern(R, X, 0, ratio, v)[site.meters]
     chosen = _affected(site, customer, pattern, meters) if isinstance(meters, int) else meters
     try:
         power = coordinate(pattern, chosen, size)  # pu, to first order; AC has the last word below
@@ -301,4 +303,4 @@ def present_loads(site: Site, scenario: Scenario, t: float) -> Loads:
         site, scenario.variation, scenario.seed, scenario.start, scenario.profile_s, season=scenario.season
     )
     demand = customers.at(np.array([t]))
-    return Loads(demand.p_kw[0], demand.q_kvar[0], float(demand.v0_volt[0]))
+    return Loads(demand.p_kw[0], demand.q_kvar[0], demand.v0_volt[0])

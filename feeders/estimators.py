@@ -245,7 +245,7 @@ def _direct_bank(site: Site, _: Job) -> monitor.MonitorDesign:
 
 def _lmi_bank(site: Site, job: Job) -> monitor.MonitorDesign:
     settings = site.tables.meta.monitor
-    lure = close_loop(site.feeder, site.droop, site.meters)
+    lure = close_loop(site.balanced, site.droop, site.meters)
     found = bank_gains(
         lure,
         settings.max_attacked,
@@ -336,7 +336,7 @@ def lmi_options(site: Site, lure: Lure) -> CircleOptions:
 
 def _load_columns(site: Site) -> Floats:
     """Error of w for unit errors of all powers, (N, 2N): `2 R dp` and `2 X dq`."""
-    model, loads = lindistflow(site.feeder), site.loads
+    model, loads = lindistflow(site.balanced), site.loads
     dp = loads.p_fraction * loads.load_peak + loads.p_floor
     dq = 0.5 * (loads.tan_max - loads.tan_min) * loads.load_peak + loads.q_floor
     return np.hstack([2.0 * model.R * dp, 2.0 * model.X * dq])

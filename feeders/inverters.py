@@ -21,6 +21,7 @@ from typing import Final
 import numpy as np
 
 from feeders.powerflow import PowerFlow, PowerFlowDiverged
+from feeders.powerflow_unbalanced import PlacesFlow
 from feeders.variation import Demand
 from gridsec.arrays import Floats
 from gridsec.droop import Droop
@@ -56,12 +57,12 @@ class Loads:
     q_kvar : (N,)
         Reactive import, kvar.
     v0_volt
-        Busbar voltage, V.
+        Busbar voltage, V; in three phases (3,).
     """
 
     p_kw: Floats
     q_kvar: Floats
-    v0_volt: float
+    v0_volt: Floats | float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,7 +109,7 @@ class ClosedLoop:
         What 1 pu means for `droop`.
     """
 
-    def __init__(self, flow: PowerFlow, droop: Droop, base_kva: float, base_volt: float) -> None:
+    def __init__(self, flow: PowerFlow | PlacesFlow, droop: Droop, base_kva: float, base_volt: float) -> None:
         self.flow = flow
         self.tau = droop.tau
         self.count = droop.tau.size
@@ -259,6 +260,6 @@ class ClosedLoop:
         probes = here.x + PROBE_PU * np.eye(self.count)
         q = self.reactive(loads.q_kvar, probes)
         p = np.broadcast_to(loads.p_kw, q.shape)
-        v, _ = self.flow.solve_batch(p, q, np.full(self.count, loads.v0_volt))
+        v, _ = self.flow.solve_batch(p, q, np.repeat(np.asarray(loads.v0_volt)[None], self.count, axis=0))
         change = (v - here.v_volt)[:, self._customer]
         return (change / (PROBE_PU * self._base_volt)).T

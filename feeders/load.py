@@ -6,78 +6,68 @@ the model's (injection positive).
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from importlib.resources.abc import Traversable
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
 
-from feeders.profiles import data_root
-from feeders.raw import CUSTOMERS_FILE, LINES_FILE, META_FILE
-from feeders.schema import CustomerRow, FeederTables, LineRow, read, to_json, validate
+from feeders.equipment import (
+    LoadModel,
+    accuracy,
+    digest,
+    find,
+    indices,
+    inverters,
+    load_model,
+    metered_customers,
+    names,
+    positions,
+)
+from feeders.load_phases import three_phase
+from feeders.schema import CustomerRow, FeederTables, LineRow, validate
 from feeders.topology import Edge, Tree, tree
-from gridsec.arrays import Floats, Ints, frozen, frozen_ints
+from gridsec.arrays import Floats, Ints
 from gridsec.detect import MeterAccuracy
-from gridsec.droop import Droop, fleet
+from gridsec.droop import Droop
 from gridsec.errors import FeederInvalid
 from gridsec.feeder import Feeder
 from gridsec.monitor import Plant
+from gridsec.network import Network
 from gridsec.online import Frame
+from gridsec.phases import PHASES, PhasedFeeder
+
+__all__ = [
+    "ABSURD_PU",
+    "LoadModel",
+    "Site",
+    "Snapshot",
+    "find",
+    "from_tables",
+    "load",
+    "names",
+    "plant",
+    "to_frame",
+    "volts",
+]
 
 # A reading is evidence even when it is absurd, but its square must stay a number.
 ABSURD_PU = 100.0
-# An active power this far beyond what a customer can draw or feed in is no measurement of it.
-CREDIBLE_FACTOR = 10.0
-CREDIBLE_KW = 50.0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LoadModel:
-    """What is known of the customers' powers without and with a reading, pu. N customers.
-
-    Attributes
-    ----------
-    load_peak, pv_peak : (N,)
-        Largest load and largest generation.
-    tan_min, tan_max : (N,)
-        Limits of the load's q / p (lagging).
-    q_floor : (N,)
-        Reactive power of the load that does not follow p.
-    p_fraction, p_floor : (N,)
-        A metered p is within ``p_fraction |reading| + p_floor`` of the truth.
-    q_error : (N,)
-        Half-width of a metered q: a fraction of the customer's range.
-    q_fraction : (N,)
-        The same fraction, for readings beyond that range.
-    credible : (N,)
-        Largest |p| that is taken for a measurement.
-    """
-
-    load_peak: Floats
-    pv_peak: Floats
-    tan_min: Floats
-    tan_max: Floats
-    q_floor: Floats
-    p_fraction: Floats
-    p_floor: Floats
-    q_error: Floats
-    q_fraction: Floats
-    credible: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Site:
     """A feeder ready to be watched or simulated. N customers, p meters, b + 1 buses.
 
+    With single-phase lines or customers anywhere, it is one in three phases, all of whose customers have one
+    phase: a customer of three is three, see `one_phase_each`.
+
     Attributes
     ----------
     tables
-        The feeder in SI, as its files say it.
+        The feeder in SI, as its files say it; in three phases with customers of one phase.
     feeder
-        The radial tree, pu.
+        The radial tree, pu; or in three phases.
     droop
         The inverters with a droop curve, in the order of the customers.
     meters : (p,)
@@ -98,7 +88,7 @@ class Site:
     """
 
     tables: FeederTables
-    feeder: Feeder
+    feeder: Network
     droop: Droop
     meters: Ints
     meter_ids: tuple[str, ...]
@@ -107,6 +97,19 @@ class Site:
     xy: Floats | None
     loads: LoadModel
     digest: str
+
+    @property
+    def balanced(self) -> Feeder:
+        """The radial tree, for what only takes balanced feeders.
+
+        Raises
+        ------
+        FeederInvalid
+            In three phases.
+        """
+        if isinstance(self.feeder, Feeder):
+            return self.feeder
+        raise FeederInvalid(["lines, customers: single phases, and this takes balanced feeders only"])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,39 +123,18 @@ class Snapshot:
     v_volt : (p,)
         Phase-to-neutral voltages, V; NaN where missing.
     p_kw : (p,)
-        Net active import of all phases together, kW; NaN where missing.
+        Net active import of the customer, kW; NaN where missing.
     q_kvar : (p,)
         Net reactive import, the inverter included, kvar; NaN where not reported.
     v0_volt
-        Busbar voltage, V; NaN where missing.
+        Busbar voltage, V; NaN where missing. In three phases (3,).
     """
 
     t: float
     v_volt: Floats
     p_kw: Floats
     q_kvar: Floats
-    v0_volt: float
-
-
-def names(*, balanced: bool = True) -> list[str]:
-    """Return the feeders that come with the project.
-
-    Parameters
-    ----------
-    balanced
-        Only those that `load` takes; the others need `feeders.load_phases`.
-    """
-    folder = data_root() / "feeders"
-    found = (entry for entry in folder.iterdir() if (entry / META_FILE).is_file())
-    return sorted(entry.name for entry in found if not (balanced and _names_phases(entry)))
-
-
-def _names_phases(folder: Traversable) -> bool:
-    """Whether a folder of ours has single-phase lines or customers: the writer leaves out default columns."""
-    tables = (folder / name for name in (LINES_FILE, CUSTOMERS_FILE))
-    return any(
-        "phases" in table.read_text(encoding="utf-8").partition("\n")[0].split(",") for table in tables
-    )
+    v0_volt: Floats | float
 
 
 def load(path_or_name: Path | str) -> Site:
@@ -171,19 +153,6 @@ def load(path_or_name: Path | str) -> Site:
     return from_tables(find(path_or_name))
 
 
-def find(path_or_name: Path | str) -> FeederTables:
-    """Read the tables of a feeder's folder, or of a feeder that comes with the project; raises as `load`."""
-    path = Path(path_or_name)
-    if path.is_dir():
-        return read(path)
-    bundled = data_root() / "feeders" / str(path_or_name)
-    if len(path.parts) == 1 and path.name not in (".", "..") and bundled.is_dir():
-        return read(Path(str(bundled)))
-    raise FeederInvalid(
-        [f"{path_or_name}: there is neither such a folder nor such a feeder; there are {', '.join(names())}"]
-    )
-
-
 def from_tables(tables: FeederTables) -> Site:
     """Turn a feeder's tables into the per-unit model.
 
@@ -193,8 +162,10 @@ def from_tables(tables: FeederTables) -> Site:
     Raises
     ------
     FeederInvalid
-        If the tables are not valid, or need what the balanced model cannot do yet.
+        If the tables are not valid, or need what the model cannot do yet.
     """
+    if any(row.phases != "abc" for rows in (tables.lines, tables.customers) for row in rows):
+        return _in_phases(one_phase_each(tables))
     problems = validate(tables) or _unsupported(tables)
     if problems:
         raise FeederInvalid(problems)
@@ -218,6 +189,50 @@ def from_tables(tables: FeederTables) -> Site:
         loads=load_model(tables),
         digest=digest(tables),
     )
+
+
+def one_phase_each(tables: FeederTables) -> FeederTables:
+    """The same feeder with a customer and a meter for every phase, each with its part of the power.
+
+    A meter of three phases reads three voltages and three powers; they are the channels "X-a", "X-b" and
+    "X-c". Standard deviations of what is not known are parted as those of independent phases, and an
+    inverter of three phases into three that follow their own phase's voltage.
+
+    Parameters
+    ----------
+    tables
+        The feeder's tables.
+    """
+    rows = [part for row in tables.customers for part in ([row] if len(row.phases) == 1 else _parts(row))]
+    return replace(tables, customers=tuple(rows))
+
+
+def _parts(row: CustomerRow) -> list[CustomerRow]:
+    def part(value: float | None, divisor: float) -> float | None:
+        return None if value is None else value / divisor
+
+    return [
+        replace(
+            row,
+            customer=f"{row.customer}-{phase}",
+            phases=phase,
+            meter=row.meter and f"{row.meter}-{phase}",
+            load_kw=row.load_kw / 3.0,
+            pv_kw=row.pv_kw / 3.0,
+            inverter_kva=row.inverter_kva / 3.0,
+            q_floor_kvar=part(row.q_floor_kvar, 3.0),
+            p_std_kw=part(row.p_std_kw, 3.0**0.5),
+            q_std_kvar=part(row.q_std_kvar, 3.0**0.5),
+        )
+        for phase in PHASES
+    ]
+
+
+def _in_phases(tables: FeederTables) -> Site:
+    """The site of a feeder whose customers have one phase each."""
+    found = three_phase(tables)
+    parts = {f.name: getattr(found, f.name) for f in fields(found)}
+    return Site(**parts | {"feeder": PhasedFeeder(found.feeder)})
 
 
 def plant(site: Site) -> Plant:
@@ -266,8 +281,7 @@ def to_frame(site: Site, snapshot: Snapshot) -> Frame:
     seen = np.isfinite(snapshot.v_volt)
     v = np.clip(snapshot.v_volt / base_volt, -ABSURD_PU, ABSURD_PU)
     y = np.where(seen, v * np.abs(v), np.nan)
-    v0 = min(max(snapshot.v0_volt / base_volt, 0.0), ABSURD_PU) if np.isfinite(snapshot.v0_volt) else np.nan
-
+    v0_squared, v0_phases = _busbar(snapshot.v0_volt, base_volt)
     metered = np.full(model.load_peak.size, np.nan)
     metered[site.meters] = snapshot.p_kw / base_kva
     known = np.abs(metered) <= model.credible  # False for NaN
@@ -291,39 +305,37 @@ def to_frame(site: Site, snapshot: Snapshot) -> Frame:
         t=snapshot.t,
         y=y,
         seen=seen,
-        v0_squared=float(v0 * v0),
+        v0_squared=v0_squared,
         p=-p,
         p_error=p_error,
         q=-0.5 * (q_low + q_high),
         q_error=0.5 * (q_high - q_low),
         q_net=q_net,
         q_net_error=np.maximum(model.q_error, model.q_fraction * size),
+        v0_phases=v0_phases,
     )
+
+
+def _busbar(v0_volt: Floats | float, base_volt: float) -> tuple[float, Floats | None]:
+    """Squared busbar voltage, the mean of the phases, pu; and that of each phase where there are several."""
+    with np.errstate(invalid="ignore"):
+        v0 = np.clip(np.where(np.isfinite(v0_volt), v0_volt, np.nan) / base_volt, 0.0, ABSURD_PU) ** 2
+    return (float(v0), None) if v0.ndim == 0 else (float(v0.mean()), v0)
 
 
 # --- building -----------------------------------------------------------------------------------
 
 
 def _unsupported(tables: FeederTables) -> tuple[str, ...]:
-    """What the format can say and the balanced single-phase equivalent cannot do yet."""
+    """What the format can say and the model cannot do yet."""
     problems = []
     closed = [line for line in tables.lines if line.closed]
     for line in closed:
         where = f"lines, line {line.line!r}"
-        if line.phases != "abc":
-            problems.append(
-                f"{where}: phases {line.phases!r}: the model is balanced yet and takes only 'abc'"
-            )
         if line.tap != 1.0:
             problems.append(
                 f"{where}: tap {line.tap:g}: the model takes no transformer in mid-feeder yet, only 1"
             )
-    problems.extend(
-        f"customers, customer {row.customer!r}: phases {row.phases!r}: the model is balanced yet "
-        "and takes only 'abc'"
-        for row in tables.customers
-        if row.phases != "abc"
-    )
     if all(line.r_ohm == line.x_ohm == 0.0 for line in closed):
         problems.append("lines: no closed line has an impedance; there is nothing to watch below the busbar")
     return tuple(problems)
@@ -335,106 +347,13 @@ def _feeder(tables: FeederTables, closed: list[LineRow], found: Tree) -> Feeder:
     lines = [closed[k] for k in found.branch]
     return Feeder(
         name=meta.name,
-        parent=_indices(found.parent),
+        parent=indices(found.parent),
         r=np.array([line.r_ohm for line in lines]) / z_base,
         x=np.array([line.x_ohm for line in lines]) / z_base,
-        bus=_indices([found.group[row.bus] for row in tables.customers]),
+        bus=indices([found.group[row.bus] for row in tables.customers]),
         customers=tuple(row.customer for row in tables.customers),
         buses=found.buses,
         base_volt=meta.voltage_volt,
         base_kva=meta.base_kva,
         charging=np.array([line.b_us for line in lines]) * (1e-6 * z_base),
     )
-
-
-def _indices(values: Sequence[int]) -> Ints:
-    return frozen_ints(np.array(values, dtype=np.intp))
-
-
-def _either(rows: list[CustomerRow], column: str, default: float) -> Floats:
-    """One column of customers.csv, with the default of feeder.toml where it is empty."""
-    cells = (getattr(row, column) for row in rows)
-    return np.array([default if cell is None else cell for cell in cells], dtype=np.float64)
-
-
-def digest(tables: FeederTables) -> str:
-    """Return the SHA-256 of a feeder's content, see `Site`."""
-    text = json.dumps(to_json(tables), sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
-def metered_customers(tables: FeederTables) -> Ints:
-    """Return the indices of the customers with a meter, ascending."""
-    return _indices([k for k, row in enumerate(tables.customers) if row.meter])
-
-
-def inverters(tables: FeederTables) -> Droop:
-    """Return the inverters with a droop curve, in the order of the customers."""
-    own = [k for k, row in enumerate(tables.customers) if row.inverter_kva > 0]
-    rows = [tables.customers[k] for k in own]
-    return fleet(
-        _indices(own),
-        [row.droop for row in rows],
-        np.array([row.inverter_kva for row in rows], dtype=np.float64),
-        tables.meta.base_kva,
-        tau=np.array([np.nan if row.tau_s is None else row.tau_s for row in rows], dtype=np.float64),
-    )
-
-
-def accuracy(tables: FeederTables) -> MeterAccuracy:
-    """Return what the meters promise, pu."""
-    meta = tables.meta
-    rows = [tables.customers[k] for k in metered_customers(tables)]
-    return MeterAccuracy(
-        class_fraction=frozen(_either(rows, "class_percent", meta.meters.class_percent) / 100.0),
-        resolution=frozen(_either(rows, "resolution_volt", meta.meters.resolution_volt) / meta.voltage_volt),
-        jitter=frozen(_either(rows, "jitter_percent", meta.meters.jitter_percent) / 100.0),
-        busbar_class=meta.busbar_class_percent / 100.0,
-        busbar_resolution=meta.busbar_resolution_volt / meta.voltage_volt,
-        busbar_jitter=meta.busbar_jitter_percent / 100.0,
-    )
-
-
-def load_model(tables: FeederTables) -> LoadModel:
-    """Return what is known of the customers' powers, in units of `base_kva`."""
-    meta, rows = tables.meta, list(tables.customers)
-    base = meta.base_kva
-    load = _either(rows, "load_kw", 0.0)
-    pv = _either(rows, "pv_kw", 0.0)
-    inverter = _either(rows, "inverter_kva", 0.0)
-    tan = {
-        name: np.tan(np.arccos(_either(rows, name, getattr(meta.load, name))))
-        for name in ("power_factor_min", "power_factor_max")
-    }
-    given = _either(rows, "q_floor_kvar", np.nan)
-    floor = np.where(np.isnan(given), meta.load.q_floor_percent / 100.0 * load, given)
-    q_fraction = _either(rows, "q_error_percent", meta.meters.q_error_percent) / 100.0
-    # A register within f |p| + h of the truth p shows r: |p| <= (|r| + h) / (1 - f), so the error is at
-    # most (f |r| + h) / (1 - f).
-    p_fraction = _either(rows, "p_error_percent", meta.meters.p_error_percent) / 100.0
-    # The range of the reactive register: the largest apparent power at the connection point.
-    span = np.maximum.reduce([load * np.hypot(1.0, tan["power_factor_min"]), pv, inverter])
-    fields = {
-        "load_peak": load / base,
-        "pv_peak": pv / base,
-        "tan_min": tan["power_factor_max"],
-        "tan_max": tan["power_factor_min"],
-        "q_floor": floor / base,
-        "p_fraction": p_fraction / (1.0 - p_fraction),
-        "p_floor": 0.5 * meta.meters.p_resolution_kw / base / (1.0 - p_fraction),
-        "q_error": q_fraction * span / base,
-        "q_fraction": q_fraction,
-        "credible": np.maximum(CREDIBLE_FACTOR * (load + pv + inverter), CREDIBLE_KW) / base,
-    }
-    return LoadModel(**{name: frozen(values) for name, values in fields.items()})
-
-
-def positions(tables: FeederTables, found: Tree) -> Floats | None:
-    """Return where the buses are (b + 1, 2), or None unless the files place every one of them."""
-    xy = np.full((len(found.buses), 2), np.nan)
-    for line in tables.lines:
-        if line.to_x is not None and line.to_y is not None:
-            xy[found.group[line.to_bus]] = line.to_x, line.to_y
-    if tables.meta.busbar_xy is not None:
-        xy[0] = tables.meta.busbar_xy
-    return frozen(xy) if np.isfinite(xy).all() else None

@@ -1,7 +1,6 @@
 """From a feeder's tables to the three-phase model in per unit.
 
-`feeders.load` makes the balanced model that the monitors run on, and refuses single-phase customers; here
-they are what the model is for.
+Customers have one phase or all three. What the monitors run on, `feeders.load.load`, has one for each phase.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from feeders.load import (
+from feeders.equipment import (
     LoadModel,
     accuracy,
     digest,

@@ -14,6 +14,7 @@ import numpy as np
 
 from feeders.variation import Stream, generator
 from gridsec.arrays import Floats, Ints
+from gridsec.phases import PhasedFeeder
 
 if TYPE_CHECKING:
     from feeders.load import Site
@@ -120,8 +121,8 @@ class Registers:
         Voltage, V.
     p_kw, q_kvar : (T, p)
         Net import, kW and kvar; q is NaN unless reported.
-    v0_volt : (T,)
-        Busbar voltage, V.
+    v0_volt : (T,) or (T, 3)
+        Busbar voltage, V; in three phases that of each.
     """
 
     v_volt: Floats
@@ -166,7 +167,7 @@ class Meters:
     bias : (p,)
         Fixed relative bias of each voltage register, 1.
     busbar_bias
-        The same for the busbar's.
+        The same for the busbar's; in three phases (3,).
     p_gain, q_gain : (p,)
         Fixed relative errors of the power registers, 1: the truth is the reading times 1 + gain, because
         data sheets state the error as a fraction of the reading.
@@ -175,6 +176,7 @@ class Meters:
     def __init__(self, site: Site, errors: MeterErrors, channel: Channel, seed: int) -> None:
         accuracy, customer = site.accuracy, site.meters
         self.count = customer.size
+        self._busbars = 3 if isinstance(site.feeder, PhasedFeeder) else 1
         self._channel = channel
         self._errors = errors
         self._seed = seed
@@ -189,12 +191,18 @@ class Meters:
         self.bias = errors.bias * accuracy.class_fraction * draw[0]
         self.p_gain = errors.power * site.loads.p_fraction[customer] * draw[1]
         self.q_gain = errors.power * site.loads.q_fraction[customer] * draw[2]
-        self.busbar_bias = errors.bias * accuracy.busbar_class * float(random.uniform(-1.0, 1.0))
+        self.busbar_bias = errors.bias * accuracy.busbar_class * random.uniform(-1.0, 1.0, self._busbars)
         self._clock = channel.clock_s * random.uniform(-1.0, 1.0, self.count + 1)
 
         nominal = site.tables.meta.voltage_volt
-        self._jitter = errors.jitter * nominal * np.append(accuracy.jitter, accuracy.busbar_jitter)
-        self._step = errors.resolution * nominal * np.append(accuracy.resolution, accuracy.busbar_resolution)
+        self._jitter = (
+            errors.jitter * nominal * np.append(accuracy.jitter, [accuracy.busbar_jitter] * self._busbars)
+        )
+        self._step = (
+            errors.resolution
+            * nominal
+            * np.append(accuracy.resolution, [accuracy.busbar_resolution] * self._busbars)
+        )
         self._p_step = errors.resolution * site.tables.meta.meters.p_resolution_kw
 
     def read(self, ticks: Ints, v_volt: Floats, p_kw: Floats, q_kvar: Floats, v0_volt: Floats) -> Registers:
@@ -206,11 +214,14 @@ class Meters:
             Numbers of the ticks, consecutive.
         v_volt, p_kw, q_kvar : (T, N)
             The truth at every customer, V, kW, kvar (net imports).
-        v0_volt : (T,)
+        v0_volt : (T,) or (T, 3)
             The truth at the busbar, V.
         """
         true = np.column_stack(
-            [v_volt[:, self._customer] * (1.0 + self.bias), v0_volt * (1.0 + self.busbar_bias)]
+            [
+                v_volt[:, self._customer] * (1.0 + self.bias),
+                v0_volt.reshape(-1, self._busbars) * (1.0 + self.busbar_bias),
+            ]
         )
         shown = _round(true + self._jitter * self._normal(ticks), self._step)
         p = _round(p_kw[:, self._customer] / (1.0 + self.p_gain), np.full(self.count, self._p_step))
@@ -218,7 +229,7 @@ class Meters:
             q = _round(q_kvar[:, self._customer] / (1.0 + self.q_gain), np.full(self.count, self._p_step))
         else:
             q = np.full(p.shape, np.nan)
-        return Registers(shown[:, :-1], p, q, shown[:, -1])
+        return Registers(shown[:, : self.count], p, q, shown[:, self.count :].reshape(v0_volt.shape))
 
     def deliver(self, ticks: Ints, t: Floats) -> Delivery:
         """When the readings of some ticks arrive.
@@ -246,8 +257,8 @@ class Meters:
         )
 
     def _normal(self, ticks: Ints) -> Floats:
-        """Standard normal numbers of each tick, (T, p + 1)."""
-        return self._draws(Stream.JITTER, ticks, self.count + 1)
+        """Standard normal numbers of each tick, one for each voltage register."""
+        return self._draws(Stream.JITTER, ticks, self.count + self._busbars)
 
     def _draws(self, stream: Stream, ticks: Ints, width: int) -> Floats:
         """Numbers of each tick: normal for JITTER, uniform on [0, 1) otherwise."""

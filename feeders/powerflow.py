@@ -104,7 +104,7 @@ class PowerFlow:
         self._loads = _load_update(grid, (grid.customer_bus.size,))
         self._source = _source_update(grid, (1,))
 
-    def solve(self, p_kw: Floats, q_kvar: Floats, v0_volt: float) -> tuple[Floats, Floats]:
+    def solve(self, p_kw: Floats, q_kvar: Floats, v0_volt: Floats | float) -> tuple[Floats, Floats]:
         """Voltages for one set of loads.
 
         Parameters
@@ -178,7 +178,7 @@ class PowerFlow:
         by_node = by_node * self._scale
         return by_node[:, self.grid.customer_bus], by_node[:, self._order]
 
-    def _solve(self, p_kw: Floats, q_kvar: Floats, v0_volt: float, column: str) -> Floats:
+    def _solve(self, p_kw: Floats, q_kvar: Floats, v0_volt: Floats | float, column: str) -> Floats:
         np.multiply(p_kw, 1e3, out=self._loads["p_specified"])
         np.multiply(q_kvar, 1e3, out=self._loads["q_specified"])
         self._source["u_ref"] = v0_volt / self._scale

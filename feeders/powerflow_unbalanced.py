@@ -24,10 +24,12 @@ import numpy as np
 from scipy.sparse import coo_array, csc_array
 from scipy.sparse.linalg import splu
 
-from feeders.powerflow import PowerFlowDiverged
+from feeders.powerflow import PowerFlow, PowerFlowDiverged
 from gridsec.arrays import Bools, Floats, Ints, Phasors
+from gridsec.feeder import Feeder
 
 if TYPE_CHECKING:
+    from feeders.load import Site
     from feeders.load_phases import ThreePhaseSite
     from feeders.schema import FeederTables, LineRow
 
@@ -87,7 +89,7 @@ class UnbalancedPowerFlow:
     Parameters
     ----------
     site
-        The feeder. Voltages come back in the order of `site.feeder.buses`.
+        The feeder. Voltages come back in the order of its buses.
     source_ohm : (3, 3)
         See `UnbalancedGrid`; without it the voltage of the busbar itself is given.
 
@@ -96,9 +98,9 @@ class UnbalancedPowerFlow:
     A solve starts flat every time, so that its result depends on its arguments alone.
     """
 
-    def __init__(self, site: ThreePhaseSite, source_ohm: Phasors | None = None) -> None:
+    def __init__(self, site: ThreePhaseSite | Site, source_ohm: Phasors | None = None) -> None:
         grid, node = _grid(site.tables, source_ohm)
-        order = np.full(len(site.feeder.buses), -1, dtype=np.intp)
+        order = np.full(max(site.bus_of_file.values()) + 1, -1, dtype=np.intp)
         for name, bus in site.bus_of_file.items():
             order[bus] = node[name]
         self._prepare(grid, order)
@@ -226,6 +228,41 @@ class UnbalancedPowerFlow:
         size = np.abs(phasors)
         flat = size.reshape(size.shape[0], 3 * self.grid.bus_count)
         return flat[:, self._node], size[:, self._order]
+
+
+class PlacesFlow:
+    """The same in the places of a `gridsec.phases.PhasedFeeder`, with the methods of the balanced power flow.
+
+    Parameters
+    ----------
+    site
+        A feeder in three phases whose customers have one each.
+    """
+
+    def __init__(self, site: Site) -> None:
+        self._flow = UnbalancedPowerFlow(site)
+        self.grid = self._flow.grid
+
+    def solve(self, p_kw: Floats, q_kvar: Floats, v0_volt: Floats | float) -> tuple[Floats, Floats]:
+        """Voltages of the customers (N,) and the places (n,), V; as `UnbalancedPowerFlow.solve`."""
+        customers, buses = self._flow.solve(p_kw, q_kvar, v0_volt)
+        return customers, buses.ravel()
+
+    def solve_batch(self, p_kw: Floats, q_kvar: Floats, v0_volt: Floats) -> tuple[Floats, Floats]:
+        """The same for T sets of loads, (T, N) and (T, n)."""
+        customers, buses = self._flow.solve_batch(p_kw, q_kvar, v0_volt)
+        return customers, buses.reshape(len(buses), -1)
+
+
+def power_flow(site: Site) -> PowerFlow | PlacesFlow:
+    """Return the AC power flow that is a feeder's truth, prepared.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    """
+    return PowerFlow(site) if isinstance(site.feeder, Feeder) else PlacesFlow(site)
 
 
 def sequence_ohm(positive: complex, zero: complex) -> Phasors:

@@ -123,9 +123,11 @@ class Reading:
     arrival
         When the reading arrives, Unix s.
     v_volt
-        Voltage, phase to neutral, V.
+        Voltage, phase to neutral, V; the mean of the phases where there are several.
     p_kw, q_kvar
         Net import, kW and kvar; None where not reported.
+    v_phases
+        Busbar voltage of each phase, V; None on a balanced feeder.
     """
 
     meter: str
@@ -135,6 +137,7 @@ class Reading:
     v_volt: float
     p_kw: float | None
     q_kvar: float | None
+    v_phases: tuple[float, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -194,7 +197,9 @@ class Sample:
     def _reading(self, j: int, meter: str, arrival: float) -> Reading:
         stamp, registers = float(self.delivery.stamp[0, j]), self.reported
         if meter == BUSBAR:
-            return Reading(meter, stamp, self.seq, arrival, float(registers.v0_volt[0]), None, None)
+            v0 = registers.v0_volt[0]
+            phases = tuple(v0.tolist()) if np.ndim(v0) else None
+            return Reading(meter, stamp, self.seq, arrival, float(np.mean(v0)), None, None, phases)
         q = float(registers.q_kvar[0, j])
         return Reading(
             meter,
@@ -287,7 +292,7 @@ def snapshots(samples: Iterable[Sample]) -> Iterator[Snapshot]:
             v_volt=np.where(meters, registers.v_volt[0], np.nan),
             p_kw=np.where(meters, registers.p_kw[0], np.nan),
             q_kvar=np.where(meters, registers.q_kvar[0], np.nan),
-            v0_volt=float(registers.v0_volt[0]) if there[-1] else np.nan,
+            v0_volt=np.where(there[-1], registers.v0_volt[0], np.nan)[()],
         )
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from feeders.inverters import TOLERANCE_PU, ClosedLoop, Loads, Point
-from feeders.powerflow import PowerFlow
+from feeders.powerflow_unbalanced import power_flow
 from feeders.variation import Customers, Demand
 from gridsec.arrays import Floats, Ints
 from gridsec.attack import InverterAttack
@@ -73,7 +73,7 @@ def truth(site: Site, scenario: Scenario, first: int, end: float) -> Iterator[Bl
     customers = Customers(
         site, scenario.variation, scenario.seed, scenario.start, scenario.profile_s, season=scenario.season
     )
-    loop = ClosedLoop(PowerFlow(site), site.droop, site.feeder.base_kva, site.feeder.base_volt)
+    loop = ClosedLoop(power_flow(site), site.droop, site.feeder.base_kva, site.feeder.base_volt)
     steps = substeps(site, scenario)
     course = _Course(loop, scenario.dt_s / steps)
     begin = first
@@ -135,13 +135,13 @@ class _Course:
         x (T, m)
             Injections of the inverters, pu.
         """
-        steps = demand.v0_volt.size
+        steps = len(demand.v0_volt)
         parts: list[tuple[Floats, Floats, Floats]] = []
         k = 0
         while k < steps:
             part = self._relax(demand, slice(k, min(k + self._stretch, steps)))
             if part is None:
-                part = self._step(Loads(demand.p_kw[k], demand.q_kvar[k], float(demand.v0_volt[k])))
+                part = self._step(Loads(demand.p_kw[k], demand.q_kvar[k], demand.v0_volt[k]))
             parts.append(part)
             k += len(part[0])
         v_volt, v_bus_volt, x = (np.concatenate(columns) for columns in zip(*parts, strict=True))

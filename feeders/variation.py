@@ -19,6 +19,7 @@ from scipy.signal import lfilter
 
 from feeders.profiles import Season, library
 from gridsec.arrays import Floats
+from gridsec.phases import PhasedFeeder
 
 if TYPE_CHECKING:
     from feeders.load import Site
@@ -48,6 +49,7 @@ class Stream(IntEnum):
     ATTACK = 9
     HIDDEN_P = 10
     HIDDEN_Q = 11
+    UNBALANCE = 12
 
 
 def generator(seed: int, stream: Stream, index: int = 0) -> np.random.Generator:
@@ -74,6 +76,8 @@ class Variation:
         Mean voltage of the busbar, pu of nominal.
     busbar_spread_pu, busbar_correlation_s
         Standard deviation and correlation time of its slow variation, pu and s.
+    busbar_unbalance_pu
+        In three phases: standard deviation of a variation as slow in each phase by itself, pu.
     tap_step_pu
         Height of one step of the transformer's tap changer upstream, pu; 0: none.
     tap_interval_s
@@ -92,6 +96,7 @@ class Variation:
     busbar_pu: float = 1.0
     busbar_spread_pu: float = 0.003
     busbar_correlation_s: float = 1800.0
+    busbar_unbalance_pu: float = 0.002
     tap_step_pu: float = 0.0125
     tap_interval_s: float = 7200.0
     hidden_kw: float = 0.0
@@ -174,8 +179,8 @@ class Demand:
         Net active import: load minus generation, kW.
     q_kvar : (T, N)
         Reactive import of the loads, kvar.
-    v0_volt : (T,)
-        Busbar voltage, V.
+    v0_volt : (T,) or (T, 3)
+        Busbar voltage, V; in three phases that of each.
     """
 
     p_kw: Floats
@@ -235,6 +240,9 @@ class Customers:
         self._cloud = Fluctuation(seed, Stream.CLOUD, count, variation.cloud_correlation_s)
         self._sky = Fluctuation(seed, Stream.COMMON_CLOUD, 1, variation.cloud_correlation_s)
         self._busbar = Fluctuation(seed, Stream.BUSBAR, 1, variation.busbar_correlation_s)
+        self._unbalance = None
+        if isinstance(site.feeder, PhasedFeeder):
+            self._unbalance = Fluctuation(seed, Stream.UNBALANCE, 3, variation.busbar_correlation_s)
         self._hidden_p = Fluctuation(seed, Stream.HIDDEN_P, count, variation.hidden_correlation_s)
         self._hidden_q = Fluctuation(seed, Stream.HIDDEN_Q, count, variation.hidden_correlation_s)
 
@@ -280,7 +288,10 @@ class Customers:
     def _busbar_volt(self, t: Floats) -> Floats:
         slow = self._variation.busbar_spread_pu * self._busbar.at(t)[:, 0]
         volt: Floats = self._nominal * (self._variation.busbar_pu + slow + self._tap(t))
-        return volt
+        if self._unbalance is None:
+            return volt
+        spread = self._nominal * self._variation.busbar_unbalance_pu
+        return np.asarray(volt[:, None] + spread * self._unbalance.at(t))
 
     def _tap(self, t: Floats) -> Floats:
         """Contribution of the tap changer, pu: each event moves it to one of the positions -1, 0, 1."""

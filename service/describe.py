@@ -6,6 +6,7 @@ from typing import Any
 
 from feeders.load import Site
 from feeders.schema import to_json
+from gridsec.feeder import Feeder
 
 
 def summary(site: Site) -> dict[str, Any]:
@@ -37,7 +38,8 @@ def detail(site: Site) -> dict[str, Any]:
     site
         The feeder.
     """
-    meta, feeder = site.tables.meta, site.feeder
+    meta = site.tables.meta
+    tree = site.feeder if isinstance(site.feeder, Feeder) else site.feeder.tree
     xy = site.xy
     return {
         **summary(site),
@@ -45,12 +47,12 @@ def detail(site: Site) -> dict[str, Any]:
         "v_min_volt": meta.limits.v_min_pu * meta.voltage_volt,
         "v_max_volt": meta.limits.v_max_pu * meta.voltage_volt,
         "layout": {
-            "buses": list(feeder.buses),
-            "parent": [None, *(int(bus) for bus in feeder.parent)],
+            "buses": list(tree.buses),
+            "parent": [None, *(int(bus) for bus in tree.parent)],
             "xy": None if xy is None else [[float(x), float(y)] for x, y in xy],
             "customers": [
-                {"customer": row.customer, "bus": feeder.buses[int(bus)], "meter": row.meter or None}
-                for row, bus in zip(site.tables.customers, feeder.bus, strict=True)
+                {"customer": row.customer, "bus": tree.buses[int(bus)], "meter": row.meter or None}
+                for row, bus in zip(site.tables.customers, tree.bus, strict=True)
             ],
         },
         "tables": to_json(site.tables),

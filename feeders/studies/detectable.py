@@ -170,7 +170,7 @@ def monitor_rule(site: Site, *, risk: float = RISK, share: float = SHARE) -> Rul
     )
     p = -share * site.loads.load_peak
     q = 0.5 * (site.loads.tan_min + site.loads.tan_max) * p
-    model = model_error_bound(site.feeder, p, q, 1.0)[site.meters]
+    model = model_error_bound(site.balanced, p, q, 1.0)[site.meters]
     if not np.isfinite(model).all():
         raise DesignInfeasible(
             f"rule of {site.feeder.name}'s monitor", f"no power flow at {share:g} of the peak"

@@ -104,7 +104,7 @@ def knowledge(
     open_[site.meters[gone]] = True
     which = np.flatnonzero(open_)
     lure = close_loop(site.feeder, site.droop, site.meters)
-    W = unknown_voltages(lindistflow(site.feeder), which, busbar=not busbar_known, tol=TOLERANCE)
+    W = unknown_voltages(lindistflow(site.balanced), which, busbar=not busbar_known, tol=TOLERANCE)
     slope = lure.slope if curves is Curves.STEEPEST else np.zeros_like(lure.slope)
     A, C = unknown_pair(lure, slope, W)
     everybody = close_loop(site.feeder, site.droop, np.arange(metered.size))

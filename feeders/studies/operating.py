@@ -46,7 +46,7 @@ def box(site: Site, *, share: float = SHARE, curves: Curves = Curves.DEADBAND) -
     frame = to_frame(
         site, Snapshot(0.0, nominal, drawn, np.full(drawn.size, np.nan), float(site.feeder.base_volt))
     )
-    model, own = lindistflow(site.feeder), site.droop.customer
+    model, own = lindistflow(site.balanced), site.droop.customer
     slope = site.droop.slope if curves is Curves.STEEPEST else np.zeros(own.size)
     loop = np.eye(model.X.shape[0])
     loop[:, own] += 2.0 * model.X[:, own] * slope

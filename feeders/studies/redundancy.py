@@ -132,7 +132,7 @@ def redundancy(
     cases = {ALL: known(silent=())}
     if silent:
         cases[SILENT] = known(silent=silent)
-    pieces = parts(site.feeder, site.feeder.bus[site.meters])
+    pieces = parts(site.balanced, site.feeder.bus[site.meters])
     tasks = [task for case, what in cases.items() for task in _tasks(site, case, what, pieces)]
     done = worked(Journal(journal, subject), tasks, progress)
     return Redundancy(

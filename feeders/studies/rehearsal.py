@@ -143,7 +143,7 @@ def _world(given: Rule, site: Site, share: float, rng: np.random.Generator) -> C
     x = np.zeros(own.size)
     for _ in range(_SETTLING):
         injected = q + off_q + np.bincount(own, weights=x, minlength=q.size)
-        v2 = bus_voltages(site.feeder, p + off_p, injected, 1.0, steps=3)[site.feeder.bus]
+        v2 = bus_voltages(site.balanced, p + off_p, injected, 1.0, steps=3)[site.feeder.bus]
         x = 0.5 * x + 0.5 * site.droop(site.droop.vbar**2 - v2[own])
     v = np.sqrt(v2[site.meters]) * (1.0 + accuracy.class_fraction * rng.uniform(-1.0, 1.0, site.meters.size))
     busbar = 1.0 + design.busbar / 2.0 * float(draw(rng, 1)[0])

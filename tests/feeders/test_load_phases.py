@@ -16,7 +16,7 @@ from gridsec import feeder as balanced
 from gridsec.arrays import Floats
 from gridsec.errors import FeederInvalid
 from gridsec.feeder import lindistflow
-from gridsec.phases import bus_voltages, lindist3flow, per_customer, sensitivities
+from gridsec.phases import PhasedFeeder, bus_voltages, lindist3flow, per_customer, sensitivities
 
 CASE = Path(__file__).parent.parent / "cases" / "good" / "single-phase"
 EUROPEAN = "ieee-european-lv"
@@ -144,11 +144,31 @@ def test_equipment_is_that_of_the_balanced_loader() -> None:
     np.testing.assert_allclose(flow.X, model.X, rtol=0, atol=1e-13)
 
 
-def test_single_phase_customers_are_not_for_the_balanced_monitors() -> None:
-    with pytest.raises(FeederInvalid) as caught:
-        load(EUROPEAN)
-    assert len(caught.value.problems) == 55
-    assert "phases 'a': the model is balanced yet" in caught.value.problems[0]
+def test_a_site_has_a_customer_and_a_meter_for_each_phase() -> None:
+    site = from_tables(single_phase())
+    assert isinstance(site.feeder, PhasedFeeder)
+    assert site.feeder.customers == ("1", "2-a", "2-b", "2-c", "3")
+    assert site.meter_ids == ("1", "2-a", "2-b", "2-c", "3")
+    assert [site.feeder.buses[place] for place in site.feeder.bus] == ["2.a", "2.a", "2.b", "2.c", "3.b"]
+    whole, parts = single_phase().customers[1], site.tables.customers[1:4]
+    assert sum(row.load_kw for row in parts) == pytest.approx(whole.load_kw)
+    assert [row.phases for row in parts] == ["a", "b", "c"]
+    # The phases together are the customer that the three-phase model has whole.
+    whole_site = three_phase(single_phase())
+    one, three = per_customer(whole_site.feeder, lindist3flow(whole_site.feeder)), site.feeder
+    sums = np.array([[1, 0, 0, 0, 0], [0, 1, 1, 1, 0], [0, 0, 0, 0, 1]]) / np.array([[1], [3], [1]])
+    for place, customer in ((three.R, one.R), (three.X, one.X)):
+        np.testing.assert_allclose(sums @ place[three.bus] @ sums.T, customer, rtol=0, atol=1e-15)
+    # And again nothing is left to part.
+    assert from_tables(site.tables).digest == site.digest
+
+
+def test_uncertain_powers_are_parted_as_those_of_independent_phases() -> None:
+    tables = single_phase()
+    rows = tuple(replace(row, p_std_kw=0.6, q_std_kvar=0.3) for row in tables.customers)
+    parts = from_tables(replace(tables, customers=rows)).tables.customers[1:4]
+    assert np.hypot.reduce([row.p_std_kw for row in parts]) == pytest.approx(0.6)
+    assert np.hypot.reduce([row.q_std_kvar for row in parts]) == pytest.approx(0.3)
 
 
 def test_there_is_no_such_feeder() -> None:

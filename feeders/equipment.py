@@ -1,0 +1,191 @@
+"""What a feeder's tables say besides its lines, balanced or in three phases: equipment, accuracies, loads.
+
+Powers in units of the three-phase base.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.resources.abc import Traversable
+from pathlib import Path
+
+import numpy as np
+
+from feeders.profiles import data_root
+from feeders.raw import CUSTOMERS_FILE, LINES_FILE, META_FILE
+from feeders.schema import CustomerRow, FeederTables, read, to_json
+from feeders.topology import Tree
+from gridsec.arrays import Floats, Ints, frozen, frozen_ints
+from gridsec.detect import MeterAccuracy
+from gridsec.droop import Droop, fleet
+from gridsec.errors import FeederInvalid
+
+# An active power this far beyond what a customer can draw or feed in is no measurement of it.
+CREDIBLE_FACTOR = 10.0
+CREDIBLE_KW = 50.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoadModel:
+    """What is known of the customers' powers without and with a reading, pu. N customers.
+
+    Attributes
+    ----------
+    load_peak, pv_peak : (N,)
+        Largest load and largest generation.
+    tan_min, tan_max : (N,)
+        Limits of the load's q / p (lagging).
+    q_floor : (N,)
+        Reactive power of the load that does not follow p.
+    p_fraction, p_floor : (N,)
+        A metered p is within ``p_fraction |reading| + p_floor`` of the truth.
+    q_error : (N,)
+        Half-width of a metered q: a fraction of the customer's range.
+    q_fraction : (N,)
+        The same fraction, for readings beyond that range.
+    credible : (N,)
+        Largest |p| that is taken for a measurement.
+    """
+
+    load_peak: Floats
+    pv_peak: Floats
+    tan_min: Floats
+    tan_max: Floats
+    q_floor: Floats
+    p_fraction: Floats
+    p_floor: Floats
+    q_error: Floats
+    q_fraction: Floats
+    credible: Floats
+
+
+def names(*, balanced: bool = True) -> list[str]:
+    """Return the feeders that come with the project.
+
+    Parameters
+    ----------
+    balanced
+        Only those without single-phase lines and customers, which every study and estimator takes.
+    """
+    folder = data_root() / "feeders"
+    found = (entry for entry in folder.iterdir() if (entry / META_FILE).is_file())
+    return sorted(entry.name for entry in found if not (balanced and _names_phases(entry)))
+
+
+def _names_phases(folder: Traversable) -> bool:
+    """Whether a folder of ours has single-phase lines or customers: the writer leaves out default columns."""
+    tables = (folder / name for name in (LINES_FILE, CUSTOMERS_FILE))
+    return any(
+        "phases" in table.read_text(encoding="utf-8").partition("\n")[0].split(",") for table in tables
+    )
+
+
+def find(path_or_name: Path | str) -> FeederTables:
+    """Read the tables of a feeder's folder, or of a feeder that comes with the project; raises as `load`."""
+    path = Path(path_or_name)
+    if path.is_dir():
+        return read(path)
+    bundled = data_root() / "feeders" / str(path_or_name)
+    if len(path.parts) == 1 and path.name not in (".", "..") and bundled.is_dir():
+        return read(Path(str(bundled)))
+    there = ", ".join(names(balanced=False))
+    raise FeederInvalid(
+        [f"{path_or_name}: there is neither such a folder nor such a feeder; there are {there}"]
+    )
+
+
+def indices(values: Sequence[int]) -> Ints:
+    """Return indices as an array."""
+    return frozen_ints(np.array(values, dtype=np.intp))
+
+
+def _either(rows: list[CustomerRow], column: str, default: float) -> Floats:
+    """One column of customers.csv, with the default of feeder.toml where it is empty."""
+    cells = (getattr(row, column) for row in rows)
+    return np.array([default if cell is None else cell for cell in cells], dtype=np.float64)
+
+
+def digest(tables: FeederTables) -> str:
+    """Return the SHA-256 of a feeder's content, see `Site`."""
+    text = json.dumps(to_json(tables), sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def metered_customers(tables: FeederTables) -> Ints:
+    """Return the indices of the customers with a meter, ascending."""
+    return indices([k for k, row in enumerate(tables.customers) if row.meter])
+
+
+def inverters(tables: FeederTables) -> Droop:
+    """Return the inverters with a droop curve, in the order of the customers."""
+    own = [k for k, row in enumerate(tables.customers) if row.inverter_kva > 0]
+    rows = [tables.customers[k] for k in own]
+    return fleet(
+        indices(own),
+        [row.droop for row in rows],
+        np.array([row.inverter_kva for row in rows], dtype=np.float64),
+        tables.meta.base_kva,
+        tau=np.array([np.nan if row.tau_s is None else row.tau_s for row in rows], dtype=np.float64),
+    )
+
+
+def accuracy(tables: FeederTables) -> MeterAccuracy:
+    """Return what the meters promise, pu."""
+    meta = tables.meta
+    rows = [tables.customers[k] for k in metered_customers(tables)]
+    return MeterAccuracy(
+        class_fraction=frozen(_either(rows, "class_percent", meta.meters.class_percent) / 100.0),
+        resolution=frozen(_either(rows, "resolution_volt", meta.meters.resolution_volt) / meta.voltage_volt),
+        jitter=frozen(_either(rows, "jitter_percent", meta.meters.jitter_percent) / 100.0),
+        busbar_class=meta.busbar_class_percent / 100.0,
+        busbar_resolution=meta.busbar_resolution_volt / meta.voltage_volt,
+        busbar_jitter=meta.busbar_jitter_percent / 100.0,
+    )
+
+
+def load_model(tables: FeederTables) -> LoadModel:
+    """Return what is known of the customers' powers, in units of `base_kva`."""
+    meta, rows = tables.meta, list(tables.customers)
+    base = meta.base_kva
+    load = _either(rows, "load_kw", 0.0)
+    pv = _either(rows, "pv_kw", 0.0)
+    inverter = _either(rows, "inverter_kva", 0.0)
+    tan = {
+        name: np.tan(np.arccos(_either(rows, name, getattr(meta.load, name))))
+        for name in ("power_factor_min", "power_factor_max")
+    }
+    given = _either(rows, "q_floor_kvar", np.nan)
+    floor = np.where(np.isnan(given), meta.load.q_floor_percent / 100.0 * load, given)
+    q_fraction = _either(rows, "q_error_percent", meta.meters.q_error_percent) / 100.0
+    # A register within f |p| + h of the truth p shows r: |p| <= (|r| + h) / (1 - f), so the error is at
+    # most (f |r| + h) / (1 - f).
+    p_fraction = _either(rows, "p_error_percent", meta.meters.p_error_percent) / 100.0
+    # The range of the reactive register: the largest apparent power at the connection point.
+    span = np.maximum.reduce([load * np.hypot(1.0, tan["power_factor_min"]), pv, inverter])
+    fields = {
+        "load_peak": load / base,
+        "pv_peak": pv / base,
+        "tan_min": tan["power_factor_max"],
+        "tan_max": tan["power_factor_min"],
+        "q_floor": floor / base,
+        "p_fraction": p_fraction / (1.0 - p_fraction),
+        "p_floor": 0.5 * meta.meters.p_resolution_kw / base / (1.0 - p_fraction),
+        "q_error": q_fraction * span / base,
+        "q_fraction": q_fraction,
+        "credible": np.maximum(CREDIBLE_FACTOR * (load + pv + inverter), CREDIBLE_KW) / base,
+    }
+    return LoadModel(**{name: frozen(values) for name, values in fields.items()})
+
+
+def positions(tables: FeederTables, found: Tree) -> Floats | None:
+    """Return where the buses are (b + 1, 2), or None unless the files place every one of them."""
+    xy = np.full((len(found.buses), 2), np.nan)
+    for line in tables.lines:
+        if line.to_x is not None and line.to_y is not None:
+            xy[found.group[line.to_bus]] = line.to_x, line.to_y
+    if tables.meta.busbar_xy is not None:
+        xy[0] = tables.meta.busbar_xy
+    return frozen(xy) if np.isfinite(xy).all() else None
