@@ -258,10 +258,10 @@ def _busbar(
     if isinstance(design.plant.feeder, Feeder):
         metered = bool(np.isfinite(frame.v0_squared) and low <= frame.v0_squared <= high)
         return frame.v0_squared if metered else state.v0_squared, metered
-    # Who gives one voltage for all phases says that they are equal.
+    # One voltage for all phases says where they are, but not how far from it each.
     given = np.broadcast_to(frame.v0_squared if frame.v0_phases is None else frame.v0_phases, 3)
-    phases = (low <= given) & (given <= high)  # False for NaN
-    return np.where(phases, given, state.v0_squared), phases
+    there = (low <= given) & (given <= high)  # False for NaN
+    return np.where(there, given, state.v0_squared), there & (frame.v0_phases is not None)
 
 
 # Frames that claim to know loads so much less well than the design assumes are believed.

@@ -8,8 +8,10 @@ from gridsec.arrays import Floats, Phasors
 from gridsec.phases import ThreePhaseFeeder
 
 
-def random_three_phase(seed: int, *, branches: int | None = None, charging: float = 0.0) -> ThreePhaseFeeder:
-    """A random tree with full impedance matrices and laterals of one or two phases."""
+def random_three_phase(
+    seed: int, *, branches: int | None = None, charging: float = 0.0, single: bool = False
+) -> ThreePhaseFeeder:
+    """A random tree with full impedance matrices and laterals; customers of one phase each if `single`."""
     rng = np.random.default_rng(seed)
     count = int(rng.integers(1, 14)) if branches is None else branches
     parent = np.array([rng.integers(max(0, k - 3), k + 1) for k in range(count)])
@@ -30,7 +32,7 @@ def random_three_phase(seed: int, *, branches: int | None = None, charging: floa
     bus = rng.integers(0, count + 1, customers)
     connected = np.zeros((customers, 3), dtype=bool)
     for j in range(customers):
-        if rng.random() < 0.3:
+        if rng.random() < 0.3 and not single:
             connected[j] = phases[bus[j]]
         else:
             connected[j, rng.choice(np.flatnonzero(phases[bus[j]]))] = True

@@ -1,0 +1,239 @@
+"""The sequential monitor in three phases, against the balanced one where phases do not touch."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from feeders.equipment import find
+from feeders.estimators import design as design_site
+from feeders.load import Site, from_tables, load, one_phase_each
+from feeders.trials import Lie, LoadError, Meters, Trial, Trick, frames
+from gridsec import sequential
+from gridsec.detect import MeterAccuracy
+from gridsec.droop import Droop
+from gridsec.feeder import Feeder
+from gridsec.network import bus_voltages
+from gridsec.online import Decision, Estimate, Frame, Verdict
+from gridsec.phases import PhasedFeeder, ThreePhaseFeeder
+from gridsec.plant import Plant
+from gridsec.sequential import LoadDoubt, SequentialDesign, SequentialOptions
+from gridsec.sequential.loads import prior
+from tests.gridsec.street import BASE_KVA, Street, make_plant
+
+CUSTOMERS = 9
+
+
+def apart(one: Plant) -> Plant:
+    """Three phases without mutual impedance, each of them the same street with customers of its own."""
+    tree, droop, count = one.balanced, one.droop, CUSTOMERS
+    branches, phase = tree.r.size, np.repeat(np.arange(3), count)
+    whole = ThreePhaseFeeder(
+        name="street",
+        parent=tree.parent,
+        # A kW in one phase does what three of them spread over all phases do.
+        z=((tree.r + 1j * tree.x) / 3.0)[:, None, None] * np.eye(3),
+        phases=np.ones((branches + 1, 3), dtype=np.bool_),
+        bus=np.tile(tree.bus, 3),
+        connected=np.equal.outer(phase, np.arange(3)),
+        customers=tuple(f"{name}-{each}" for each in "abc" for name in tree.customers),
+        buses=tree.buses,
+        base_volt=tree.base_volt,
+        base_kva=tree.base_kva,
+        charging=np.zeros((branches, 3, 3)),
+    )
+
+    def three(values: np.ndarray) -> np.ndarray:
+        return np.concatenate([values] * 3)
+
+    def shifted(index: np.ndarray) -> np.ndarray:
+        return np.concatenate([index + k * count for k in range(3)])
+
+    fleet = Droop(
+        customer=shifted(droop.customer),
+        v=three(droop.v),
+        q=three(droop.q),
+        tau=three(droop.tau),
+        vbar=droop.vbar,
+    )
+    parts = ("class_fraction", "resolution", "jitter")
+    accuracy = replace(one.accuracy, **{name: three(getattr(one.accuracy, name)) for name in parts})
+    assert isinstance(accuracy, MeterAccuracy)
+    return Plant(PhasedFeeder(whole), fleet, shifted(one.meters), accuracy, one.loss_correction)
+
+
+def together(heard: list[Frame]) -> Frame:
+    """What three streets say, as one feeder."""
+    names = ("y", "seen", "p", "p_error", "q", "q_error", "q_net", "q_net_error")
+    v0 = np.array([frame.v0_squared for frame in heard])
+    arrays = {name: np.concatenate([getattr(frame, name) for frame in heard]) for name in names}
+    return Frame(t=heard[0].t, v0_squared=float(v0.mean()), v0_phases=v0, **arrays)
+
+
+def prepare(plant: Plant, phases: int, commission_s: float = 0.0) -> SequentialDesign:
+    n = plant.feeder.bus.size
+    doubt = LoadDoubt(np.full(n, 0.03 / BASE_KVA), np.full(n, 0.6 / BASE_KVA), 600.0)
+    # As many false alarms and suspicions per meter, however many meters there are.
+    options = SequentialOptions(
+        alarms_per_year=float(phases), suspect=0.05 * phases, commission_s=commission_s
+    )
+    return sequential.design(plant, doubt=doubt, step_s=1.0, options=options, max_attacked=3)
+
+
+def side_by_side(
+    lies: tuple[dict[int, float], ...], silent: tuple[tuple[int, ...], ...] = ((), (), ()), count: int = 30
+) -> tuple[list[tuple[Estimate, Verdict]], tuple[Estimate, Verdict], SequentialDesign]:
+    """The last answers of a balanced monitor for each phase, and of one for all three."""
+    one = make_plant(np.random.default_rng(5), customers=CUSTOMERS, drop=0.03, loss_correction=0)
+    alone, whole = prepare(one, 1), prepare(apart(one), 3)
+    streets = [Street(one, np.random.default_rng([5, k])) for k in range(3)]
+    states = [sequential.init(alone, 1000.0) for _ in streets]
+    answers: list[tuple[Estimate, Verdict]] = []
+    state = sequential.init(whole, 1000.0)
+    for tick in range(count):
+        told = lies if tick >= 10 else ({}, {}, {})
+        for street in streets:
+            street.advance(1.0)
+        heard = [street.frame(told[k], silent[k] if tick >= 10 else ()) for k, street in enumerate(streets)]
+        stepped = [sequential.step(alone, before, frame) for before, frame in zip(states, heard, strict=True)]
+        states, answers = [each[0] for each in stepped], [each[1:] for each in stepped]
+        state, estimate, verdict = sequential.step(whole, state, together(heard))
+    return answers, (estimate, verdict), whole
+
+
+class TestPhasesThatDoNotTouch:
+    def test_the_prior_is_that_of_each_phase(self) -> None:
+        one = make_plant(np.random.default_rng(5), customers=CUSTOMERS, drop=0.03)
+        alone, whole = prepare(one, 1), prepare(apart(one), 3)
+        blocks = whole.prior.between.reshape(3, CUSTOMERS, 3, CUSTOMERS)
+        for k in range(3):
+            for j in range(3):
+                expected = alone.prior.between if j == k else np.zeros((CUSTOMERS, CUSTOMERS))
+                np.testing.assert_allclose(blocks[k, :, j], expected, rtol=0, atol=1e-18)
+        np.testing.assert_allclose(
+            whole.prior.variance.reshape(-1, 3).T, [alone.prior.variance] * 3, rtol=1e-12
+        )
+        for name in ("most_p", "most_q", "reach", "white", "fixed"):
+            np.testing.assert_allclose(getattr(whole, name), np.tile(getattr(alone, name), 3), rtol=1e-12)
+        # Lie by lie, each phase has the false-alarm rate of the balanced monitor.
+        np.testing.assert_allclose(whole.sigmas, alone.sigmas, rtol=1e-12)
+
+    @pytest.mark.parametrize(
+        "lies",
+        [
+            ({}, {}, {}),
+            ({2: 0.04}, {}, {}),
+            ({2: 0.04}, {5: -0.03}, {}),
+            ({0: 0.05}, {1: 0.05}, {8: -0.05}),
+        ],
+    )
+    def test_each_phase_gets_the_answers_of_a_balanced_monitor(
+        self, lies: tuple[dict[int, float], ...]
+    ) -> None:
+        alone, (estimate, verdict), _ = side_by_side(lies)
+        assert verdict.suspects.sum() == sum(map(len, lies))
+        for name in ("v2", "std", "trusted"):
+            expected = np.concatenate([getattr(each, name) for each, _ in alone])
+            np.testing.assert_allclose(getattr(estimate, name), expected, rtol=0, atol=2e-9)
+        for name in ("suspects", "score", "attack"):
+            expected = np.concatenate([getattr(each, name) for _, each in alone])
+            np.testing.assert_allclose(getattr(verdict, name), expected, rtol=0, atol=2e-9)
+        assert verdict.kinds == tuple(kind for _, each in alone for kind in each.kinds)
+        wanted = Decision.ATTACKED if verdict.suspects.any() else Decision.CLEAN
+        assert verdict.decision is wanted
+
+    def test_a_silent_meter_is_missed_in_its_phase_only(self) -> None:
+        alone, (estimate, _), _ = side_by_side(({}, {}, {}), ((), (4,), ()))
+        expected = np.concatenate([each.std for each, _ in alone])
+        np.testing.assert_allclose(estimate.std, expected, rtol=0, atol=2e-9)
+
+
+def spread_evenly(name: str, kw: float) -> tuple[Site, Site]:
+    """A balanced feeder, and the same with a customer and a meter for each phase."""
+    tables = find(name)
+    rows = tuple(replace(row, p_std_kw=kw, q_std_kvar=kw / 3.0) for row in tables.customers)
+    lines = tuple(replace(line, r0_ohm=4.0 * line.r_ohm, x0_ohm=3.0 * line.x_ohm) for line in tables.lines)
+    tables = replace(tables, customers=rows, lines=lines)
+    return from_tables(tables), from_tables(one_phase_each(tables))
+
+
+def test_balanced_phases_are_the_single_phase_equivalent() -> None:
+    one, three = spread_evenly("kerber-landnetz", 0.6)
+    assert isinstance(one.feeder, Feeder)
+    assert isinstance(three.feeder, PhasedFeeder)
+    count = one.feeder.bus.size
+    mean = np.kron(np.eye(count), np.full((1, 3), 1.0 / 3.0))  # of the phases of each customer
+    rng = np.random.default_rng(1)
+    p, q = rng.normal(-0.02, 0.01, (2, count))
+    thirds = [np.repeat(each, 3) / 3.0 for each in (p, q)]
+    for steps, tolerance in ((0, 1e-13), (1, 1e-5)):
+        expected = bus_voltages(one.feeder, p, q, 1.02, steps=steps)[one.feeder.bus]
+        found = bus_voltages(three.feeder, *thirds, 1.02, steps=steps)[three.feeder.bus]
+        np.testing.assert_allclose(found, np.repeat(expected, 3), rtol=0, atol=tolerance)
+    # Errors of the loads as well: the mean over a customer's phases is as uncertain as its balanced voltage.
+    made = [design_site(site).design for site in (one, three)]
+    priors = [prior(d.plant.feeder, d.prior.meters, d.doubt, busbar=0.0).between for d in made]
+    np.testing.assert_allclose(mean @ priors[1] @ mean.T, priors[0], rtol=0, atol=1e-15)
+    assert made[1].customers == 3 * made[0].customers
+
+
+class TestTheEuropeanFeeder:
+    """55 single-phase customers, 19 inverters; the truth is asymmetric AC power flow."""
+
+    @staticmethod
+    def trial(lie: Lie | None, seconds: float = 40.0, kw: float = 0.6) -> Trial:
+        return Trial(
+            load("ieee-european-lv"),
+            seed=4,
+            duration_s=seconds,
+            meters=Meters.WHITE,
+            load_error=LoadError(kw, kw / 3.0),
+            lie=lie,
+            profile_s=300_000.0,
+        )
+
+    def test_eighteen_liars_are_named_and_nobody_else(self) -> None:
+        this = self.trial(Lie(Trick.BIAS, 18, 3.0, onset_s=20.0))
+        watcher = design_site(this.stated)
+        state, inside = watcher.init(0.0), []
+        for frame, truth in frames(this):
+            state, estimate, verdict = watcher.step(state, frame)
+            inside.append(np.abs(estimate.v2 - truth.v2) <= estimate.bound)
+        np.testing.assert_array_equal(verdict.suspects, truth.liars)
+        assert truth.liars.sum() == 18
+        assert verdict.decision is Decision.ATTACKED
+        assert np.mean(inside) > 0.999
+
+    def test_without_a_phase_of_the_busbar_that_phase_is_known_less_well(self) -> None:
+        this = self.trial(None, 20.0)
+        watcher = design_site(this.stated)
+        phase = np.array(["abc".index(row.phases) for row in this.stated.tables.customers])
+        stds, played = [], list(frames(this))
+        for lost in (None, 1):
+            state = watcher.init(0.0)
+            for frame, truth in played:  # noqa: B007  # the last one is looked at
+                heard = frame
+                if lost is not None:
+                    assert frame.v0_phases is not None
+                    v0 = np.where(np.arange(3) == lost, np.nan, frame.v0_phases)
+                    heard = replace(frame, v0_phases=v0, v0_squared=float("nan"))
+                state, estimate, verdict = watcher.step(state, heard)
+            assert not verdict.suspects.any()
+            assert (np.abs(estimate.v2 - truth.v2) <= estimate.bound).all()
+            stds.append(estimate.std)
+        ratio = stds[1] / stds[0]
+        # Mutual impedance lets the others feel a little of what is not known of it.
+        assert (ratio > 1.0).all()
+        assert ratio[phase == 1].max() > 2.0 > 1.5 > ratio[phase != 1].max()
+
+    def test_one_voltage_for_three_phases_accuses_nobody(self) -> None:
+        this = self.trial(None, 20.0)
+        watcher = design_site(this.stated)
+        state = watcher.init(0.0)
+        for frame, _ in frames(this):
+            assert frame.v0_phases is not None
+            assert np.ptp(frame.v0_phases) > 1e-3
+            state, _, verdict = watcher.step(state, replace(frame, v0_phases=None))
+            assert not verdict.suspects.any()

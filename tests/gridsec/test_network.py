@@ -1,0 +1,129 @@
+"""What estimators ask of a feeder, balanced or not, against dense matrices and the AC power flow."""
+
+from __future__ import annotations
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import given, settings
+
+from gridsec.arrays import Floats
+from gridsec.errors import DesignInfeasible, FeederInvalid
+from gridsec.feeder import Feeder, lindistflow
+from gridsec.network import (
+    Network,
+    Power,
+    along,
+    bus_voltages,
+    busbar_places,
+    by_place,
+    columns,
+    covariance,
+    model_error_bound,
+    one_busbar,
+    own,
+    sizes,
+    variances,
+)
+from gridsec.phases import PHASES, PhasedFeeder
+from gridsec.plant import setting
+from tests.gridsec.radial import random_feeder
+from tests.gridsec.street import make_plant
+from tests.gridsec.unbalanced import power_flow, random_three_phase
+
+seeds = st.integers(0, 100_000)
+
+
+def phased(seed: int) -> PhasedFeeder:
+    """A random feeder in three phases with customers of one."""
+    return PhasedFeeder(random_three_phase(seed, single=True))
+
+
+def dense(feeder: Network, power: Power) -> Floats:
+    """R or X from customers to places: of the tree by `lindistflow`, or by differences of AC power flows."""
+    if isinstance(feeder, Feeder):
+        model = lindistflow(feeder)
+        return model.R_bus if power is Power.ACTIVE else model.X_bus
+    step, none, out = 1e-5, np.zeros(feeder.bus.size), []
+    for c in range(feeder.bus.size):
+        # 1 pu of the power of a phase is a third of S.
+        unit = 3.0 * step * (np.arange(feeder.bus.size) == c)
+        one = (unit, none) if power is Power.ACTIVE else (none, unit)
+        up, down = (
+            np.abs(power_flow(feeder.tree, *(sign * each for each in one), np.ones(3))) ** 2
+            for sign in (1, -1)
+        )
+        out.append(((up - down) / (4.0 * step)).T.ravel())
+    return np.array(out).T
+
+
+@pytest.mark.parametrize("kind", [random_feeder, phased])
+@given(seed=seeds)
+@settings(max_examples=15, deadline=None)
+def test_every_word_is_that_of_the_dense_matrix(kind: object, seed: int) -> None:
+    assert callable(kind)
+    feeder: Network = kind(seed)
+    rng, count = np.random.default_rng(seed), feeder.bus.size
+    metered = np.sort(rng.choice(count, max(1, count // 2), replace=False))
+    weights, variance = rng.normal(size=metered.size), rng.uniform(0.0, 2.0, count)
+    tol = 1e-9 if isinstance(feeder, Feeder) else 1e-7
+    for power in Power:
+        M = dense(feeder, power)
+        there = ~np.isnan(M).any(axis=1)
+        size = max(1.0, np.abs(M[there]).max(initial=0.0)) ** 2 * count
+
+        def same(found: Floats, expected: Floats, size: float = size) -> None:
+            np.testing.assert_allclose(found, expected, rtol=0, atol=tol * size)
+
+        same(columns(feeder, power, metered)[there], 2.0 * M[np.ix_(there, metered)])
+        rows = M[feeder.bus]
+        same(own(feeder, power), rows.diagonal())
+        same(along(feeder, power, metered, weights), 2.0 * weights @ rows[metered])
+        same(sizes(feeder, power, metered), ((2.0 * rows[metered]) ** 2).sum(axis=0))
+        whole = 4.0 * (M * variance) @ M.T
+        places = feeder.bus[metered]
+        same(covariance(feeder, power, places, variance)[there], whole[np.ix_(there, places)])
+        same(variances(feeder, power, variance)[there], whole.diagonal()[there])
+
+
+@given(seeds)
+@settings(max_examples=30, deadline=None)
+def test_voltages_of_the_places_within_their_bound_of_the_power_flow(seed: int) -> None:
+    feeder = phased(seed)
+    rng = np.random.default_rng(seed)
+    p, q = 0.01 * rng.normal(-0.5, 1.0, (2, feeder.bus.size)) / 3.0
+    v0 = rng.uniform(0.95, 1.05, 3) ** 2
+    exact = (np.abs(power_flow(feeder.tree, 3.0 * p, 3.0 * q, v0)) ** 2).T.ravel()
+    found, bound = bus_voltages(feeder, p, q, v0), model_error_bound(feeder, p, q, v0)
+    np.testing.assert_allclose(found[busbar_places(feeder)], v0, rtol=1e-14)
+    assert (np.abs(found - exact)[feeder.bus] <= bound + 1e-12).all()
+    many = bus_voltages(feeder, np.stack([p, 0.0 * p]), np.stack([q, 0.0 * q]), v0)
+    np.testing.assert_array_equal(many[0], found)
+    linear = by_place(feeder, v0) + 2.0 * (feeder.R @ p + feeder.X @ q)
+    np.testing.assert_allclose(bus_voltages(feeder, p, q, v0, steps=0), linear, rtol=0, atol=1e-12)
+
+
+def test_places_know_their_bus_and_their_phase() -> None:
+    feeder = phased(3)
+    for name, place, phase, bus in zip(
+        feeder.customers, feeder.bus.tolist(), feeder.tree.phase, feeder.tree.bus, strict=True
+    ):
+        assert feeder.buses[place] == f"{feeder.tree.buses[bus]}.{PHASES[phase]}", name
+    same = np.asarray(one_busbar(feeder, feeder.bus, feeder.bus))
+    np.testing.assert_array_equal(same, np.equal.outer(feeder.tree.phase, feeder.tree.phase))
+    np.testing.assert_array_equal(
+        by_place(feeder, np.array([1.0, 2.0, 3.0]))[feeder.bus], feeder.tree.phase + 1.0
+    )
+    np.testing.assert_array_equal(by_place(feeder, 4.0), np.full(len(feeder.buses), 4.0))
+
+
+def test_what_is_refused() -> None:
+    several = next(
+        tree for tree in map(random_three_phase, range(100)) if (tree.connected.sum(axis=1) > 1).any()
+    )
+    with pytest.raises(FeederInvalid, match="has several phases; expected one customer for each"):
+        PhasedFeeder(several)
+    plant = make_plant(np.random.default_rng(0))
+    other = type(plant)(phased(0), plant.droop, plant.meters, plant.accuracy)
+    with pytest.raises(DesignInfeasible, match="cannot watch single phases"):
+        setting(other, max_attacked=1)
