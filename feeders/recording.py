@@ -29,6 +29,7 @@ from feeders.variation import Variation
 from gridsec import attack as attacks
 from gridsec.arrays import Bools, Floats
 from gridsec.errors import GridsecError
+from gridsec.feeder import Feeder
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -51,6 +52,9 @@ READINGS: Final = pa.schema(
         ("q_kvar", pa.float64()),
     ]
 )
+PHASES: Final = pa.field("v_phases", pa.list_(pa.float64()))
+"""Voltages of the busbar's phases, a column of recordings of feeders in three phases."""
+
 REQUIRED: Final = ("meter", "t", "v_volt")
 
 
@@ -182,7 +186,7 @@ def record(site: Site, scenario: Scenario, path: Path | str) -> Recording:
     partial = tuple(target.with_name(target.name + ".partial") for target in targets)
     try:
         with (
-            pq.ParquetWriter(partial[0], READINGS.with_metadata(extra)) as readings,
+            pq.ParquetWriter(partial[0], _readings_schema(site).with_metadata(extra)) as readings,
             pq.ParquetWriter(partial[1], _truth_schema(site).with_metadata(extra)) as truth,
         ):
             _write(simulate(site, scenario), scenario.dt_s, readings, truth)
@@ -336,14 +340,18 @@ def _rows(chunk: list[Sample]) -> dict[str, Any]:
     """Every arriving reading of some ticks, copies included, as columns; `meter` is a number."""
     width = len(chunk[0].meter_ids) + 1
     seq = np.repeat(np.array([sample.seq for sample in chunk], dtype=np.int64)[:, None], width, axis=1)
+    v0 = _registers(chunk, "v0_volt").reshape(len(chunk), -1)
     stack = {
         "meter": np.broadcast_to(np.arange(width, dtype=np.int32), seq.shape),
         "t": np.concatenate([sample.delivery.stamp for sample in chunk]),
         "seq": seq,
-        "v_volt": np.column_stack([_registers(chunk, "v_volt"), _registers(chunk, "v0_volt")]),
+        "v_volt": np.column_stack([_registers(chunk, "v_volt"), v0.mean(axis=1)]),
         "p_kw": np.column_stack([_registers(chunk, "p_kw"), np.full(len(chunk), np.nan)]),
         "q_kvar": np.column_stack([_registers(chunk, "q_kvar"), np.full(len(chunk), np.nan)]),
     }
+    if v0.shape[1] > 1:
+        stack["v_phases"] = np.full((*seq.shape, v0.shape[1]), np.nan)
+        stack["v_phases"][:, -1] = v0
     parts = []
     for name in ("arrival", "copy"):
         arrival = np.concatenate([getattr(sample.delivery, name) for sample in chunk])
@@ -374,7 +382,14 @@ def _table(ids: list[str], rows: dict[str, Any]) -> Any:
         # NaN in a register means: not reported.
         **{name: pa.array(rows[name], from_pandas=True) for name in ("p_kw", "q_kvar")},
     }
-    return pa.table(columns, schema=READINGS)
+    if "v_phases" not in rows:
+        return pa.table(columns, schema=READINGS)
+    phases = [row.tolist() if np.isfinite(row).all() else None for row in rows["v_phases"]]
+    return pa.table({**columns, PHASES.name: pa.array(phases, PHASES.type)}, schema=READINGS.append(PHASES))
+
+
+def _readings_schema(site: Site) -> Any:
+    return READINGS if isinstance(site.feeder, Feeder) else READINGS.append(PHASES)
 
 
 def _truth_schema(site: Site) -> Any:
@@ -413,9 +428,13 @@ def _matrix(column: Any) -> Any:
 
 def _readings(batch: Any) -> Iterator[Reading]:
     size = batch.num_rows
-    there = {name: batch.column(name).to_pylist() for name in batch.schema.names if name in READINGS.names}
+    there = {
+        name: batch.column(name).to_pylist()
+        for name in batch.schema.names
+        if name in (*READINGS.names, PHASES.name)
+    }
     nothing = [None] * size
-    for meter, t, seq, arrival, v_volt, p_kw, q_kvar in zip(
+    for meter, t, seq, arrival, v_volt, p_kw, q_kvar, phases in zip(
         there["meter"],
         there["t"],
         there.get("seq", nothing),
@@ -423,6 +442,7 @@ def _readings(batch: Any) -> Iterator[Reading]:
         there["v_volt"],
         there.get("p_kw", nothing),
         there.get("q_kvar", nothing),
+        there.get(PHASES.name, nothing),
         strict=True,
     ):
-        yield Reading(meter, t, seq, arrival, v_volt, p_kw, q_kvar)
+        yield Reading(meter, t, seq, arrival, v_volt, p_kw, q_kvar, phases and tuple(phases))

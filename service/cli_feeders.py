@@ -22,35 +22,36 @@ app = typer.Typer(no_args_is_help=True, help="List, show, check and design feede
 def feeders_list() -> None:
     """List the feeders that come with gridsec."""
     from feeders.load import load, names
-    from feeders.load_phases import three_phase_names
+    from gridsec.feeder import Feeder as Balanced
 
-    table = Table("name", "title", "customers", "meters", "inverters", "M")
-    for name in names():
+    table = Table("name", "title", "phases", "customers", "meters", "inverters", "M")
+    for name in names(balanced=False):
         site = load(name)
         counts = (len(site.feeder.customers), len(site.meter_ids), site.droop.customer.size)
         cells = (*map(str, counts), str(site.tables.meta.monitor.max_attacked))
-        table.add_row(name, escape(site.tables.meta.title), *cells)
+        phases = "balanced" if isinstance(site.feeder, Balanced) else "single-phase"
+        table.add_row(name, escape(site.tables.meta.title), phases, *cells)
     out.print(table)
-    out.print(f"With single-phase customers, which no monitor takes yet: {', '.join(three_phase_names())}")
 
 
 @app.command("show")
 def feeders_show(feeder: Feeder) -> None:
     """Show a feeder and its customers."""
     from feeders.load import load
+    from service.voltages import bus_names
 
     site = load(feeder)
-    meta, tree = site.tables.meta, site.feeder
+    meta = site.tables.meta
     out.print(f"[bold]{escape(meta.name)}[/] {escape(meta.title)}")
     out.print(
-        f"{meta.voltage_volt:g} V phase to neutral, {len(tree.buses)} buses, "
-        f"{len(tree.customers)} customers, {len(site.meter_ids)} meters, "
+        f"{meta.voltage_volt:g} V phase to neutral, {len(bus_names(site))} buses, "
+        f"{len(site.feeder.customers)} customers, {len(site.meter_ids)} meters, "
         f"watched every {meta.monitor.tick_s:g} s for up to {meta.monitor.max_attacked} manipulated meters"
     )
-    table = Table("customer", "bus", "meter", "load kW", "PV kW", "inverter kVA", "droop")
+    table = Table("customer", "bus", "phases", "meter", "load kW", "PV kW", "inverter kVA", "droop")
     for row in site.tables.customers:
         numbers = (f"{row.load_kw:g}", f"{row.pv_kw:g}", f"{row.inverter_kva:g}")
-        table.add_row(escape(row.customer), escape(row.bus), row.meter, *numbers, row.droop)
+        table.add_row(escape(row.customer), escape(row.bus), row.phases, row.meter, *numbers, row.droop)
     out.print(table)
 
 

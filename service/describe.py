@@ -51,7 +51,12 @@ def detail(site: Site) -> dict[str, Any]:
             "parent": [None, *(int(bus) for bus in tree.parent)],
             "xy": None if xy is None else [[float(x), float(y)] for x, y in xy],
             "customers": [
-                {"customer": row.customer, "bus": tree.buses[int(bus)], "meter": row.meter or None}
+                {
+                    "customer": row.customer,
+                    "bus": tree.buses[int(bus)],
+                    "meter": row.meter or None,
+                    "phase": row.phases if len(row.phases) == 1 else None,
+                }
                 for row, bus in zip(site.tables.customers, tree.bus, strict=True)
             ],
         },

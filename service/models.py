@@ -58,6 +58,7 @@ class MeterState(BaseModel):
     v2_pu_estimated: Number = Field(description="Reconstructed squared voltage, pu.")
     attack_volt_estimated: Number = Field(description="Reported minus reconstructed, V; 0 if no suspect.")
     kind: str | None = Field(default=None, description="What the manipulation looks like, if known.")
+    phase: str | None = Field(default=None, description="Phase that it measures; null if balanced.")
 
 
 class CustomerState(BaseModel):
@@ -95,7 +96,12 @@ class BusState(BaseModel):
     """One bus at the latest tick."""
 
     bus: str
-    v_volt: Number = Field(description="Reconstructed voltage, phase to neutral, V.")
+    v_volt: Number = Field(
+        description="Reconstructed voltage to neutral, V; of several phases that furthest from nominal."
+    )
+    v_phases: list[Number] | None = Field(
+        default=None, description="Reconstructed voltage of each phase, V; null on a balanced feeder."
+    )
 
 
 class Silence(BaseModel):
@@ -213,6 +219,7 @@ class LayoutCustomer(BaseModel):
     customer: str
     bus: str = Field(description="Id of the bus in this layout (zero-impedance lines fuse buses).")
     meter: str | None = Field(default=None, description="Its meter; null if it has none.")
+    phase: str | None = Field(default=None, description="Its phase: a, b or c; null on a balanced feeder.")
 
 
 class Layout(BaseModel):

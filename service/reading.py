@@ -21,6 +21,7 @@ VOLT_FACTOR = 10.0
 """A meter that reads more than this many times the nominal voltage is broken, not manipulated."""
 
 SEQ_MAX = 2**63 - 1
+PHASES = 3
 HEAD_BYTES = 200
 NOT_REPORTED = math.nan
 
@@ -58,6 +59,9 @@ class Reading(msgspec.Struct, frozen=True, gc=False):
         Net import at the connection point, kW and kvar; NaN where not reported.
     seq
         Running number of the reading, or None.
+    v_phases
+        Voltage of each phase at the busbar of a feeder in three phases, V, NaN where there is none; None
+        where the reading does not tell them apart.
     """
 
     feeder: str
@@ -67,6 +71,7 @@ class Reading(msgspec.Struct, frozen=True, gc=False):
     p_kw: float = NOT_REPORTED
     q_kvar: float = NOT_REPORTED
     seq: int | None = None
+    v_phases: tuple[float, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +123,7 @@ class Known:
 
 
 class Raw(msgspec.Struct, gc=False):
-    """A reading as it is on the wire; `meter` is there in batches only."""
+    """A reading as it is on the wire; `meter` is there in batches only, `v_phases` at the busbar."""
 
     t: float
     v_volt: float
@@ -126,6 +131,7 @@ class Raw(msgspec.Struct, gc=False):
     q_kvar: float | None = None
     seq: int | None = None
     meter: str | None = None
+    v_phases: list[float | None] | None = None
 
 
 def plausible(raw: Raw, known: Known) -> bool:
@@ -137,7 +143,14 @@ def plausible(raw: Raw, known: Known) -> bool:
         and (raw.p_kw is None or -limit <= raw.p_kw <= limit)
         and (raw.q_kvar is None or -limit <= raw.q_kvar <= limit)
         and (raw.seq is None or 0 <= raw.seq <= SEQ_MAX)
+        and (raw.v_phases is None or _phases_plausible(raw.v_phases, known))
     )
+
+
+def _phases_plausible(phases: list[float | None], known: Known) -> bool:
+    # A phase may be dead, and its voltage 0.
+    highest = VOLT_FACTOR * known.nominal_volt
+    return len(phases) == PHASES and all(v is None or 0.0 <= v <= highest for v in phases)
 
 
 def to_reading(feeder: str, meter: str | None, raw: Raw) -> Reading:
@@ -150,6 +163,7 @@ def to_reading(feeder: str, meter: str | None, raw: Raw) -> Reading:
         NOT_REPORTED if raw.p_kw is None else raw.p_kw,
         NOT_REPORTED if raw.q_kvar is None else raw.q_kvar,
         raw.seq,
+        None if raw.v_phases is None else tuple(math.nan if v is None else v for v in raw.v_phases),
     )
 
 
@@ -202,6 +216,7 @@ def judge(value: Any, known: Known, *, in_batch: bool) -> Raw | Findings:
         findings.add(BadReason.VALUE, problem)
     p_kw = _power(value, "p_kw", known, findings)
     q_kvar = _power(value, "q_kvar", known, findings)
+    v_phases = _phases(value.get("v_phases"), known, findings)
     seq = value.get("seq")
     if seq is not None and (isinstance(seq, bool) or not isinstance(seq, int)):
         findings.add(BadReason.TYPE, f"seq is {name_of(seq)}, not an integer")
@@ -215,7 +230,20 @@ def judge(value: Any, known: Known, *, in_batch: bool) -> Raw | Findings:
         findings.add(BadReason.UNKNOWN_METER, f"the feeder has no meter `{str(meter)[:64]}`")
     if findings.of or t is None or v_volt is None:
         return findings
-    return Raw(t, v_volt, p_kw, q_kvar, seq, meter)
+    return Raw(t, v_volt, p_kw, q_kvar, seq, meter, v_phases)
+
+
+def _phases(value: Any, known: Known, findings: Findings) -> list[float | None] | None:
+    if value is None:
+        return None
+    if not isinstance(value, list) or len(value) != PHASES:
+        findings.add(BadReason.TYPE, f"v_phases is {name_of(value)}, not an array of {PHASES} voltages")
+        return None
+    named = {f"v_phases[{k}]": v for k, v in enumerate(value)}
+    phases = [_number(named, name, findings, required=False) for name in named]
+    if not findings.of and not _phases_plausible(phases, known):
+        findings.add(BadReason.VALUE, f"v_phases are absurd where {known.nominal_volt:g} V is nominal")
+    return phases
 
 
 def _power(value: dict[Any, Any], name: str, known: Known, findings: Findings) -> float | None:

@@ -87,6 +87,7 @@ def _checked(feeder: str, known: Known, recorded: Recorded, tally: Tally) -> Rea
         "p_kw": recorded.p_kw,
         "q_kvar": recorded.q_kvar,
         "seq": recorded.seq,
+        "v_phases": recorded.v_phases and list(recorded.v_phases),
     }
     found = judge(fields, known, in_batch=False)
     if isinstance(found, Findings):

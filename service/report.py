@@ -11,14 +11,16 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
 
-from feeders.load import Site, Snapshot, volts
-from gridsec.arrays import Bools, Floats
+from feeders.load import Site, volts
+from gridsec.arrays import Bools
 from gridsec.online import Cause, Decision, Estimate, Verdict
 from service.align import Tick
+from service.voltages import attack_volts, bus_names, bus_volts, std_volts
 
 BUSBAR = "substation"
 """The name under which the busbar meter is reported among the silent ones (as in its zenoh key)."""
@@ -55,6 +57,8 @@ class MeterReport:
         Reconstructed manipulation: reported minus reconstructed voltage, V, for suspects; 0 for others.
     kind
         What the manipulation looks like, see `gridsec.online.Kind`; None where nobody can tell.
+    phase
+        The phase that it measures: a, b or c; None on a balanced feeder.
     """
 
     meter: str
@@ -69,6 +73,7 @@ class MeterReport:
     v2_pu_estimated: float | None
     attack_volt_estimated: float | None
     kind: str | None = None
+    phase: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,7 +161,8 @@ class FeederReport:
     meters
         One entry per meter, in the order of the feeder's file.
     bus_v_volt
-        (bus id, reconstructed voltage in V or None) of every bus, the busbar first.
+        (bus id, reconstructed voltage in V or None) of every bus, the busbar first; in three phases that of
+        the phase furthest from nominal.
     silent
         (meter id, seconds since its last usable reading, infinity if there never was one) of the meters
         that have been silent for longer than the feeder's `silence_s`; the busbar meter appears as
@@ -167,6 +173,8 @@ class FeederReport:
         One entry per customer, and per droop inverter, in the order of the feeder's file.
     explanations
         Where several explanations fit the readings, those, the likeliest first.
+    bus_phases
+        In three phases, the voltage of each phase of every bus, V; None for one that it does not have.
     """
 
     feeder: str
@@ -183,31 +191,12 @@ class FeederReport:
     customers: tuple[CustomerReport, ...] = ()
     inverters: tuple[InverterReport, ...] = ()
     explanations: tuple[ExplanationReport, ...] = ()
+    bus_phases: tuple[tuple[float | None, ...], ...] = ()
 
 
 def finite(value: float) -> float | None:
     """Return a number that JSON can carry: None for NaN and infinities."""
     return float(value) if math.isfinite(value) else None
-
-
-def snapshot(tick: Tick) -> Snapshot:
-    """Return what a tick's readings say, as `feeders.load.to_frame` takes it.
-
-    Parameters
-    ----------
-    tick
-        The tick.
-    """
-    nan = math.nan
-    rows = [(nan, nan, nan) if r is None else (r.v_volt, r.p_kw, r.q_kvar) for r in tick.readings]
-    columns = np.array(rows, dtype=np.float64).reshape(-1, 3)
-    return Snapshot(
-        t=tick.t,
-        v_volt=columns[:, 0].copy(),
-        p_kw=columns[:, 1].copy(),
-        q_kvar=columns[:, 2].copy(),
-        v0_volt=nan if tick.busbar is None else tick.busbar.v_volt,
-    )
 
 
 def build(site: Site, tick: Tick, max_attacked: int, estimate: Estimate, verdict: Verdict) -> FeederReport:
@@ -224,10 +213,10 @@ def build(site: Site, tick: Tick, max_attacked: int, estimate: Estimate, verdict
     estimate, verdict
         What the monitor made of it.
     """
-    v, std = volts(site, estimate.v2), _std_volts(site, estimate)
+    v, std = volts(site, estimate.v2), std_volts(site, estimate)
     at = site.meters
     numbers = np.column_stack((verdict.score, verdict.threshold, v[at], std[at], estimate.v2[at]))
-    attack = _attack_volts(site, tick, verdict)
+    attack = attack_volts(site, tick, verdict)
     kinds = verdict.kinds or (None,) * len(site.meter_ids)
     meters = []
     for k, (meter, reading) in enumerate(zip(site.meter_ids, tick.readings, strict=True)):
@@ -246,9 +235,11 @@ def build(site: Site, tick: Tick, max_attacked: int, estimate: Estimate, verdict
                 v2_pu_estimated=v2_pu,
                 attack_volt_estimated=finite(attack[k]),
                 kind=None if kinds[k] is None else str(kinds[k]),
+                phase=_phase(site, k),
             )
         )
-    buses = zip(site.feeder.buses, volts(site, estimate.v2_bus), strict=True)
+    one, phases = bus_volts(site, estimate.v2_bus)
+    buses = zip(bus_names(site), one, strict=True)
     return _whole(
         site,
         tick,
@@ -259,6 +250,7 @@ def build(site: Site, tick: Tick, max_attacked: int, estimate: Estimate, verdict
         customers=tuple(map(CustomerReport, site.feeder.customers, map(finite, v), map(finite, std))),
         inverters=_inverters(site, estimate, verdict),
         explanations=_explanations(site, verdict),
+        bus_phases=tuple(tuple(map(finite, row)) for row in phases) if phases.size else (),
     )
 
 
@@ -285,6 +277,7 @@ def blind(site: Site, tick: Tick, max_attacked: int, cause: Cause, reason: str) 
             v_volt_std=None,
             v2_pu_estimated=None,
             attack_volt_estimated=None,
+            phase=_phase(site, k),
         )
         for k, (meter, reading) in enumerate(zip(site.meter_ids, tick.readings, strict=True))
     )
@@ -294,17 +287,16 @@ def blind(site: Site, tick: Tick, max_attacked: int, cause: Cause, reason: str) 
         max_attacked,
         verdict=(Decision.UNDECIDED, cause, reason),
         meters=meters,
-        buses=tuple((bus, None) for bus in site.feeder.buses),
+        buses=tuple((bus, None) for bus in bus_names(site)),
         customers=tuple(CustomerReport(customer, None, None) for customer in site.feeder.customers),
         inverters=_inverters(site, None, None),
         explanations=(),
     )
 
 
-def _std_volts(site: Site, estimate: Estimate) -> Floats:
-    """Standard deviation of every customer's voltage, V, (N,): the estimator's own, or from its bound."""
-    half, share = (estimate.std, 1.0) if estimate.std.size else (estimate.bound, 1.0 / 3.0)
-    return np.asarray(0.5 * share * (volts(site, estimate.v2 + half) - volts(site, estimate.v2 - half)))
+def _phase(site: Site, meter: int) -> str | None:
+    phases = site.tables.customers[int(site.meters[meter])].phases
+    return phases if len(phases) == 1 else None
 
 
 def _inverters(site: Site, estimate: Estimate | None, verdict: Verdict | None) -> tuple[InverterReport, ...]:
@@ -394,14 +386,6 @@ def _in_ids(site: Site, text: str) -> str:
     return re.sub(rf"(?<!\w)(?<!nverter of )(?:{names})(?!\w)", lambda found: meter_of[found[0]], text)
 
 
-def _attack_volts(site: Site, tick: Tick, verdict: Verdict) -> Floats:
-    """Turn the reconstructed attack on the squared voltage into volts: ``sqrt(y) - sqrt(y - a)``."""
-    base = site.feeder.base_volt
-    reported = np.array([math.nan if r is None else r.v_volt for r in tick.readings], dtype=np.float64)
-    true = volts(site, (reported / base) ** 2 - verdict.attack)
-    return np.where(verdict.suspects, reported - true, 0.0)
-
-
 def _whole(
     site: Site,
     tick: Tick,
@@ -413,6 +397,7 @@ def _whole(
     customers: tuple[CustomerReport, ...],
     inverters: tuple[InverterReport, ...],
     explanations: tuple[ExplanationReport, ...],
+    bus_phases: tuple[tuple[float | None, ...], ...] = (),
 ) -> FeederReport:
     limits, nominal = site.tables.meta.limits, site.tables.meta.voltage_volt
     decision, cause, reason = verdict
@@ -431,6 +416,7 @@ def _whole(
         customers=customers,
         inverters=inverters,
         explanations=explanations,
+        bus_phases=bus_phases,
     )
 
 
@@ -468,6 +454,7 @@ def to_json(report: FeederReport) -> dict[str, Any]:
                 "v2_pu_estimated": m.v2_pu_estimated,
                 "attack_volt_estimated": m.attack_volt_estimated,
                 "kind": m.kind,
+                "phase": m.phase,
             }
             for m in report.meters
         ],
@@ -492,7 +479,10 @@ def to_json(report: FeederReport) -> dict[str, Any]:
             | {"probability": e.probability}
             for e in report.explanations
         ],
-        "buses": [{"bus": bus, "v_volt": v} for bus, v in report.bus_v_volt],
+        "buses": [
+            {"bus": bus, "v_volt": v, "v_phases": None if phases is None else list(phases)}
+            for (bus, v), phases in zip_longest(report.bus_v_volt, report.bus_phases)
+        ],
         "silent": [{"meter": meter, "seconds": finite(seconds)} for meter, seconds in report.silent],
         "v_min_volt": report.v_min_volt,
         "v_max_volt": report.v_max_volt,

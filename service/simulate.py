@@ -66,6 +66,7 @@ def payload_of(reading: Reading) -> bytes:
         "v_volt": reading.v_volt,
         "p_kw": reading.p_kw,
         "q_kvar": reading.q_kvar,
+        "v_phases": reading.v_phases,
     }
     return msgspec.json.encode({name: value for name, value in fields.items() if value is not None})
 

@@ -21,7 +21,8 @@ from service.align import Aligner, AlignRules, Clock, Outcome, Tick, rules
 from service.commissioning import Commissioning
 from service.conditions import conditions
 from service.reading import Known, Reading
-from service.report import FeederReport, blind, build, snapshot
+from service.report import FeederReport, blind, build
+from service.voltages import snapshot
 
 POWER_MAX_FACTOR = 100.0
 """Powers beyond this many times the feeder's base power are no readings."""

@@ -70,7 +70,7 @@ export function showDetail(feeder, customer, { meter, inverter, v, std, own }, p
   byId("detail-title").textContent = customer.customer;
   const head = el("p", { class: "where" },
     el("span", { class: "state", "data-status": now.key, text: now.text }),
-    el("span", { class: "quiet", text: ` ${customer.meter ? `meter ${customer.meter}, ` : ""}bus ${customer.bus}` }));
+    el("span", { class: "quiet", text: ` ${customer.meter ? `meter ${customer.meter}, ` : ""}bus ${customer.bus}${customer.phase ? `, phase ${customer.phase}` : ""}` }));
   const half = isKnown(std) ? 3 * std : null;
   const list = el("dl", { class: "numbers" });
   if (meter) list.append(...row("Meter says", volt(meter.v_volt_reported, 2), pu(meter.v_volt_reported)));

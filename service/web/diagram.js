@@ -249,7 +249,7 @@ export class Diagram {
       part.note.textContent = loud
         ? signed(meter.attack_volt_estimated)
         : part.labels ? (name.length > 8 ? `${name.slice(0, 7)}…` : name) : "";
-      part.group.setAttribute("aria-label", `${id}: ${now.text}, reconstructed ${volt(v)}`);
+      part.group.setAttribute("aria-label", `${id}${part.customer.phase ? `, phase ${part.customer.phase}` : ""}: ${now.text}, reconstructed ${volt(v)}`);
       part.group.classList.toggle("selected", id === this.selected);
     }
     if (this.busbarName) {

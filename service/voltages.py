@@ -1,0 +1,102 @@
+"""Voltages on their way from readings to reports: those of meters, of buses and of their phases."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from feeders.load import Site, Snapshot, volts
+from gridsec.arrays import Floats
+from gridsec.feeder import Feeder
+from gridsec.online import Estimate, Verdict
+from service.align import Tick
+
+
+def snapshot(tick: Tick) -> Snapshot:
+    """Return what a tick's readings say, as `feeders.load.to_frame` takes it.
+
+    Parameters
+    ----------
+    tick
+        The tick.
+    """
+    nan = math.nan
+    rows = [(nan, nan, nan) if r is None else (r.v_volt, r.p_kw, r.q_kvar) for r in tick.readings]
+    columns = np.array(rows, dtype=np.float64).reshape(-1, 3)
+    return Snapshot(
+        t=tick.t,
+        v_volt=columns[:, 0].copy(),
+        p_kw=columns[:, 1].copy(),
+        q_kvar=columns[:, 2].copy(),
+        v0_volt=_busbar(tick),
+    )
+
+
+def _busbar(tick: Tick) -> Floats | float:
+    if tick.busbar is None:
+        return math.nan
+    phases = tick.busbar.v_phases
+    return tick.busbar.v_volt if phases is None else np.array(phases)
+
+
+def bus_names(site: Site) -> tuple[str, ...]:
+    """Return the buses of the feeder's tree, whatever the number of their phases, the busbar first.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    """
+    return site.feeder.buses if isinstance(site.feeder, Feeder) else site.feeder.tree.buses
+
+
+def bus_volts(site: Site, v2_bus: Floats) -> tuple[Floats, Floats]:
+    """Return the voltage of every bus, V: in three phases that of the phase furthest from nominal.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    v2_bus : (n,)
+        Squared voltages as in `gridsec.online.Estimate`, pu.
+
+    Returns
+    -------
+    one : (b + 1,)
+        Voltage of each bus, V.
+    phases : (b + 1, 3) or (b + 1, 0)
+        Voltage of each of its phases, V, NaN for one that it does not have; nothing on a balanced feeder.
+    """
+    v = volts(site, v2_bus)
+    if isinstance(site.feeder, Feeder):
+        return v, np.zeros((v.size, 0))
+    phases = np.where(site.feeder.tree.phases, v.reshape(-1, 3), np.nan)
+    off = np.where(np.isnan(phases), -1.0, np.abs(phases - site.feeder.base_volt))
+    return np.take_along_axis(phases, off.argmax(axis=1)[:, None], axis=1)[:, 0], phases
+
+
+def std_volts(site: Site, estimate: Estimate) -> Floats:
+    """Return the standard deviation of every customer's voltage, V, (N,): told, or from the bound.
+
+    Parameters
+    ----------
+    site, estimate
+        The feeder, and what the estimator says.
+    """
+    half, share = (estimate.std, 1.0) if estimate.std.size else (estimate.bound, 1.0 / 3.0)
+    return np.asarray(0.5 * share * (volts(site, estimate.v2 + half) - volts(site, estimate.v2 - half)))
+
+
+def attack_volts(site: Site, tick: Tick, verdict: Verdict) -> Floats:
+    """Turn the reconstructed attack on the squared voltage into volts: ``sqrt(y) - sqrt(y - a)``.
+
+    Parameters
+    ----------
+    site, tick, verdict
+        The feeder, what was known, and what the estimator says.
+    """
+    base = site.feeder.base_volt
+    reported = np.array([math.nan if r is None else r.v_volt for r in tick.readings], dtype=np.float64)
+    true = volts(site, (reported / base) ** 2 - verdict.attack)
+    return np.where(verdict.suspects, reported - true, 0.0)
