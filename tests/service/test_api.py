@@ -94,7 +94,7 @@ def test_state_is_the_report(setup: Setup) -> None:
     contract = {"feeder", "t", "verdict", "reason", "max_attacked", "meters"}
     meter = {
         *("meter", "bus", "seen", "suspect", "score", "threshold", "v_volt_reported", "v_volt_estimated"),
-        *("v_volt_std", "v2_pu_estimated", "attack_volt_estimated", "kind"),
+        *("v_volt_std", "v2_pu_estimated", "attack_volt_estimated", "kind", "phase"),
     }
     assert contract | {"customers", "inverters", "explanations"} <= set(response.json())
     assert all(set(item) == meter for item in response.json()["meters"])

@@ -19,7 +19,8 @@ from gridsec.online import Cause, Decision, Estimate, Explanation, Kind, Verdict
 from service.align import Tick
 from service.conditions import AlarmKind, conditions
 from service.reading import Reading
-from service.report import BUSBAR, ExplanationReport, FeederReport, blind, build, snapshot, to_json
+from service.report import BUSBAR, ExplanationReport, FeederReport, blind, build, to_json
+from service.voltages import snapshot
 from service.watch import design
 
 T = 1_795_212_000.0
@@ -135,6 +136,7 @@ def test_json_is_plain_and_has_no_nan(site: Site) -> None:
     assert found["explanations"] == []
     wanted = {
         "kind",
+        "phase",
         "meter",
         "bus",
         "seen",

@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from feeders.doubts import load_doubt
 from feeders.equipment import find
 from feeders.estimators import design as design_site
 from feeders.load import Site, from_tables, load, one_phase_each
+from feeders.powerflow_unbalanced import power_flow
 from feeders.trials import Lie, LoadError, Meters, Trial, Trick, frames
 from gridsec import sequential
 from gridsec.detect import MeterAccuracy
@@ -193,6 +195,23 @@ class TestTheEuropeanFeeder:
             lie=lie,
             profile_s=300_000.0,
         )
+
+    def test_the_prior_is_the_covariance_of_the_power_flow(self) -> None:
+        site = self.trial(None).stated
+        assert isinstance(site.feeder, PhasedFeeder)
+        rng, draws, count = np.random.default_rng(2), 2000, site.feeder.bus.size
+        known, unknown = np.full(count, 0.3), 0.6 * rng.normal(size=(draws, count))
+        other = 0.2 * rng.normal(size=(draws, count))
+        v0 = np.full((draws, 3), site.feeder.base_volt)
+        v, _ = power_flow(site).solve_batch(known + unknown, 0.2 * known + other, v0)
+        expected = prior(site.feeder, site.feeder.bus, load_doubt(site), busbar=0.0).between
+        found = np.cov((v / site.feeder.base_volt) ** 2, rowvar=False)
+        assert np.linalg.norm(found - expected) < 0.05 * np.linalg.norm(expected)
+        # Phases that share a cable err against each other: that is no neglected rounding.
+        phase = np.array([row.phases for row in site.tables.customers])
+        apart = phase[:, None] != phase
+        assert np.linalg.norm(expected[apart]) > 0.1 * np.linalg.norm(expected)
+        assert np.linalg.norm((found - expected)[apart]) < 0.2 * np.linalg.norm(expected[apart])
 
     def test_eighteen_liars_are_named_and_nobody_else(self) -> None:
         this = self.trial(Lie(Trick.BIAS, 18, 3.0, onset_s=20.0))
