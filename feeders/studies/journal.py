@@ -59,6 +59,9 @@ class Journal:
         if lines[-1] or len(lines) == 1:
             path.write_text("\n".join([*lines[:-1], ""] if len(lines) > 1 else [head, ""]), encoding="utf-8")
 
+    def __contains__(self, key: str) -> bool:
+        return key in self._done
+
     def get(self, key: str, work: Callable[[], Any]) -> Any:
         """Return the result of a piece of work, which is done now if it was not before.
 
