@@ -1,0 +1,362 @@
+"""One error of a feeder's files after the other: which of all that can be thought of do the readings speak for.
+
+References
+----------
+docs/theory-studies.md, section 8.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from itertools import combinations
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from feeders.schema import LineRow
+from feeders.studies import calibrate_feeder as model
+from gridsec.arrays import Floats, Ints
+from gridsec.phases import PHASES
+from gridsec.studies.calibrate import Evidence, Fit, evidence, fit, weigh
+from gridsec.studies.calibrate_model import Regressors, Series, lengthened, regressors, steps
+from gridsec.studies.calibrate_noise import LoadErrors, Whitening, increments, learn, whitening
+
+if TYPE_CHECKING:
+    from feeders.schema import FeederTables
+    from feeders.studies.calibrate_feeder import Network, Powers
+    from feeders.studies.calibrate_readings import Frames
+
+__all__ = ["Guess", "Kind", "Round", "State", "apply", "compare", "longer", "prepare"]
+
+LENGTH_SPREAD: Final = 0.3
+"""Prior standard deviation of the relative error of a length that is a mistake."""
+
+CHANGE_SPREAD: Final = 0.005
+"""The same of a change of a meter's relative error."""
+
+SHORTEST: Final = 0.05
+"""No line is shorter than this part of what its files say."""
+
+PIECES: Final = 8
+"""Stretches of time in which a meter's error may differ."""
+
+_CHUNK: Final = 128
+_REFIT: Final = 3
+_NOISE_ROUNDS: Final = 2
+
+
+class Kind(StrEnum):
+    """What may be wrong."""
+
+    BUS = "bus"
+    PHASE = "phase"
+    SWAP = "swap"
+    LENGTH = "length"
+    METER = "meter"
+
+
+@dataclass(frozen=True, slots=True)
+class Guess:
+    """An error of the files that is looked at.
+
+    Attributes
+    ----------
+    kind
+        What it is.
+    subject
+        Customer, customer and customer of a swap, meter, or branch; by index in the present network.
+    other
+        The second customer, the bus of the merged tree, or nothing: -1.
+    phases
+        Phases of the customer.
+    since, until
+        When the meter's error is different, Unix s.
+    """
+
+    kind: Kind
+    subject: int
+    other: int = -1
+    phases: str = ""
+    since: float = np.nan
+    until: float = np.nan
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """Files as corrected so far, and what is left out of account.
+
+    Attributes
+    ----------
+    tables
+        The files.
+    excluded
+        Meters whose errors change, or that the caller does not trust.
+    lengths
+        Factor on each line so far, by its id.
+    """
+
+    tables: FeederTables
+    excluded: tuple[str, ...] = ()
+    lengths: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Round:
+    """All that is known with the files as corrected so far."""
+
+    state: State
+    net: Network
+    drawn: Powers
+    series: Series
+    noise: LoadErrors
+    whiten: Whitening
+    given: Regressors
+    fit: Fit
+    readings: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Verdict:
+    """What comparing all guesses has brought.
+
+    Attributes
+    ----------
+    guesses
+        All of them.
+    found
+        What the readings say about each.
+    confidence : (H,)
+        See `gridsec.studies.calibrate.Weighed`.
+    any
+        Logarithm of the mean Bayes factor.
+    kept : (k,)
+        The guesses that cannot be told apart, the best first.
+    """
+
+    guesses: list[Guess]
+    found: Evidence
+    confidence: Floats
+    any: float
+    kept: Ints
+
+
+def prepare(state: State, frames: Frames, *, tolerance: float, errors: bool = False) -> Round:
+    """Fit the meters, loads and lines of files that are taken to be right.
+
+    Parameters
+    ----------
+    state
+        The files.
+    frames
+        The readings.
+    tolerance
+        Relative error of a line's length that is no mistake.
+    errors
+        Whether the standard errors of the loads' errors are wanted.
+    """
+    net = model.network(state.tables)
+    drawn = model.powers(net.site, frames)
+    series = model.series(net, frames, drawn, state.excluded)
+    free = [
+        k
+        for k, chain in enumerate(net.lines)
+        if any(state.tables.lines[row].line in state.lengths for row in chain)
+    ]
+    priors = model.doubts(net, drawn, tolerance, free, LENGTH_SPREAD)
+    given = regressors(net.places, series, priors)
+    used = np.flatnonzero(given.spread > 0.0)
+    white, common = model.meter_noise(net, frames)
+    own, gap = model.field(net, drawn), model.gaps(net, drawn)
+    rest = series.residual(net.places)
+    size = _typical(net)
+    noise = LoadErrors(size, size, net.site.tables.meta.load.correlation_s, 1.0, np.full(4, np.nan))
+    guess, left = noise, rest
+    for turn in range(_NOISE_ROUNDS):
+        last = errors and turn == _NOISE_ROUNDS - 1
+        products = increments(series.t, series.seen, left)
+        noise = learn(products, own, white.mean(axis=0), float(common.mean()), guess, errors=last)
+        S = noise.covariance(own)
+        whiten = whitening(series.t, series.seen, S, noise.time_s, noise.white**2 * white, common, gap)
+        both = whiten(np.concatenate([given.columns[:, :, used], rest[:, :, None]], axis=2))
+        flat = both.reshape(-1, used.size + 1)
+        found = fit(flat[:, -1], flat[:, :-1], given.spread[used], int(series.seen.sum()))
+        left = np.where(series.seen, rest - given.columns[:, :, used] @ found.estimate, 0.0)
+    return Round(state, net, drawn, series, noise, whiten, given, _spread_out(found, used, given), flat[:, -1])
+
+
+def _typical(net: Network) -> float:
+    return 0.02 * float(np.median(net.site.loads.load_peak[net.site.meters]))
+
+
+def _spread_out(found: Fit, used: Ints, given: Regressors) -> Fit:
+    """Coefficients that are known to be 0 take their places again."""
+    estimate, std = np.zeros((2, given.spread.size))
+    estimate[used], std[used] = found.estimate, found.std
+    return replace(found, estimate=estimate, std=std)
+
+
+def compare(now: Round, frames: Frames, risk: float, tell: Callable[[int, int], None]) -> Verdict:
+    """Weigh every error of the files that can be thought of.
+
+    Parameters
+    ----------
+    now
+        The present files.
+    frames
+        The readings.
+    risk
+        Probability of a proposal for files without errors.
+    tell
+        Told how far it is.
+    """
+    guesses: list[Guess] = []
+    parts: list[Evidence] = []
+    chunks = list(_chunks(now))
+    for k, (some, make, spread) in enumerate(chunks):
+        tell(k, len(chunks))
+        z = now.whiten(make())
+        parts.append(evidence(now.fit, z.reshape(-1, len(some)), np.full(len(some), spread)))
+        guesses.extend(some)
+    tell(len(chunks), len(chunks))
+    found = Evidence(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("g", "h", "log_factor")))
+    kind = np.array([list(Kind).index(guess.kind) for guess in guesses], dtype=np.intp)
+    exact = found.log_factor.copy()
+    refit = [h for h in np.argsort(-exact)[: 2 * _REFIT] if guesses[h].kind in _MOVES][:_REFIT]
+    for h in refit:
+        if exact[h] > 0.0:
+            exact[h] = _exactly(now, frames, guesses[h])
+    weighed = weigh(exact, kind, risk)
+    return Verdict(
+        guesses, Evidence(found.g, found.h, exact), weighed.confidence, weighed.any, weighed.kept
+    )
+
+
+_MOVES: Final = (Kind.BUS, Kind.PHASE, Kind.SWAP)
+
+Chunk = tuple[list[Guess], Callable[[], Floats], float]
+
+
+def _chunks(now: Round) -> Iterator[Chunk]:
+    """Guesses of like kind, and how their effects are made; (T, p, H)."""
+    net, series = now.net, now.series
+    trusted = [
+        j for j, name in enumerate(net.site.meter_ids) if name not in now.state.excluded and series.seen[:, j].any()
+    ]
+    guesses = [*_buses(net, trusted), *_phases(net, trusted), *_swaps(net, trusted)]
+    for first in range(0, len(guesses), _CHUNK):
+        some = guesses[first : first + _CHUNK]
+        yield some, lambda some=some: _moves(now, some), 0.0
+    lengths = [Guess(Kind.LENGTH, k) for k in range(len(net.lines))]
+    yield lengths, lambda: _seen(now, lengthened(net.places, series)), LENGTH_SPREAD
+    for j in trusted:
+        columns, times = steps(series, j, PIECES)
+        changes = [Guess(Kind.METER, j, since=since, until=until) for since, until in times]
+        yield changes, lambda columns=columns: columns, CHANGE_SPREAD
+
+
+def _buses(net: Network, trusted: list[int]) -> list[Guess]:
+    out = []
+    rows = net.site.tables.customers
+    for j in trusted:
+        customer = int(net.site.meters[j])
+        phases = rows[customer].phases
+        out += [
+            Guess(Kind.BUS, customer, bus, phases)
+            for bus in range(len(net.feeder.buses))
+            if bus != net.feeder.bus[customer] and net.reaches(bus, phases)
+        ]
+    return out
+
+
+def _phases(net: Network, trusted: list[int]) -> list[Guess]:
+    out = []
+    if not isinstance(net.feeder, model.Feeder):
+        for j in trusted:
+            customer = int(net.site.meters[j])
+            bus, phases = int(net.feeder.bus[customer]), net.site.tables.customers[customer].phases
+            if len(phases) == 1:
+                others = [phase for phase in PHASES if phase != phases and net.reaches(bus, phase)]
+                out += [Guess(Kind.PHASE, customer, bus, phase) for phase in others]
+    return out
+
+
+def _swaps(net: Network, trusted: list[int]) -> list[Guess]:
+    W = net.places.weight
+    customers = [int(net.site.meters[j]) for j in trusted]
+    return [Guess(Kind.SWAP, a, b) for a, b in combinations(customers, 2) if (W[a] != W[b]).any()]
+
+
+def _moves(now: Round, guesses: list[Guess]) -> Floats:
+    net, series = now.net, now.series
+    out = np.empty((*series.y.shape, len(guesses)))
+    for h, guess in enumerate(guesses):
+        if guess.kind is Kind.SWAP:
+            W = net.places.weight
+            change = {guess.subject: W[guess.other], guess.other: W[guess.subject]}
+        else:
+            change = {guess.subject: net.weight(guess.other, guess.phases)}
+        out[:, :, h] = net.places.moved(series, change)
+    return _seen(now, out)
+
+
+def _seen(now: Round, columns: Floats) -> Floats:
+    return np.where(now.series.seen[:, :, None], columns, 0.0)
+
+
+def _exactly(now: Round, frames: Frames, guess: Guess) -> float:
+    """Gain of the log-likelihood with the power flow of the files as corrected."""
+    after = model.network(apply(now.state, now.net, guess, 1.0).tables)
+    drawn = model.powers(after.site, frames)
+    series = model.series(after, frames, drawn, now.state.excluded)
+    # The meters of a swap have changed places; their readings are compared in the old order.
+    order = [after.site.meter_ids.index(name) for name in now.net.site.meter_ids]
+    rest = series.residual(after.places)[:, order]
+    y = now.whiten(rest[:, :, None]).ravel()
+    z = now.readings - y
+    return float(evidence(now.fit, z[:, None], np.zeros(1)).log_factor[0])
+
+
+def apply(state: State, net: Network, guess: Guess, factor: float) -> State:
+    """Correct the files.
+
+    Parameters
+    ----------
+    state
+        The files.
+    net
+        Their network, which the guess is about.
+    guess
+        The error.
+    factor
+        On the length of the branch's lines, for a length.
+    """
+    tables = state.tables
+    customers, lines = list(tables.customers), list(tables.lines)
+    if guess.kind is Kind.METER:
+        return replace(state, excluded=(*state.excluded, net.site.meter_ids[guess.subject]))
+    if guess.kind is Kind.LENGTH:
+        lengths = dict(state.lengths)
+        for row in net.lines[guess.subject]:
+            lines[row] = longer(lines[row], factor)
+            lengths[lines[row].line] = lengths.get(lines[row].line, 1.0) * factor
+        return replace(state, tables=replace(tables, lines=tuple(lines)), lengths=lengths)
+    one = customers[guess.subject]
+    if guess.kind is Kind.SWAP:
+        other = customers[guess.other]
+        customers[guess.subject] = replace(one, meter=other.meter)
+        customers[guess.other] = replace(other, meter=one.meter)
+    else:
+        bus = net.feeder.buses[guess.other] if guess.kind is Kind.BUS else one.bus
+        customers[guess.subject] = replace(one, bus=bus, phases=guess.phases or one.phases)
+    return replace(state, tables=replace(tables, customers=tuple(customers)))
+
+
+def longer(line: LineRow, factor: float) -> LineRow:
+    """A line of another length."""
+    scaled = {
+        name: None if (value := getattr(line, name)) is None else value * factor
+        for name in ("r_ohm", "x_ohm", "r0_ohm", "x0_ohm", "b_us")
+    }
+    return replace(line, **scaled)
