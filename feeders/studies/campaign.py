@@ -142,20 +142,16 @@ def campaign(
         progress(done * plan.together, plan.scenarios)
     with closing((runner or Here()).run(partial(_scene, site.tables, plan), todo)) as results:
         for scene, rows in results:
-            kept.get(_key(scene), partial(_same, rows))
+            kept.put(_key(scene), rows)
             done += 1
             if progress is not None:
                 progress(done * plan.together, plan.scenarios)
-    rows = [row for scene in range(plan.scenes) for row in kept.get(_key(scene), list)]
+    rows = [row for scene in range(plan.scenes) for row in kept[_key(scene)]]
     return _campaign(site, plan, used, rows)
 
 
 def _key(scene: int) -> str:
     return f"scene|{scene}"
-
-
-def _same(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    return rows
 
 
 # What the worker of this process prepared last, and for what.
