@@ -236,6 +236,8 @@ class Region:
         Sensitivities of the voltage magnitudes in the middle of the box.
     p_error, q_error : (N, N)
         How far those anywhere in the box are off, entry by entry.
+    dv_dv0, v0_error : (N,)
+        The same for the voltage of the busbar.
     low, high : (N,)
         Proven limits of the voltage magnitudes in the box, pu.
     """
@@ -244,6 +246,8 @@ class Region:
     dv_dq: Floats
     p_error: Floats
     q_error: Floats
+    dv_dv0: Floats
+    v0_error: Floats
     low: Floats
     high: Floats
 
@@ -284,7 +288,17 @@ def region(net: Network, box: Box) -> Region:
     off = np.hstack([error(xi, own) for xi, own in columns])
     low, high = _limits(net, box, at.v, J, off)
     n = r.size
-    return Region(J[:, :n], J[:, n : 2 * n], off[:, :n], off[:, n : 2 * n], low, high)
+    p, q, busbar = slice(n), slice(n, 2 * n), 2 * n
+    return Region(
+        dv_dp=J[:, p],
+        dv_dq=J[:, q],
+        p_error=off[:, p],
+        q_error=off[:, q],
+        dv_dv0=J[:, busbar],
+        v0_error=off[:, busbar],
+        low=low,
+        high=high,
+    )
 
 
 def _split(box: Box) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:

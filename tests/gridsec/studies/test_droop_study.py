@@ -14,6 +14,7 @@ from gridsec.droop import Droop, voltage_curve
 from gridsec.errors import DesignInfeasible
 from gridsec.feeder import Feeder
 from gridsec.studies.droop_network import Box, currents, network, region, sensitivity, solve
+from gridsec.studies.droop_rest import always, at_rest, injected, rest, shares
 from gridsec.studies.droop_stability import (
     Loop,
     Update,
@@ -27,6 +28,8 @@ from gridsec.studies.droop_stability import (
     verified,
 )
 from tests.gridsec.radial import random_feeder, random_loop, sweep
+
+FEW = settings(max_examples=25)
 
 
 def random_box(feeder: Feeder, rng: np.random.Generator, size: float) -> Box:
@@ -44,6 +47,7 @@ def corners(box: Box, rng: np.random.Generator) -> tuple[Floats, Floats, float]:
     return p, q, float(rng.choice([box.v0_low, box.v0_high]))
 
 
+@FEW
 @given(seed=st.integers(0, 200), charging=st.sampled_from([0.0, 0.01]))
 def test_power_flow_against_sweeps(seed: int, charging: float) -> None:
     feeder = random_feeder(seed, charging=charging)
@@ -79,6 +83,7 @@ def test_no_solution_is_nan_and_an_error_of_what_needs_one() -> None:
         sensitivity(net, s, V[0])
 
 
+@FEW
 @given(seed=st.integers(0, 300))
 def test_sensitivities_against_differences_of_the_sweeps(seed: int) -> None:
     feeder = random_feeder(seed)
@@ -101,6 +106,7 @@ def test_sensitivities_against_differences_of_the_sweeps(seed: int) -> None:
     np.testing.assert_allclose(found.v * found.busbar.real, d0, atol=1e-7)
 
 
+@FEW
 @given(seed=st.integers(0, 300), size=st.sampled_from([0.1, 1.0]))
 def test_nothing_in_a_box_is_outside_of_its_bounds(seed: int, size: float) -> None:
     feeder = random_feeder(seed)
@@ -147,7 +153,7 @@ def random_given(seed: int, update: Update, *, spread: float = 1.0) -> Loop:
     return Loop(S, np.zeros((m, m)), tau, update, np.arange(m))
 
 
-@settings(max_examples=30)
+@FEW
 @given(seed=st.integers(0, 200), interval=st.sampled_from([0.2, 1.0, 4.0, 100.0]))
 def test_one_time_constant_and_no_dead_time_the_criterion_is_exact(seed: int, interval: float) -> None:
     """`alpha (1 + g) < 2` is where the linear loop with all slopes at their bounds becomes unstable."""
@@ -161,7 +167,7 @@ def test_one_time_constant_and_no_dead_time_the_criterion_is_exact(seed: int, in
     assert growth(1.001 * exact * made.S, np.ones(made.tau.size), made.tau, made.update) > 1.0
 
 
-@settings(max_examples=30)
+@FEW
 @given(seed=st.integers(0, 200), dead=st.integers(0, 3), spread=st.sampled_from([1.0, 4.0]))
 def test_what_is_verified_contracts_for_any_slopes_that_change_at_any_time(
     seed: int, dead: int, spread: float
@@ -185,6 +191,7 @@ def test_what_is_verified_contracts_for_any_slopes_that_change_at_any_time(
     assert np.abs(e).max() < 1e-2
 
 
+@FEW
 @given(seed=st.integers(0, 100))
 def test_continuous_filters_of_one_time_constant_are_always_proven(seed: int) -> None:
     made = random_given(seed, Update(0.0))
@@ -203,6 +210,7 @@ def test_small_gain_needs_no_interval_and_no_dead_time() -> None:
     assert growth(nothing.S, nothing.tau, nothing.tau, Update()) == 0.0
 
 
+@FEW
 @given(seed=st.integers(0, 100))
 def test_every_trajectory_ends_within_reach(seed: int) -> None:
     feeder, droop, _ = random_loop(seed, gain=0.5)
@@ -227,6 +235,7 @@ def test_every_trajectory_ends_within_reach(seed: int) -> None:
     assert np.all(x <= within.x_high + room)
 
 
+@FEW
 @given(seed=st.integers(0, 100), times=st.floats(0.7, 20.0))
 def test_steeper_curves_have_the_same_limits_and_deadband(seed: int, times: float) -> None:
     rng = np.random.default_rng(seed)
@@ -259,3 +268,90 @@ def test_loop_leaves_out_inverters_that_do_not_react() -> None:
     made = loop(droop, quiet, Update())
     assert made.tau.size == 0
     assert proof(made).kind == "deadband"
+
+
+# --- rest, and the band of voltages -----------------------------------------------------------------------
+
+
+@FEW
+@given(seed=st.integers(0, 200), gain=st.sampled_from([0.3, 3.0, 30.0]))
+def test_at_rest_every_inverter_gives_what_its_curve_asks_for(seed: int, gain: float) -> None:
+    feeder, droop, _ = random_loop(seed, gain=gain)
+    rng = np.random.default_rng(seed)
+    p, q = rng.uniform(-0.05, 0.05, (2, 3, len(feeder.customers)))
+    x, V = rest(network(feeder), droop, p + 1j * q, np.array([0.99, 1.0, 1.04]))
+    assert np.isfinite(V).all()
+    for row, v0 in enumerate((0.99, 1.0, 1.04)):
+        s = injected(droop, p[row] + 1j * q[row], x[row])
+        v = np.sqrt(sweep(feeder, s.real, s.imag, v0**2)[feeder.bus])
+        np.testing.assert_allclose(np.abs(V[row]), v, atol=1e-10)
+        np.testing.assert_allclose(voltage_curve(droop, v[droop.customer]), x[row], atol=1e-9)
+
+
+def test_where_there_is_no_power_flow_there_is_no_rest() -> None:
+    feeder, droop, _ = random_loop(3, gain=0.5)
+    x, V = rest(network(feeder), droop, np.full(len(feeder.customers), -50.0 + 0j), 1.0)
+    assert np.isnan(x).all()
+    assert np.isnan(V).all()
+
+
+@FEW
+@given(seed=st.integers(0, 300))
+def test_no_voltage_leaves_its_proven_band(seed: int) -> None:
+    feeder, droop, _ = random_loop(seed, gain=0.6)
+    net, rng = network(feeder), np.random.default_rng(seed)
+    loads = random_box(feeder, rng, 1.0)
+    try:
+        ever = always(net, droop, loads)
+    except DesignInfeasible:
+        return
+    drawn = [corners(loads, rng) for _ in range(8)]
+    s, v0 = np.array([p + 1j * q for p, q, _ in drawn]), np.array([v for *_, v in drawn])
+    x, V = rest(net, droop, s, v0)
+    assert np.all(np.abs(V) >= ever.low)
+    assert np.all(np.abs(V) <= ever.high)
+    jumped = np.abs(solve(net, injected(droop, s, np.roll(x, 1, axis=0)), v0))
+    assert np.all(jumped >= ever.low)
+    assert np.all(jumped <= ever.high)
+    try:
+        still = at_rest(net, droop, loads)
+    except DesignInfeasible:
+        return
+    assert np.all(np.abs(V) >= still.low)
+    assert np.all(np.abs(V) <= still.high)
+    assert np.all(still.low >= ever.low)
+
+
+def test_the_band_at_rest_is_reached_where_all_sensitivities_are_positive() -> None:
+    """A line of one cable: the corners of the box are the extreme loads."""
+    feeder, droop, _ = random_loop(4, gain=0.2)
+    count = len(feeder.customers)
+    full, none = np.full(count, 0.01), np.zeros(count)
+    line = replace(feeder, parent=np.arange(feeder.parent.size), x=0.5 * feeder.r)
+    loads = Box(-full, full, none, none, 1.0, 1.0)
+    net = network(line)
+    band = at_rest(net, droop, loads)
+    V = np.abs(rest(net, droop, np.stack([-full, full]) + 0j, 1.0)[1])
+    np.testing.assert_allclose(band.low, V[0], atol=2e-4)
+    np.testing.assert_allclose(band.high, V[1], atol=2e-4)
+
+
+@FEW
+@given(seed=st.integers(0, 100))
+def test_shares_of_the_gain_against_eigenvalues(seed: int) -> None:
+    made = random_given(seed, Update())
+    gain = float(np.linalg.norm(made.S, 2))
+    found = shares(made, 1.5 * gain)
+    assert found.part.sum() == pytest.approx(1.0)
+    for i in np.flatnonzero(found.factor < 1e6):
+        root = np.ones(made.tau.size)
+        root[i] = np.sqrt(found.factor[i])
+        assert np.linalg.norm(root[:, None] * made.S * root, 2) == pytest.approx(1.5 * gain, rel=1e-6)
+    for i in np.flatnonzero(np.isinf(found.factor)):
+        root = np.ones(made.tau.size)
+        root[i] = 1e3
+        assert (
+            made.S[i, i] == pytest.approx(0.0)
+            or np.linalg.norm(root[:, None] * made.S * root, 2) < 1.5 * gain
+        )
+    assert np.all(shares(made, 0.5 * gain).factor == 1.0)
