@@ -87,22 +87,25 @@ def steps_of(values: Sequence[float], unit: str) -> Scale:
         What it is for, at least one finite value, and its unit.
     """
     finite = [value for value in values if math.isfinite(value)]
-    low, high = min(finite), max(finite)
-    if high - low < 0.05 * abs(high):  # all but the same: do not blow up what makes no difference
-        low = 0.0
+    least, most = min(finite), max(finite)
+    same = most - least < 0.05 * max(abs(most), abs(least))
+    low, high = (min(least, 0.0), max(most, 0.0)) if same else (least, most)
     step = (high - low) / STEPS or 1.0
     size = 10.0 ** math.floor(math.log10(step))
     while True:
         for factor in (1.0, 2.0, 2.5, 5.0, 10.0):
-            first = math.floor(low / (factor * size) + 1e-9) * factor * size
-            if first + STEPS * factor * size >= high * (1.0 - 1e-12):
-                return Scale(tuple(first + k * factor * size for k in range(STEPS + 1)), unit)
+            step = factor * size
+            first = math.floor(low / step + 1e-9) * step
+            # What makes all but no difference is on one step, not on two.
+            apart = same and least // step != most // step
+            if first + STEPS * step >= high * (1.0 - 1e-12) and not apart:
+                return Scale(tuple(first + k * step for k in range(STEPS + 1)), unit)
         size *= 10.0
 
 
 def _digits(step: float) -> int:
     digits = max(0, -math.floor(math.log10(step)))
-    return digits + (abs(step * 10**digits - round(step * 10**digits)) > 1e-6)
+    return digits + int(abs(step * 10.0**digits - round(step * 10.0**digits)) > 1e-6)
 
 
 def draw_map(

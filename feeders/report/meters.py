@@ -109,14 +109,13 @@ def _sizes(meters: pd.DataFrame, liars: int, sure: str) -> Finding:
     together = "alone" if liars == 1 else f"with up to {liars} lying together"
     never = meters[[math.isinf(v) or math.isnan(v) for v in meters["noticed"]]]
     lead: Sentence = (
-        "Every one of the ",
+        "All ",
         how_many(meters, name),
-        f" meters, {together}, can be lied about by a little: up to ",
+        f" meters, {together}, can be lied about by a little: for lies up to ",
         least(meters, name, "hidden", "V"),
-        " (",
-        f"{_which(meters, 'hidden', smallest=True)}) and ",
+        f" ({_which(meters, 'hidden', smallest=True)}) to ",
         most(meters, name, "hidden", "V"),
-        f" ({_which(meters, 'hidden')}) nobody is ever named.",
+        f" ({_which(meters, 'hidden')}) nobody is named, with {sure} at any one moment.",
     )
     if len(never):
         noticed: Sentence = (
@@ -125,11 +124,12 @@ def _sizes(meters: pd.DataFrame, liars: int, sure: str) -> Finding:
         )
         return Finding(Standing.PART, (lead, noticed))
     noticed = (
-        f"Somebody is surely noticed (with {sure} at any one moment) from ",
+        "Larger lies may go unnoticed, depending on the honest errors of the moment; somebody is surely "
+        "noticed from ",
         least(meters, name, "noticed", "V"),
         f" ({_which(meters, 'noticed', smallest=True)}) to ",
         most(meters, name, "noticed", "V"),
-        f" ({_which(meters, 'noticed')}) on, by meter; below that it depends on honest errors.",
+        f" ({_which(meters, 'noticed')}) on.",
     )
     if not all(math.isfinite(v) for v in meters["named"]):
         named: Sentence = ("Not every liar is proved to be named, however large the lie.",)

@@ -20,11 +20,11 @@ class Question(Enum):
     """What a committee asks, in the order in which the summary answers."""
 
     LIES = "Which meters can be lied about without anyone noticing, and by how much?"
-    INVISIBLE = "Could liars stay invisible for ever, even to someone who knows everything else?"
     PROTECT = "Which few meters should be protected?"
     PICTURE = "What can an attacker do to the picture of the voltage?"
     FLEET = "Are the inverters stable, and do they keep the voltage band?"
     MONITOR = "How did the monitor behave in simulated attacks?"
+    INVISIBLE = "Could liars stay invisible for ever, even to someone who knows everything else?"
     RECORDS = "What do the recorded readings say about the files?"
     OTHER = "What else was studied?"
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from feeders.report.drawing import Drawing
 from feeders.report.maps import Shape, Spot, draw_map, steps_of
@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from feeders.load import Site
 
 __all__ = ["names_of", "size_map", "spots_by_size"]
+
+FEW: Final = 40
+"""Up to so many numbers stand in a map themselves."""
 
 
 def size_map(
@@ -61,7 +64,8 @@ def spots_by_size(
             spots.append(Spot(Shape.ALARM, name, f"{name}: no bound", weight=math.inf))
         else:
             tip = f"{name}: {number(value)} {unit}"
-            spots.append(Spot(Shape.STEP, _short(name, names), tip, scale.step(value), value))
+            label = _short(name, names) + (f": {number(value)}" if len(sizes) <= FEW else "")
+            spots.append(Spot(Shape.STEP, label, tip, scale.step(value), value))
     legend = {} if scale is None else {n: Spot(Shape.STEP, step=k) for k, n in enumerate(scale.names())}
     if any(spot.shape is Shape.ALARM for spot in spots):
         legend["no bound"] = Spot(Shape.ALARM)
@@ -85,10 +89,10 @@ def names_of(site: Site, who: str) -> list[str]:
 
 
 def _short(name: str, names: Sequence[str]) -> str:
-    """A name without the words that all of them begin with."""
+    """A name with only the last of the words that all of them begin with."""
     some = [each for each in names if each]
     words = name.split(" ")
     same = 0
     while same < len(words) - 1 and all(each.split(" ")[: same + 1] == words[: same + 1] for each in some):
         same += 1
-    return " ".join(words[same:])
+    return " ".join(words[max(same - 1, 0) :])
