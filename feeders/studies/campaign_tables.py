@@ -33,8 +33,8 @@ def scenarios(rows: Sequence[dict[str, Any]]) -> tuple[pd.DataFrame, pd.DataFram
     kept = ("scenario", "alarms_per_year", "kind", "size", "liars", "place")
     each = [{name: row[name] for name in kept} | one for row in rows for one in row.get("each", ())]
     frame = pd.DataFrame([{name: cell for name, cell in row.items() if name != "each"} for row in rows])
-    columns = [*kept, "who", "inverter", "lie_volt", "delay_s"]
-    return frame, pd.DataFrame(each, columns=columns)
+    liars = pd.DataFrame(each, columns=[*kept, "who", "inverter", "lie_volt", "delay_s"])
+    return frame, liars.astype({"alarms_per_year": float, "delay_s": float})
 
 
 def grouped(found: pd.DataFrame, liars: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
