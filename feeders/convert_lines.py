@@ -116,6 +116,24 @@ def capacitor(name: str, bus: str, siemens: float, phases: str = "abc") -> LineR
     )
 
 
+def open_end(row: LineRow, bus: str, volt: float) -> LineRow | None:
+    """Return a line that is open at one end only as a line to nowhere: its charging goes on.
+
+    Parameters
+    ----------
+    row
+        The line.
+    bus
+        Its closed end.
+    volt
+        Nominal voltage, V; below 1000 the charging is too small to matter.
+    """
+    if row.b_us == 0 or volt < 1000.0 or not (row.r_ohm or row.x_ohm):
+        return None
+    name = f"{row.line} open end"
+    return replace(row, line=name, from_bus=bus, to_bus=f"{bus} {name}", closed=True)
+
+
 def merged(lines: Sequence[LineRow], busbar: str, changes: list[Change]) -> list[LineRow]:
     """Return the lines with those in parallel as one, and those that switches short-circuit open.
 
@@ -140,7 +158,9 @@ def merged(lines: Sequence[LineRow], busbar: str, changes: list[Change]) -> list
         solid = row.closed and row.r_ohm == row.x_ohm == 0.0
         one, other = fused(row.from_bus), fused(row.to_bus)
         if solid and one == other:
-            changes.append(Change(f"switch {row.line}", "closed", "changed", "open; others join the same buses"))
+            changes.append(
+                Change(f"switch {row.line}", "closed", "changed", "open; others join the same buses")
+            )
             row = replace(row, closed=False)  # noqa: PLW2901
         elif solid:
             above[other] = one
@@ -172,7 +192,9 @@ def _parallel(rows: list[LineRow], changes: list[Change]) -> LineRow:
     changes.append(Change(f"lines {names}", "all of it", "changed", f"in parallel; one line {first.line}"))
     positive = [complex(row.r_ohm, row.x_ohm) for row in rows]
     total = 1.0 / sum(1.0 / z for z in positive)
-    limits = [row.rating_a * abs(z) / abs(total) for row, z in zip(rows, positive, strict=True) if row.rating_a]
+    limits = [
+        row.rating_a * abs(z) / abs(total) for row, z in zip(rows, positive, strict=True) if row.rating_a
+    ]
     joined = replace(
         first,
         r_ohm=rounded(total.real),
@@ -180,7 +202,9 @@ def _parallel(rows: list[LineRow], changes: list[Change]) -> LineRow:
         b_us=rounded(sum(row.b_us for row in rows)),
         rating_a=rounded(min(limits)) if len(limits) == len(rows) else None,
     )
-    zeros = [complex(row.r0_ohm, row.x0_ohm) for row in rows if row.r0_ohm is not None and row.x0_ohm is not None]
+    zeros = [
+        complex(row.r0_ohm, row.x0_ohm) for row in rows if row.r0_ohm is not None and row.x0_ohm is not None
+    ]
     if len(zeros) < len(rows) or not all(zeros):
         return replace(joined, r0_ohm=None, x0_ohm=None)
     zero = 1.0 / sum(1.0 / z for z in zeros)

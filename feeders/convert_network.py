@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -287,7 +287,7 @@ def accepting(tables: FeederTables, changes: list[Change]) -> FeederTables:
     """
     doubts: set[str] = set()
     for problem in validate(tables):
-        sentence, found, doubt = problem.partition(" (if it is right: accept = [\"")
+        sentence, found, doubt = problem.partition(' (if it is right: accept = ["')
         if found:
             doubts.add(doubt.partition('"')[0])
             changes.append(Change("feeder", sentence, "accepted", "as the source has it"))
@@ -390,7 +390,9 @@ def _kept(
             kept.append(replace(away, to_x=place[0], to_y=place[1]) if place else away)
         elif a or b:
             changes.append(
-                Change(f"line {row.line}", "all of it", "left out", "open towards what the busbar does not feed")
+                Change(
+                    f"line {row.line}", "all of it", "left out", "open towards what the busbar does not feed"
+                )
             )
     outside = len(network.nominal.keys() - inside.keys())
     if outside:
@@ -421,9 +423,14 @@ def _behind(
             bus
             for end in each.buses
             if end not in inside
-            for bus in _reached(end, [row for row in everything if not {row.from_bus, row.to_bus} & inside.keys()])
+            for bus in _reached(
+                end, [row for row in everything if not {row.from_bus, row.to_bus} & inside.keys()]
+            )
         }
-        loads = sum(draw.bus in far for draw in network.draws)
+        if not np.isfinite(np.array([each.power_kva[k] for k in ends])).all():
+            effect = f"{len(far)} bus(es); what flows there is not known"
+            changes.append(Change(each.name, "all behind it", "left out", effect))
+            continue
         for k in ends:
             power = each.power_kva[k]
             name = each.name if len(ends) == 1 else f"{each.name} {each.buses[k]}"
@@ -434,7 +441,7 @@ def _behind(
                 each.name,
                 "all behind it",
                 "changed",
-                f"{len(far)} bus(es) and {loads} load(s) became a customer that draws what flows there, "
+                f"{len(far)} bus(es) became a customer that draws what flows there, "
                 f"{total.real:.4g} kW and {total.imag:.4g} kvar; exact at these loads only",
             )
         )
@@ -447,7 +454,11 @@ def _even(power: Phasors) -> bool:
 
 
 def customers_of(
-    draws: Iterable[Draw], volt: float, droop: str | None, changes: list[Change]
+    draws: Iterable[Draw],
+    volt: float,
+    droop: str | None,
+    changes: list[Change],
+    taken: Collection[str] = (),
 ) -> tuple[list[CustomerRow], dict[str, complex]]:
     """Return rows of customers.csv, and what each draws at the source's operating point, kVA.
 
@@ -461,12 +472,14 @@ def customers_of(
         Preset of the generators' inverters; None: by their size.
     changes
         Takes what is not carried over exactly.
+    taken
+        Names that other customers have.
     """
     rows: list[CustomerRow] = []
     power: dict[str, complex] = {}
     for draw in sorted(draws, key=lambda each: each.rating_kva is not None):
         for phases, kva in _connections(draw):
-            row = CustomerRow(_unique(draw, phases, power), draw.bus, 0.0, phases=phases)
+            row = CustomerRow(_unique(draw, phases, {*taken, *power}), draw.bus, 0.0, phases=phases)
             power[row.customer] = kva
             if draw.rating_kva is None:
                 rows.append(_load(row, kva, len(rows), volt, changes))
@@ -476,7 +489,9 @@ def customers_of(
             if share > 0:
                 row = replace(row, inverter_kva=rounded(share), droop=droop or droop_preset(share))
                 changes.append(
-                    Change(f"generator {draw.name}", "droop curve", "added", f"{row.droop}, not in the source")
+                    Change(
+                        f"generator {draw.name}", "droop curve", "added", f"{row.droop}, not in the source"
+                    )
                 )
             rows.append(row)
     return rows, power
@@ -488,7 +503,7 @@ def _connections(draw: Draw) -> list[tuple[str, complex]]:
     return [(phase, complex(kva)) for phase, kva in zip("abc", draw.power_kva, strict=True) if kva != 0]
 
 
-def _unique(draw: Draw, phases: str, taken: Mapping[str, complex]) -> str:
+def _unique(draw: Draw, phases: str, taken: Collection[str]) -> str:
     several = phases != "abc" and len(_connections(draw)) > 1
     name = (f"{draw.name}-{phases}" if several else draw.name)[:120]
     while name in taken:
@@ -510,4 +525,3 @@ def _load(row: CustomerRow, kva: complex, number: int, volt: float, changes: lis
     row = replace(row, load_kw=rounded(max(p, 0.0)), load_profile=usual_profile(number, household=household))
     assert row.load_profile in envelopes()  # noqa: S101  # the library's own names
     return reactive(row, p / math.hypot(p, q) if p > 0 and q > 0 else None)
-

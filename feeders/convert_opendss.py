@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 
 from feeders.convert_changes import Change
-from feeders.convert_lines import capacitor, line_row
+from feeders.convert_lines import capacitor, line_row, open_end
 from feeders.convert_network import Coupling, Draw, Network
 from feeders.schema import LineRow
 from gridsec.arrays import Floats, Phasors
@@ -60,7 +60,12 @@ class _Element:
     nodes: tuple[tuple[int, ...], ...]
     power_kva: tuple[Phasors, ...]
     enabled: bool
-    closed: bool
+    on: tuple[int, ...]
+
+    @property
+    def closed(self) -> bool:
+        """Whether it is connected at all its ends."""
+        return self.enabled and len(self.on) == len(self.buses)
 
 
 @contextmanager
@@ -226,10 +231,8 @@ def _element(dss: Any, full: str, problems: list[str]) -> _Element:
         problems.append(
             f"{kind} {name} has a conductor besides the phases 1, 2, 3 and the grounded neutral 0; expected none"
         )
-    closed = enabled and not any(
-        element.IsOpen(terminal, 0) for terminal in range(1, int(element.NumTerminals()) + 1)
-    )
-    return _Element(name, kind, buses, nodes, tuple(powers), enabled, closed)
+    on = tuple(k for k in range(len(buses)) if enabled and not element.IsOpen(k + 1, 0))
+    return _Element(name, kind, buses, nodes, tuple(powers), enabled, on)
 
 
 def _build_everything(dss: Any, elements: list[_Element]) -> None:
@@ -261,7 +264,9 @@ def _take(dss: Any, each: _Element, network: Network, problems: list[str]) -> No
         bus = each.buses[0] if each.buses else ""
         network.of_bus.append((bus, Change(label, "all of it", "left out", CONTROLS[each.kind])))
     elif each.kind not in SILENT and each.kind != "vsource":
-        change = Change(label, "all of it", "left out", "has no place in a feeder; the check shows what that does")
+        change = Change(
+            label, "all of it", "left out", "has no place in a feeder; the check shows what that does"
+        )
         network.of_bus.append((each.buses[0], change))
 
 
@@ -309,7 +314,12 @@ def _line(dss: Any, each: _Element, network: Network, problems: list[str]) -> No
         changes := [],
     )
     network.of_bus.extend((each.buses[0], change) for change in changes)
-    network.lines.append(_rated(dss, each, row))
+    row = _rated(dss, each, row)
+    network.lines.append(row)
+    if len(each.on) == 1:
+        bus = each.buses[each.on[0]]
+        stub = open_end(row, bus, network.nominal[bus])
+        network.lines += [stub] if stub else []
 
 
 def _rated(dss: Any, each: _Element, row: LineRow) -> LineRow:
@@ -369,7 +379,11 @@ def _draw(dss: Any, each: _Element, network: Network) -> None:
     if each.kind in GENERATORS:
         rating = float(np.abs(power.sum()))
         dss.Circuit.SetActiveElement(f"{each.kind}.{each.name}")
-        given = dss.Properties.Value("kva") if "kva" in [n.lower() for n in dss.Element.AllPropertyNames()] else ""
+        given = (
+            dss.Properties.Value("kva")
+            if "kva" in [n.lower() for n in dss.Element.AllPropertyNames()]
+            else ""
+        )
         rating = max(rating, float(given or 0.0)) if each.kind == "pvsystem" else 0.0
         effect = "a customer with generation; its fixed reactive power is that of its droop curve"
         network.of_bus.append((each.buses[0], Change(label, "control", "changed", effect)))

@@ -15,7 +15,7 @@ from power_grid_model.validation import validate_input_data
 
 from feeders.convert_changes import Change
 from feeders.convert_customers import rounded
-from feeders.convert_lines import capacitor, line_row
+from feeders.convert_lines import capacitor, line_row, open_end
 from feeders.convert_network import Coupling, Draw, Network
 from feeders.records import some
 from feeders.schema import LineRow
@@ -56,7 +56,9 @@ def read_pgm(path: Path) -> Network:
         With everything that is wrong with its data.
     """
     tables = _tables(path)
-    symmetric = not any(len(tables[kind]) for kind in ("asym_load", "asym_gen", "asym_line") if kind in tables)
+    symmetric = not any(
+        len(tables[kind]) for kind in ("asym_load", "asym_gen", "asym_line") if kind in tables
+    )
     problems = validate_input_data(tables, symmetric=symmetric)
     if problems:
         raise FeederInvalid(f"{path.name}: {problem} Ids: {_shown(problem.ids)}" for problem in problems)
@@ -93,9 +95,13 @@ def _tables(path: Path) -> Tables:
     except (OSError, UnicodeDecodeError) as error:
         raise GridsecError(f"{path}: cannot be read: {error}") from error
     except Exception as error:  # whatever the foreign reader raises on a foreign file
-        raise GridsecError(f"{path}: power-grid-model cannot read it: {' '.join(str(error).split())}") from error
+        raise GridsecError(
+            f"{path}: power-grid-model cannot read it: {' '.join(str(error).split())}"
+        ) from error
     tables = {kind.value: rows for kind, rows in data.items()}
-    problems = [f"{path.name}: the table {kind!r} is missing" for kind in ("node", "source") if kind not in tables]
+    problems = [
+        f"{path.name}: the table {kind!r} is missing" for kind in ("node", "source") if kind not in tables
+    ]
     if any(not isinstance(rows, np.ndarray) or rows.ndim != 1 for rows in tables.values()):
         problems.append(f"{path.name}: is a batch; expected one set of input data")
     elif any("u_rated" not in (rows.dtype.names or ()) for kind, rows in tables.items() if kind == "node"):
@@ -142,7 +148,10 @@ def _volts(tables: Tables, solved: Tables) -> dict[str, Phasors]:
         v = v[:, None] * TURN
     v = v * (tables["node"]["u_rated"] / 3.0**0.5)[:, None]
     fed = nodes["energized"].astype(bool)
-    return {str(row): volt if on else np.full(3, np.nan + 0j) for row, volt, on in zip(nodes["id"], v, fed, strict=True)}
+    return {
+        str(row): volt if on else np.full(3, np.nan + 0j)
+        for row, volt, on in zip(nodes["id"], v, fed, strict=True)
+    }
 
 
 def _closed(row: Any) -> bool:
@@ -166,19 +175,26 @@ def _lines(tables: Tables, network: Network) -> None:
                 network.of_bus.append((ends[0], Change(name, "shunt conductance", "left out", effect)))
             _zero_charging(network, name, ends[0], b1, b0)
             limit = _finite(row["i_n"])
-            network.lines.append(
-                LineRow(
-                    name,
-                    *ends,
-                    rounded(float(row["r1"])),
-                    rounded(float(row["x1"])),
-                    r0_ohm=_finite(row["r0"]),
-                    x0_ohm=_finite(row["x0"]),
-                    b_us=rounded(1e6 * b1),
-                    closed=_closed(row),
-                    rating_a=limit if limit else None,
-                )
+            made = LineRow(
+                name,
+                *ends,
+                rounded(float(row["r1"])),
+                rounded(float(row["x1"])),
+                r0_ohm=_finite(row["r0"]),
+                x0_ohm=_finite(row["x0"]),
+                b_us=rounded(1e6 * b1),
+                closed=_closed(row),
+                rating_a=limit if limit else None,
             )
+            _add_line(row, made, network)
+
+
+def _add_line(row: Any, made: LineRow, network: Network) -> None:
+    network.lines.append(made)
+    if bool(row["from_status"]) != bool(row["to_status"]):
+        bus = made.from_bus if row["from_status"] else made.to_bus
+        stub = open_end(made, bus, network.nominal[bus])
+        network.lines += [stub] if stub else []
 
 
 def _zero_charging(network: Network, name: str, bus: str, b1: float, b0: float) -> None:
@@ -202,7 +218,7 @@ def _asymmetric_lines(tables: Tables, network: Network) -> None:
         made = line_row(name, ends, np.arange(3), z, _capacitances(row), changes)
         network.of_bus.extend((ends[0], change) for change in changes)
         limit = _finite(row["i_n"])
-        network.lines.append(replace(made, closed=_closed(row), rating_a=limit if limit else None))
+        _add_line(row, replace(made, closed=_closed(row), rating_a=limit if limit else None), network)
 
 
 def _capacitances(row: Any) -> Floats:
