@@ -9,7 +9,10 @@ from typing import Final
 
 from feeders.report.drawing import Area, Disc, Drawing, Line, Mark, Text, regular, width_of
 
-__all__ = ["Bar", "Curve", "Row", "curves", "rows", "ticks"]
+__all__ = ["LINES", "Bar", "Curve", "Row", "curves", "rows", "ticks"]
+
+LINES: Final = ("line-a", "line-b", "line-c", "line-d", "line-ink", "line-bad", "line-wire", "line-s")
+"""Looks of curves, told apart by colour and by dashes."""
 
 _LETTERS: Final = 11.5
 _ROW: Final = 19.0
@@ -17,13 +20,28 @@ _ROW: Final = 19.0
 
 @dataclass(frozen=True, slots=True)
 class Bar:
-    """A part of a row, from one value to another; `meaning` for the legend, `tip` for who points at it."""
+    """A part of a row, from one value to another.
+
+    Attributes
+    ----------
+    low, high
+        The values.
+    look
+        One of the looks of drawings.
+    meaning
+        For the legend.
+    tip
+        For whoever points at it.
+    inset
+        Px that the bar keeps from the row's edges.
+    """
 
     low: float
     high: float
     look: str
     meaning: str
     tip: str = ""
+    inset: float = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,9 +84,9 @@ def rows(data: Sequence[Row], width: float, *, axis: str, start: float = 0.0) ->
     for k, row in enumerate(data):
         y = 30.0 + _ROW * k
         marks.append(Text(left - 7.0, y + 12.5, _cut(row.label, left - 12.0), "text", "end", _LETTERS))
-        for j, bar in enumerate(row.bars):
-            a, b, inset = at(bar.low), at(bar.high), 3.0 + 1.5 * (j % 2 if len(row.bars) == 2 else 0)
-            corners = ((a, y + inset), (b, y + inset), (b, y + _ROW - inset), (a, y + _ROW - inset))
+        for bar in row.bars:
+            (a, b), (above, below) = (at(bar.low), at(bar.high)), (y + bar.inset, y + _ROW - bar.inset)
+            corners = ((a, above), (b, above), (b, below), (a, below))
             marks.append(Area(corners, bar.look, f"{row.label}: {bar.tip or bar.meaning}"))
         furthest = max((bar.high for bar in row.bars), default=start)
         marks.append(Text(at(furthest) + 6.0, y + 12.5, row.shown, "text", size=_LETTERS))
@@ -80,7 +98,7 @@ def rows(data: Sequence[Row], width: float, *, axis: str, start: float = 0.0) ->
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """A curve; `look` is one of line-a, line-b, line-c, line-d, line-ink, limit; a shape marks its points."""
+    """A curve; `look` is one of LINES, or limit; a shape marks its points where it has some."""
 
     x: tuple[float, ...]
     y: tuple[float, ...]
@@ -97,6 +115,7 @@ def curves(
     y: str,
     low: float | None = None,
     high: float | None = None,
+    decades: bool = False,
 ) -> Drawing:
     """Draw curves.
 
@@ -110,11 +129,15 @@ def curves(
         What the axes are, with their units.
     low, high
         Where the ordinate begins and ends at the latest.
+    decades
+        Abscissas are decimal logarithms.
     """
     xs = [v for c in data for v in c.x if math.isfinite(v)] or [0.0, 1.0]
     ys = [v for c in data for v in c.y if math.isfinite(v)] or [0.0, 1.0]
     ys += [v for v in (low, high) if v is not None]
     across = ticks(min(xs), max(xs), 4 if width < 500.0 else 8)
+    if decades:
+        across = [float(k) for k in range(math.floor(min(xs)), math.ceil(max(xs)) + 1)]
     up = ticks(min(ys), max(ys), 5)
     left = max(width_of(_tick(v, up), _LETTERS) for v in up) + 14.0
     top, bottom = 26.0, 0.42 * width + 60.0
@@ -131,9 +154,9 @@ def curves(
     marks += [Line((at(x0, v), at(x1, v)), "grid") for v in up]
     marks.append(Line((at(x0, y0), at(x1, y0)), "axis"))
     marks += [Text(left - 7.0, at(x0, v)[1] + 4.0, _tick(v, up), "quiet", "end", _LETTERS) for v in up]
-    marks += [
-        Text(at(v, y0)[0], bottom + 16.0, _tick(v, across), "quiet", "middle", _LETTERS) for v in across
-    ]
+    for v in across:
+        name = f"{10.0**v:g}" if decades else _tick(v, across)
+        marks.append(Text(at(v, y0)[0], bottom + 16.0, name, "quiet", "middle", _LETTERS))
     marks.append(Text(width - 16.0, bottom + 33.0, x, "quiet", "end"))
     for curve in data:
         marks += _curve(curve, at)

@@ -114,11 +114,16 @@ LOOKS: Final[dict[str, Look]] = {
     "fill-d": Look(fill="d"),
     "fill-bad": Look(fill="bad"),
     "fill-soft": Look(fill="line"),
+    "fill-ink": Look(fill="ink"),
+    "fill-wire": Look(fill="wire"),
     "line-a": Look(stroke="a", width=2.0),
     "line-b": Look(stroke="b", width=2.0, dash="7 3"),
     "line-c": Look(stroke="c", width=2.0, dash="2 3"),
     "line-d": Look(stroke="d", width=2.0, dash="9 3 2 3"),
-    "line-ink": Look(stroke="ink", width=2.0),
+    "line-ink": Look(stroke="ink", width=1.4),
+    "line-bad": Look(stroke="bad", width=2.0, dash="12 4"),
+    "line-wire": Look(stroke="wire", width=2.4, dash="4 4"),
+    "line-s": Look(stroke="s3", width=2.0, dash="1 4"),
     **{f"step{k}": Look(fill=f"s{k}", stroke="ink", width=0.9) for k in range(STEPS)},
 }
 
