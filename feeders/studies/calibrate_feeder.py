@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -94,13 +94,14 @@ def network(tables: FeederTables) -> Network:
     FeederInvalid
         With every problem of the files.
     """
-    unbalanced = any(row.phases != "abc" for row in (*tables.lines, *tables.customers))
+    unbalanced = any(line.phases != "abc" for line in tables.lines)
+    unbalanced |= any(row.phases != "abc" for row in tables.customers)
     site: Site | ThreePhaseSite = three_phase(tables) if unbalanced else from_tables(tables)
     closed = [k for k, line in enumerate(tables.lines) if line.closed]
     rows = [tables.lines[k] for k in closed]
     edges = [Edge(row.line, row.from_bus, row.to_bus, row.r_ohm == row.x_ohm == 0.0) for row in rows]
-    lines = tuple((closed[k],) for k in tree(tables.meta.busbar, edges).branch)
-    feeder, lines = _merged(site.feeder, lines)
+    each: tuple[tuple[int, ...], ...] = tuple((closed[k],) for k in tree(tables.meta.busbar, edges).branch)
+    feeder, lines = _merged(site.feeder, each)
     if isinstance(feeder, Feeder):
         place = np.column_stack([np.arange(len(feeder.buses)), np.zeros(len(feeder.buses))]).astype(np.intp)
     else:
@@ -123,7 +124,7 @@ def _merged(
         for k, above in enumerate(feeder.parent.tolist()):
             keep[above] |= bool((feeder.phases[k + 1] != feeder.phases[above]).any())
     new = np.cumsum(keep) - 1
-    above_of, chain = np.zeros(count, dtype=np.intp), [()] * count
+    above_of, chain = np.zeros(count, dtype=np.intp), list[tuple[int, ...]]([()] * count)
     impedances = {name: np.array(getattr(feeder, name)) for name in _impedances(feeder)}
     for k, above in enumerate(feeder.parent.tolist()):
         chain[k + 1] = lines[k]
@@ -134,7 +135,7 @@ def _merged(
             for values in impedances.values():
                 values[k] += values[above - 1]
     kept = np.flatnonzero(keep)
-    change = {name: values[kept[1:] - 1] for name, values in impedances.items()}
+    change: dict[str, Any] = {name: values[kept[1:] - 1] for name, values in impedances.items()}
     change |= {"parent": new[above_of[kept[1:]]], "bus": new[feeder.bus]}
     change |= {"buses": tuple(feeder.buses[k] for k in kept)}
     if isinstance(feeder, ThreePhaseFeeder):
@@ -208,7 +209,7 @@ def powers(site: Site | ThreePhaseSite, given: Frames) -> Powers:
     draws = np.broadcast_to(IDLE * model.load_peak, (T, N)).copy()
     missing = np.zeros((T, N), dtype=np.bool_)
     metered_q = np.zeros(N, dtype=np.bool_)
-    q_read, v = np.zeros((T, N)), np.ones((T, N))
+    q_read, v = np.zeros((T, N)), np.full((T, N), site.feeder.base_volt)
     for j, customer in zip(order, site.meters.tolist(), strict=True):
         there = np.isfinite(given.p_kw[:, j])
         if there.any():
@@ -220,7 +221,10 @@ def powers(site: Site | ThreePhaseSite, given: Frames) -> Powers:
             q_read[:, customer] = np.interp(given.t, given.t[there], given.q_kvar[there, j]) / base
         there = np.isfinite(given.v_volt[:, j])
         if there.any():
-            v[:, customer] = np.interp(given.t, given.t[there], given.v_volt[there, j]) / site.feeder.base_volt
+            v[:, customer] = (
+                np.interp(given.t, given.t[there], given.v_volt[there, j]) / site.feeder.base_volt
+            )
+    v /= site.feeder.base_volt
     low = np.maximum(draws, 0.0)
     high = np.maximum(low, np.minimum(draws + model.pv_peak, model.load_peak))
     load = np.where(model.pv_peak > 0.0, 0.5 * (low + high), low)
@@ -282,12 +286,9 @@ def _voltages(feeder: Feeder | ThreePhaseFeeder, p: Floats, q: Floats, v0_square
     busbar = np.repeat(v0_squared[:, None], 3, axis=1)
     parts = [slice(k, k + _CHUNK) for k in range(0, v0_squared.size, _CHUNK)]
     # 1 pu of a phase's power is a third of the feeder's base.
-    in_phases = [3.0 * feeder.connections(power) for power in (p, q)]
+    p3, q3 = (3.0 * feeder.connections(power) for power in (p, q))
     return np.concatenate(
-        [
-            three.flow.bus_voltages(feeder, in_phases[0][some], in_phases[1][some], busbar[some], steps=_STEPS)
-            for some in parts
-        ]
+        [three.bus_voltages(feeder, p3[some], q3[some], busbar[some], steps=_STEPS) for some in parts]
     )
 
 
@@ -341,7 +342,9 @@ def field(net: Network, drawn: Powers) -> Field:
     metered = np.zeros(model.load_peak.size)
     metered[site.meters] = 1.0
     # Behind a roof, net readings leave open how much of them the load is.
-    behind = np.where(drawn.metered_q | (model.pv_peak == 0.0), 0.0, 0.5 * np.minimum(model.pv_peak, model.load_peak))
+    behind = np.where(
+        drawn.metered_q | (model.pv_peak == 0.0), 0.0, 0.5 * np.minimum(model.pv_peak, model.load_peak)
+    )
     hidden_q = (0.5 * (model.tan_min + model.tan_max) * behind) ** 2 / 3.0
     hidden_p = np.where(metered > 0.0, 0.0, (IDLE * model.load_peak) ** 2)
     return Field(

@@ -77,9 +77,7 @@ def open_readings(path: Path | str) -> pd.DataFrame | Recording:
         raise RecordingInvalid(f"{path}: no table of readings: {error}") from error
 
 
-def frames(
-    site: Site | ThreePhaseSite, readings: pd.DataFrame | Recording | Path | str
-) -> Frames:
+def frames(site: Site | ThreePhaseSite, readings: pd.DataFrame | Recording | Path | str) -> Frames:
     """Put readings into frames.
 
     Parameters
@@ -112,7 +110,7 @@ def frames(
         raise RecordingInvalid(f"readings of meters that {site.feeder.name} does not have: {shown}")
     if not (column == len(site.meter_ids)).any():
         raise RecordingInvalid("readings: none of the busbar (an empty meter); nothing to compare with")
-    return _binned(site, given, column.to_numpy(dtype=np.intp))
+    return _binned(site, given, np.asarray(column, dtype=np.intp))
 
 
 def _binned(site: Site | ThreePhaseSite, given: pd.DataFrame, column: Ints) -> Frames:

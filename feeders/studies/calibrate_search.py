@@ -1,4 +1,4 @@
-"""One error of a feeder's files after the other: which of all that can be thought of do the readings speak for.
+"""One error of a feeder's files after the other: which of all that can be do the readings speak for.
 
 References
 ----------
@@ -10,14 +10,16 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from functools import partial
 from itertools import combinations
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from feeders.schema import LineRow
 from feeders.studies import calibrate_feeder as model
 from gridsec.arrays import Floats, Ints
+from gridsec.feeder import Feeder
 from gridsec.phases import PHASES
 from gridsec.studies.calibrate import Evidence, Fit, evidence, fit, weigh
 from gridsec.studies.calibrate_model import Regressors, Series, lengthened, regressors, steps
@@ -28,7 +30,19 @@ if TYPE_CHECKING:
     from feeders.studies.calibrate_feeder import Network, Powers
     from feeders.studies.calibrate_readings import Frames
 
-__all__ = ["Guess", "Kind", "Round", "State", "apply", "compare", "longer", "prepare"]
+__all__ = [
+    "Correction",
+    "Guess",
+    "Kind",
+    "Round",
+    "State",
+    "Verdict",
+    "apply",
+    "compare",
+    "correction",
+    "longer",
+    "prepare",
+]
 
 LENGTH_SPREAD: Final = 0.3
 """Prior standard deviation of the relative error of a length that is a mistake."""
@@ -83,6 +97,29 @@ class Guess:
     until: float = np.nan
 
 
+@dataclass(frozen=True, slots=True)
+class Correction:
+    """An error of the files in their own words.
+
+    Attributes
+    ----------
+    kind
+        What it is.
+    names
+        The customer, both customers of a swap, the meter, or the lines.
+    bus, phases
+        Where the customer is.
+    factor
+        On the lines' length.
+    """
+
+    kind: Kind
+    names: tuple[str, ...]
+    bus: str = ""
+    phases: str = ""
+    factor: float = 1.0
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
     """Files as corrected so far, and what is left out of account.
@@ -94,12 +131,21 @@ class State:
     excluded
         Meters whose errors change, or that the caller does not trust.
     lengths
-        Factor on each line so far, by its id.
+        Factor on each line that was found to be of another length, by its id.
     """
 
     tables: FeederTables
     excluded: tuple[str, ...] = ()
     lengths: dict[str, float] = field(default_factory=dict)
+
+    def after(self, wrong: Correction) -> State:
+        """Correct one error more."""
+        if wrong.kind is Kind.METER:
+            return replace(self, excluded=(*self.excluded, *wrong.names))
+        lengths = dict(self.lengths)
+        if wrong.kind is Kind.LENGTH:
+            lengths |= {name: lengths.get(name, 1.0) * wrong.factor for name in wrong.names}
+        return replace(self, tables=apply(self.tables, wrong), lengths=lengths)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -178,12 +224,22 @@ def prepare(state: State, frames: Frames, *, tolerance: float, errors: bool = Fa
         products = increments(series.t, series.seen, left)
         noise = learn(products, own, white.mean(axis=0), float(common.mean()), guess, errors=last)
         S = noise.covariance(own)
-        whiten = whitening(series.t, series.seen, S, noise.time_s, noise.white**2 * white, common, gap)
+        whiten = whitening(
+            series.t,
+            series.seen,
+            S,
+            time_s=noise.time_s,
+            white=noise.white**2 * white,
+            common=common,
+            gaps=gap,
+        )
         both = whiten(np.concatenate([given.columns[:, :, used], rest[:, :, None]], axis=2))
         flat = both.reshape(-1, used.size + 1)
         found = fit(flat[:, -1], flat[:, :-1], given.spread[used], int(series.seen.sum()))
         left = np.where(series.seen, rest - given.columns[:, :, used] @ found.estimate, 0.0)
-    return Round(state, net, drawn, series, noise, whiten, given, _spread_out(found, used, given), flat[:, -1])
+    return Round(
+        state, net, drawn, series, noise, whiten, given, _spread_out(found, used, given), flat[:, -1]
+    )
 
 
 def _typical(net: Network) -> float:
@@ -220,17 +276,14 @@ def compare(now: Round, frames: Frames, risk: float, tell: Callable[[int, int], 
         parts.append(evidence(now.fit, z.reshape(-1, len(some)), np.full(len(some), spread)))
         guesses.extend(some)
     tell(len(chunks), len(chunks))
-    found = Evidence(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("g", "h", "log_factor")))
+    g, h, factor = (np.concatenate([getattr(part, n) for part in parts]) for n in ("g", "h", "log_factor"))
     kind = np.array([list(Kind).index(guess.kind) for guess in guesses], dtype=np.intp)
-    exact = found.log_factor.copy()
-    refit = [h for h in np.argsort(-exact)[: 2 * _REFIT] if guesses[h].kind in _MOVES][:_REFIT]
-    for h in refit:
-        if exact[h] > 0.0:
-            exact[h] = _exactly(now, frames, guesses[h])
+    exact = factor.copy()
+    for k in [k for k in np.argsort(-factor)[: 2 * _REFIT] if guesses[k].kind in _MOVES][:_REFIT]:
+        if factor[k] > 0.0:
+            exact[k] = _exactly(now, frames, guesses[k])
     weighed = weigh(exact, kind, risk)
-    return Verdict(
-        guesses, Evidence(found.g, found.h, exact), weighed.confidence, weighed.any, weighed.kept
-    )
+    return Verdict(guesses, Evidence(g, h, exact), weighed.confidence, weighed.any, weighed.kept)
 
 
 _MOVES: Final = (Kind.BUS, Kind.PHASE, Kind.SWAP)
@@ -241,19 +294,17 @@ Chunk = tuple[list[Guess], Callable[[], Floats], float]
 def _chunks(now: Round) -> Iterator[Chunk]:
     """Guesses of like kind, and how their effects are made; (T, p, H)."""
     net, series = now.net, now.series
-    trusted = [
-        j for j, name in enumerate(net.site.meter_ids) if name not in now.state.excluded and series.seen[:, j].any()
-    ]
+    trusted = np.flatnonzero(series.seen.any(axis=0)).tolist()
     guesses = [*_buses(net, trusted), *_phases(net, trusted), *_swaps(net, trusted)]
     for first in range(0, len(guesses), _CHUNK):
         some = guesses[first : first + _CHUNK]
-        yield some, lambda some=some: _moves(now, some), 0.0
+        yield some, partial(_moves, now, some), 0.0
     lengths = [Guess(Kind.LENGTH, k) for k in range(len(net.lines))]
-    yield lengths, lambda: _seen(now, lengthened(net.places, series)), LENGTH_SPREAD
+    yield lengths, partial(_seen, now, lengthened(net.places, series)), LENGTH_SPREAD
     for j in trusted:
         columns, times = steps(series, j, PIECES)
         changes = [Guess(Kind.METER, j, since=since, until=until) for since, until in times]
-        yield changes, lambda columns=columns: columns, CHANGE_SPREAD
+        yield changes, partial(_seen, now, columns), CHANGE_SPREAD
 
 
 def _buses(net: Network, trusted: list[int]) -> list[Guess]:
@@ -272,7 +323,7 @@ def _buses(net: Network, trusted: list[int]) -> list[Guess]:
 
 def _phases(net: Network, trusted: list[int]) -> list[Guess]:
     out = []
-    if not isinstance(net.feeder, model.Feeder):
+    if not isinstance(net.feeder, Feeder):
         for j in trusted:
             customer = int(net.site.meters[j])
             bus, phases = int(net.feeder.bus[customer]), net.site.tables.customers[customer].phases
@@ -307,55 +358,80 @@ def _seen(now: Round, columns: Floats) -> Floats:
 
 def _exactly(now: Round, frames: Frames, guess: Guess) -> float:
     """Gain of the log-likelihood with the power flow of the files as corrected."""
-    after = model.network(apply(now.state, now.net, guess, 1.0).tables)
+    after = model.network(apply(now.state.tables, correction(now, guess)))
     drawn = model.powers(after.site, frames)
     series = model.series(after, frames, drawn, now.state.excluded)
     # The meters of a swap have changed places; their readings are compared in the old order.
     order = [after.site.meter_ids.index(name) for name in now.net.site.meter_ids]
     rest = series.residual(after.places)[:, order]
-    y = now.whiten(rest[:, :, None]).ravel()
-    z = now.readings - y
+    z = now.readings - now.whiten(rest[:, :, None]).ravel()
     return float(evidence(now.fit, z[:, None], np.zeros(1)).log_factor[0])
 
 
-def apply(state: State, net: Network, guess: Guess, factor: float) -> State:
+def correction(now: Round, guess: Guess, factor: float = 1.0) -> Correction:
+    """A guess in the words of the files.
+
+    Parameters
+    ----------
+    now
+        The files that it is about.
+    guess
+        The error.
+    factor
+        On the length, for a length.
+    """
+    net, tables = now.net, now.state.tables
+    if guess.kind is Kind.METER:
+        return Correction(guess.kind, (net.site.meter_ids[guess.subject],))
+    if guess.kind is Kind.LENGTH:
+        return Correction(
+            guess.kind, tuple(tables.lines[k].line for k in net.lines[guess.subject]), factor=factor
+        )
+    names = tables.customers[guess.subject].customer
+    if guess.kind is Kind.SWAP:
+        return Correction(guess.kind, (names, tables.customers[guess.other].customer))
+    return Correction(guess.kind, (names,), net.feeder.buses[guess.other], guess.phases)
+
+
+def apply(tables: FeederTables, wrong: Correction) -> FeederTables:
     """Correct the files.
 
     Parameters
     ----------
-    state
+    tables
         The files.
-    net
-        Their network, which the guess is about.
-    guess
-        The error.
-    factor
-        On the length of the branch's lines, for a length.
+    wrong
+        Their error; that of a meter changes nothing in them.
     """
-    tables = state.tables
-    customers, lines = list(tables.customers), list(tables.lines)
-    if guess.kind is Kind.METER:
-        return replace(state, excluded=(*state.excluded, net.site.meter_ids[guess.subject]))
-    if guess.kind is Kind.LENGTH:
-        lengths = dict(state.lengths)
-        for row in net.lines[guess.subject]:
-            lines[row] = longer(lines[row], factor)
-            lengths[lines[row].line] = lengths.get(lines[row].line, 1.0) * factor
-        return replace(state, tables=replace(tables, lines=tuple(lines)), lengths=lengths)
-    one = customers[guess.subject]
-    if guess.kind is Kind.SWAP:
-        other = customers[guess.other]
-        customers[guess.subject] = replace(one, meter=other.meter)
-        customers[guess.other] = replace(other, meter=one.meter)
+    if wrong.kind is Kind.METER:
+        return tables
+    if wrong.kind is Kind.LENGTH:
+        rows = (longer(row, wrong.factor) if row.line in wrong.names else row for row in tables.lines)
+        return replace(tables, lines=tuple(rows))
+    customers = {row.customer: row for row in tables.customers}
+    one = customers[wrong.names[0]]
+    if wrong.kind is Kind.SWAP:
+        other = customers[wrong.names[1]]
+        changed = [replace(one, meter=other.meter), replace(other, meter=one.meter)]
+    elif wrong.kind is Kind.PHASE:
+        changed = [replace(one, phases=wrong.phases)]
     else:
-        bus = net.feeder.buses[guess.other] if guess.kind is Kind.BUS else one.bus
-        customers[guess.subject] = replace(one, bus=bus, phases=guess.phases or one.phases)
-    return replace(state, tables=replace(tables, customers=tuple(customers)))
+        changed = [replace(one, bus=wrong.bus)]
+    customers |= {row.customer: row for row in changed}
+    return replace(tables, customers=tuple(customers.values()))
 
 
 def longer(line: LineRow, factor: float) -> LineRow:
-    """A line of another length."""
-    scaled = {
+    """A line of another length.
+
+    Parameters
+    ----------
+    line
+        The line.
+    factor
+        On its length.
+    """
+    scaled: dict[str, Any] = {
         name: None if (value := getattr(line, name)) is None else value * factor
         for name in ("r_ohm", "x_ohm", "r0_ohm", "x0_ohm", "b_us")
     }

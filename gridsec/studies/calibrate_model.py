@@ -10,7 +10,7 @@ order
     2 y_j b_j                       bias b_j of meter j, relative to the busbar's
     -(drop of U along branch l)     per unit of its length, at the places behind it
     A_ji p_i, B_ji q_i              errors of the gain of power registers
-    -B_ji load_i                    error of tan(phi) where q is not metered, and -B_ji for what q keeps at p = 0
+    -B_ji load_i                    error of tan(phi) where q is not metered; -B_ji: what q is at p = 0
 
 and for customers at other places, exactly in the linear flow, ``W'(U + dU) - W U`` with W, W' the weights.
 
@@ -105,7 +105,7 @@ class Series:
     load : (T, N)
         What draws reactive power by its power factor, pu.
     steep : (T, N)
-        Derivative of the customer's own inverter's q in the squared voltage read; 0 without, or with q metered.
+        Derivative of the inverter's q in the squared voltage read; 0 without one, or with q metered.
     places : (T, Q)
         Squared voltages by power flow, pu.
     drop : (T, F, L)

@@ -1,7 +1,7 @@
-"""What is left of readings when the model is right: errors of loads, correlated in time and place, and meters'.
+"""What is left of readings when the model is right: errors of loads, correlated in time and place; noise.
 
-The powers of N customers err by independent Ornstein-Uhlenbeck processes of correlation time tau. At the p
-meters that is a field of covariance ``S exp(-abs(dt) / tau)`` with ``S = k_p S_p + k_q S_q + S_0``; meters add
+The powers of N customers err by independent Ornstein-Uhlenbeck processes of correlation time tau. At the
+p meters that is a field of covariance ``S exp(-abs(dt) / tau)``, ``S = k_p S_p + k_q S_q + S_0``; meters add
 white noise, the busbar's the same to all. A Kalman filter over the few modes of S that stand out of the
 meters' noise whitens readings and regressors alike, readings that are missing left out exactly.
 
@@ -25,10 +25,12 @@ __all__ = ["Field", "Increments", "LoadErrors", "Whitening", "increments", "lear
 
 # Modes of the field whose variance is less than this share of the meters' own are white noise.
 _FAINT = 1e-3
-# Lags of increments, in frames; and blocks of time that a jackknife leaves out in turn.
+# Lags of increments, in frames, and blocks of time whose scores are compared.
 _LAGS = (1, 2, 4, 8, 16, 32)
 _BLOCKS = 8
-# Prior of the logarithms: variances within a factor e^3 of what was expected, the correlation time within e^2,
+# Step of the derivative of the score, in logarithms.
+_DIFFERENCE = 1e-3
+# Prior of the logarithms: powers within a factor e^3 of what was expected, the correlation time within e^2, and
 # the meters' noise within e^0.5.
 _SPREAD = np.array([3.0, 3.0, 2.0, 0.5])
 
@@ -63,7 +65,7 @@ class LoadErrors:
     white
         Factor on the standard deviation of the meters' noise.
     std : (4,)
-        Standard errors of the logarithms of ``p, q, time_s, white``, by the jackknife.
+        Standard errors of the logarithms of ``p, q, time_s, white``, see `learn`.
     """
 
     p: float
@@ -114,7 +116,14 @@ class Whitening:
 
 
 def whitening(
-    t: Floats, seen: Bools, S: Floats, time_s: float, white: Floats, common: Floats, gaps: Sequence[Floats]
+    t: Floats,
+    seen: Bools,
+    S: Floats,
+    *,
+    time_s: float,
+    white: Floats,
+    common: Floats,
+    gaps: Sequence[Floats],
 ) -> Whitening:
     """Make the filter.
 
@@ -149,7 +158,7 @@ def whitening(
             covariance[np.diag_indices_from(covariance)] += white[k, rows]
             C = np.linalg.cholesky(covariance)
             half = solve_triangular(C, np.eye(rows.size), lower=True)
-            inverse[np.ix_([k], rows, rows)] = half
+            inverse[k][np.ix_(rows, rows)] = half
             K = cross @ half.T @ half
             gain[k][:, rows] = K
             P = P - K @ cross.T
@@ -239,21 +248,40 @@ def learn(
     """
     base = np.log([guess.p, guess.q, guess.time_s, guess.white])
     problem = _Composite(given.dt, field, white, common, base)
-
-    def best(start: Floats, without: int | None) -> Floats:
-        use = np.arange(len(given.total)) != (-1 if without is None else without)
-        count = given.count[use].sum(axis=0)
-        mean = given.total[use].sum(axis=0) / np.maximum(count, 1.0)
-        found = minimize(problem.value, start, args=(mean, count), jac=True, method="L-BFGS-B")
-        return np.asarray(found.x)
-
-    x = best(np.zeros(4), None)
-    std = np.full(4, np.nan)
-    if errors:
-        left = np.array([best(x, b) for b in range(_BLOCKS)])
-        std = np.sqrt((_BLOCKS - 1) / _BLOCKS * np.sum((left - left.mean(axis=0)) ** 2, axis=0))
+    count = given.count.sum(axis=0)
+    mean = given.total.sum(axis=0) / np.maximum(count, 1.0)
+    found = minimize(
+        problem.value,
+        np.zeros(4),
+        args=(mean, count),
+        jac=True,
+        method="L-BFGS-B",
+        options={"ftol": 1e-12, "gtol": 1e-6, "maxiter": 200},
+    )
+    x = np.asarray(found.x)
+    std = _errors(problem, x, given) if errors else np.full(4, np.nan)
     p, q, time_s, factor = np.exp(base + x).tolist()
     return replace(guess, p=p, q=q, time_s=time_s, white=factor, std=std)
+
+
+def _errors(problem: _Composite, x: Floats, given: Increments) -> Floats:
+    """Standard errors ``H^-1 (J + P) H^-1``: curvature, scores of blocks of time, the prior."""
+    count = given.count.sum(axis=0)
+    mean = given.total.sum(axis=0) / np.maximum(count, 1.0)
+    H = np.array(
+        [
+            problem.value(x + step, mean, count)[1] - problem.value(x - step, mean, count)[1]
+            for step in _DIFFERENCE * np.eye(4)
+        ]
+    ) / (2.0 * _DIFFERENCE)
+    scores = []
+    for total, some in zip(given.total, given.count, strict=True):
+        scores.append(problem.value(x, total / np.maximum(some, 1.0), some)[1] - x / _SPREAD**2)
+    J = np.cov(np.array(scores).T, ddof=1) * len(scores)
+    # A flat likelihood may curve the wrong way a little: no direction is known less than before.
+    values, vectors = np.linalg.eigh(0.5 * (H + H.T))
+    inverse = (vectors / np.maximum(values, (1.0 / _SPREAD**2).min())) @ vectors.T
+    return np.asarray(np.sqrt((inverse @ (J + np.diag(1.0 / _SPREAD**2)) @ inverse).diagonal()))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
