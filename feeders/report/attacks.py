@@ -46,8 +46,8 @@ def campaign(_: Site, found: Campaign) -> Section:
             Figure(
                 "campaign-delay",
                 "How soon",
-                "Share of the liars named within some time of the beginning of their lie, by kind. A curve that "
-                "stays below 100 % has liars that were never named.",
+                "Share of the liars named within some time of the beginning of their lie, by kind. A curve "
+                "that stays below 100 % has liars that were never named.",
                 partial(_delay_chart, _at(found.liars, rate)),
             ),
             Figure(
@@ -75,10 +75,11 @@ def campaign(_: Site, found: Campaign) -> Section:
             "reason": "why a scenario could not be played",
         },
         assumptions=(
-            f"{plan.scenarios} scenarios of {plan.duration_s:g} s at {plan.step_s:g} s on days of profiles, seed "
-            f"{plan.seed}; the truth is full AC power flow with the inverters in closed loop.",
-            f"Watched by the {plan.estimator} monitor, set for {rate:g} false alarms a year; powers known within "
-            f"{plan.load_error.p_kw:g} kW and {plan.load_error.q_kvar:g} kvar (1 sigma); meters: {plan.meters}.",
+            f"{plan.scenarios} scenarios of {plan.duration_s:g} s at {plan.step_s:g} s on days of profiles, "
+            f"seed {plan.seed}; the truth is full AC power flow with the inverters in closed loop.",
+            f"Watched by the {plan.estimator} monitor, set for {rate:g} false alarms a year; powers known "
+            f"within {plan.load_error.p_kw:g} kW and {plan.load_error.q_kvar:g} kvar (1 sigma); "
+            f"errors of meters: {plan.meters}.",
             "A simulated attack is one that somebody thought of: others may fare differently.",
         ),
     )
@@ -164,7 +165,7 @@ def _open(played: pd.DataFrame, impossible: int) -> list[Sentence]:
             Value(total, f"{number(total, 0)} s", "campaign-scenarios:undecided_s:sum"),
             ", and CLEAN for ",
             Value(clean, f"{number(clean, 0)} s", "campaign-scenarios:clean_lying_s:sum"),
-            " in which somebody lied.",
+            " in which somebody lied and was not seen yet, or never.",
         )
     )
     if impossible:

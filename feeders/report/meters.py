@@ -278,8 +278,8 @@ def _protection(site: Site, found: Protect) -> Finding:
         " after.",
     )
     proof: Sentence = ("No fewer suffice; other choices of as many may be as good.",)
-    if not count:
-        return Finding(Standing.PROVED, (lead, effect))
+    if not count and not math.isnan(found.before):
+        return Finding(Standing.PROVED, (lead,) if math.isinf(found.before) else (lead, effect))
     if found.gap:
         needed = Value(found.least, str(found.least), "protect-summary:least:row 0")
         proof = (

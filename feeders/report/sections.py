@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
-from feeders.report import attacks, invisible, meters
+from feeders.report import attacks, invisible, meters, records
 from feeders.report.section import Question, Section
 from feeders.report.words import Finding, Standing, Value, listed, plural
 
@@ -67,6 +67,7 @@ SECTIONS: Final[dict[str, Callable[[Site, Any], Section]]] = {
     "protect": meters.protect,
     "detectable": meters.detectable,
     "campaign": attacks.campaign,
+    "calibrate": records.calibrate,
 }
 
 ANSWERS: Final[dict[str, tuple[Question, ...]]] = {
