@@ -1,7 +1,7 @@
 """A campaign: hundreds of simulated attacks on a feeder, and what its monitor made of them.
 
 Six meters on the European low-voltage benchmark of CIGRE. A scene is a moment of the profiles, here of summer
-and winter, with its own errors of loads and meters; the truth is full AC power flow with the feeder's inverters.
+and winter, with its own errors of loads and meters; the truth is full AC power flow with all inverters.
 """
 
 from __future__ import annotations
