@@ -144,6 +144,7 @@ def calibrate(
     risk: float = 0.05,
     tolerance: float = 0.02,
     exclude: Sequence[str] = (),
+    kinds: Sequence[Kind] = tuple(Kind),
     journal: Path | None = None,
     progress: Progress | None = None,
 ) -> Calibrate:
@@ -161,6 +162,8 @@ def calibrate(
         Relative error (1 sigma) of lines' lengths that is no mistake.
     exclude
         Meters that are not trusted. Their powers are still believed.
+    kinds
+        Which errors to look for; fewer take less time, and what is not looked for may pass for another.
     journal
         File in which each error that is found is kept; an interrupted study goes on from it.
     progress
@@ -183,14 +186,16 @@ def calibrate(
     if unknown:
         raise ValueError(f"{site.feeder.name} has no meter {', '.join(unknown)}")
     given = frames(site, readings)
-    kept = Journal(journal, _subject(site, given, risk, tolerance, exclude))
+    kept = Journal(
+        journal, _subject(site, given, risk, tolerance) | {"exclude": sorted(exclude), "kinds": sorted(kinds)}
+    )
     state, found = State(site.tables, tuple(exclude)), list[dict[str, Any]]()
     while True:
         now = prepare(state, given, tolerance=tolerance, errors=True)
         said: list[Verdict] = []
 
         def work(now: Round = now, said: list[Verdict] = said) -> dict[str, Any] | None:
-            said.append(compare(now, given, risk, progress or _quiet))
+            said.append(compare(now, given, risk, progress or _quiet, kinds))
             return _best(now, said[0], risk)
 
         row = kept.get(f"error {len(found)}", work)
@@ -199,7 +204,7 @@ def calibrate(
         wrong = _read(row["correction"])
         state = state.after(wrong)
         found.append(row)
-    verdict = said[0] if said else compare(now, given, risk, progress or _quiet)
+    verdict = said[0] if said else compare(now, given, risk, progress or _quiet, kinds)
     lines, ids = calibrate_tables.lines(now, tolerance)
     wrongs = [_read(row["correction"]) for row in found]
     rows, sure = calibrate_tables.final(found, wrongs, lines, ids)
@@ -223,9 +228,7 @@ def _quiet(done: int, total: int) -> None:
     """Tell nobody."""
 
 
-def _subject(
-    site: Site | ThreePhaseSite, given: Frames, risk: float, tolerance: float, exclude: Sequence[str]
-) -> dict[str, Any]:
+def _subject(site: Site | ThreePhaseSite, given: Frames, risk: float, tolerance: float) -> dict[str, Any]:
     content = hashlib.sha256()
     for values in (given.t, given.v_volt, given.p_kw, given.q_kvar, given.v0_volt, given.count):
         content.update(np.ascontiguousarray(values).tobytes())
@@ -235,7 +238,6 @@ def _subject(
         "readings": content.hexdigest(),
         "risk": risk,
         "tolerance": tolerance,
-        "exclude": sorted(exclude),
     }
 
 

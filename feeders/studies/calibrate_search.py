@@ -7,7 +7,7 @@ docs/theory-studies.md, section 8.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import partial
@@ -222,7 +222,9 @@ def prepare(state: State, frames: Frames, *, tolerance: float, errors: bool = Fa
     for turn in range(_NOISE_ROUNDS):
         last = errors and turn == _NOISE_ROUNDS - 1
         products = increments(series.t, series.seen, left)
-        noise = learn(products, own, white.mean(axis=0), float(common.mean()), guess, errors=last)
+        noise = learn(
+            products, own, white.mean(axis=0), float(common.mean()), guess, errors=last, start=noise
+        )
         S = noise.covariance(own)
         whiten = whitening(
             series.t,
@@ -253,7 +255,13 @@ def _spread_out(found: Fit, used: Ints, given: Regressors) -> Fit:
     return replace(found, estimate=estimate, std=std)
 
 
-def compare(now: Round, frames: Frames, risk: float, tell: Callable[[int, int], None]) -> Verdict:
+def compare(
+    now: Round,
+    frames: Frames,
+    risk: float,
+    tell: Callable[[int, int], None],
+    kinds: Collection[Kind] = tuple(Kind),
+) -> Verdict:
     """Weigh every error of the files that can be thought of.
 
     Parameters
@@ -266,10 +274,12 @@ def compare(now: Round, frames: Frames, risk: float, tell: Callable[[int, int], 
         Probability of a proposal for files without errors.
     tell
         Told how far it is.
+    kinds
+        What to look for.
     """
     guesses: list[Guess] = []
     parts: list[Evidence] = []
-    chunks = list(_chunks(now))
+    chunks = list(_chunks(now, kinds))
     for k, (some, make, spread) in enumerate(chunks):
         tell(k, len(chunks))
         z = now.whiten(make())
@@ -291,17 +301,19 @@ _MOVES: Final = (Kind.BUS, Kind.PHASE, Kind.SWAP)
 Chunk = tuple[list[Guess], Callable[[], Floats], float]
 
 
-def _chunks(now: Round) -> Iterator[Chunk]:
+def _chunks(now: Round, kinds: Collection[Kind]) -> Iterator[Chunk]:
     """Guesses of like kind, and how their effects are made; (T, p, H)."""
     net, series = now.net, now.series
     trusted = np.flatnonzero(series.seen.any(axis=0)).tolist()
-    guesses = [*_buses(net, trusted), *_phases(net, trusted), *_swaps(net, trusted)]
+    moves = {Kind.BUS: _buses, Kind.PHASE: _phases, Kind.SWAP: _swaps}
+    guesses = [guess for kind, made in moves.items() if kind in kinds for guess in made(net, trusted)]
     for first in range(0, len(guesses), _CHUNK):
         some = guesses[first : first + _CHUNK]
         yield some, partial(_moves, now, some), 0.0
-    lengths = [Guess(Kind.LENGTH, k) for k in range(len(net.lines))]
-    yield lengths, partial(_seen, now, lengthened(net.places, series)), LENGTH_SPREAD
-    for j in trusted:
+    if Kind.LENGTH in kinds:
+        lengths = [Guess(Kind.LENGTH, k) for k in range(len(net.lines))]
+        yield lengths, partial(_seen, now, lengthened(net.places, series)), LENGTH_SPREAD
+    for j in trusted if Kind.METER in kinds else ():
         columns, times = steps(series, j, PIECES)
         changes = [Guess(Kind.METER, j, since=since, until=until) for since, until in times]
         yield changes, partial(_seen, now, columns), CHANGE_SPREAD

@@ -24,7 +24,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import solve_triangular
 
 from gridsec.arrays import Bools, Floats, Ints
 
@@ -37,21 +37,19 @@ class Fit:
 
     Attributes
     ----------
-    A : (n, K)
-        Whitened regressors, each times the standard deviation of its prior.
+    explained : (n, K)
+        Whitened regressors, each times the standard deviation of its prior, times ``L^-T`` with
+        ``L L^T = I + A^T A``: ``P = I - explained explained^T``.
     residual : (n,)
         ``P y``.
-    factor
-        Cholesky factor of ``I + A^T A``.
     estimate, std : (K,)
         Coefficients and their standard errors, the prior included.
     scale
         ``y^T P y / n``, at least 1: residuals larger than the noise explains weaken all evidence.
     """
 
-    A: Floats
+    explained: Floats
     residual: Floats
-    factor: tuple[Floats, bool]
     estimate: Floats
     std: Floats
     scale: float
@@ -74,16 +72,15 @@ def fit(y: Floats, columns: Floats, spread: Floats, count: int) -> Fit:
     A = columns * spread
     normal = A.T @ A
     normal[np.diag_indices_from(normal)] += 1.0
-    factor = cho_factor(normal, lower=True)
-    scaled = cho_solve(factor, A.T @ y)
-    inverse = cho_solve(factor, np.eye(spread.size))
-    residual = y - A @ scaled
+    half = solve_triangular(np.linalg.cholesky(normal), np.eye(spread.size), lower=True)
+    explained = A @ half.T
+    scaled = explained.T @ y
+    residual = y - explained @ scaled
     return Fit(
-        A=A,
+        explained=explained,
         residual=residual,
-        factor=factor,
-        estimate=spread * scaled,
-        std=spread * np.sqrt(inverse.diagonal()),
+        estimate=spread * (half.T @ scaled),
+        std=spread * np.sqrt(np.einsum("ij,ij->j", half, half)),
         scale=max(1.0, float(y @ residual) / max(count, 1)),
     )
 
@@ -117,9 +114,9 @@ def evidence(given: Fit, z: Floats, spread: Floats) -> Evidence:
     spread : (H,)
         Standard deviation of its coefficient before any reading; 0: the coefficient is 1.
     """
-    projected = given.A.T @ z
+    projected = given.explained.T @ z
     g = z.T @ given.residual / given.scale
-    h = np.einsum("ij,ij->j", z, z) - np.einsum("ij,ij->j", projected, cho_solve(given.factor, projected))
+    h = np.einsum("ij,ij->j", z, z) - np.einsum("ij,ij->j", projected, projected)
     h = np.maximum(h, 0.0) / given.scale
     s2 = spread**2
     free = 0.5 * (g**2 * s2 / (1.0 + h * s2) - np.log1p(h * s2))
@@ -191,8 +188,8 @@ def explain(given: Fit, z: Floats, own: Floats, like: float) -> tuple[Floats, Fl
     same : (H, H)
         Pairs whose effects, less what the other regressors explain, are alike.
     """
-    projected = given.A.T @ z
-    inner = z.T @ z - projected.T @ cho_solve(given.factor, projected)
+    projected = given.explained.T @ z
+    inner = z.T @ z - projected.T @ projected
     inner = 0.5 * (inner + inner.T) / given.scale
     g, h = z.T @ given.residual / given.scale, inner.diagonal()
     with np.errstate(divide="ignore", invalid="ignore"):

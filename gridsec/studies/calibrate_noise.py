@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
 
 from gridsec.arrays import Bools, Floats
@@ -30,8 +30,8 @@ _LAGS = (1, 2, 4, 8, 16, 32)
 _BLOCKS = 8
 # Step of the derivative of the score, in logarithms.
 _DIFFERENCE = 1e-3
-# Prior of the logarithms: powers within a factor e^3 of what was expected, the correlation time within e^2, and
-# the meters' noise within e^0.5.
+# Prior of the logarithms: powers within a factor e^3 of what was expected, the correlation time within e^2,
+# and the noise of the meters within e^0.5.
 _SPREAD = np.array([3.0, 3.0, 2.0, 0.5])
 
 
@@ -224,7 +224,14 @@ def increments(t: Floats, seen: Bools, residual: Floats) -> Increments:
 
 
 def learn(
-    given: Increments, field: Field, white: Floats, common: float, guess: LoadErrors, *, errors: bool = True
+    given: Increments,
+    field: Field,
+    white: Floats,
+    common: float,
+    guess: LoadErrors,
+    *,
+    errors: bool = True,
+    start: LoadErrors | None = None,
 ) -> LoadErrors:
     """Sizes and correlation time of the loads' errors: the composite likelihood of the increments.
 
@@ -242,21 +249,23 @@ def learn(
     common
         The same of the busbar's.
     guess
-        Where to begin, and the middle of the prior.
+        The middle of the prior.
     errors
         Whether standard errors are wanted.
+    start
+        Where to begin, if not there.
     """
-    base = np.log([guess.p, guess.q, guess.time_s, guess.white])
+    base, begin = (np.log([n.p, n.q, n.time_s, n.white]) for n in (guess, start or guess))
     problem = _Composite(given.dt, field, white, common, base)
     count = given.count.sum(axis=0)
     mean = given.total.sum(axis=0) / np.maximum(count, 1.0)
     found = minimize(
         problem.value,
-        np.zeros(4),
+        begin - base,
         args=(mean, count),
         jac=True,
         method="L-BFGS-B",
-        options={"ftol": 1e-12, "gtol": 1e-6, "maxiter": 200},
+        options={"ftol": 1e-11, "gtol": 1e-3, "maxiter": 200},
     )
     x = np.asarray(found.x)
     std = _errors(problem, x, given) if errors else np.full(4, np.nan)
@@ -305,10 +314,10 @@ class _Composite:
         total, gradient = float(0.5 * np.sum((x / _SPREAD) ** 2)), x / _SPREAD**2
         for h, lag in enumerate(self.dt.tolist()):
             share = -np.expm1(-lag / time_s)
-            factors = cho_factor(2.0 * (share * S + D), lower=True)
-            inverse = cho_solve(factors, np.eye(self.white.size))
+            covariance = 2.0 * (share * S + D)
+            inverse = np.linalg.inv(covariance)
             fit = inverse @ mean[h]
-            total += weight[h] * (2.0 * np.log(factors[0].diagonal()).sum() + np.trace(fit))
+            total += weight[h] * (np.linalg.slogdet(covariance)[1] + np.trace(fit))
             slope = inverse - fit @ inverse
             turned = -lag / time_s * np.exp(-lag / time_s) * S
             for k, part in enumerate((share * 2.0 * active, share * 2.0 * reactive, turned)):
