@@ -136,8 +136,9 @@ def test_nothing_in_a_box_is_outside_of_its_bounds(seed: int, size: float) -> No
 def test_a_box_that_holds_collapse_is_refused() -> None:
     feeder = random_feeder(3)
     count = len(feeder.customers)
+    none = np.zeros(count)
     with pytest.raises(DesignInfeasible):
-        region(network(feeder), Box(np.full(count, -20.0), np.zeros(count), *np.zeros((2, count)), 1.0, 1.0))
+        region(network(feeder), Box(np.full(count, -20.0), none, none, none, 1.0, 1.0))
 
 
 # --- certificates -----------------------------------------------------------------------------------------
