@@ -289,7 +289,7 @@ def _td(cell: Any) -> Markup:
     if isinstance(cell, bool | np.bool_):
         return el("td", "yes" if cell else "no")
     if isinstance(cell, float | np.floating):
-        key = "" if math.isnan(cell) else repr(float(cell))
+        key = "" if math.isnan(cell) else repr(float(cell)).replace("inf", "Infinity")
         return el("td", _written(float(cell)), class_="n", data_key=key)
     if isinstance(cell, int | np.integer):
         return el("td", str(cell).replace("-", "−"), class_="n", data_key=str(cell))

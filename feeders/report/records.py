@@ -52,7 +52,7 @@ def calibrate(site: Site, found: Calibrate) -> Section:
             Figure(
                 "calibrate-bias",
                 "By how much meters are off",
-                f"Error of each meter's voltage relative to the busbar's meter, %, with 95 % intervals.{shown}",
+                f"Error of each meter's voltage against the busbar's meter, %, with 95 % intervals.{shown}",
                 partial(_bias_chart, known),
             )
         )
