@@ -42,7 +42,10 @@ def campaign(
     ] = None,
     promised: Annotated[
         bool,
-        typer.Option("--promised", help="Also lies of the sizes that `study detectable` finds, for M = 2."),
+        typer.Option(
+            "--promised",
+            help="Lies of the sizes that `study detectable` finds, for M = 2, in place of the six kinds.",
+        ),
     ] = False,
     liars: Annotated[
         list[int] | None, typer.Option(help="How many lie; may be repeated. [default: 1 and 3]", min=1)
@@ -99,7 +102,7 @@ def campaign(
             scenes=-(-scenarios // together),
             together=together,
             seed=seed,
-            kinds=tuple(_kind(each) for each in kind) if kind else KINDS,
+            kinds=tuple(_kind(each) for each in kind or ()) or KINDS,
             liars=tuple(liars or (1, 3)),
             places=_each(place, Place, "--place"),
             design=_each([design], Design, "--design")[0],
@@ -114,7 +117,7 @@ def campaign(
             load_error=LoadError(load_error_kw, load_error_kvar),
         )
         if promised:
-            plan = _with_promised(site, plan)
+            plan = _with_promised(site, plan, plan.kinds if kind else ())
         with bar("scenarios") as tell:
             found = study(site, plan, runner=_runner(workers, dask), journal=journal, progress=tell)
     impossible = int((found.scenarios["reason"] != "").sum())
@@ -129,14 +132,14 @@ def campaign(
     write_tables(out, found.tables)
 
 
-def _with_promised(site: Site, plan: Plan) -> Plan:
+def _with_promised(site: Site, plan: Plan, others: tuple[Kind, ...]) -> Plan:
     from feeders.studies.campaign_plan import promised
     from feeders.studies.detectable import detectable
 
     stated = plan.trial(site, plan.moment(0)).stated
     with bar("lies of meters, errors of customers") as tell:
         found = detectable(stated, max_attacked=2, progress=tell)
-    return replace(plan, kinds=(*plan.kinds, *promised(found)))
+    return replace(plan, kinds=(*others, *promised(found)))
 
 
 def _short(table: pd.DataFrame) -> pd.DataFrame:

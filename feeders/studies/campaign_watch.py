@@ -25,7 +25,7 @@ from gridsec.online import Decision, Frame
 if TYPE_CHECKING:
     from feeders.load import Site
 
-__all__ = ["Prepared", "prepare", "watch"]
+__all__ = ["Prepared", "prepare", "risings", "watch"]
 
 ERROR_PERCENTILE = 95.0
 
@@ -245,7 +245,8 @@ def _told(  # noqa: PLR0917  # one row needs all that is known of the case
     lies, named = np.hstack([played.liars[begin:], wrong]), np.hstack([seen.named, inverters])
     told = _each(played, begin, site, lies, named, names, step_s)
     # A name that stays a while after the lie is not false.
-    false = (named & ~np.logical_or.accumulate(lies, axis=0)).any(axis=0)
+    wrong_names = named & ~np.logical_or.accumulate(lies, axis=0)
+    false = wrong_names.any(axis=0)
     delays = np.array([one["delay_s"] for one in told])
     missed = [one["who"] for one in told if np.isinf(one["delay_s"])]
     lying: Bools = np.any(lies, axis=1)
@@ -257,7 +258,7 @@ def _told(  # noqa: PLR0917  # one row needs all that is known of the case
         "named": len(told) - len(missed),
         "missed": " ".join(missed),
         "falsely_named": " ".join(np.array(names)[false]),
-        "false_events": int((np.diff(named & ~lies, axis=0, prepend=False) & (false)).sum()),
+        "false_events": risings(wrong_names),
         "delay_s": float(delays.max()) if delays.size else float("nan"),
         "clear_s": (float(quiet[0] * step_s) if quiet.size else float("inf")) if ended else float("nan"),
         "most_named": int(named.sum(axis=1).max(initial=0)),
@@ -266,6 +267,18 @@ def _told(  # noqa: PLR0917  # one row needs all that is known of the case
         "clean_lying_s": float((seen.clean & lying & ~named.any(axis=1)).sum() * step_s),
     }
     return row | _errors(plan, site, seen, played, begin, lies) | {"each": told}
+
+
+def risings(flags: Bools) -> int:
+    """How often any of some flags goes up, from down before the first row.
+
+    Parameters
+    ----------
+    flags : (T, k)
+        The flags over time.
+    """
+    before = np.vstack([np.zeros((1, flags.shape[1]), dtype=np.bool_), flags[:-1]])
+    return int(np.count_nonzero(flags & ~before))
 
 
 def _each(  # noqa: PLR0917  # meters and inverters alike

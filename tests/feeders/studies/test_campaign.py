@@ -23,10 +23,14 @@ from feeders.load import load
 from feeders.profiles import Season
 from feeders.studies.campaign import Campaign, campaign
 from feeders.studies.campaign_lies import attacks, liars
-from feeders.studies.campaign_plan import CLEAN, Case, Kind, Place, Plan
+from feeders.studies.campaign_plan import CLEAN, Case, Kind, Place, Plan, promised
+from feeders.studies.campaign_promises import rehearse_everywhere
 from feeders.studies.campaign_run import ClusterUnusable, Dask, Here, Processes, WorkerLost
 from feeders.studies.campaign_tables import false_names, grouped, scenarios
+from feeders.studies.campaign_watch import risings
+from feeders.studies.detectable import detectable
 from feeders.studies.journal import OtherStudy
+from feeders.studies.rehearsal import rehearse
 from feeders.trials import frames, judge
 from gridsec.feeder import lindistflow
 
@@ -183,7 +187,43 @@ def test_settings_reach_the_estimator() -> None:
         campaign(SITE, replace(PLAN, settings=(("colour", 1.0),)))
 
 
+# --------------------------------------------------------------------------------------------- promises
+
+
+def test_promised_sizes_are_kept() -> None:
+    """None of the hidden size is named, none of the named size missed, under full AC power flow."""
+    plan = replace(
+        PLAN,
+        scenes=4,
+        together=5,
+        duration_s=20.0,
+        lying_s=12.0,
+        places=(Place.RANDOM,),
+        alarms_per_year=(1.0,),
+    )
+    stated = plan.trial(SITE, plan.moment(0)).stated
+    found = detectable(stated, max_attacked=2)
+    told = campaign(SITE, replace(plan, kinds=promised(found))).liars
+    volts = found.meters.set_index("meter")
+    assert set(told["kind"]) == {"hidden", "named"}
+    for lie in told.to_dict("records"):
+        column = "hidden_alone" if lie["kind"] == "hidden" else "named"
+        assert lie["lie_volt"] == pytest.approx(lie["size"] * volts.loc[lie["who"], column])
+        assert math.isinf(lie["delay_s"]) == (lie["kind"] == "hidden")
+    # The same promise at one operating point, in pieces.
+    whole = rehearse_everywhere(stated, found, trials=5, piece=3)
+    parts = [rehearse(stated, found, trials=n, seed=seed) for n, seed in ((3, 0), (2, 3))]
+    assert (whole.trials, whole.hidden_named, whole.large_missed) == (5, 0, 0)
+    assert whole.honest_named == sum(part.honest_named for part in parts)
+
+
 # ----------------------------------------------------------------------------------------------- tables
+
+
+def test_false_names_are_counted_when_they_appear() -> None:
+    flags = np.array([[1, 0], [1, 0], [0, 1], [1, 1], [0, 0]], dtype=np.bool_)
+    assert risings(flags) == 3
+    assert risings(flags[:0]) == 0
 
 
 def row(**values: object) -> dict[str, object]:
