@@ -1,4 +1,4 @@
-"""What a conversion could not carry over as it was: every element of it, what was done, and what that does."""
+"""What a conversion could not carry over as it was: each element, what was done, and what that does."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ from dataclasses import astuple, dataclass
 from typing import Final, Literal
 
 CHANGES_FILE: Final = "conversion.csv"
+WHOLE: Final = "all of it"
+"""The property of an element that is meant as a whole."""
+
 NAMED: Final = 8
 """Elements that a sentence names; the file names all of them."""
 
@@ -24,7 +27,7 @@ class Change:
     element
         Its name, with its kind.
     prop
-        Which property of it; "all of it" where the whole element is meant.
+        Which property of it; WHOLE where all of it is meant.
     done
         What was done.
     effect
@@ -49,7 +52,8 @@ def sentences(changes: Iterable[Change]) -> tuple[str, ...]:
     for change in changes:
         fates.setdefault((change.done, change.prop, change.effect), []).append(change.element)
     return tuple(
-        f"{done}: {_listed(elements)}: {prop}; {effect}" for (done, prop, effect), elements in fates.items()
+        f"{done}: {'' if prop == WHOLE else f'{prop} of '}{_listed(elements)}; {effect}"
+        for (done, prop, effect), elements in fates.items()
     )
 
 

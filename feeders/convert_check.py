@@ -91,7 +91,8 @@ class SourceCheck:
         """The finding in words; the difference is rounded up to a power of ten, the same on every machine."""
         text = (
             f"AC power flow of {self.tool} and of this folder at the source's loads, {self.buses} buses"
-            f"{', phase by phase' if self.three_phase else ''}: |v| differs by less than {_above(self.largest_pu)} pu"
+            f"{', phase by phase' if self.three_phase else ''}: |v| differs by less than "
+            f"{_above(self.largest_pu)} pu"
         )
         if not self.exact:
             text += f" (bus {self.at})"
@@ -101,7 +102,7 @@ class SourceCheck:
 
 
 def _above(value: float) -> str:
-    return f"{10.0 ** math.ceil(math.log10(max(value, 1e-8) * 1.000001) - 1e-9):.0e}"
+    return f"{10.0 ** math.ceil(math.log10(max(value, 1e-8)) - 1e-9):.0e}"
 
 
 def compare(state: SourceState, tables: FeederTables) -> SourceCheck:
@@ -123,7 +124,7 @@ def compare(state: SourceState, tables: FeederTables) -> SourceCheck:
     """
     power = np.array([state.power_kva.get(row.customer, 0.0) for row in tables.customers])
     size = np.abs(state.busbar_volt)
-    single = any(row.phases != "abc" for row in (*tables.lines, *tables.customers))
+    single = {row.phases for row in tables.lines} | {row.phases for row in tables.customers} != {"abc"}
     phases = single or bool(np.ptp(size) > UNIFORM * size[0]) or not _uniform(state)
     if phases:
         unbalanced = three_phase(tables)

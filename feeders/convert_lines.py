@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from feeders.convert_changes import Change
+from feeders.convert_changes import WHOLE, Change
 from feeders.convert_customers import rounded
 from feeders.schema import LineRow
 from gridsec.arrays import Floats, Ints, Phasors
@@ -22,14 +22,15 @@ def line_row(
     name: str,
     ends: tuple[str, str],
     phases: Ints,
+    *,
     series: Phasors,
     shunt: Floats,
     changes: list[Change],
 ) -> LineRow:
     """Return the row of a line given by matrices.
 
-    A matrix of three phases becomes cyclically symmetric: the mean of its diagonal and of the rest. One of two
-    phases is that of three whose third carries nothing. Of the charging the positive sequence remains.
+    A matrix of three phases becomes cyclically symmetric: the mean of its diagonal and of the rest. One of
+    two phases is that of three whose third carries nothing. Of the charging the positive sequence remains.
 
     Parameters
     ----------
@@ -60,7 +61,7 @@ def line_row(
                 label,
                 "impedance matrix",
                 "approximated",
-                f"taken as transposed: its entries differ from their mean by up to {100 * off:.1g} % of the largest",
+                f"taken as transposed; entries are up to {100 * off:.1g} % of the largest off their mean",
             )
         )
     if count == 2:
@@ -189,7 +190,7 @@ def _parallel(rows: list[LineRow], changes: list[Change]) -> LineRow:
     first = rows[0]
     if len({row.phases for row in rows}) > 1:
         return _side_by_side(rows, names, changes)
-    changes.append(Change(f"lines {names}", "all of it", "changed", f"in parallel; one line {first.line}"))
+    changes.append(Change(f"lines {names}", WHOLE, "changed", f"in parallel; one line {first.line}"))
     positive = [complex(row.r_ohm, row.x_ohm) for row in rows]
     total = 1.0 / sum(1.0 / z for z in positive)
     limits = [
@@ -226,7 +227,7 @@ def _side_by_side(rows: list[LineRow], names: str, changes: list[Change]) -> Lin
     changes.append(
         Change(
             f"lines {names}",
-            "all of it",
+            WHOLE,
             "changed" if alike else "approximated",
             f"side by side; one line {rows[0].line} of all phases"
             + ("" if alike else f" with their mean impedance, from which they differ by {100 * apart:.1g} %"),

@@ -7,57 +7,21 @@ customers that draw what flows into them.
 
 from __future__ import annotations
 
-import math
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from feeders.columns import SUSPICIONS
-from feeders.convert_changes import Change
+from feeders.convert_changes import WHOLE, Change
 from feeders.convert_check import SourceState
-from feeders.convert_customers import (
-    HOUSEHOLD_KW,
-    USUAL_POWER_FACTOR,
-    base_kva,
-    droop_preset,
-    reactive,
-    rounded,
-    usual_profile,
-    with_meters,
-)
+from feeders.convert_customers import USUAL_POWER_FACTOR, base_kva, with_meters
+from feeders.convert_draws import Draw, customers_of, is_even
 from feeders.convert_lines import merged
-from feeders.profiles import envelopes
-from feeders.schema import CustomerRow, FeederMeta, FeederTables, LineRow, LoadDefaults, validate
+from feeders.schema import FeederMeta, FeederTables, LineRow, LoadDefaults, validate
 from gridsec.arrays import Phasors
 from gridsec.errors import FeederInvalid, GridsecError
-
-EVEN: float = 1e-6
-"""Spread of the phases' powers, as a share of the largest, below which a connection is of three phases."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Draw:
-    """A load or a generator at a bus.
-
-    Attributes
-    ----------
-    name, bus
-        Its name and where it is.
-    power_kva : (3,)
-        What it takes from each phase at the source's operating point, P + jQ, kVA.
-    even
-        It is one connection of all three phases.
-    rating_kva
-        Rating of a generator's inverter; None: no generator.
-    """
-
-    name: str
-    bus: str
-    power_kva: Phasors
-    even: bool = True
-    rating_kva: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -333,7 +297,7 @@ def _as_rows(couplings: Iterable[Coupling]) -> list[LineRow]:
 
 
 def _busbar(network: Network, rows: list[LineRow], root: str | None) -> str:
-    """Return the bus asked for, or the first from the source on that is more than the way to a transformer."""
+    """Return the bus asked for, or the first from the source on that has lines."""
     if root is not None:
         hits = [bus for bus in network.nominal if bus == root] or [
             bus for bus in network.nominal if bus.lower() == root.lower()
@@ -344,15 +308,42 @@ def _busbar(network: Network, rows: list[LineRow], root: str | None) -> str:
     if len(network.sources) != 1:
         names = ", ".join(network.sources) or "none"
         raise GridsecError(f"the busbar is not clear, voltage sources at: {names}; name it with root")
-    bus, seen = network.sources[0], set[str]()
-    while not any(row.closed and bus in (row.from_bus, row.to_bus) for row in rows):
-        seen.add(bus)
-        beyond = {b for each in network.couplings if bus in each.buses for b in each.buses} - seen
+    way = _way_down(network, rows)
+    if not _has_lines(way[-1], rows):
+        beyond = ", ".join(sorted(_beyond(network, way))) or "none"
+        raise GridsecError(f"the busbar is not clear, candidates: {beyond}; name it with root")
+    return way[-1]
+
+
+def below_source(network: Network) -> str | None:
+    """Return the bus of the only source's only transformer on its other side; None if there is no such bus.
+
+    Parameters
+    ----------
+    network
+        The network.
+    """
+    way = _way_down(network, network.lines) if len(network.sources) == 1 else []
+    return way[-1] if len(way) > 1 and _has_lines(way[-1], network.lines) else None
+
+
+def _way_down(network: Network, rows: list[LineRow]) -> list[str]:
+    """Follow transformers from the source, as long as there is only one way and no line."""
+    way = [network.sources[0]]
+    while not _has_lines(way[-1], rows):
+        beyond = _beyond(network, way)
         if len(beyond) != 1:
-            names = ", ".join(sorted(beyond)) or "none"
-            raise GridsecError(f"the busbar is not clear, candidates: {names}; name it with root")
-        bus = beyond.pop()
-    return bus
+            break
+        way.append(beyond.pop())
+    return way
+
+
+def _has_lines(bus: str, rows: list[LineRow]) -> bool:
+    return any(row.closed and bus in (row.from_bus, row.to_bus) for row in rows)
+
+
+def _beyond(network: Network, way: list[str]) -> set[str]:
+    return {bus for each in network.couplings if way[-1] in each.buses for bus in each.buses} - set(way)
 
 
 def _infeeds(network: Network, rows: list[LineRow], busbar: str, inside: Mapping[str, int]) -> list[str]:
@@ -369,8 +360,8 @@ def _infeeds(network: Network, rows: list[LineRow], busbar: str, inside: Mapping
             ways = [bus for bus in inside if bus != busbar and bus in above]
             if ways:
                 problems.append(
-                    f"{len(ways)} of the feeder's buses can be reached from the source {source!r} not only through "
-                    f"the busbar {busbar!r}, among them {', '.join(ways[:5])}: a mesh; "
+                    f"{len(ways)} of the feeder's buses can be reached from the source {source!r} not only "
+                    f"through the busbar {busbar!r}, among them {', '.join(ways[:5])}: a mesh; "
                     "open a line of it, or name another busbar with root"
                 )
     return problems
@@ -390,21 +381,23 @@ def _kept(
             kept.append(replace(away, to_x=place[0], to_y=place[1]) if place else away)
         elif a or b:
             changes.append(
-                Change(
-                    f"line {row.line}", "all of it", "left out", "open towards what the busbar does not feed"
-                )
+                Change(f"line {row.line}", WHOLE, "left out", "open towards what the busbar does not feed")
             )
     outside = len(network.nominal.keys() - inside.keys())
     if outside:
         changes.append(
             Change(
-                f"{outside} bus(es)",
-                "all of it",
+                _buses(outside),
+                WHOLE,
                 "left out",
                 "above the busbar, behind a transformer or without supply",
             )
         )
     return kept
+
+
+def _buses(count: int) -> str:
+    return f"{count} bus{'es' if count != 1 else ''}"
 
 
 def _behind(
@@ -428,100 +421,21 @@ def _behind(
             )
         }
         if not np.isfinite(np.array([each.power_kva[k] for k in ends])).all():
-            effect = f"{len(far)} bus(es); what flows there is not known"
-            changes.append(Change(each.name, "all behind it", "left out", effect))
+            effect = f"{_buses(len(far))}; what flows there is not known"
+            changes.append(Change(each.name, "load side", "left out", effect))
             continue
         for k in ends:
             power = each.power_kva[k]
             name = each.name if len(ends) == 1 else f"{each.name} {each.buses[k]}"
-            draws.append(Draw(name, each.buses[k], power, even=_even(power)))
+            draws.append(Draw(name, each.buses[k], power, even=is_even(power)))
         total = sum((each.power_kva[k].sum() for k in ends), start=0j)
         changes.append(
             Change(
                 each.name,
-                "all behind it",
+                "load side",
                 "changed",
-                f"{len(far)} bus(es) became a customer that draws what flows there, "
+                f"{_buses(len(far))} became a customer that draws what flows there, "
                 f"{total.real:.4g} kW and {total.imag:.4g} kvar; exact at these loads only",
             )
         )
     return draws
-
-
-def _even(power: Phasors) -> bool:
-    size = float(np.abs(power).max())
-    return size > 0 and float(np.abs(power - power.mean()).max()) <= EVEN * size
-
-
-def customers_of(
-    draws: Iterable[Draw],
-    volt: float,
-    droop: str | None,
-    changes: list[Change],
-    taken: Collection[str] = (),
-) -> tuple[list[CustomerRow], dict[str, complex]]:
-    """Return rows of customers.csv, and what each draws at the source's operating point, kVA.
-
-    Parameters
-    ----------
-    draws
-        Loads and generators.
-    volt
-        Nominal voltage, V.
-    droop
-        Preset of the generators' inverters; None: by their size.
-    changes
-        Takes what is not carried over exactly.
-    taken
-        Names that other customers have.
-    """
-    rows: list[CustomerRow] = []
-    power: dict[str, complex] = {}
-    for draw in sorted(draws, key=lambda each: each.rating_kva is not None):
-        for phases, kva in _connections(draw):
-            row = CustomerRow(_unique(draw, phases, {*taken, *power}), draw.bus, 0.0, phases=phases)
-            power[row.customer] = kva
-            if draw.rating_kva is None:
-                rows.append(_load(row, kva, len(rows), volt, changes))
-                continue
-            share = draw.rating_kva if phases == "abc" else draw.rating_kva / len(_connections(draw))
-            row = replace(row, pv_kw=rounded(max(-kva.real, 0.0)), pv_profile=f"PV{len(rows) % 8 + 1}")
-            if share > 0:
-                row = replace(row, inverter_kva=rounded(share), droop=droop or droop_preset(share))
-                changes.append(
-                    Change(
-                        f"generator {draw.name}", "droop curve", "added", f"{row.droop}, not in the source"
-                    )
-                )
-            rows.append(row)
-    return rows, power
-
-
-def _connections(draw: Draw) -> list[tuple[str, complex]]:
-    if draw.even:
-        return [("abc", complex(draw.power_kva.sum()))]
-    return [(phase, complex(kva)) for phase, kva in zip("abc", draw.power_kva, strict=True) if kva != 0]
-
-
-def _unique(draw: Draw, phases: str, taken: Collection[str]) -> str:
-    several = phases != "abc" and len(_connections(draw)) > 1
-    name = (f"{draw.name}-{phases}" if several else draw.name)[:120]
-    while name in taken:
-        name += "'"
-    return name
-
-
-def _load(row: CustomerRow, kva: complex, number: int, volt: float, changes: list[Change]) -> CustomerRow:
-    p, q = kva.real, kva.imag
-    if p < 0:
-        changes.append(
-            Change(f"load {row.customer}", "p_kw", "changed", "feeds in; its expected load is taken as 0")
-        )
-    if q < 0:
-        changes.append(
-            Change(f"load {row.customer}", "power factor", "approximated", "leading; expected to be 1")
-        )
-    household = volt < 1000.0 and p <= HOUSEHOLD_KW
-    row = replace(row, load_kw=rounded(max(p, 0.0)), load_profile=usual_profile(number, household=household))
-    assert row.load_profile in envelopes()  # noqa: S101  # the library's own names
-    return reactive(row, p / math.hypot(p, q) if p > 0 and q > 0 else None)

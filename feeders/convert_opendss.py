@@ -16,9 +16,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from feeders.convert_changes import Change
+from feeders.convert_changes import WHOLE, Change
+from feeders.convert_draws import Draw
 from feeders.convert_lines import capacitor, line_row, open_end
-from feeders.convert_network import Coupling, Draw, Network
+from feeders.convert_network import Coupling, Network
 from feeders.schema import LineRow
 from gridsec.arrays import Floats, Phasors
 from gridsec.errors import FeederInvalid, GridsecError
@@ -111,7 +112,7 @@ def read_opendss(path: Path) -> Network:
             return _read(dss, path)
         except (FeederInvalid, GridsecError):
             raise
-        except Exception as error:  # noqa: BLE001  # whatever the foreign engine raises on a foreign file
+        except Exception as error:  # whatever the foreign engine raises on a foreign file
             raise GridsecError(f"{path}: OpenDSS: {' '.join(str(error).split())}") from error
 
 
@@ -229,7 +230,8 @@ def _element(dss: Any, full: str, problems: list[str]) -> _Element:
         powers.append(power)
     if enabled and kind not in COUPLINGS and any(node > PHASES for here in nodes for node in here):
         problems.append(
-            f"{kind} {name} has a conductor besides the phases 1, 2, 3 and the grounded neutral 0; expected none"
+            f"{kind} {name} has a conductor besides the phases 1, 2, 3 and the grounded neutral 0; "
+            "expected none"
         )
     on = tuple(k for k in range(len(buses)) if enabled and not element.IsOpen(k + 1, 0))
     return _Element(name, kind, buses, nodes, tuple(powers), enabled, on)
@@ -249,7 +251,7 @@ def _take(dss: Any, each: _Element, network: Network, problems: list[str]) -> No
     """Add an element to the network, or say what becomes of it."""
     label = f"{each.kind} {each.name}"
     if not each.enabled:
-        network.changes.append(Change(label, "all of it", "left out", "disabled in the source"))
+        network.changes.append(Change(label, WHOLE, "left out", "disabled in the source"))
     elif each.kind in {"capacitor", "reactor"} and _is_shunt(each):
         _shunt(dss, each, network)
     elif each.kind in SERIES:
@@ -262,11 +264,9 @@ def _take(dss: Any, each: _Element, network: Network, problems: list[str]) -> No
         _draw(dss, each, network)
     elif each.kind in CONTROLS:
         bus = each.buses[0] if each.buses else ""
-        network.of_bus.append((bus, Change(label, "all of it", "left out", CONTROLS[each.kind])))
+        network.of_bus.append((bus, Change(label, WHOLE, "left out", CONTROLS[each.kind])))
     elif each.kind not in SILENT and each.kind != "vsource":
-        change = Change(
-            label, "all of it", "left out", "has no place in a feeder; the check shows what that does"
-        )
+        change = Change(label, WHOLE, "left out", "has no place in a feeder; the check shows what that does")
         network.of_bus.append((each.buses[0], change))
 
 
@@ -296,7 +296,9 @@ def _line(dss: Any, each: _Element, network: Network, problems: list[str]) -> No
             problems.append(f"line {label} has a conductor to ground; expected phases 1, 2, 3")
         return
     matrix, count = _yprim(dss, each), len(here)
-    series: Phasors = np.linalg.inv(-0.5 * (matrix[:count, count:] + matrix[count:, :count].T))
+    series = np.asarray(
+        np.linalg.inv(-0.5 * (matrix[:count, count:] + matrix[count:, :count].T)), dtype=np.complex128
+    )
     shunt: Floats = (
         matrix[:count, :count] + matrix[count:, count:] + matrix[:count, count:] + matrix[count:, :count]
     ).imag
@@ -305,13 +307,14 @@ def _line(dss: Any, each: _Element, network: Network, problems: list[str]) -> No
     if min(series.real.diagonal().min(), series.imag.diagonal().min()) < 0:
         problems.append(f"line {label} has a negative resistance or reactance; expected none")
         return
+    changes: list[Change] = []
     row = line_row(
         label,
         (each.buses[0], each.buses[1]),
         phases,
-        series[np.ix_(order, order)],
-        shunt[np.ix_(order, order)],
-        changes := [],
+        series=series[np.ix_(order, order)],
+        shunt=shunt[np.ix_(order, order)],
+        changes=changes,
     )
     network.of_bus.extend((each.buses[0], change) for change in changes)
     row = _rated(dss, each, row)
@@ -336,7 +339,7 @@ def _shunt(dss: Any, each: _Element, network: Network) -> None:
     kvar = -sum(power.sum() for power in each.power_kva).imag
     if not each.closed or each.kind == "reactor" or kvar <= 0:
         effect = f"{-kvar:.4g} kvar" if each.closed else "switched off in the source"
-        network.of_bus.append((bus, Change(label, "all of it", "left out", effect)))
+        network.of_bus.append((bus, Change(label, WHOLE, "left out", effect)))
         return
     here = [k for k, node in enumerate(each.nodes[0]) if 1 <= node <= PHASES]
     block = _yprim(dss, each)[np.ix_(here, here)].imag

@@ -23,7 +23,8 @@ from feeders.convert_customers import (
     usual_profile,
     with_meters,
 )
-from feeders.convert_network import Converted, below, customers_of, finished
+from feeders.convert_draws import customers_of
+from feeders.convert_network import Converted, Network, below, below_source, finished
 from feeders.convert_pandapower_net import ids, network_of
 from feeders.profiles import envelopes
 from feeders.schema import CustomerRow, FeederMeta, FeederTables, LoadDefaults, MonitorDefaults
@@ -114,7 +115,7 @@ def from_pandapower(
     """
     network = network_of(net)
     names = ids(net.bus, "bus")
-    part = below(network, names[_root(net, root)], opened)
+    part = below(network, _root(net, network, names, root), opened)
     source = _Source(net, names, {i for i, bus in names.items() if bus in part.inside}, part.changes)
     customers = _customers(source, droop)
     volt = network.nominal[part.busbar]
@@ -138,21 +139,24 @@ def from_pandapower(
     return finished(network, part, tables, {**source.power, **drawn})
 
 
-def _root(net: Any, wanted: str | None) -> int:
+def _root(net: Any, network: Network, names: dict[int, str], wanted: str | None) -> str:
     if wanted is not None:
-        named = [int(i) for i in net.bus.index if str(net.bus.at[i, "name"]) == wanted]
-        hits = named or [int(i) for i in net.bus.index if str(i) == wanted]
+        named = [i for i in names if str(net.bus.at[i, "name"]) == wanted]
+        hits = named or [i for i in names if str(i) == wanted] or [i for i in names if names[i] == wanted]
         if len(hits) != 1:
             raise GridsecError(f"{len(hits)} buses are called {wanted!r}; give the index of one")
-        return hits[0]
+        return names[hits[0]]
     trafos = net.trafo[net.trafo.in_service]
     sides = sorted({int(bus) for bus in trafos.lv_bus})
     if not sides:
         sides = sorted({int(bus) for bus in net.ext_grid.bus[net.ext_grid.in_service]})
-    if len(sides) != 1:
-        names = ", ".join(str(net.bus.at[bus, "name"]) for bus in sides) or "none"
-        raise GridsecError(f"the busbar is not clear, candidates: {names}; name it with root")
-    return sides[0]
+    if len(sides) == 1:
+        return names[sides[0]]
+    found = below_source(network)
+    if found is None:
+        candidates = ", ".join(str(net.bus.at[bus, "name"]) for bus in sides) or "none"
+        raise GridsecError(f"the busbar is not clear, candidates: {candidates}; name it with root")
+    return found
 
 
 # --- loads and generators -----------------------------------------------------------------------
@@ -275,7 +279,7 @@ def _generators(
             inverter_kva=rounded(rows[k].inverter_kva + kva),
             droop=droop or droop_preset(rows[k].inverter_kva + kva),
         )
-        effect = f"{rows[k].droop} at customer {rows[k].customer}, not in the source"
+        effect = f"{rows[k].droop}, not in the source; at the first customer of its bus"
         source.changes.append(Change(label, "droop curve", "added", effect))
 
 

@@ -13,17 +13,18 @@ from typing import Any, Final
 
 import numpy as np
 
-from feeders.convert_changes import Change
+from feeders.convert_changes import WHOLE, Change
 from feeders.convert_customers import rounded
+from feeders.convert_draws import Draw
 from feeders.convert_lines import capacitor, open_end
-from feeders.convert_network import Coupling, Draw, Network
+from feeders.convert_network import Coupling, Network
 from feeders.schema import LineRow
 from gridsec.arrays import Phasors
 
-# Tables that are carried over, or told about one by one; every other table with rows in the feeder earns a note.
+# Tables that are carried over, or told about one by one; every other row in the feeder earns a note.
 CARRIED: Final = {
-    "bus", "line", "load", "asymmetric_load", "asymmetric_sgen", "sgen", "switch", "trafo", "trafo3w", "ext_grid",
-    "gen", "storage", "motor", "ward", "shunt",
+    "bus", "line", "load", "asymmetric_load", "asymmetric_sgen", "sgen", "switch", "trafo", "trafo3w",
+    "ext_grid", "gen", "storage", "motor", "ward", "shunt",
 }  # fmt: skip
 FIXED: Final = {"gen": -1.0, "storage": 1.0, "motor": 1.0, "ward": 1.0}
 """Tables of what becomes a customer as the source's power flow has it, and the sign of its results."""
@@ -225,7 +226,7 @@ def _flow(solved: Any, table: str, index: int, side: str) -> Phasors:
     if unbalanced(solved):
         row = solved[f"res_{table}_3ph"].loc[index]
         s = [complex(row[f"p_{phase}{tail}_mw"], row[f"q_{phase}{tail}_mvar"]) for phase in "abc"]
-        return np.array(s) * 1e3
+        return np.asarray(np.array(s) * 1e3, dtype=np.complex128)
     row = solved[f"res_{table}"].loc[index]
     return np.full(3, complex(row[f"p{tail}_mw"], row[f"q{tail}_mvar"]) * 1e3 / 3.0)
 
@@ -239,7 +240,7 @@ def _transformers(net: Any, solved: Any, buses: dict[int, str], network: Network
             ends = [(side, bus) for side, bus in ends if (int(i), bus) not in opened]
             label = f"{'transformer' if table == 'trafo' else 'three-winding transformer'} {names[int(i)]}"
             if not row.in_service or len(ends) < 2:
-                network.changes.append(Change(label, "all of it", "left out", "switched off in the source"))
+                network.changes.append(Change(label, WHOLE, "left out", "switched off in the source"))
                 continue
             network.couplings.append(
                 Coupling(
@@ -273,7 +274,7 @@ def _fixed(net: Any, solved: Any, buses: dict[int, str], network: Network) -> No
                     if solved is not None
                     else "unknown"
                 )
-                network.of_bus.append((bus, Change(label, "all of it", "left out", effect)))
+                network.of_bus.append((bus, Change(label, WHOLE, "left out", effect)))
                 continue
             network.draws.append(Draw(label, bus, power, rating_kva=0.0 if power.real.sum() < 0 else None))
             effect = f"a customer that draws {power.real.sum():.4g} kW and {power.imag.sum():.4g} kvar"
@@ -282,7 +283,8 @@ def _fixed(net: Any, solved: Any, buses: dict[int, str], network: Network) -> No
     for i in map(int, net.asymmetric_sgen.index):
         row = net.asymmetric_sgen.loc[i]
         scale = -1e3 * float(row.scaling) * float(row.in_service)
-        power = scale * np.array([complex(row[f"p_{p}_mw"], row[f"q_{p}_mvar"]) for p in "abc"])
+        each = [scale * complex(row[f"p_{p}_mw"], row[f"q_{p}_mvar"]) for p in "abc"]
+        power = np.array(each, dtype=np.complex128)
         network.draws.append(Draw(names[i], buses[int(row.bus)], power, even=False, rating_kva=0.0))
 
 
@@ -293,7 +295,7 @@ def _shunts(net: Any, buses: dict[int, str], network: Network) -> None:
         row = net.shunt.loc[i]
         bus, label = buses[int(row.bus)], f"shunt {names[i]}"
         if not row.in_service:
-            network.of_bus.append((bus, Change(label, "all of it", "left out", "switched off in the source")))
+            network.of_bus.append((bus, Change(label, WHOLE, "left out", "switched off in the source")))
             continue
         p, q = (float(row[name]) * float(row.step) for name in ("p_mw", "q_mvar"))
         if p != 0:
@@ -314,10 +316,8 @@ def _rest(net: Any, buses: dict[int, str], network: Network) -> None:
             continue
         ends = [column for column in ("bus", "from_bus", "to_bus") if column in content.columns]
         for i in content.index if ends else ():
-            change = Change(f"{table} {i}", "all of it", "left out", "has no place in a feeder")
+            change = Change(f"{table} {i}", WHOLE, "left out", "has no place in a feeder")
             network.of_bus.append((buses[int(content.at[i, ends[0]])], change))
     if "controller" in net and len(net.controller):
         effect = "taps and set points stand as the file has them"
-        network.changes.append(
-            Change(f"{len(net.controller)} controller(s)", "all of it", "left out", effect)
-        )
+        network.changes.append(Change(f"{len(net.controller)} controller(s)", WHOLE, "left out", effect))

@@ -10,13 +10,14 @@ from typing import Any, Final
 
 import numpy as np
 from power_grid_model import CalculationMethod, PowerGridModel
-from power_grid_model.utils import json_deserialize
+from power_grid_model.utils import json_deserialize  # type: ignore[attr-defined]  # documented, but not re-exported
 from power_grid_model.validation import validate_input_data
 
-from feeders.convert_changes import Change
+from feeders.convert_changes import WHOLE, Change
 from feeders.convert_customers import rounded
+from feeders.convert_draws import Draw
 from feeders.convert_lines import capacitor, line_row, open_end
-from feeders.convert_network import Coupling, Draw, Network
+from feeders.convert_network import Coupling, Network
 from feeders.records import some
 from feeders.schema import LineRow
 from gridsec.arrays import Floats, Phasors
@@ -34,7 +35,7 @@ COUPLINGS: Final = {
 }
 STATUS: Final = ("status", "from_status", "to_status", "status_1", "status_2", "status_3")
 TOLERANCES: Final = (1e-11, 1e-9, 1e-7)
-"""Largest voltage corrections of the last Newton step, pu; links, almost short circuits, allow no smaller one."""
+"""Largest voltage corrections of the last Newton step, pu; links, almost short circuits, limit them."""
 TURN: Final = np.exp(-2j * np.pi / 3.0 * np.arange(3))
 
 Tables = dict[str, Any]
@@ -129,12 +130,12 @@ def _solve(path: Path, tables: Tables, symmetric: bool) -> Tables:
     raise AssertionError("the last tolerance has returned or raised")
 
 
-def _shown(ids: Iterable[Any]) -> str:
-    return some([str(each if isinstance(each, int) else each[-1]) for each in ids])
+def _shown(ids: Iterable[Any] | None) -> str:
+    return some([str(each if isinstance(each, int) else each[-1]) for each in ids or ()])
 
 
-def _rows(tables: Tables, kind: str) -> Iterable[Any]:
-    return tables.get(kind, ())
+def _rows(tables: Tables, kind: str) -> list[Any]:
+    return list(tables.get(kind, ()))
 
 
 def _nominal(tables: Tables) -> dict[str, float]:
@@ -204,7 +205,7 @@ def _zero_charging(network: Network, name: str, bus: str, b1: float, b0: float) 
 
 
 def _asymmetric_lines(tables: Tables, network: Network) -> None:
-    """Lines given by matrices; a neutral is grounded at both ends and eliminated, as power-grid-model does."""
+    """Lines given by matrices; a neutral is grounded at both ends and eliminated."""
     for row in _rows(tables, "asym_line"):
         name, ends = f"asym_line {row['id']}", (str(row["from_node"]), str(row["to_node"]))
         letters = "abc" if np.isnan(row["r_na"]) else "abcn"
@@ -215,7 +216,7 @@ def _asymmetric_lines(tables: Tables, network: Network) -> None:
         if len(letters) > 3:
             z = z[:3, :3] - np.outer(z[:3, 3], z[3, :3]) / z[3, 3]
         changes: list[Change] = []
-        made = line_row(name, ends, np.arange(3), z, _capacitances(row), changes)
+        made = line_row(name, ends, np.arange(3), series=z, shunt=_capacitances(row), changes=changes)
         network.of_bus.extend((ends[0], change) for change in changes)
         limit = _finite(row["i_n"])
         _add_line(row, replace(made, closed=_closed(row), rating_a=limit if limit else None), network)
@@ -244,7 +245,7 @@ def _couplings(tables: Tables, solved: Tables, network: Network) -> None:
             ]
             joined = [k for k, ok in enumerate(on) if ok]
             if len(joined) < 2:
-                network.changes.append(Change(label, "all of it", "left out", "switched off in the source"))
+                network.changes.append(Change(label, WHOLE, "left out", "switched off in the source"))
                 continue
             network.couplings.append(
                 Coupling(
@@ -292,7 +293,7 @@ def _shunts(tables: Tables, solved: Tables, network: Network) -> None:
         label, bus = f"shunt {row['id']}", str(row["node"])
         p, q = (1e-3 * float(np.sum(flow[name])) for name in ("p", "q"))
         if not row["status"]:
-            network.of_bus.append((bus, Change(label, "all of it", "left out", "switched off in the source")))
+            network.of_bus.append((bus, Change(label, WHOLE, "left out", "switched off in the source")))
             continue
         if row["g1"] != 0:
             network.of_bus.append((bus, Change(label, "conductance", "left out", f"{p:.4g} kW")))
@@ -318,4 +319,4 @@ def _rest(tables: Tables, network: Network) -> None:
             effect = "not part of a power flow"
         else:
             continue
-        network.changes.append(Change(f"{len(rows)} {kind}(s)", "all of it", "left out", effect))
+        network.changes.append(Change(f"{len(rows)} {kind}(s)", WHOLE, "left out", effect))
