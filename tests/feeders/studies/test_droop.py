@@ -117,7 +117,6 @@ def test_the_verdict_is_that_of_the_simulation_in_200_fleets_around_the_edge() -
             found = judge(subject, fleet, update, at, seed=seed)
             key = (found.verdict, bool(moved > 1e-3))
             told[key] = told.get(key, 0) + 1
-    print(told)
     assert sum(told.values()) == 200
     assert told.get((Verdict.STABLE, True), 0) == 0
     assert told.get((Verdict.UNSTABLE, False), 0) == 0
