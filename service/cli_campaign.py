@@ -70,6 +70,9 @@ def campaign(
         list[float] | None,
         typer.Option(help="False alarms it may raise in a year; may be repeated, for a curve. [default: 1]"),
     ] = None,
+    learned: Annotated[
+        float, typer.Option(help="Hours over which it has learned its meters' fixed errors before.", min=0.0)
+    ] = 0.0,
     meters: Annotated[str, typer.Option(help="Errors of the meters: site, real or white.")] = "site",
     load_error_kw: Annotated[
         float, typer.Option(help="What nobody knows of each customer's active power, 1 sigma.", min=0.0)
@@ -112,6 +115,7 @@ def campaign(
             seasons=_each(season, Season, "--season"),
             estimator=estimator,
             alarms_per_year=tuple(sorted(set(alarms_per_year or (1.0,)))),
+            learn_s=3600.0 * learned,
             settings=tuple(_setting(each) for each in setting or ()),
             meters=_each([meters], Meters, "--meters")[0],
             load_error=LoadError(load_error_kw, load_error_kvar),

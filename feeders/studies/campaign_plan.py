@@ -27,10 +27,14 @@ if TYPE_CHECKING:
     from feeders.load import Site
     from feeders.studies.detectable import Detectable
 
-__all__ = ["CLEAN", "KINDS", "Case", "Design", "Kind", "Moment", "Place", "Plan", "promised"]
+__all__ = ["CLEAN", "KINDS", "LEARN_STEP_S", "Case", "Design", "Kind", "Moment", "Place", "Plan", "promised"]
 
 CLEAN: Final = "clean"
 """Name of the kind of case in which nobody lies."""
+
+
+LEARN_STEP_S: Final = 10.0
+"""Interval of the readings from which meters' fixed errors are learned, s."""
 
 
 class Place(StrEnum):
@@ -165,6 +169,9 @@ class Plan:
         Name of an estimator family.
     alarms_per_year
         False alarms that the estimator may raise in a year; every case is watched once for each.
+    learn_s
+        How long the estimator has learned its meters' fixed errors before each scene, from honest readings
+        every LEARN_STEP_S; 0: not at all.
     settings
         Other settings of the feeder's `[monitor]`, by name.
     meters, load_error, variation, report_q
@@ -186,6 +193,7 @@ class Plan:
     seasons: tuple[Season, ...] = tuple(Season)
     estimator: str = "sequential"
     alarms_per_year: tuple[float, ...] = (1.0,)
+    learn_s: float = 0.0
     settings: tuple[tuple[str, float], ...] = ()
     meters: Meters = Meters.SITE
     load_error: LoadError = field(default_factory=lambda: LoadError(0.1, 0.05))
@@ -205,6 +213,7 @@ class Plan:
             ("kinds of lies need different names", len({k.name for k in self.kinds}) < len(self.kinds)),
             ("a false-alarm rate is missing or not positive", min(self.alarms_per_year, default=0.0) <= 0.0),
             ("step_s and lying_s must be positive", min(self.step_s, self.lying_s) <= 0.0),
+            (f"learn_s must be 0 or from {LEARN_STEP_S:g} s on", 0.0 != self.learn_s < LEARN_STEP_S),
             (
                 "lies must begin after the first frame and before the last",
                 not self.step_s <= self.onset_s[0] <= self.onset_s[1] <= self.duration_s - self.step_s,
@@ -324,6 +333,8 @@ class Plan:
                 raise ValueError(f"{name!r} is no setting of an estimator")
         # A whole number stays one, whatever the setting was written as.
         chosen = {name: type(known[name])(value) for name, value in self.settings}
+        if self.learn_s:
+            chosen["commission_s"] = self.learn_s
         monitor = replace(meta.monitor, estimator=self.estimator, alarms_per_year=alarms_per_year, **chosen)
         return from_tables(replace(stated.tables, meta=replace(meta, monitor=monitor)))
 

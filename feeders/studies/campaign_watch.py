@@ -16,11 +16,12 @@ from feeders.campaign import NoSuchAttack
 from feeders.estimators import Watcher, design
 from feeders.scenario import Scenario
 from feeders.studies.campaign_lies import attacks
-from feeders.studies.campaign_plan import CLEAN, Case, Plan
-from feeders.trials import Truth, frames
+from feeders.studies.campaign_plan import CLEAN, LEARN_STEP_S, Case, Plan
+from feeders.trials import Trial, Truth, frames
 from gridsec.arrays import Bools, Floats
 from gridsec.attack import Attack, Coordinated, Reports, apply_all, manipulated, reach
 from gridsec.online import Decision, Frame
+from gridsec.sequential import Commission
 
 if TYPE_CHECKING:
     from feeders.load import Site
@@ -44,12 +45,15 @@ class Prepared:
         The feeder whose files say how wrong loads and meters are.
     watchers
         By false-alarm rate.
+    learners
+        The same, with the interval of the readings that they learn from; none where nothing is learned.
     """
 
     site: Site
     plan: Plan
     stated: Site
     watchers: dict[float, Watcher]
+    learners: dict[float, Watcher]
 
 
 def prepare(site: Site, plan: Plan) -> Prepared:
@@ -65,10 +69,16 @@ def prepare(site: Site, plan: Plan) -> Prepared:
     NotObservable, DesignInfeasible, EstimatorUnusable, FeederInvalid, ValueError
         If the estimator cannot watch this feeder with these settings.
     """
-    stated = plan.trial(site, plan.moment(0)).stated
-    return Prepared(
-        site, plan, stated, {rate: design(plan.watched(stated, rate)) for rate in plan.alarms_per_year}
-    )
+    scene = plan.trial(site, plan.moment(0))
+    watchers = _designed(plan, scene.stated)
+    learners = _designed(plan, replace(scene, step_s=LEARN_STEP_S).stated) if plan.learn_s else {}
+    if any(watcher.learner is None for watcher in learners.values()):
+        raise ValueError(f"{plan.estimator} does not learn its meters' fixed errors")
+    return Prepared(site, plan, scene.stated, watchers, learners)
+
+
+def _designed(plan: Plan, stated: Site) -> dict[float, Watcher]:
+    return {rate: design(plan.watched(stated, rate)) for rate in plan.alarms_per_year}
 
 
 def watch(given: Prepared, scene: int) -> list[dict[str, Any]]:
@@ -91,9 +101,12 @@ def watch(given: Prepared, scene: int) -> list[dict[str, Any]]:
     honest = replace(trial.scenario, season=moment.season)
     played = _Played.of(list(frames(trial, honest)))
     onsets = {round(case.onset_s / plan.step_s) for case in cases[1:]}
+    known = _learned(given, trial, honest) if plan.learn_s else {}
     clean, states = {}, {}
     for rate, watcher in given.watchers.items():
-        clean[rate], states[rate] = _clean(watcher, honest.start, played, onsets)
+        clean[rate], states[rate] = _clean(
+            watcher, watcher.init(honest.start, known.get(rate)), played, onsets
+        )
     head = {
         "scene": scene,
         "season": str(moment.season),
@@ -146,9 +159,32 @@ class _Seen:
     v2: Floats  # (T, N)
 
 
-def _clean(watcher: Watcher, t: float, played: _Played, onsets: set[int]) -> tuple[_Seen, dict[int, Any]]:
+def _learned(given: Prepared, trial: Trial, honest: Scenario) -> dict[float, Commission]:
+    """What estimators learn of their meters in the honest time before a scene."""
+    learn_s = given.plan.learn_s
+    # One frame more than what is asked for, and quasi-static inverters: they settle between two readings.
+    before = replace(
+        honest,
+        start=honest.start - learn_s - LEARN_STEP_S,
+        profile_s=honest.profile_s - learn_s - LEARN_STEP_S,
+        duration_s=learn_s + LEARN_STEP_S,
+        dt_s=LEARN_STEP_S,
+        substep_s=LEARN_STEP_S,
+    )
+    states = {rate: watcher.init(before.start) for rate, watcher in given.learners.items()}
+    for frame, _ in frames(replace(trial, step_s=LEARN_STEP_S), before):
+        for rate, watcher in given.learners.items():
+            states[rate], _, _ = watcher.step(states[rate], frame)
+    found = {}
+    for rate, watcher in given.learners.items():
+        if watcher.learner is not None:
+            found[rate] = watcher.learner.commission(states[rate])
+    return found
+
+
+def _clean(watcher: Watcher, state: Any, played: _Played, onsets: set[int]) -> tuple[_Seen, dict[int, Any]]:
     """Watch the scene without lies, and keep the states before some frames."""
-    states, parts, state, begin = {}, [], watcher.init(t), 0
+    states, parts, begin = {}, [], 0
     for end in sorted({*onsets, len(played.frames)}):
         seen, state = _step(watcher, state, played.frames[begin:end])
         states[end], begin = state, end

@@ -173,6 +173,7 @@ def test_what_cannot_be_played_says_why() -> None:
         ({"estimator": "oracle"}, "does not exist"),
         ({"alarms_per_year": ()}, "false-alarm rate"),
         ({"kinds": ()}, "no kinds"),
+        ({"learn_s": 5.0}, "0 or from 10 s on"),
     ],
 )
 def test_wrong_plans_are_told(wrong: dict[str, object], why: str) -> None:
@@ -185,6 +186,21 @@ def test_settings_reach_the_estimator() -> None:
     assert design(plan.watched(plan.trial(SITE, plan.moment(0)).stated, 1.0)).max_attacked == 2
     with pytest.raises(ValueError, match="'colour' is no setting"):
         campaign(SITE, replace(PLAN, settings=(("colour", 1.0),)))
+
+
+def test_lies_inside_the_class_are_named_once_meters_are_learned() -> None:
+    """A meter of class 0.5 that changes by 0.7 % may only be told when its own fixed error is known."""
+    kinds = (Kind("bias", Trick.BIAS, (0.7,)),)
+    plan = replace(
+        PLAN, scenes=2, together=3, kinds=kinds, lying_s=12.0, duration_s=23.0, alarms_per_year=(1.0,)
+    )
+    unknown = campaign(SITE, plan).liars
+    learned = campaign(SITE, replace(plan, learn_s=3600.0)).liars
+    assert learned[["scenario", "who", "lie_volt"]].equals(unknown[["scenario", "who", "lie_volt"]])
+    assert np.isinf(unknown["delay_s"]).any()
+    assert np.isfinite(learned["delay_s"]).all()
+    with pytest.raises(ValueError, match="exact-bank does not learn"):
+        campaign(SITE, replace(plan, learn_s=3600.0, estimator="exact-bank"))
 
 
 # --------------------------------------------------------------------------------------------- promises
