@@ -31,6 +31,9 @@ MOST_BUSES: Final = 150
 IDLE: Final = 0.25
 """Share of its peak that a customer without meter is taken to draw."""
 
+CLOUDS: Final = 0.2
+"""Relative error of a roof's generation that is taken from the other roofs."""
+
 STEEP_PU: Final = 0.003
 """Half of the voltage over which the slope of an inverter's curve is taken, pu."""
 
@@ -174,7 +177,7 @@ class Powers:
 
     Attributes
     ----------
-    p, q, load, steep : (T, N)
+    p, q, load, roof, steep : (T, N)
         See `gridsec.studies.calibrate_model.Series`.
     metered_q : (N,)
         Whose reactive power is metered.
@@ -185,6 +188,7 @@ class Powers:
     p: Floats
     q: Floats
     load: Floats
+    roof: Floats
     steep: Floats
     metered_q: Bools
     missing: Bools
@@ -221,14 +225,13 @@ def powers(site: Site | ThreePhaseSite, given: Frames) -> Powers:
             q_read[:, customer] = np.interp(given.t, given.t[there], given.q_kvar[there, j]) / base
         there = np.isfinite(given.v_volt[:, j])
         if there.any():
-            v[:, customer] = (
-                np.interp(given.t, given.t[there], given.v_volt[there, j]) / site.feeder.base_volt
-            )
+            v[:, customer] = np.interp(given.t, given.t[there], given.v_volt[there, j])
     v /= site.feeder.base_volt
     low = np.maximum(draws, 0.0)
-    high = np.maximum(low, np.minimum(draws + model.pv_peak, model.load_peak))
-    load = np.where(model.pv_peak > 0.0, 0.5 * (low + high), low)
-    q = 0.5 * (model.tan_min + model.tan_max) * load
+    tan = 0.5 * (model.tan_min + model.tan_max)
+    roof = model.pv_peak * _sun(draws, model.pv_peak)[:, None]
+    load = np.clip(draws + roof, low, np.maximum(low, model.load_peak))
+    q = tan * load
     steep = np.zeros((T, N))
     own = site.droop.customer
     if own.size:
@@ -240,10 +243,18 @@ def powers(site: Site | ThreePhaseSite, given: Frames) -> Powers:
         p=-draws,
         q=-np.where(metered_q, q_read, q),
         load=np.where(metered_q, 0.0, load),
+        roof=np.where(metered_q, 0.0, tan * roof),
         steep=np.where(metered_q, 0.0, steep),
         metered_q=metered_q,
         missing=missing,
     )
+
+
+def _sun(draws: Floats, pv_peak: Floats) -> Floats:
+    """Generation relative to its peak: the largest that any roof feeds in beyond its load, (T,)."""
+    roofs = pv_peak > 0.0
+    feeds = -draws[:, roofs] / pv_peak[roofs]
+    return np.asarray(np.clip(feeds.max(axis=1, initial=0.0), 0.0, 1.0))
 
 
 def series(net: Network, given: Frames, drawn: Powers, excluded: Collection[str]) -> Series:
@@ -273,6 +284,7 @@ def series(net: Network, given: Frames, drawn: Powers, excluded: Collection[str]
         p=drawn.p,
         q=drawn.q,
         load=drawn.load,
+        roof=drawn.roof,
         steep=drawn.steep,
         places=U[:, phase, bus],
         drop=U[:, :, net.feeder.parent] - U[:, :, 1:],
@@ -321,6 +333,7 @@ def doubts(net: Network, drawn: Powers, tolerance: float, free: Collection[int],
         p_gain=np.where(without, 0.0, model.p_fraction / root),
         q_gain=np.where(unmetered, 0.0, model.q_fraction / root),
         tan=np.where(unmetered, half / root, 0.0),
+        roof=np.where(unmetered & (model.pv_peak > 0.0), CLOUDS, 0.0),
         p_level=np.where(without, IDLE * model.load_peak, 0.0),
         q_level=np.where(unmetered, model.q_floor / root, 0.0),
         length=length,
@@ -341,11 +354,7 @@ def field(net: Network, drawn: Powers) -> Field:
     A, B = net.places.at_meters
     metered = np.zeros(model.load_peak.size)
     metered[site.meters] = 1.0
-    # Behind a roof, net readings leave open how much of them the load is.
-    behind = np.where(
-        drawn.metered_q | (model.pv_peak == 0.0), 0.0, 0.5 * np.minimum(model.pv_peak, model.load_peak)
-    )
-    hidden_q = (0.5 * (model.tan_min + model.tan_max) * behind) ** 2 / 3.0
+    hidden_q = CLOUDS**2 * np.mean(drawn.roof**2, axis=0)
     hidden_p = np.where(metered > 0.0, 0.0, (IDLE * model.load_peak) ** 2)
     return Field(
         active=(A * metered) @ A.T,

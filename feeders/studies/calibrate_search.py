@@ -2,7 +2,7 @@
 
 References
 ----------
-docs/theory-studies.md, section 8.
+docs/theory-studies.md, Calibration.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ dependence.
 References
 ----------
 .. [1] V. Vovk, R. Wang, "E-values: calibration, combination and applications", Annals of Statistics 2021.
-docs/theory-studies.md, section 8.
+docs/theory-studies.md, Calibration.
 """
 
 from __future__ import annotations

@@ -11,12 +11,13 @@ order
     -(drop of U along branch l)     per unit of its length, at the places behind it
     A_ji p_i, B_ji q_i              errors of the gain of power registers
     -B_ji load_i                    error of tan(phi) where q is not metered; -B_ji: what q is at p = 0
+    -B_ji roof_i                    error of the generation, where only load less generation is metered
 
 and for customers at other places, exactly in the linear flow, ``W'(U + dU) - W U`` with W, W' the weights.
 
 References
 ----------
-docs/theory-studies.md, section 8.
+docs/theory-studies.md, Calibration.
 """
 
 from __future__ import annotations
@@ -104,6 +105,8 @@ class Series:
         Net injections, pu.
     load : (T, N)
         What draws reactive power by its power factor, pu.
+    roof : (T, N)
+        Generation times tan(phi) of the load, where only their difference is metered, pu.
     steep : (T, N)
         Derivative of the inverter's q in the squared voltage read; 0 without one, or with q metered.
     places : (T, Q)
@@ -118,6 +121,7 @@ class Series:
     p: Floats
     q: Floats
     load: Floats
+    roof: Floats
     steep: Floats
     places: Floats
     drop: Floats
@@ -140,6 +144,8 @@ class Doubts:
         Relative error of the power registers, 1.
     tan : (N,)
         Error of tan(phi) where q is not metered, 1.
+    roof : (N,)
+        Relative error of the generation that the load is found by, 1.
     p_level, q_level : (N,)
         Constant error of the powers, pu.
     length : (L,)
@@ -150,6 +156,7 @@ class Doubts:
     p_gain: Floats
     q_gain: Floats
     tan: Floats
+    roof: Floats
     p_level: Floats
     q_level: Floats
     length: Floats
@@ -203,6 +210,7 @@ def regressors(places: Places, series: Series, doubts: Doubts) -> Regressors:
         "p_gain": spatial(A, series.p),
         "q_gain": spatial(B, series.q),
         "tan": spatial(B, -series.load),
+        "roof": spatial(B, -series.roof),
         "p_level": spatial(A, np.ones_like(series.p)),
         "q_level": spatial(B, np.ones_like(series.p)),
         "length": lengthened(places, series),

@@ -7,7 +7,7 @@ meters' noise whitens readings and regressors alike, readings that are missing l
 
 References
 ----------
-docs/theory-studies.md, section 8.
+docs/theory-studies.md, Calibration.
 """
 
 from __future__ import annotations
