@@ -22,7 +22,7 @@ from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]  # h
 
 from gridsec.errors import GridsecError
 
-__all__ = ["ClusterUnusable", "Dask", "Here", "Processes", "Runner", "WorkerLost", "versions"]
+__all__ = ["ClusterUnusable", "Dask", "Here", "Processes", "Runner", "WorkerLost", "agree", "versions"]
 
 Work = Callable[[int], Any]
 Made = Generator[tuple[int, Any], None, None]
@@ -178,26 +178,58 @@ class Dask:
             raise ClusterUnusable(f"no Dask scheduler answers at {self.address}: {error}") from error
         with client:
             self._check(client)
-            futures = {client.submit(_one, work, piece, pure=False): piece for piece in pieces}
+            waiting, running = deque(pieces), dict[Any, int]()
+            done = dask.as_completed(loop=client.loop)
+
+            def hand_out() -> None:
+                # Each piece brings the feeder along: the scheduler holds a few for each worker only, and one
+                # at least, which waits where all workers have gone.
+                while waiting and len(running) < max(4 * sum(client.nthreads().values()), 1):
+                    future = client.submit(_one, work, waiting[0], pure=False)
+                    running[future] = waiting.popleft()
+                    done.add(future)
+
             try:
-                for future in dask.as_completed(list(futures), loop=client.loop):
-                    yield futures.pop(future), future.result()
+                hand_out()
+                for future in done:
+                    theirs, made = future.result()
+                    agree("a worker", theirs)
+                    yield running.pop(future), made
+                    hand_out()
             except dask.KilledWorker as error:
                 raise WorkerLost(str(error)) from error
             finally:
-                client.cancel(list(futures))
+                client.cancel(list(running))
 
     def _check(self, client: Any) -> None:
+        """Whether there are workers, who compute as this process would; who comes later is asked then."""
         try:
             client.wait_for_workers(1, timeout=self.timeout_s)
         except TimeoutError as error:
             raise ClusterUnusable(f"the Dask cluster at {self.address} has no workers") from error
-        mine = versions()
-        for worker, theirs in client.run(versions).items():
-            if theirs != mine:
-                raise ClusterUnusable(f"Dask worker {worker} has {theirs}; here is {mine}")
+        for worker, theirs in client.run(versions, on_error="return").items():
+            agree(worker, theirs)
 
 
-def _one(work: Work, piece: int) -> Any:
+def agree(worker: str, theirs: Any) -> None:
+    """Refuse a worker with other versions, or without any.
+
+    Parameters
+    ----------
+    worker, theirs
+        Its name, and its versions or what went wrong when it was asked.
+
+    Raises
+    ------
+    ClusterUnusable
+        If they are not those of this process.
+    """
+    mine = versions()
+    if theirs != mine:
+        raise ClusterUnusable(f"the versions of Dask worker {worker} are {theirs!r}, not {mine!r}")
+
+
+def _one(work: Work, piece: int) -> tuple[dict[str, str], Any]:
+    """Work on a piece in a worker that is not ours."""
     threadpool_limits(limits=1)
-    return work(piece)
+    return versions(), work(piece)

@@ -52,6 +52,7 @@ def test_wrong_arguments_are_told(
     for wrong, why in (
         (("--kind", "charm:3"), "'charm': expected one of bias, together"),
         (("--kind", "bias:x"), "expected something like bias:1,3"),
+        (("--kind", "inverter"), "expected something like bias:1,3"),
         (("--place", "nowhere"), "expected one of random, street, sensitive, colluding"),
         (("--season", "carnival"), "expected one of winter, spring, summer, autumn"),
         (("--estimator", "oracle"), "estimator 'oracle' does not exist"),

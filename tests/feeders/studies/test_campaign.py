@@ -25,7 +25,15 @@ from feeders.studies.campaign import Campaign, campaign
 from feeders.studies.campaign_lies import attacks, liars
 from feeders.studies.campaign_plan import CLEAN, Case, Kind, Place, Plan, promised
 from feeders.studies.campaign_promises import rehearse_everywhere
-from feeders.studies.campaign_run import ClusterUnusable, Dask, Here, Processes, WorkerLost
+from feeders.studies.campaign_run import (
+    ClusterUnusable,
+    Dask,
+    Here,
+    Processes,
+    WorkerLost,
+    agree,
+    versions,
+)
 from feeders.studies.campaign_tables import false_names, grouped, scenarios
 from feeders.studies.campaign_watch import risings
 from feeders.studies.detectable import detectable
@@ -339,6 +347,13 @@ def test_no_cluster_is_told() -> None:
     pytest.importorskip("distributed")
     with pytest.raises(ClusterUnusable, match="no Dask scheduler answers at tcp"):
         list(Dask("tcp://127.0.0.1:1", timeout_s=0.2).run(abs, [0]))
+
+
+@pytest.mark.parametrize("theirs", [versions() | {"numpy": "1.0"}, ModuleNotFoundError("no gridsec")])
+def test_a_worker_that_computes_otherwise_is_refused(theirs: object) -> None:
+    agree("tcp://a:1", versions())
+    with pytest.raises(ClusterUnusable, match="tcp://a:1 are .*(1.0|no gridsec)"):
+        agree("tcp://a:1", theirs)
 
 
 # ----------------------------------------------------------------------------------------- interruptions
