@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Final
 
 from feeders.report.book import Report
 from feeders.report.sections import Outcome, Result
+from feeders.studies.journal import OtherStudy
 from gridsec.errors import GridsecError
 from service.tables import write_tables
 
@@ -201,10 +202,19 @@ def outcome(
     problem = ""
     with bar(study.what) as tell:
         try:
-            found = study.run(site, asked, journal, tell)
+            found = _run(study, site, asked, journal, tell)
         except (GridsecError, ValueError) as error:
             problem = str(error)
     return Outcome(name, found, problem, shlex.join(words), time.perf_counter() - start, resumed)
+
+
+def _run(study: Study, site: Site, asked: Asked, journal: Path, tell: Progress) -> Result:
+    """Go on from a journal; one that is another study's, of an earlier program, is laid aside."""
+    try:
+        return study.run(site, asked, journal, tell)
+    except OtherStudy:
+        journal.replace(journal.with_suffix(".other"))
+        return study.run(site, asked, journal, tell)
 
 
 def _key(site: Site, words: list[str]) -> str:

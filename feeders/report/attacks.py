@@ -22,6 +22,17 @@ if TYPE_CHECKING:
 
 __all__ = ["campaign"]
 
+# What a page has room for; the files have all.
+_BY = {"by_kind": "kind", "by_size": "size", "by_place": "place", "by_liars": "liars"}
+_SHOWN = (
+    *("scenarios", "exact", "named", "named_low", "named_high", "false", "delay_median_s"),
+    *("error_liars_worst", "error_others_worst", "undecided"),
+)
+_SCENARIOS = (
+    *("scenario", "kind", "size", "liars", "named", "missed", "falsely_named", "delay_s"),
+    *("undecided_s", "clean_lying_s", "error_liars", "error_others", "reason"),
+)
+
 
 def campaign(_: Site, found: Campaign) -> Section:
     """How the monitor behaved in simulated attacks.
@@ -63,6 +74,8 @@ def campaign(_: Site, found: Campaign) -> Section:
         answers={Question.MONITOR: _behaved(found, rate)},
         figures=figures,
         tables=found.tables,
+        shown={name: (by, *_SHOWN) if by == "kind" else ("kind", by, *_SHOWN) for name, by in _BY.items()}
+        | {"scenarios": _SCENARIOS},
         columns={
             "exact": "share of scenarios in which all liars and nobody else were named",
             "named": "share of the liars that were named",

@@ -166,7 +166,7 @@ def _glyph(spot: Spot, x: float, y: float, size: float) -> list[Mark]:
             shield = tuple((x + r * a, y + r * b) for a, b in outline)
             marks = [Area(shield, "shield", spot.tip), Line(tick, "tick")]
         case Shape.ALARM:
-            marks = [Area(regular(x, y, 1.4 * size, 4), "alarm", spot.tip)]
+            marks = [Area(regular(x, y, 1.3 * size, 4), "alarm", spot.tip)]
         case Shape.SUN:
             marks = [Disc(x, y, 1.25 * size, "plain", spot.tip), Disc(x, y, 0.72 * size, "solid", spot.tip)]
         case Shape.OPEN:

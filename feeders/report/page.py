@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 
 __all__ = ["About", "Chapter", "page"]
 
+MOST_COLUMNS: Final = 13
+"""It shows so many columns at most, and more than FEW_COLUMNS in small print."""
+FEW_COLUMNS: Final = 8
 OPEN_ROWS: Final = 14
 """Tables up to this many rows are open."""
 MOST_ROWS: Final = 500
@@ -191,7 +194,7 @@ def _feeder(facts: Mapping[str, str], chart: Figure) -> Markup:
     told = [el("div", el("dt", name), el("dd", value)) for name, value in facts.items()]
     return el(
         "section",
-        el("h2", "The feeder"),
+        el("div", el("h2", "The feeder"), class_="head"),
         el("dl", told, class_="facts"),
         _figure(chart),
         class_="card",
@@ -201,29 +204,28 @@ def _feeder(facts: Mapping[str, str], chart: Figure) -> Markup:
 
 def _chapter(chapter: Chapter, folder: str) -> Markup:
     outcome, told = chapter.outcome, chapter.section
-    several = len(told.answers) > 1
+    alone = len(told.answers) == 1
     answers = [
         join(
             [
-                el(
-                    "div",
-                    el("span", question.value if several else ""),
-                    _standing(finding),
-                    class_="question",
-                ),
+                None if alone else el("div", question.value, _standing(finding), class_="question"),
                 el("div", _sentences(finding), class_="answer"),
             ]
         )
         for question, finding in told.answers.items()
     ]
+    pill = [_standing(finding) for finding in told.answers.values()] if alone else None
     meanings = [join([el("dt", name), el("dd", text)]) for name, text in told.columns.items()]
     return el(
         "section",
-        el("h2", told.title),
+        el("div", el("h2", told.title), pill, class_="head"),
         answers,
         [_figure(figure) for figure in told.figures],
         el("h3", "Numbers") if told.tables else None,
-        [_table(outcome.study, name, table, folder) for name, table in told.tables.items()],
+        [
+            _table(outcome.study, name, table, folder, told.shown.get(name, ()))
+            for name, table in told.tables.items()
+        ],
         el("dl", meanings, class_="columns") if meanings else None,
         el("h3", "What was assumed") if told.assumptions else None,
         el("ul", [el("li", each) for each in told.assumptions], class_="plain") if told.assumptions else None,
@@ -250,9 +252,10 @@ def _figure(figure: Figure) -> Markup:
     return el("figure", caption, drawings, id=figure.name)
 
 
-def _table(study: str, name: str, table: pd.DataFrame, folder: str) -> Markup:
-    """A table; long ones are closed, and what is too long for a page stays in its file."""
-    kept = [column for column in table.columns if not (table[column].map(_silent)).all() or table.empty]
+def _table(study: str, name: str, table: pd.DataFrame, folder: str, chosen: Sequence[str]) -> Markup:
+    """A table; long ones are closed, and what is too long or too wide for a page stays in its file."""
+    said = [column for column in table.columns if table.empty or not table[column].map(_silent).all()]
+    kept = [column for column in chosen or said if column in said][:MOST_COLUMNS]
     shown = table[kept].head(MOST_ROWS)
     numeric = {column: _numeric(shown[column]) for column in kept}
     head = [
@@ -265,12 +268,15 @@ def _table(study: str, name: str, table: pd.DataFrame, folder: str) -> Markup:
         for column in kept
     ]
     body = [el("tr", [_td(cell) for cell in row]) for row in shown.itertuples(index=False, name=None)]
-    grid = el(
-        "div", el("table", el("thead", el("tr", head)), el("tbody", body)), class_="scroll", tabindex="0"
-    )
+    crowded = "wide" if len(kept) > FEW_COLUMNS else None
+    crowded = "wide" if len(kept) > FEW_COLUMNS else None
+    rows = el("table", el("thead", el("tr", head)), el("tbody", body), class_=crowded)
+    grid = el("div", rows, class_="scroll", tabindex="0")
     size = f"{name.replace('_', ' ')}: {len(table)} row{'s' * (len(table) != 1)}"
     if len(table) > MOST_ROWS:
         size += f", the first {MOST_ROWS} shown"
+    if len(kept) < len(said):
+        size += f", {len(kept)} of {len(said)} columns"
     where = f"{folder}/tables/{study}-{name}.csv" if folder else ""
     note = el("span", f" · {where}", class_="quiet") if where else None
     return el("details", el("summary", size, note), grid, open=0 < len(table) <= OPEN_ROWS)
@@ -323,7 +329,7 @@ def _made(about: About, chapters: Sequence[Chapter]) -> Markup:
     )
     return el(
         "section",
-        el("h2", "How this was made"),
+        el("div", el("h2", "How this was made"), class_="head"),
         el("h3", "The whole report again"),
         el("pre", about.command),
         el("h3", "Versions"),

@@ -43,6 +43,8 @@ class Section:
         Its figures; their names begin with the study's.
     tables
         Its tables by name.
+    shown
+        Columns of a table that the page shows, where it is not to be the first ones; files have all.
     columns
         What columns of the tables mean, in the order in which that is told.
     assumptions
@@ -53,5 +55,6 @@ class Section:
     answers: Mapping[Question, Finding]
     figures: tuple[Figure, ...] = ()
     tables: Mapping[str, pd.DataFrame] = field(default_factory=dict)
+    shown: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     columns: Mapping[str, str] = field(default_factory=dict)
     assumptions: tuple[str, ...] = ()

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from feeders.report import attacks, invisible, meters, records
 from feeders.report.section import Question, Section
-from feeders.report.words import Finding, Standing, Value, listed, plural
+from feeders.report.words import Finding, Standing, Value, plural
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -81,6 +81,17 @@ ANSWERS: Final[dict[str, tuple[Question, ...]]] = {
 """What a study answers: asked although it failed, or was not run."""
 
 
+TITLES: Final = {
+    "redundancy": "Who can lie without ever being noticed",
+    "protect": "Which meters to protect",
+    "detectable": "How large a lie must be",
+    "droop": "The inverters",
+    "campaign": "Simulated attacks",
+    "calibrate": "What the readings say about the files",
+}
+"""Headings of sections that could not be made."""
+
+
 def section(site: Site, outcome: Outcome) -> Section:
     """The section of a study, whatever became of it.
 
@@ -117,4 +128,4 @@ def _generic(study: str) -> Callable[[Site, Result], Section]:
 
 
 def _title(study: str) -> str:
-    return f"Study: {listed([study])}"
+    return TITLES.get(study, f"Study: {study}")

@@ -81,12 +81,8 @@ class Protect:
     @property
     def tables(self) -> dict[str, pd.DataFrame]:
         """All tables by name; `summary` is one row: what was asked, how many, what that does."""
-        asked = {
-            "goal": str(self.goal),
-            "max_attacked": self.max_attacked,
-            "attack": str(self.attack),
-            "lie_volt": self.lie_volt,
-        }
+        asked = {"goal": str(self.goal), "max_attacked": self.max_attacked}
+        asked |= {"lie_volt": self.lie_volt} if self.goal is Goal.BOUND else {"attack": str(self.attack)}
         found = {
             "protected": len(self.meters),
             "least": self.least,

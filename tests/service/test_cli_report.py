@@ -95,6 +95,19 @@ def test_an_interrupted_report_goes_on(
     assert journal.read_bytes().splitlines() == [line.strip() for line in lines]
 
 
+def test_a_journal_of_something_else_is_laid_aside(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = tmp_path / "report.html"
+    words = ("cigre-lv", "--out", str(page), "--studies", "protect")
+    assert run(monkeypatch, capsys, *words)[0] == 0
+    (journal,) = (tmp_path / "report-files" / "journals").iterdir()
+    journal.write_text('{"study": "another"}\n', encoding="utf-8")
+    assert run(monkeypatch, capsys, *words)[0] == 0
+    assert journal.with_suffix(".other").read_text(encoding="utf-8") == '{"study": "another"}\n'
+    assert "another" not in journal.read_text(encoding="utf-8")
+
+
 def test_what_a_study_cannot_answer_is_in_the_report(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
