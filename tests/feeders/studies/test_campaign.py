@@ -352,7 +352,7 @@ def test_no_cluster_is_told() -> None:
 @pytest.mark.parametrize("theirs", [versions() | {"numpy": "1.0"}, ModuleNotFoundError("no gridsec")])
 def test_a_worker_that_computes_otherwise_is_refused(theirs: object) -> None:
     agree("tcp://a:1", versions())
-    with pytest.raises(ClusterUnusable, match="tcp://a:1 are .*(1.0|no gridsec)"):
+    with pytest.raises(ClusterUnusable, match=r"tcp://a:1 are .*(1.0|no gridsec)"):
         agree("tcp://a:1", theirs)
 
 
