@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from feeders.powerflow import PowerFlowDiverged
-from feeders.studies.droop_fleets import KVA_PER_KW, customer_indices, point
+from feeders.studies.droop_fleets import KVA_PER_KW, point
 from feeders.studies.droop_verdict import CLEARLY, Subject, judge
+from feeders.studies.hidden import customer_indices
 from gridsec.arrays import Floats, Ints
 from gridsec.droop import Droop, fleet
 from gridsec.studies.droop_network import Box, currents, sensitivity

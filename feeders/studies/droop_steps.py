@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pandas as pd
@@ -183,7 +183,7 @@ def _told(xs: list[Floats], window: int, still: float) -> Outcome:
     return Outcome.OSCILLATES if late >= DECAYS * before else Outcome.OPEN
 
 
-def step_rows(site: Site, runs: Mapping[str, Run]) -> list[dict[str, object]]:
+def step_rows(site: Site, runs: Mapping[str, Run]) -> list[dict[str, Any]]:
     """Settling time, overshoot and extreme voltages of steps, one row each.
 
     Parameters
@@ -193,9 +193,9 @@ def step_rows(site: Site, runs: Mapping[str, Run]) -> list[dict[str, object]]:
     runs
         By name.
     """
-    rows: list[dict[str, object]] = []
+    rows: list[dict[str, Any]] = []
     for name, run in runs.items():
-        row: dict[str, object] = {"step": name, "outcome": str(run.outcome)}
+        row: dict[str, Any] = {"step": name, "outcome": str(run.outcome)}
         if not len(run.v):
             rows.append(row)
             continue

@@ -8,7 +8,7 @@ docs/theory-studies.md, section on the droop fleet.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any, Final
@@ -28,7 +28,17 @@ from gridsec.studies.droop_stability import Loop, Update, growth, loop, proof, r
 if TYPE_CHECKING:
     from feeders.load import Site
 
-__all__ = ["Judgement", "Subject", "Verdict", "edge", "inverter_rows", "judge", "longest_interval"]
+__all__ = [
+    "Judgement",
+    "Subject",
+    "Verdict",
+    "edge",
+    "inverter_rows",
+    "judge",
+    "longest_interval",
+    "margin",
+    "worst",
+]
 
 KICK: Final = 1e-3
 """Largest deviation from rest from which an unstable fleet is simulated, part of each limit."""
@@ -288,3 +298,39 @@ def inverter_rows(
         }
         for k in order
     ]
+
+
+def margin(subject: Subject, droop: Droop, update: Update, loads: Box) -> float:
+    """Factor on the steepest slopes up to which all curves with the same limits are proven to be stable.
+
+    Parameters
+    ----------
+    subject, droop, update, loads
+        As in `judge`.
+
+    Returns
+    -------
+    float
+        0 if nothing can be said of all that such curves can do.
+    """
+    try:
+        within = reach(subject.net, droop, loads, rounds=0)
+    except DesignInfeasible:
+        return 0.0
+    size = within.region.low.size
+    wide = replace(within.region, low=np.zeros(size), high=np.full(size, np.inf))
+    return proof(loop(droop, replace(within, region=wide), update)).factor
+
+
+def worst(verdicts: Iterable[str]) -> Verdict:
+    """One verdict of several: unstable if one is, stable if all are.
+
+    Parameters
+    ----------
+    verdicts
+        At least one.
+    """
+    known = set(verdicts)
+    if Verdict.UNSTABLE in known:
+        return Verdict.UNSTABLE
+    return Verdict.STABLE if known == {Verdict.STABLE} else Verdict.UNDECIDED

@@ -270,9 +270,9 @@ def _responses(given: Loop) -> list[Complex]:
     alpha = given.update.share(given.tau)
     angles = np.pi * np.linspace(0.0, 1.0, _ANGLES * (1 + given.update.dead))
     if np.all(alpha == alpha[:1]) and alpha.size:
-        # One response for all: only where it reaches furthest to the left decides.
+        # One response for all: where it reaches furthest to the left decides, or where errors weigh most.
         h = alpha[0] * np.exp(-1j * angles * given.update.dead) / (np.exp(1j * angles) - 1.0 + alpha[0])
-        angles = angles[np.argsort(h.real)[:3]]
+        angles = angles[[0, *np.argsort(h.real)[:3], *np.argsort(h.real - np.abs(h) ** 2)[:3]]]
     return [alpha * np.exp(-1j * w * given.update.dead) / (np.exp(1j * w) - 1.0 + alpha) for w in angles]
 
 
@@ -368,7 +368,7 @@ class Proof:
 _MOST: Final = 1e6
 """Factors beyond this are not told apart."""
 
-_BACKOFF: Final = (0.999, 0.99, 0.95)
+_BACKOFF: Final = (0.999, 0.99, 0.95, 0.8)
 """Shares of the factor found at the frequencies that are tried in its proof."""
 
 
