@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from feeders.load import Site, from_tables
+from feeders.load import Site, find, from_tables
 from feeders.load_phases import ThreePhaseSite, three_phase
 from feeders.topology import Edge, tree
 from gridsec import phases as three
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from feeders.schema import FeederTables
     from feeders.studies.calibrate_readings import Frames
 
-__all__ = ["Network", "network"]
+__all__ = ["Network", "network", "site_of"]
 
 MOST_BUSES: Final = 150
 """In larger feeders lines in series without customers between them are one."""
@@ -84,6 +85,23 @@ class Network:
         return bool(all(self.feeder.phases[bus][PHASES.index(phase)] for phase in phases))
 
 
+def site_of(path_or_name: Path | str) -> Site | ThreePhaseSite:
+    """Load a feeder, balanced or of three phases.
+
+    Parameters
+    ----------
+    path_or_name
+        As in `feeders.load.load`, which says what it raises.
+    """
+    return _site(find(path_or_name))
+
+
+def _site(tables: FeederTables) -> Site | ThreePhaseSite:
+    unbalanced = any(line.phases != "abc" for line in tables.lines)
+    unbalanced |= any(row.phases != "abc" for row in tables.customers)
+    return three_phase(tables) if unbalanced else from_tables(tables)
+
+
 def network(tables: FeederTables) -> Network:
     """Prepare a feeder.
 
@@ -97,9 +115,7 @@ def network(tables: FeederTables) -> Network:
     FeederInvalid
         With every problem of the files.
     """
-    unbalanced = any(line.phases != "abc" for line in tables.lines)
-    unbalanced |= any(row.phases != "abc" for row in tables.customers)
-    site: Site | ThreePhaseSite = three_phase(tables) if unbalanced else from_tables(tables)
+    site = _site(tables)
     closed = [k for k, line in enumerate(tables.lines) if line.closed]
     rows = [tables.lines[k] for k in closed]
     edges = [Edge(row.line, row.from_bus, row.to_bus, row.r_ohm == row.x_ohm == 0.0) for row in rows]
