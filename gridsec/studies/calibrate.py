@@ -25,6 +25,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import solve_triangular
+from scipy.special import logsumexp
 
 from gridsec.arrays import Bools, Floats, Ints
 
@@ -156,15 +157,11 @@ def weigh(log_factor: Floats, kind: Ints, risk: float) -> Weighed:
     """
     _, where, count = np.unique(kind, return_inverse=True, return_counts=True)
     log_share = log_factor - np.log(count.size * count[where])
-    top = max(float(log_share.max(initial=0.0)), 0.0)
-    share = np.exp(log_share - top)
-    whole = float(share.sum()) + float(np.exp(-top))
-    order = np.argsort(-share, kind="stable")
-    among = np.cumsum(share[order]) / max(float(share.sum()), np.finfo(np.float64).tiny)
+    total = float(logsumexp(log_share))
+    order = np.argsort(-log_share, kind="stable")
+    among = np.cumsum(np.exp(log_share[order] - total))
     kept = order[: int(np.searchsorted(among, 1.0 - risk)) + 1]
-    with np.errstate(divide="ignore"):
-        total = float(np.log(share.sum()) + top)
-    return Weighed(share / whole, total, kept)
+    return Weighed(np.exp(log_share - np.logaddexp(total, 0.0)), total, kept)
 
 
 def explain(given: Fit, z: Floats, own: Floats, like: float) -> tuple[Floats, Floats, Bools]:
