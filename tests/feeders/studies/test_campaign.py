@@ -326,6 +326,17 @@ def test_a_piece_that_always_kills_its_process_is_given_up() -> None:
         list(Processes(1, retries=1).run(os._exit, [7]))
 
 
+def test_whoever_stops_listening_stops_the_processes() -> None:
+    made = Processes(2).run(time.sleep, [0, 100, 100])
+    assert next(made) == (0, None)
+    begun = time.monotonic()
+    made.close()
+    for child in multiprocessing.active_children():
+        child.join(60.0)
+    assert not multiprocessing.active_children()
+    assert time.monotonic() - begun < 60.0
+
+
 def test_a_dask_cluster_gives_the_same_also_when_a_worker_is_killed(here: Campaign) -> None:
     distributed = pytest.importorskip("distributed")
     killed: list[int] = []
