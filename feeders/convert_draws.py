@@ -14,6 +14,9 @@ from feeders.convert_customers import HOUSEHOLD_KW, droop_preset, reactive, roun
 from feeders.schema import CustomerRow
 from gridsec.arrays import Phasors
 
+NO_POWER: Final = 1e-9
+"""Share of a load's power that is a solver's last digits."""
+
 EVEN: Final = 1e-6
 """Spread of the phases' powers, as a share of the largest, below which a connection is of three phases."""
 
@@ -111,7 +114,7 @@ def _load(row: CustomerRow, kva: complex, number: int, volt: float, changes: lis
         changes.append(
             Change(f"load {row.customer}", "p_kw", "changed", "feeds in; its expected load is taken as 0")
         )
-    if q < 0:
+    if q < -NO_POWER * abs(kva):
         changes.append(
             Change(f"load {row.customer}", "power factor", "approximated", "leading; expected to be 1")
         )

@@ -31,6 +31,9 @@ CONSTANT_POWER: Final = (
     "batchedit load..* model=1 vminpu=0.01 vlowpu=0.005 vmaxpu=10",
     "batchedit generator..* model=1 vminpu=0.01 vmaxpu=10",
 )
+DEAD: Final = 1e-4
+"""Voltage, pu, below which nothing energises a phase: only open lines end there."""
+
 SERIES: Final = {"line", "reactor"}
 COUPLINGS: Final = {"transformer", "autotrans"}
 LOADS: Final = {"load"}
@@ -117,16 +120,20 @@ def read_opendss(path: Path) -> Network:
 
 
 def _read(dss: Any, path: Path) -> Network:
-    dss.Text.Command(f'compile "{path.resolve()}"')
+    dss.Text.Command(f'redirect "{path.resolve()}"')
     if not dss.Basic.NumCircuits():
         raise GridsecError(f"{path}: OpenDSS finds no circuit in it; expected 'new circuit...'")
     problems: list[str] = []
     _run(dss, SOLVER)
-    found = _solved(dss, path)
+    found = _solved(dss)
+    if not found:
+        raise GridsecError(f"{path}: OpenDSS's own power flow does not converge")
+    elements = [_element(dss, name, problems) for name in dss.Circuit.AllElementNames()]
     changes = _voltage_dependence(dss)
     _run(dss, CONSTANT_POWER)
-    volts = _solved(dss, path)
-    elements = [_element(dss, name, problems) for name in dss.Circuit.AllElementNames()]
+    volts = _solved(dss)
+    if volts:
+        elements = [_element(dss, name, problems) for name in dss.Circuit.AllElementNames()]
     nominal = _nominal(dss, problems)
     network = Network(
         tool=f"OpenDSS {version('dss_python_backend')}",
@@ -135,6 +142,7 @@ def _read(dss: Any, path: Path) -> Network:
         volts=volts,
         as_found=found if changes else {},
         xy=_positions(dss),
+        unsolved="with loads of constant power OpenDSS's own power flow does not converge",
     )
     network.of_bus.extend(changes)
     _build_everything(dss, elements)
@@ -150,18 +158,19 @@ def _run(dss: Any, commands: tuple[str, ...]) -> None:
         dss.Text.Command(command)
 
 
-def _solved(dss: Any, path: Path) -> dict[str, Phasors]:
-    """Solve, and return the voltages of all buses, V."""
+def _solved(dss: Any) -> dict[str, Phasors]:
+    """Solve, and return the voltages of all buses, V; none if there is no solution."""
     dss.Solution.Solve()
     if not dss.Solution.Converged():
-        raise GridsecError(f"{path}: OpenDSS's own power flow does not converge")
+        return {}
     volts: dict[str, Phasors] = {}
     for bus in dss.Circuit.AllBusNames():
         dss.Circuit.SetActiveBus(bus)
         parts = np.array(dss.Bus.Voltages()).reshape(-1, 2)
         v = np.full(PHASES, np.nan, dtype=np.complex128)
         for node, (real, imaginary) in zip(dss.Bus.Nodes(), parts, strict=True):
-            if 1 <= node <= PHASES:
+            live = abs(complex(real, imaginary)) > DEAD * 1000.0 * float(dss.Bus.kVBase())
+            if 1 <= node <= PHASES and live:
                 v[node - 1] = complex(real, imaginary)
         volts[bus] = v
     return volts

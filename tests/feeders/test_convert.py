@@ -299,7 +299,7 @@ def test_unknown_sources(tmp_path: Path) -> None:
         (str(tmp_path / "list.json"), "neither a pandapower net"),
         (str(tmp_path / "other.json"), "neither a pandapower net"),
         ("1-LV-rural9--0-sw", "SimBench has no grid"),
-        ("pandapower:create_bus", "no network"),
+        ("pandapower:create_bus", "cannot build"),
     ]:
         with pytest.raises(GridsecError, match=words):
             convert(source, tmp_path / "out")
