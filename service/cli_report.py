@@ -28,7 +28,8 @@ def report(
         Path, typer.Option(help="The page; figures, tables and journals go into a folder beside it.")
     ] = Path("report.html"),
     studies: Annotated[
-        str | None, typer.Option(help="Names of studies, with commas between them. [default: all]")
+        str | None,
+        typer.Option(help="Names of studies, with commas between them. [default: all there is data for]"),
     ] = None,
     max_attacked: Annotated[int, typer.Option(help="M: how many meters lie together at most.", min=1)] = 2,
     goal: Annotated[
@@ -54,6 +55,10 @@ def report(
     workers: Annotated[
         int | None, typer.Option(help="Processes for simulated attacks. [default: all cores]", min=1)
     ] = None,
+    hosting: Annotated[bool, typer.Option("--hosting", help="Look for hosting capacities too.")] = False,
+    readings: Annotated[
+        Path | None, typer.Option(help="A recording (Parquet or CSV) to compare the files with.")
+    ] = None,
     at: Annotated[
         str | None,
         typer.Option(help="Date and time that the report bears, like 2026-11-21T12:00Z. [default: now]"),
@@ -69,7 +74,7 @@ def report(
     from feeders.studies.protect import Goal
     from service.study_report import STUDIES, Asked, outcome, seeds, versions, write
 
-    chosen = _studies(studies, tuple(STUDIES))
+    chosen = _studies(studies, tuple(STUDIES), recorded=readings is not None)
     if goal not in tuple(Goal):
         raise typer.BadParameter(f"{goal!r}: expected one of {', '.join(Goal)}", param_hint="--goal")
     if (goal == Goal.BOUND) != (lie_volt is not None):
@@ -86,6 +91,8 @@ def report(
         scenarios=scenarios,
         seed=seed,
         workers=workers or os.cpu_count() or 1,
+        hosting=hosting,
+        readings=readings,
     )
     site = load(feeder)
     folder = out.with_name(f"{out.stem}-files")
@@ -101,12 +108,16 @@ def report(
         raise typer.Exit(FAILED)
 
 
-def _studies(text: str | None, known: tuple[str, ...]) -> tuple[str, ...]:
-    """Names of studies, each once."""
-    names = [name.strip() for name in (text or ",".join(known)).split(",")]
+def _studies(text: str | None, known: tuple[str, ...], *, recorded: bool) -> tuple[str, ...]:
+    """Names of studies, each once; calibration only where there are readings."""
+    if text is None:
+        return tuple(name for name in known if recorded or name != "calibrate")
+    names = [name.strip() for name in text.split(",")]
     for name in names:
         if name not in known:
             raise typer.BadParameter(f"{name!r}: expected some of {', '.join(known)}", param_hint="--studies")
+    if "calibrate" in names and not recorded:
+        raise typer.BadParameter("calibrate needs --readings", param_hint="--studies")
     return tuple(name for name in known if name in names)
 
 

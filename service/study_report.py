@@ -49,7 +49,11 @@ class Asked:
     unknown, silent, busbar_unknown
         What nobody knows; meters that are missing.
     scenarios, seed, workers
-        Of simulated attacks.
+        Of simulated attacks; the seed is for all that is random.
+    hosting
+        Whether to look for hosting capacities.
+    readings
+        A recording to compare the files with.
     """
 
     feeder: str
@@ -62,6 +66,8 @@ class Asked:
     scenarios: int = 160
     seed: int = 0
     workers: int = 1
+    hosting: bool = False
+    readings: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,6 +126,21 @@ def _redundancy(site: Site, asked: Asked, journal: Path | None, tell: Progress |
     )
 
 
+def _droop(site: Site, asked: Asked, journal: Path | None, tell: Progress | None) -> Result:
+    from feeders.studies.droop import DroopOptions, droop
+
+    options = DroopOptions(hosting=asked.hosting)
+    return droop(site, options, seed=asked.seed, journal=journal, progress=tell)
+
+
+def _calibrate(site: Site, asked: Asked, journal: Path | None, tell: Progress | None) -> Result:
+    from feeders.studies.calibrate import calibrate
+
+    if asked.readings is None:
+        raise ValueError("there are no recorded readings to compare with")
+    return calibrate(site, asked.readings, journal=journal, progress=tell)
+
+
 def _campaign(site: Site, asked: Asked, journal: Path | None, tell: Progress | None) -> Result:
     from feeders.studies.campaign import campaign
     from feeders.studies.campaign_plan import Plan
@@ -158,14 +179,24 @@ def _campaigned(asked: Asked) -> list[str]:
     return ["--scenarios", str(asked.scenarios), "--seed", str(asked.seed), *count, *setting]
 
 
+def _fleet(asked: Asked) -> list[str]:
+    return ["--seed", str(asked.seed)] + ["--hosting"] * asked.hosting
+
+
 STUDIES: Final[dict[str, Study]] = {
     "detectable": Study(_detectable, _liars, "lies of meters, errors of customers"),
     "protect": Study(_protect, _protection, "meters protected, against attacks"),
+    "droop": Study(_droop, _fleet, "fleets, steps and loads", seeded=True),
     "campaign": Study(_campaign, _campaigned, "simulated attacks", seeded=True),
     "redundancy": Study(
         _redundancy,
         lambda asked: [word for name in asked.silent for word in ("--silent", name)] + _known(asked),
         "searching for liars that stay invisible",
+    ),
+    "calibrate": Study(
+        _calibrate,
+        lambda asked: [] if asked.readings is None else ["--readings", str(asked.readings)],
+        "errors that the readings may speak for",
     ),
 }
 """Studies of a report, in the order of its sections."""

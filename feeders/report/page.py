@@ -30,7 +30,8 @@ FEW_COLUMNS: Final = 8
 OPEN_ROWS: Final = 14
 """Tables up to this many rows are open."""
 MOST_ROWS: Final = 500
-"""The page shows so many rows of a table at most; the files beside it have all."""
+HEAD_ROWS: Final = 60
+"""Of tables with more than MOST_ROWS rows the page shows the first ones; the files beside it have all."""
 
 MARK: Final = Markup(
     '<svg viewBox="0 0 24 24" aria-hidden="true"><path d="M3 4v16M3 8h11M3 16h7"/>'
@@ -256,7 +257,7 @@ def _table(study: str, name: str, table: pd.DataFrame, folder: str, chosen: Sequ
     """A table; long ones are closed, and what is too long or too wide for a page stays in its file."""
     said = [column for column in table.columns if table.empty or not table[column].map(_silent).all()]
     kept = [column for column in chosen or said if column in said][:MOST_COLUMNS]
-    shown = table[kept].head(MOST_ROWS)
+    shown = table[kept].head(len(table) if len(table) <= MOST_ROWS else HEAD_ROWS)
     numeric = {column: _numeric(shown[column]) for column in kept}
     head = [
         el(
@@ -274,7 +275,7 @@ def _table(study: str, name: str, table: pd.DataFrame, folder: str, chosen: Sequ
     grid = el("div", rows, class_="scroll", tabindex="0")
     size = f"{name.replace('_', ' ')}: {len(table)} row{'s' * (len(table) != 1)}"
     if len(table) > MOST_ROWS:
-        size += f", the first {MOST_ROWS} shown"
+        size += f", the first {HEAD_ROWS} shown"
     if len(kept) < len(said):
         size += f", {len(kept)} of {len(said)} columns"
     where = f"{folder}/tables/{study}-{name}.csv" if folder else ""

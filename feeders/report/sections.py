@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
-from feeders.report import attacks, invisible, meters, records
+from feeders.report import attacks, fleet, invisible, meters, records
 from feeders.report.section import Question, Section
 from feeders.report.words import Finding, Standing, Value, plural
 
@@ -66,6 +66,7 @@ SECTIONS: Final[dict[str, Callable[[Site, Any], Section]]] = {
     "redundancy": invisible.redundancy,
     "protect": meters.protect,
     "detectable": meters.detectable,
+    "droop": fleet.droop,
     "campaign": attacks.campaign,
     "calibrate": records.calibrate,
 }

@@ -125,6 +125,7 @@ def test_what_a_study_cannot_answer_is_in_the_report(
     ("words", "said"),
     [
         (("--studies", "protect,palmistry"), "'palmistry': expected some of"),
+        (("--studies", "calibrate"), "calibrate needs --readings"),
         (("--goal", "all"), "expected one of identify, notice, bound"),
         (("--goal", "bound"), "goes with --goal bound"),
         (("--lie-volt", "3"), "goes with --goal bound"),
