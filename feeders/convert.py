@@ -1,27 +1,39 @@
 """Conversion of other formats into feeder folders, each with the SOURCE.md that tells where it is from.
 
 Sources: the name of a feeder that comes with the project (builds that folder again), `profiles` (builds
-the profile library again), `pandapower:<network>`, `simbench:<code>`, or the path of a pandapower JSON
-file. pandapower and simbench are the optional extra `convert`.
+the profile library again), `pandapower:<network>`, `simbench:<code>` or the code alone, the path of a
+pandapower JSON file, of an OpenDSS master file (.dss) or of a power-grid-model JSON file, or a feeder's
+folder. pandapower, simbench and OpenDSS are the optional extra `convert`.
 """
 
 from __future__ import annotations
 
+import json
+import logging
 import random
 import re
-from collections.abc import Callable
-from dataclasses import astuple, dataclass
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from feeders import convert_simbench
+from feeders.convert_changes import CHANGES_FILE, Change, changes_csv, sentences
+from feeders.convert_check import SourceCheck, compare
+from feeders.convert_network import Converted, feeder_of
+from feeders.convert_opendss import read_opendss
 from feeders.convert_pandapower import Fleet, from_pandapower
+from feeders.convert_pgm import read_pgm
 from feeders.convert_source import feeder_source, profiles_source
 from feeders.profiles import ENVELOPES, Season
-from feeders.schema import validate, write
+from feeders.schema import read, validate, write
 from gridsec.errors import FeederInvalid, GridsecError
 
 PROFILES = "profiles"
+OPENDSS, PGM = "opendss", "power-grid-model"
+SIMBENCH_CODE = re.compile(r"[0-9]-[A-Za-z0-9.]+(-[A-Za-z0-9.]+)*--[0-9]-(no_)?sw")
+TABLES = ("bus", "line", "load", "ext_grid", "switch", "trafo", "trafo3w", "sgen", "shunt")
 SEED = 1
 KERBER = "(G. Kerber, dissertation, TU Munich 2011)"
 
@@ -36,17 +48,19 @@ class Recipe:
     root: str | None = None
     fleet: Fleet | None = None
     max_attacked: int = 1
-    mend: Callable[[Any], str] | None = None
+    mend: Callable[[Any], Change] | None = None
     """Corrects what is wrong in the source, and says what."""
 
 
-def _reactive_powers(net: Any) -> str:
+def _reactive_powers(net: Any) -> Change:
     """Bring the reactive powers of two phases to the unit of the third."""
     net.asymmetric_load[["q_b_mvar", "q_c_mvar"]] *= 1000.0
-    return (
-        "changed: the reactive powers of phases b and c are a thousandth of what they should be in "
-        "pandapower's file; they are taken 1000 times, which gives everybody the power factor 0.95 that "
-        "phase a has there"
+    return Change(
+        "the loads of phases b and c",
+        "reactive power",
+        "changed",
+        "a thousandth of what it should be in pandapower's file; taken 1000 times, which gives everybody the "
+        "power factor 0.95 that phase a has there",
     )
 
 
@@ -109,6 +123,30 @@ RECIPES: dict[str, Recipe] = {
 }
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Conversion:
+    """What became of a source.
+
+    Attributes
+    ----------
+    changes
+        What was left out, approximated, added or changed; also in conversion.csv beside the feeder.
+    check
+        The feeder's AC power flow beside the source's own; None if there is none.
+    unchecked
+        Why there is none.
+    """
+
+    changes: tuple[Change, ...]
+    check: SourceCheck | None
+    unchecked: str = ""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """The changes in words, as in SOURCE.md."""
+        return sentences(self.changes)
+
+
 def convert(
     source: str,
     out: Path | str,
@@ -116,7 +154,8 @@ def convert(
     root: str | None = None,
     name: str | None = None,
     droop: str | None = None,
-) -> tuple[str, ...]:
+    opened: Sequence[str] = (),
+) -> Conversion:
     """Convert a source into a feeder's folder (or the profile library) with its SOURCE.md.
 
     Parameters
@@ -131,55 +170,146 @@ def convert(
         Name of the feeder; default: the name of the folder.
     droop
         Preset of the source's generators.
-
-    Returns
-    -------
-    notes
-        What was left out, added or changed; also in SOURCE.md.
+    opened
+        Lines to take as open, so that a mesh becomes radial.
 
     Raises
     ------
     FeederInvalid
         If the result is no valid feeder: a loop, an island, ...
     GridsecError
-        If the source does not exist, or the extra `convert` is not installed.
+        If the source does not exist, its own tool cannot read it, or the extra `convert` is not installed.
     """
     folder = Path(out)
     if source == PROFILES:
-        return _convert_profiles(folder)
+        _convert_profiles(folder)
+        return Conversion((), None, "profiles have no power flow")
     recipe = RECIPES.get(source)
-    origin = source if recipe is None else recipe.source
-    net, package = _open(origin)
-    mended = (recipe.mend(net),) if recipe and recipe.mend else ()
     chosen = name or (
         source if recipe is not None else re.sub(r"[^A-Za-z0-9_-]+", "-", folder.resolve().name)
     )
-    tables, others = from_pandapower(
+    converted, package = _converted(source, chosen[:64], root=root, droop=droop, opened=opened)
+    problems = validate(converted.tables)
+    if problems:
+        raise FeederInvalid(
+            [*problems, *(f"while converting: {note}" for note in sentences(converted.changes))]
+        )
+    write(converted.tables, folder)
+    done = _checked(converted, folder)
+    (folder / CHANGES_FILE).write_text(changes_csv(done.changes), encoding="utf-8", newline="\n")
+    target = f"data/feeders/{chosen}" if recipe else str(out)
+    text = feeder_source(
+        converted.tables,
+        about=recipe.about if recipe else "A converted network.",
+        origin=recipe.source if recipe else source,
+        package=package,
+        command=" ".join(["gridsec feeders convert", source, target, *_options(root, name, droop, opened)]),
+        notes=done.notes,
+        check=done.check.sentence if done.check else f"Not checked: {done.unchecked}",
+    )
+    (folder / "SOURCE.md").write_text(text, encoding="utf-8", newline="\n")
+    return done
+
+
+def check_against_source(
+    source: str, folder: Path | str, *, root: str | None = None, opened: Sequence[str] = ()
+) -> SourceCheck:
+    """Compare a folder's AC power flow with that of the source it was made from, at the source's loads.
+
+    Parameters
+    ----------
+    source
+        As `convert` takes it.
+    folder
+        The feeder.
+    root, opened
+        As `convert` was given them.
+
+    Raises
+    ------
+    GridsecError
+        If the source cannot be read, or its own power flow fails.
+    PowerFlowDiverged
+        If the feeder's does.
+    """
+    converted, _ = _converted(source, "check", root=root, opened=opened)
+    if converted.state is None:
+        raise GridsecError(converted.unchecked)
+    return compare(converted.state, read(folder))
+
+
+def _checked(converted: Converted, folder: Path) -> Conversion:
+    """Compare what was written with the source's power flow."""
+    if converted.state is None:
+        return Conversion(converted.changes, None, converted.unchecked)
+    try:
+        return Conversion(converted.changes, compare(converted.state, read(folder)))
+    except GridsecError as error:
+        return Conversion(converted.changes, None, " ".join(str(error).split()))
+
+
+def _converted(
+    source: str, name: str, *, root: str | None, opened: Sequence[str] = (), droop: str | None = None
+) -> tuple[Converted, str]:
+    """Return a source as a feeder, and the package that holds its data or reads its file."""
+    recipe = RECIPES.get(source)
+    origin = recipe.source if recipe else source
+    path = Path(origin)
+    if path.is_dir():
+        return Converted(read(path), (), None, "it was a feeder's folder already"), "gridsec"
+    kind = _kind(path) if path.is_file() else ""
+    if kind == OPENDSS:
+        found = feeder_of(read_opendss(path), name, root=root, opened=opened, droop=droop)
+        return found, "opendssdirect.py"
+    if kind == PGM:
+        return feeder_of(read_pgm(path), name, root=root, opened=opened, droop=droop), "power-grid-model"
+    net, package = _open(origin)
+    mended = (recipe.mend(net),) if recipe and recipe.mend else ()
+    found = from_pandapower(
         net,
-        chosen,
+        name,
         title=recipe.title if recipe else "",
         root=root or (recipe.root if recipe else None),
+        opened=opened,
         droop=droop,
         fleet=recipe.fleet if recipe else None,
         max_attacked=recipe.max_attacked if recipe else 1,
     )
-    notes = mended + others
-    problems = validate(tables)
-    if problems:
-        raise FeederInvalid([*problems, *(f"while converting: {note}" for note in notes)])
-    write(tables, folder)
-    target = f"data/feeders/{chosen}" if recipe else str(out)
-    command = " ".join(["gridsec convert", source, target, *_options(root, name, droop)])
-    about = recipe.about if recipe else "A converted network."
-    text = feeder_source(tables, about=about, origin=origin, package=package, command=command, notes=notes)
-    (folder / "SOURCE.md").write_text(text, encoding="utf-8", newline="\n")
-    return notes
+    return replace(found, changes=(*mended, *found.changes)), package
 
 
-def _options(root: str | None, name: str | None, droop: str | None) -> list[str]:
+def _kind(path: Path) -> str:
+    """Tell from a file's name and content which tool it is for.
+
+    Raises
+    ------
+    GridsecError
+        If it is for none of them.
+    """
+    if path.suffix.lower() == ".dss":
+        return OPENDSS
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise GridsecError(
+            f"{path}: no valid JSON ({error}); expected a pandapower or power-grid-model JSON file, "
+            "or an OpenDSS master file with the ending .dss"
+        ) from error
+    if isinstance(content, dict):
+        if content.get("_class") == "pandapowerNet":
+            return "pandapower"
+        if "data" in content and "version" in content:
+            return PGM
+    raise GridsecError(
+        f"{path}: JSON, but neither a pandapower net (which says _class pandapowerNet) nor input data of "
+        "power-grid-model (which has version, type and data)"
+    )
+
+
+def _options(root: str | None, name: str | None, droop: str | None, opened: Sequence[str]) -> list[str]:
     """Return the options of the command line that were given."""
     given = ((f"--root {root!r}", root), (f"--name {name}", name), (f"--droop {droop}", droop))
-    return [text for text, value in given if value]
+    return [text for text, value in given if value] + [f"--open {line!r}" for line in opened]
 
 
 def _seeded(make: Callable[[], Any]) -> Any:
@@ -192,7 +322,7 @@ def _seeded(make: Callable[[], Any]) -> Any:
         random.setstate(state)
 
 
-def _convert_profiles(folder: Path) -> tuple[str, ...]:
+def _convert_profiles(folder: Path) -> None:
     columns = convert_simbench.year()
     loads = convert_simbench.load_profiles(columns)
     stretches = [(season.file, *astuple(stretch)) for season, stretch in convert_simbench.STRETCHES.items()]
@@ -202,39 +332,58 @@ def _convert_profiles(folder: Path) -> tuple[str, ...]:
         (folder / season.file).write_bytes(convert_simbench.library_csv(columns, season))
     (folder / ENVELOPES).write_text(convert_simbench.envelopes_csv(columns), encoding="ascii", newline="\n")
     (folder / "SOURCE.md").write_text(text, encoding="utf-8", newline="\n")
-    return ()
 
 
 def _open(origin: str) -> tuple[Any, str]:
-    """Return the net of a source and the name of the package that holds its data."""
+    """Return the pandapower net of a source and the name of the package that holds its data."""
     kind, _, rest = origin.partition(":")
     try:
         import pandapower
         import pandapower.networks
     except ImportError as error:
         raise GridsecError("conversion needs the extra 'convert': pip install 'gridsec[convert]'") from error
-    if kind == "simbench" and rest:
-        return convert_simbench.grid(rest), "simbench"
+    if (kind == "simbench" and rest) or SIMBENCH_CODE.fullmatch(origin):
+        return convert_simbench.grid(rest or origin), "simbench"
     if kind == "pandapower" and rest:
-        makers = {rest, f"create_{rest}"}
-        found: list[Callable[[], Any]] = [
-            getattr(pandapower.networks, maker)
-            for maker in makers
-            if callable(getattr(pandapower.networks, maker, None))
-        ]
-        if not found:
-            raise GridsecError(f"pandapower has no network {rest!r}")
-        return _seeded(found[0]), "pandapower"
+        return _named(rest), "pandapower"
     path = Path(origin)
     if not path.is_file():
         raise GridsecError(
             f"{origin!r} is no source; expected profiles, {', '.join(RECIPES)}, pandapower:<network>, "
-            "simbench:<code>, or a pandapower JSON file"
+            "simbench:<code>, a pandapower or power-grid-model JSON file, an OpenDSS master file (.dss), "
+            "or a feeder's folder"
         )
     try:
-        net = pandapower.from_json(str(path))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            net = pandapower.from_json(str(path))
     except Exception as error:  # whatever the foreign reader raises on a foreign file
         raise GridsecError(f"{origin}: pandapower cannot read it: {error}") from error
     if not isinstance(net, pandapower.pandapowerNet):
         raise GridsecError(f"{origin}: holds no pandapower net")
-    return net, "file"
+    missing = [table for table in TABLES if not hasattr(net.get(table), "columns")]
+    if missing:
+        raise FeederInvalid(f"{origin}: the table {table!r} is missing" for table in missing)
+    return net, "pandapower"
+
+
+def _named(name: str) -> Any:
+    """Build one of pandapower's own networks."""
+    from pandapower import networks
+
+    found = [getattr(networks, maker, None) for maker in (name, f"create_{name}")]
+    makers: list[Callable[[], Any]] = [maker for maker in found if callable(maker)]
+    if not makers:
+        raise GridsecError(f"pandapower has no network {name!r}")
+    talk = logging.getLogger("pandapower")
+    level = talk.level
+    talk.setLevel(logging.ERROR)
+    try:
+        net = _seeded(makers[0])
+    except Exception as error:  # whatever a maker that needs arguments, or is none, raises
+        raise GridsecError(f"pandapower cannot build {name!r} by itself: {error}") from error
+    finally:
+        talk.setLevel(level)
+    if not hasattr(net, "bus"):
+        raise GridsecError(f"pandapower's {name!r} is no network")
+    return net

@@ -52,6 +52,8 @@ POSSIBILITY OF SUCH DAMAGE."""
 
 OWN_FILE = "The licence of the converted file applies; this conversion adds no terms of its own."
 
+LICENCES = {"simbench": ODBL.format(this="This folder"), "pandapower": PANDAPOWER}
+
 ASSUMED = """\
 Every customer has a meter. The transformer is upstream of the metered busbar and not part of the feeder.
 Where the source gives no load profile or no reactive power, the load follows a profile of the library
@@ -83,7 +85,14 @@ def _version(package: str) -> str:
 
 
 def feeder_source(
-    tables: FeederTables, *, about: str, origin: str, package: str, command: str, notes: tuple[str, ...]
+    tables: FeederTables,
+    *,
+    about: str,
+    origin: str,
+    package: str,
+    command: str,
+    notes: tuple[str, ...],
+    check: str,
 ) -> str:
     """Return the SOURCE.md of a converted feeder.
 
@@ -96,21 +105,20 @@ def feeder_source(
     origin
         What was converted, as `convert` takes it.
     package
-        `pandapower`, `simbench`, or `file`.
+        The package that holds the data, or that reads the file.
     command
         Command line that makes the folder again.
     notes
         What was left out, added or changed.
+    check
+        How the AC power flow compares with the source's.
     """
-    made = _version("pandapower") if package == "file" else _version(package)
-    licence = {"simbench": ODBL.format(this="This folder"), "pandapower": PANDAPOWER, "file": OWN_FILE}[
-        package
-    ]
+    licence = LICENCES.get(origin.partition(":")[0], OWN_FILE)
     return f"""# {tables.meta.title}
 
 {about}
 
-- Source: `{origin}`, {made}
+- Source: `{origin}`, {_version(package)}
 - Made by: `{command}`
 - {len(tables.lines)} lines and switches, {len(tables.customers)} customers
 
@@ -119,6 +127,10 @@ def feeder_source(
 ## Left out, added, changed
 
 {_wrapped(notes)}
+
+## Checked
+
+{textwrap.fill(check, 108, break_on_hyphens=False)}.
 
 ## Licence
 

@@ -94,7 +94,7 @@ def manipulations(
         rating = np.array([row.inverter_kva for row in site.tables.customers])[site.droop.customer]
         q = lie.size / 100.0 * signs * rating[liars] / site.feeder.base_kva
         return (), (InverterAttack(liars, q, t_on, t_off),)
-    return (_plain(lie, liars, signs, t_on, t_off),), ()
+    return (each_alone(lie, liars, signs, t_on, t_off),), ()
 
 
 def _coordinated(site: Site, lie: Lie, scenario: Scenario, t_on: float, t_off: float) -> Attack:
@@ -119,15 +119,25 @@ def _coordinated(site: Site, lie: Lie, scenario: Scenario, t_on: float, t_off: f
     return told[0]
 
 
-def _plain(lie: Lie, liars: Ints, signs: Floats, t_on: float, t_off: float) -> Attack:
-    """Every liar for itself."""
+def each_alone(lie: Lie, liars: Ints, signs: Floats, t_on: float, t_off: float) -> Attack:
+    """A lie that every meter tells for itself.
+
+    Parameters
+    ----------
+    lie
+        The trick, neither of inverters nor coordinated, and its size.
+    liars, signs : (k,)
+        Which meters, and by which multiple of the size each; signs for most.
+    t_on, t_off
+        When, Unix s.
+    """
     share = lie.size / 100.0
     attack: Attack
     match lie.trick:
         case Trick.BIAS:
             attack = Bias(liars, t_on, t_off, share * signs)
         case Trick.TOGETHER:
-            attack = Bias(liars, t_on, t_off, np.full(liars.size, share))
+            attack = Bias(liars, t_on, t_off, share * np.abs(signs))
         case Trick.SCALING:
             attack = Scaling(liars, t_on, t_off, share * signs)
         case Trick.DRIFT:

@@ -13,6 +13,8 @@ from typing import Any
 from feeders.columns import shown
 
 META_FILE, LINES_FILE, CUSTOMERS_FILE = "feeder.toml", "lines.csv", "customers.csv"
+FOREIGN = {".json", ".dss"}
+"""Endings of files that hold networks of other tools."""
 MAX_BYTES = 64 * 1024 * 1024
 
 # Rows with their numbers as a person counts them.
@@ -37,9 +39,10 @@ def from_folder(folder: Path) -> Raw:
     raw = Raw(META_FILE, None, LINES_FILE, None, CUSTOMERS_FILE, None, [])
     if not folder.is_dir():
         what = "is a file, not a folder" if folder.exists() else "does not exist"
-        raw.problems.append(
-            f"{folder} {what}; expected a folder with {META_FILE}, {LINES_FILE}, {CUSTOMERS_FILE}"
-        )
+        problem = f"{folder} {what}; expected a folder with {META_FILE}, {LINES_FILE}, {CUSTOMERS_FILE}"
+        if folder.is_file() and folder.suffix.lower() in FOREIGN:
+            problem += f"; made from a network by: gridsec feeders convert {folder} {folder.stem}"
+        raw.problems.append(problem)
         return raw
     text = _file_text(folder / META_FILE, raw.problems)
     if text is not None:

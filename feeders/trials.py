@@ -192,13 +192,15 @@ class Truth:
     inverters: Bools
 
 
-def frames(trial: Trial) -> Iterator[tuple[Frame, Truth]]:
+def frames(trial: Trial, scenario: Scenario | None = None) -> Iterator[tuple[Frame, Truth]]:
     """Play a trial.
 
     Parameters
     ----------
     trial
         The trial.
+    scenario
+        What is played in place of `trial.scenario`: another season, other attacks.
 
     Yields
     ------
@@ -211,7 +213,7 @@ def frames(trial: Trial) -> Iterator[tuple[Frame, Truth]]:
     NoSuchAttack, PowerFlowDiverged, NoEquilibrium
         When the lie cannot be told on this feeder, or the feeder not be solved.
     """
-    site, scenario = trial.stated, trial.scenario
+    site, scenario = trial.stated, trial.scenario if scenario is None else scenario
     known = Customers(
         site, scenario.variation, scenario.seed, scenario.start, scenario.profile_s, season=scenario.season
     )

@@ -40,6 +40,7 @@ app = typer.Typer(
     add_completion=False,
 )
 app.add_typer(cli_feeders.app, name="feeders")
+app.command("convert")(cli_feeders.convert)
 app.add_typer(cli_study.app, name="study")
 app.command()(cli_reproduce.reproduce)
 
@@ -465,21 +466,3 @@ def replay(
 
 def _counts(counts: dict[str, int]) -> str:
     return ", ".join(f"{name} {count}" for name, count in sorted(counts.items()) if count) or "none"
-
-
-@app.command()
-def convert(
-    source: Annotated[str, typer.Argument(help="E.g. pandapower:create_kerber_dorfnetz, or a file.")],
-    out: Annotated[Path, typer.Argument(help="Folder to write.")],
-    root: Annotated[str | None, typer.Option(help="Bus that is the metered busbar.")] = None,
-    name: Annotated[
-        str | None, typer.Option(help="Name of the feeder. [default: that of the folder]")
-    ] = None,
-    droop: Annotated[str | None, typer.Option(help="Droop preset of the source's generators.")] = None,
-) -> None:
-    """Convert a network of pandapower or SimBench into a feeder's folder."""
-    from feeders.convert import convert as run
-
-    for note in run(source, out, root=root, name=name, droop=droop):
-        console.out.print(f"note: {escape(note)}")
-    console.out.print(f"[green]{escape(str(out))} written[/]")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
@@ -15,7 +15,13 @@ from rich.table import Table
 from gridsec.errors import FeederInvalid
 from service.console import FEEDER, Feeder, complain, err, out
 
-app = typer.Typer(no_args_is_help=True, help="List, show, check and design feeders.")
+if TYPE_CHECKING:
+    from feeders.convert import Conversion
+
+app = typer.Typer(no_args_is_help=True, help="List, show, check, convert and design feeders.")
+
+SHOWN = 40
+"""Rows of the table of changes that are printed; the file has all of them."""
 
 
 @app.command("list")
@@ -135,3 +141,56 @@ def feeders_design(
     )
     if finished.proof:
         out.print(finished.proof)
+
+
+@app.command("convert")
+def convert(
+    source: Annotated[
+        str,
+        typer.Argument(
+            help="pandapower:NETWORK, simbench:CODE, a pandapower or power-grid-model JSON file, "
+            "an OpenDSS master file (.dss), or a feeder's folder."
+        ),
+    ],
+    folder: Annotated[Path, typer.Argument(help="Folder to write.")],
+    *,
+    root: Annotated[str | None, typer.Option(help="Bus that is the metered busbar.")] = None,
+    name: Annotated[
+        str | None, typer.Option(help="Name of the feeder. [default: that of the folder]")
+    ] = None,
+    droop: Annotated[str | None, typer.Option(help="Droop preset of the source's generators.")] = None,
+    opened: Annotated[
+        list[str] | None, typer.Option("--open", help="A line to take as open; may be repeated.")
+    ] = None,
+) -> None:
+    """Convert another tool's network into a feeder's folder, and check it by AC power flow against that tool.
+
+    What could not be carried over as it was is printed, and written into conversion.csv and SOURCE.md.
+    """
+    from feeders.convert import convert as run
+
+    done = run(source, folder, root=root, name=name, droop=droop, opened=opened or ())
+    _show_changes(done)
+    out.print(f"[green]{escape(str(folder))} written[/]")
+    if done.check is None:
+        err.print(f"[yellow]not checked: {escape(done.unchecked)}[/]")
+        return
+    colour = "green" if done.check.exact else "yellow"
+    out.print(f"[{colour}]{escape(done.check.sentence)}[/]")
+    out.print(f"largest difference {done.check.largest_pu:.2e} pu, at bus {escape(done.check.at)}")
+
+
+def _show_changes(done: Conversion) -> None:
+    """Print what was not carried over as it was, elements of the same fate in one row."""
+    if not done.changes:
+        return
+    fates: dict[tuple[str, str, str], list[str]] = {}
+    for change in done.changes:
+        fates.setdefault((change.prop, change.done, change.effect), []).append(change.element)
+    table = Table("element", "property", "done", "effect", title="Left out, approximated, added, changed")
+    for (prop, what, effect), elements in list(fates.items())[:SHOWN]:
+        more = f" and {len(elements) - 3} more" if len(elements) > 3 else ""
+        table.add_row(escape(", ".join(elements[:3]) + more), escape(prop), what, escape(effect))
+    out.print(table)
+    if len(fates) > SHOWN:
+        out.print(f"and {len(fates) - SHOWN} more kinds of changes, in conversion.csv")

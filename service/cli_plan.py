@@ -50,7 +50,7 @@ def redundancy(
     from feeders.studies.redundancy import redundancy as study
 
     site = load(feeder)
-    with _bar("searching for liars that stay invisible") as tell, _said():
+    with bar("searching for liars that stay invisible") as tell, said():
         found = study(
             site,
             unknown=unknown,
@@ -61,11 +61,11 @@ def redundancy(
             progress=tell,
         )
     console.out.print(_unknowns(found.unknown, found.feeder))
-    _show("Liars that stay invisible", found.summary)
-    _show("By meter", found.meters)
-    _show("Liars inside one part", found.parts)
+    show("Liars that stay invisible", found.summary)
+    show("By meter", found.meters)
+    show("Liars inside one part", found.parts)
     if found.silent:
-        _show(f"What changes without {', '.join(found.silent)}", found.changes)
+        show(f"What changes without {', '.join(found.silent)}", found.changes)
     write_tables(out, found.tables)
 
 
@@ -102,7 +102,7 @@ def protect(
         if name not in known:
             raise typer.BadParameter(f"{name!r}: expected one of {', '.join(known)}", param_hint=option)
     site = load(feeder)
-    with _bar("meters protected, against attacks") as tell, _said():
+    with bar("meters protected, against attacks") as tell, said():
         found = study(
             site,
             max_attacked=max_attacked,
@@ -122,8 +122,8 @@ def protect(
     console.out.print(escape(f"{found.feeder}: protect {count} of {len(site.meter_ids)} meters; {proof}"))
     console.out.print(f"{measure}: {_cell(found.before)} before, {_cell(found.after)} after")
     if count:
-        _show("Protect", found.meters)
-        _show("Attacks that ask for them", found.attacks)
+        show("Protect", found.meters)
+        show("Attacks that ask for them", found.attacks)
     write_tables(out, found.tables)
 
 
@@ -144,15 +144,15 @@ def detectable(
     from feeders.studies.rehearsal import rehearse
 
     site = load(feeder)
-    with _bar("lies of meters, errors of customers") as tell, _said():
+    with bar("lies of meters, errors of customers") as tell, said():
         found = study(site, max_attacked=max_attacked, share=share, risk=risk, journal=journal, progress=tell)
     more = found.max_attacked - 1
     places = ["customer", "bus"]
-    _show(f"Lies, V: each alone, and with {more} more", found.meters.drop(columns=places).round(2))
-    _show(f"Errors of the voltage with {more + 1} unnoticed liars, V", found.customers.round(2))
+    show(f"Lies, V: each alone, and with {more} more", found.meters.drop(columns=places).round(2))
+    show(f"Errors of the voltage with {more + 1} unnoticed liars, V", found.customers.round(2))
     write_tables(out, found.tables)
     if trials:
-        with _bar("simulated lies") as tell:
+        with bar("simulated lies") as tell:
             seen = rehearse(site, found, trials=trials, seed=seed, share=share, progress=tell)
         console.out.print(
             f"{seen.trials} lies up to the hidden size: {seen.hidden_named} led to a name\n"
@@ -175,8 +175,14 @@ def _curves(name: str) -> Any:
 
 
 @contextmanager
-def _bar(what: str) -> Iterator[Tell]:
-    """A progress bar on the terminal."""
+def bar(what: str) -> Iterator[Tell]:
+    """A progress bar on the terminal.
+
+    Parameters
+    ----------
+    what
+        Which pieces of work are counted.
+    """
     with Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -185,13 +191,13 @@ def _bar(what: str) -> Iterator[Tell]:
         console=console.err,
         transient=True,
         disable=not console.err.is_terminal,
-    ) as bar:
-        task = bar.add_task(escape(what), total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
+    ) as shown:
+        task = shown.add_task(escape(what), total=None)
+        yield lambda done, total: shown.update(task, completed=done, total=total)
 
 
 @contextmanager
-def _said() -> Iterator[None]:
+def said() -> Iterator[None]:
     """Say what is wrong with what was asked."""
     try:
         yield
@@ -199,8 +205,14 @@ def _said() -> Iterator[None]:
         raise typer.BadParameter(str(error)) from error
 
 
-def _show(title: str, frame: pd.DataFrame) -> None:
-    """Print a table; columns that say nothing are left out."""
+def show(title: str, frame: pd.DataFrame) -> None:
+    """Print a table; columns that say nothing are left out.
+
+    Parameters
+    ----------
+    title, frame
+        What it is, and the table.
+    """
     kept = [name for name in frame.columns if not all(_empty(cell) for cell in frame[name])]
     table = Table(*(escape(name.replace("_", " ")) for name in kept), title=title, title_justify="left")
     for row in frame[kept].itertuples(index=False):

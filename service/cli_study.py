@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from service import cli_plan, console
+from service import cli_calibrate, cli_campaign, cli_droop, cli_plan, cli_report, console
 from service.console import Feeder
 
 if TYPE_CHECKING:
@@ -22,6 +22,10 @@ app = typer.Typer(no_args_is_help=True, help="Study feeders and estimators.")
 app.command("redundancy")(cli_plan.redundancy)
 app.command("protect")(cli_plan.protect)
 app.command("detectable")(cli_plan.detectable)
+app.command("calibrate")(cli_calibrate.calibrate)
+app.command("campaign")(cli_campaign.campaign)
+app.command("droop")(cli_droop.droop)
+app.command("report")(cli_report.report)
 
 
 @app.callback()

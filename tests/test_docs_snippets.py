@@ -111,6 +111,14 @@ def test_the_estimator_is_compared_with_ours() -> None:
     assert row.split("│")[2].strip().endswith("of 1")
 
 
+@pytest.mark.usefixtures("installed")
+def test_the_estimator_enters_a_campaign() -> None:
+    few = ("--scenarios", "3", "--duration", "30", "--workers", "1", "--kind", "bias:8", "--liars", "1")
+    told = run("-c", GRIDSEC, "study", "campaign", "simbench-lv-rural1", "--estimator", "neighbours", *few)
+    assert "3 scenarios of 30 s watched by neighbours" in told
+    assert re.search(r"bias +│ 8 +│ 2 +│ 1 +│ 1 +│ 0 ", told)
+
+
 def test_the_estimator_serves(installed: Path) -> None:
     with serve("simbench-lv-rural1", installed, "--estimator", "neighbours") as live:
         assert live.get("/api/v1/feeders/simbench-lv-rural1/commissioning")["estimator"] == "neighbours"

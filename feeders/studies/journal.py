@@ -59,6 +59,12 @@ class Journal:
         if lines[-1] or len(lines) == 1:
             path.write_text("\n".join([*lines[:-1], ""] if len(lines) > 1 else [head, ""]), encoding="utf-8")
 
+    def __contains__(self, key: str) -> bool:
+        return key in self._done
+
+    def __getitem__(self, key: str) -> Any:
+        return self._done[key]
+
     def get(self, key: str, work: Callable[[], Any]) -> Any:
         """Return the result of a piece of work, which is done now if it was not before.
 
@@ -70,12 +76,21 @@ class Journal:
             Makes it; its result survives JSON.
         """
         if key not in self._done:
-            value = work()
-            self._done[key] = value
-            if self._path is not None:
-                with self._path.open("a", encoding="utf-8") as file:
-                    file.write(json.dumps([key, value]) + "\n")
+            self.put(key, work())
         return self._done[key]
+
+    def put(self, key: str, value: Any) -> None:
+        """Keep the result of a piece of work that was done elsewhere.
+
+        Parameters
+        ----------
+        key, value
+            Its name, and its result, which survives JSON.
+        """
+        self._done[key] = value
+        if self._path is not None:
+            with self._path.open("a", encoding="utf-8") as file:
+                file.write(json.dumps([key, value]) + "\n")
 
 
 def worked(

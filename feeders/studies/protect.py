@@ -80,8 +80,20 @@ class Protect:
 
     @property
     def tables(self) -> dict[str, pd.DataFrame]:
-        """All tables by name."""
-        return {"meters": self.meters, "attacks": self.attacks}
+        """All tables by name; `summary` is one row: what was asked, how many, what that does."""
+        asked = {"goal": str(self.goal), "max_attacked": self.max_attacked}
+        asked |= {"lie_volt": self.lie_volt} if self.goal is Goal.BOUND else {"attack": str(self.attack)}
+        found = {
+            "protected": len(self.meters),
+            "least": self.least,
+            "before": self.before,
+            "after": self.after,
+        }
+        return {
+            "summary": pd.DataFrame([asked | found]),
+            "meters": self.meters,
+            "attacks": self.attacks,
+        }
 
 
 def protect(

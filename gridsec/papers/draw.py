@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator, Mapping
 
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Canvas
@@ -167,6 +167,48 @@ def png(figure: Figure) -> bytes:
     about = {"Title": figure.name, "Description": figure.caption, "Software": None}
     with _settings():
         canvas.savefig(buffer, format="png", dpi=DPI, metadata=about)
+    return buffer.getvalue()
+
+
+def sheet(
+    width: float,
+    height: float,
+    marks: Callable[[Axes], None],
+    *,
+    scale: float,
+    about: Mapping[str, str | None],
+) -> bytes:
+    """Draw on an empty sheet as a PNG; the same marks give the same bytes.
+
+    Parameters
+    ----------
+    width, height
+        Of the sheet, px; a px is a hundredth of an inch for whoever draws.
+    marks
+        Draws on axes that cover the sheet, in px from its upper left corner.
+    scale
+        Dots per px.
+    about
+        Kept in the file.
+
+    Raises
+    ------
+    ModuleNotFoundError
+        matplotlib is not installed; see `available`.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure as Canvas
+
+    buffer = io.BytesIO()
+    with _settings():
+        canvas = Canvas(figsize=(width / 100.0, height / 100.0))
+        FigureCanvasAgg(canvas)
+        axes = canvas.add_axes((0.0, 0.0, 1.0, 1.0))
+        axes.set_axis_off()
+        marks(axes)
+        axes.set_xlim(0.0, width)
+        axes.set_ylim(height, 0.0)
+        canvas.savefig(buffer, format="png", dpi=100.0 * scale, metadata=cast("Any", dict(about)))
     return buffer.getvalue()
 
 

@@ -18,6 +18,7 @@ from pandapower import networks
 from pandapower.toolbox import drop_trafos, select_subnet
 
 from feeders.convert import RECIPES, SEED, convert
+from feeders.convert_changes import sentences
 from feeders.convert_pandapower import Fleet, from_pandapower
 from feeders.convert_simbench import envelope, envelopes_csv, library_csv
 from feeders.load import from_tables, load, names
@@ -57,21 +58,25 @@ def original(name: str) -> tuple[Any, int]:
 
 @pytest.mark.parametrize("name", FROM_PANDAPOWER)
 def test_recipe_builds_the_committed_folder(name: str, tmp_path: Path) -> None:
-    notes = convert(name, tmp_path / "out")
+    done = convert(name, tmp_path / "out")
     committed = Path(str(data_root())) / "feeders" / name
-    for file in ("feeder.toml", "lines.csv", "customers.csv", "SOURCE.md"):
+    for file in ("feeder.toml", "lines.csv", "customers.csv", "conversion.csv", "SOURCE.md"):
         assert (tmp_path / "out" / file).read_text() == (committed / file).read_text(), file
     source = (committed / "SOURCE.md").read_text()
-    assert all(note in " ".join(source.split()) for note in notes)
-    assert f"gridsec convert {name} data/feeders/{name}" in source
+    assert all(note in " ".join(source.split()) for note in done.notes)
+    assert f"gridsec feeders convert {name} data/feeders/{name}" in source
+    assert done.check is not None
+    assert done.check.exact
 
 
 @pytest.mark.parametrize("name", FROM_SIMBENCH)
 def test_recipe_builds_the_committed_simbench_folder(name: str, tmp_path: Path) -> None:
     pytest.importorskip("simbench", reason="the extra `convert` is not installed")
-    convert(name, tmp_path / "out")
+    done = convert(name, tmp_path / "out")
+    assert done.check is not None
+    assert done.check.largest_pu < 1e-8
     committed = Path(str(data_root())) / "feeders" / name
-    for file in ("feeder.toml", "lines.csv", "customers.csv"):
+    for file in ("feeder.toml", "lines.csv", "customers.csv", "conversion.csv"):
         assert (tmp_path / "out" / file).read_text() == (committed / file).read_text(), file
 
 
@@ -151,17 +156,20 @@ def street() -> Any:
     pp.create_load(net, bus[6], 0.1, name="beyond")
     pp.create_sgen(net, bus[1], 0.006, sn_mva=0.007, name="roof")
     pp.create_sgen(net, bus[4], 0.003, q_mvar=0.001, name="field")
-    pp.create_shunt(net, bus[2], 0.01)
+    pp.create_shunt(net, bus[2], 0.01, name="coil")
+    pp.create_shunt(net, bus[2], -0.012, p_mw=0.001, name="condenser")
+    pp.create_impedance(net, bus[2], bus[4], 0.01, 0.01, 1.0, name="choke")
     pp.create_gen(net, bus[4], 0.01)
     pp.create_storage(net, bus[1], 0.001, 0.01)
     return net
 
 
 def test_everything_is_carried_over_or_named() -> None:
-    tables, notes = from_pandapower(street(), "street", title="A street")
+    converted = from_pandapower(street(), "street", title="A street")
+    tables, notes = converted.tables, sentences(converted.changes)
     assert validate(tables) == ()
     lines = {line.line: line for line in tables.lines}
-    assert set(lines) == {"one", "two", "two-1", "two-2", "coupler"}
+    assert set(lines) == {"one", "two", "two-1", "two-2", "coupler", "shunt condenser"}
     assert lines["one"].r_ohm == pytest.approx(0.01)
     assert lines["one"].b_us == pytest.approx(2 * 2 * np.pi * 50 * 500e-9 * 0.1 * 1e6)
     assert lines["one"].rating_a == pytest.approx(400.0)
@@ -169,7 +177,8 @@ def test_everything_is_carried_over_or_named() -> None:
     assert (lines["coupler"].r_ohm, lines["coupler"].x_ohm, lines["coupler"].closed) == (0.0, 0.0, True)
     assert sum(not line.closed for line in tables.lines) == 1  # the tie between busbar and far
     customers = {row.customer: row for row in tables.customers}
-    assert set(customers) == {"house-0", "house-1", "seller", "field"}
+    assert set(customers) == {"house-0", "house-1", "seller", "field", "gen gen-0", "storage storage-0"}
+    assert lines["shunt condenser"].b_us == pytest.approx(1e6 * 0.012 / 0.4**2)
     assert customers["house-0"].power_factor == pytest.approx(0.8)
     assert customers["house-0"].bus == customers["house-1"].bus == "A-2"
     assert (customers["house-0"].pv_kw, customers["house-0"].inverter_kva) == (6.0, 7.0)
@@ -177,27 +186,30 @@ def test_everything_is_carried_over_or_named() -> None:
     assert customers["house-1"].load_kw == pytest.approx(1.0)
     assert (customers["field"].load_kw, customers["field"].pv_kw) == (0.0, 3.0)
     assert customers["field"].droop == "vde4105-small"
-    assert len({row.meter for row in tables.customers}) == 4
+    assert len({row.meter for row in tables.customers}) == 6
     said = "\n".join(notes)
     for part in (
-        "house-1 has a leading power factor",
-        "seller feeds in 1 kW",
-        "field has no load at its bus",
-        "fixed reactive power of field",
-        "row(s) of the table shunt",
-        "row(s) of the table gen",
-        "row(s) of the table storage",
-        "across, open towards a part",
-        "bus(es) that the busbar does not feed",
+        "power factor of load house-1; leading",
+        "p_mw of load seller; feeds in",
+        "customer of generator field; has no load at its bus",
+        "q_mvar of generator field; its droop curve decides",
+        "inductance of shunt coil; 10 kvar",
+        "connection of shunt condenser; 12 kvar",
+        "conductance of shunt condenser; 1 kW",
+        "left out: impedance 0",
+        "control of gen gen-0; a customer that draws -10 kW",
+        "control of storage storage-0; a customer that draws 1 kW",
+        "line across; open towards what the busbar does not feed",
+        "left out: 3 buses; above the busbar, behind a transformer or without supply",
     ):
         assert part in said, part
     from_tables(tables)
 
 
 def test_power_factor_interval_holds_the_profiles_history() -> None:
-    tables, _ = from_pandapower(street(), "street")
+    tables = from_pandapower(street(), "street").tables
     for row in tables.customers:
-        if row.load_kw == 0.0 or row.power_factor is None:
+        if row.load_kw == 0.0 or row.power_factor is None or row.q_floor_kvar is None:
             continue
         assert row.power_factor_min is not None
         assert row.power_factor_max is not None
@@ -211,7 +223,8 @@ def test_power_factor_interval_holds_the_profiles_history() -> None:
 
 def test_single_phase_loads_become_single_phase_customers() -> None:
     net = networks.ieee_european_lv_asymmetric("on_peak_566")
-    tables, notes = from_pandapower(net, "european")
+    converted = from_pandapower(net, "european")
+    tables, notes = converted.tables, sentences(converted.changes)
     assert validate(tables) == ()
     loads = net.asymmetric_load
     for phase in "abc":
@@ -228,11 +241,13 @@ def test_single_phase_loads_become_single_phase_customers() -> None:
 
 def test_synthetic_fleet() -> None:
     net = networks.create_kerber_landnetz_freileitung_1()
-    tables, notes = from_pandapower(net, "fleet", fleet=Fleet(3, 0.0, "asnzs4777-a"))
+    converted = from_pandapower(net, "fleet", fleet=Fleet(3, 0.0, "asnzs4777-a"))
+    tables, added = converted.tables, [each for each in converted.changes if each.done == "added"]
     with_inverter = [k for k, row in enumerate(tables.customers) if row.inverter_kva > 0]
     assert with_inverter == list(range(0, 13, 3))
     assert {row.inverter_kva for row in tables.customers} == {0.0, 4.0}
-    assert any("5 synthetic PV inverters with droop curve asnzs4777-a" in note for note in notes)
+    assert len(added) == 5
+    assert all("asnzs4777-a" in each.effect for each in added)
 
 
 def test_ambiguous_and_unknown_busbars() -> None:
@@ -241,10 +256,10 @@ def test_ambiguous_and_unknown_busbars() -> None:
         from_pandapower(net, "x")
     with pytest.raises(GridsecError, match="0 buses are called 'Bus X'"):
         from_pandapower(net, "x", root="Bus X")
-    commercial, _ = from_pandapower(net, "x", root="Bus C1")
+    commercial = from_pandapower(net, "x", root="Bus C1").tables
     assert all(row.customer.startswith("Load C") for row in commercial.customers)
-    by_index, _ = from_pandapower(net, "x", root=str(net.bus.index[net.bus.name == "Bus C1"][0]))
-    assert by_index == commercial
+    by_index = from_pandapower(net, "x", root=str(net.bus.index[net.bus.name == "Bus C1"][0]))
+    assert by_index.tables == commercial
 
 
 def test_loop_in_the_source_is_refused(tmp_path: Path) -> None:
@@ -260,7 +275,7 @@ def test_loop_in_the_source_is_refused(tmp_path: Path) -> None:
 def test_pandapower_file(tmp_path: Path) -> None:
     path = tmp_path / "street.json"
     pp.to_json(street(), str(path))
-    notes = convert(str(path), tmp_path / "my street", droop="ieee1547-a")
+    notes = convert(str(path), tmp_path / "my street", droop="ieee1547-a").notes
     site = load(tmp_path / "my street")
     assert site.feeder.name == "my-street"
     assert {row.droop for row in site.tables.customers} == {"", "ieee1547-a"}
@@ -276,11 +291,15 @@ def test_any_pandapower_network_by_name(tmp_path: Path) -> None:
 def test_unknown_sources(tmp_path: Path) -> None:
     (tmp_path / "text.json").write_text("no json")
     (tmp_path / "list.json").write_text("[1, 2]")
+    (tmp_path / "other.json").write_text('{"type": "FeatureCollection"}')
     for source, words in [
         ("pandapower:no_such_network", "no network"),
         ("nonsense", "is no source"),
-        (str(tmp_path / "text.json"), "pandapower"),
-        (str(tmp_path / "list.json"), "pandapower"),
+        (str(tmp_path / "text.json"), "no valid JSON"),
+        (str(tmp_path / "list.json"), "neither a pandapower net"),
+        (str(tmp_path / "other.json"), "neither a pandapower net"),
+        ("1-LV-rural9--0-sw", "SimBench has no grid"),
+        ("pandapower:create_bus", "cannot build"),
     ]:
         with pytest.raises(GridsecError, match=words):
             convert(source, tmp_path / "out")
@@ -376,7 +395,8 @@ def test_other_infeeds_and_deeper_transformers_are_named() -> None:
     pp.create_ext_grid(net, 2)
     below = pp.create_bus(net, 0.23, name="below")
     pp.create_transformer_from_parameters(net, 2, below, 0.05, 0.4, 0.23, 1.0, 4.0, 0.1, 0.5)
-    _, notes = from_pandapower(net, "x", root="busbar")
-    said = "\n".join(notes)
-    assert "1 more infeed(s) of an external grid" in said
-    assert "1 transformer(s) that the feeder's buses supply" in said
+    with pytest.raises(FeederInvalid, match="another voltage source"):
+        from_pandapower(net, "x", root="busbar")
+    net.ext_grid.loc[1, "in_service"] = False
+    said = "\n".join(sentences(from_pandapower(net, "x", root="busbar").changes))
+    assert "load side of transformer trafo-1; 1 bus became a customer" in said

@@ -27,7 +27,7 @@ def test_agrees_with_pandapower(scenario: str) -> None:
     net = networks.ieee_european_lv_asymmetric(scenario)
     net.trafo["tap_dependency_table"] = False  # the file is older than this column
     pp.runpp_3ph(net, tolerance_mva=1e-10, numba=False)
-    tables, _ = from_pandapower(net, "european")
+    tables = from_pandapower(net, "european").tables
     site = three_phase(tables)
     root = int(net.trafo.lv_bus.iloc[0])
     angle = {phase: np.deg2rad(net.res_bus_3ph.at[root, f"va_{phase}_degree"]) for phase in "abc"}

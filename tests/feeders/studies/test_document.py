@@ -17,7 +17,10 @@ PROGRAMS = re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)
 RURAL = load("simbench-lv-rural1")
 
 
-@pytest.mark.parametrize("program", PROGRAMS, ids=["redundancy", "protect", "detectable"])
+STUDIES = [re.findall(r"feeders\.studies\.(\w+)", program)[0] for program in PROGRAMS]
+
+
+@pytest.mark.parametrize("program", PROGRAMS, ids=STUDIES)
 def test_programs_run(program: str, capsys: pytest.CaptureFixture[str]) -> None:
     exec(compile(program, "docs/studies.md", "exec"), {})
     assert capsys.readouterr().out.strip()

@@ -1,0 +1,160 @@
+"""Round trip of a conversion: the source tool's own AC power flow beside that of the feeder it became.
+
+Both see the same loads, of constant power, and the same voltage at the busbar: what is left between them is
+what the conversion did to the network.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from feeders.load import from_tables
+from feeders.load_phases import three_phase
+from feeders.powerflow import PowerFlow
+from feeders.powerflow_unbalanced import UnbalancedPowerFlow
+from feeders.schema import FeederTables
+from gridsec.arrays import Floats, Phasors
+from gridsec.errors import GridsecError
+
+BALANCED_PU: Final = 1e-6
+UNBALANCED_PU: Final = 1e-5
+"""Differences that a conversion with nothing left out stays below."""
+
+UNIFORM: Final = 1e-8
+"""Spread of the phases' voltages below which a state is balanced."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SourceState:
+    """The source tool's power flow at the source's own loads.
+
+    Attributes
+    ----------
+    tool
+        Name and version.
+    power_kva
+        Net import P + jQ of each customer, kVA; the others draw nothing.
+    busbar_volt : (3,)
+        Voltages of the busbar, phase to neutral, V.
+    volts
+        Voltage magnitudes (3,) of each bus, V, all loads of constant power; NaN where a phase is absent.
+    as_found
+        The same with the loads' dependence on the voltage; empty if there is none.
+    """
+
+    tool: str
+    power_kva: Mapping[str, complex]
+    busbar_volt: Phasors
+    volts: Mapping[str, Floats]
+    as_found: Mapping[str, Floats]
+
+
+@dataclass(frozen=True, slots=True)
+class SourceCheck:
+    """How far a feeder's AC voltages are from those of its source.
+
+    Attributes
+    ----------
+    tool
+        The source's tool and its version.
+    buses
+        How many buses were compared.
+    three_phase
+        Whether phase by phase.
+    largest_pu
+        Largest difference of a voltage's magnitude, all loads of constant power, pu.
+    at
+        Bus of the largest difference.
+    as_found_pu
+        Largest difference from the source with its loads' dependence on the voltage, pu; None: there is none.
+    """
+
+    tool: str
+    buses: int
+    three_phase: bool
+    largest_pu: float
+    at: str
+    as_found_pu: float | None
+
+    @property
+    def exact(self) -> bool:
+        """Whether the difference is no more than that of two solvers."""
+        return self.largest_pu <= (UNBALANCED_PU if self.three_phase else BALANCED_PU)
+
+    @property
+    def sentence(self) -> str:
+        """The finding in words; the difference is rounded up to a power of ten, the same on every machine."""
+        text = (
+            f"AC power flow of {self.tool} and of this folder at the source's loads, {self.buses} buses"
+            f"{', phase by phase' if self.three_phase else ''}: |v| differs by less than "
+            f"{_above(self.largest_pu)} pu"
+        )
+        if not self.exact:
+            text += f" (bus {self.at})"
+        if self.as_found_pu is not None:
+            text += f"; with the loads' dependence on the voltage by less than {_above(self.as_found_pu)} pu"
+        return text
+
+
+def _above(value: float) -> str:
+    return f"{10.0 ** math.ceil(math.log10(max(value, 1e-8)) - 1e-9):.0e}"
+
+
+def compare(state: SourceState, tables: FeederTables) -> SourceCheck:
+    """Solve a converted feeder at its source's loads and compare the voltages of all buses.
+
+    Parameters
+    ----------
+    state
+        What the source's tool found.
+    tables
+        The feeder.
+
+    Raises
+    ------
+    PowerFlowDiverged
+        When the feeder has no solution at these loads.
+    FeederInvalid
+        If neither the balanced nor the three-phase model takes the feeder.
+    """
+    power = np.array([state.power_kva.get(row.customer, 0.0) for row in tables.customers])
+    size = np.abs(state.busbar_volt)
+    single = {row.phases for row in tables.lines} | {row.phases for row in tables.customers} != {"abc"}
+    phases = single or bool(np.ptp(size) > UNIFORM * size[0]) or not _uniform(state)
+    if phases:
+        unbalanced = three_phase(tables)
+        v0 = np.asarray(state.busbar_volt, dtype=np.complex128)
+        _, volts = UnbalancedPowerFlow(unbalanced).solve(power.real, power.imag, v0)
+        index = unbalanced.bus_of_file
+    else:
+        site = from_tables(tables)
+        _, single_phase = PowerFlow(site).solve(power.real, power.imag, float(size[0]))
+        volts, index = np.repeat(single_phase[:, None], 3, axis=1), site.bus_of_file
+    common = [bus for bus in state.volts if bus in index]
+    if not common:
+        raise GridsecError("the source's power flow and the feeder have no bus in common")
+    ours = volts[[index[bus] for bus in common]]
+    nominal = tables.meta.voltage_volt
+    apart = _apart(ours, [state.volts[bus] for bus in common]) / nominal
+    found = None
+    if state.as_found:
+        found = float(_apart(ours, [state.as_found[bus] for bus in common]).max() / nominal)
+    worst = int(apart.argmax())
+    return SourceCheck(state.tool, len(common), phases, float(apart[worst]), common[worst], found)
+
+
+def _apart(ours: Floats, theirs: list[Floats]) -> Floats:
+    """Largest difference at each bus over the phases that the source has."""
+    there = np.array(theirs)
+    missing = np.isnan(ours) & ~np.isnan(there)
+    return np.asarray(np.where(missing, np.inf, np.nan_to_num(np.abs(ours - there))).max(axis=1))
+
+
+def _uniform(state: SourceState) -> bool:
+    volts = np.array(list(state.volts.values())).reshape(-1, 3)
+    return bool((np.ptp(volts, axis=1) <= UNIFORM * volts.max(axis=1)).all())

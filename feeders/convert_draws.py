@@ -1,0 +1,123 @@
+"""Loads and generators of other tools' networks as customers, with what they draw at the source's loads."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from feeders.convert_changes import Change
+from feeders.convert_customers import HOUSEHOLD_KW, droop_preset, reactive, rounded, usual_profile
+from feeders.schema import CustomerRow
+from gridsec.arrays import Phasors
+
+NO_POWER: Final = 1e-9
+"""Share of a load's power that is a solver's last digits."""
+
+EVEN: Final = 1e-6
+"""Spread of the phases' powers, as a share of the largest, below which a connection is of three phases."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Draw:
+    """A load or a generator at a bus.
+
+    Attributes
+    ----------
+    name, bus
+        Its name and where it is.
+    power_kva : (3,)
+        What it takes from each phase at the source's operating point, P + jQ, kVA.
+    even
+        It is one connection of all three phases.
+    rating_kva
+        Rating of a generator's inverter; None: no generator.
+    """
+
+    name: str
+    bus: str
+    power_kva: Phasors
+    even: bool = True
+    rating_kva: float | None = None
+
+
+def is_even(power: Phasors) -> bool:
+    """Return whether all phases draw the same, and anything at all."""
+    size = float(np.abs(power).max())
+    return size > 0 and float(np.abs(power - power.mean()).max()) <= EVEN * size
+
+
+def customers_of(
+    draws: Iterable[Draw],
+    volt: float,
+    droop: str | None,
+    changes: list[Change],
+    taken: Collection[str] = (),
+) -> tuple[list[CustomerRow], dict[str, complex]]:
+    """Return rows of customers.csv, and what each draws at the source's operating point, kVA.
+
+    Parameters
+    ----------
+    draws
+        Loads and generators.
+    volt
+        Nominal voltage, V.
+    droop
+        Preset of the generators' inverters; None: by their size.
+    changes
+        Takes what is not carried over exactly.
+    taken
+        Names that other customers have.
+    """
+    rows: list[CustomerRow] = []
+    power: dict[str, complex] = {}
+    for draw in sorted(draws, key=lambda each: each.rating_kva is not None):
+        for phases, kva in _connections(draw):
+            row = CustomerRow(_unique(draw, phases, {*taken, *power}), draw.bus, 0.0, phases=phases)
+            power[row.customer] = kva
+            if draw.rating_kva is None:
+                rows.append(_load(row, kva, len(rows), volt, changes))
+                continue
+            share = draw.rating_kva if phases == "abc" else draw.rating_kva / len(_connections(draw))
+            row = replace(row, pv_kw=rounded(max(-kva.real, 0.0)), pv_profile=f"PV{len(rows) % 8 + 1}")
+            if share > 0:
+                row = replace(row, inverter_kva=rounded(share), droop=droop or droop_preset(share))
+                changes.append(
+                    Change(
+                        f"generator {draw.name}", "droop curve", "added", f"{row.droop}, not in the source"
+                    )
+                )
+            rows.append(row)
+    return rows, power
+
+
+def _connections(draw: Draw) -> list[tuple[str, complex]]:
+    if draw.even:
+        return [("abc", complex(draw.power_kva.sum()))]
+    return [(phase, complex(kva)) for phase, kva in zip("abc", draw.power_kva, strict=True) if kva != 0]
+
+
+def _unique(draw: Draw, phases: str, taken: Collection[str]) -> str:
+    several = phases != "abc" and len(_connections(draw)) > 1
+    name = (f"{draw.name}-{phases}" if several else draw.name)[:120]
+    while name in taken:
+        name += "'"
+    return name
+
+
+def _load(row: CustomerRow, kva: complex, number: int, volt: float, changes: list[Change]) -> CustomerRow:
+    p, q = kva.real, kva.imag
+    if p < 0:
+        changes.append(
+            Change(f"load {row.customer}", "p_kw", "changed", "feeds in; its expected load is taken as 0")
+        )
+    if q < -NO_POWER * abs(kva):
+        changes.append(
+            Change(f"load {row.customer}", "power factor", "approximated", "leading; expected to be 1")
+        )
+    household = volt < 1000.0 and p <= HOUSEHOLD_KW
+    row = replace(row, load_kw=rounded(max(p, 0.0)), load_profile=usual_profile(number, household=household))
+    return reactive(row, p / math.hypot(p, q) if p > 0 and q > 0 else None)

@@ -1,0 +1,441 @@
+"""A network of any tool, and the feeder below one of its buses.
+
+The readers of other tools' files make a `Network` in SI; here it becomes a feeder's tables: the busbar is
+found, the rest of the network cut off, parallel lines become one, and transformers below the busbar become
+customers that draw what flows into them.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from feeders.columns import SUSPICIONS
+from feeders.convert_changes import WHOLE, Change
+from feeders.convert_check import SourceState
+from feeders.convert_customers import USUAL_POWER_FACTOR, base_kva, with_meters
+from feeders.convert_draws import Draw, customers_of, is_even
+from feeders.convert_lines import merged
+from feeders.schema import FeederMeta, FeederTables, LineRow, LoadDefaults, validate
+from gridsec.arrays import Phasors
+from gridsec.errors import FeederInvalid, GridsecError
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Coupling:
+    """A transformer, or anything else that joins buses and is no line.
+
+    Attributes
+    ----------
+    name, buses
+        Its name, with its kind, and the buses it joins.
+    power_kva
+        What flows into it from each of them, by phase, kVA.
+    """
+
+    name: str
+    buses: tuple[str, ...]
+    power_kva: tuple[Phasors, ...]
+
+
+@dataclass(slots=True)
+class Network:
+    """A network in SI, with the state its own tool found.
+
+    Attributes
+    ----------
+    tool
+        The source's tool and its version.
+    sources
+        Buses with a voltage source.
+    nominal
+        Nominal voltage of each bus, phase to neutral, V.
+    lines
+        Rows of lines.csv, in any direction.
+    draws, couplings
+        What is connected to the buses besides.
+    xy
+        Positions.
+    volts : (3,)
+        Complex voltages of the buses, V; NaN where a phase is absent. Loads of constant power.
+    as_found : (3,)
+        The same with the loads' dependence on the voltage; empty if there is none.
+    changes
+        What could not be carried over so far.
+    of_bus
+        Changes that matter if their bus is in the feeder.
+    unsolved
+        Why the source's own power flow gave no voltages.
+    """
+
+    tool: str
+    sources: list[str]
+    nominal: dict[str, float]
+    lines: list[LineRow] = field(default_factory=list)
+    draws: list[Draw] = field(default_factory=list)
+    couplings: list[Coupling] = field(default_factory=list)
+    xy: dict[str, tuple[float, float]] = field(default_factory=dict)
+    volts: dict[str, Phasors] = field(default_factory=dict)
+    as_found: dict[str, Phasors] = field(default_factory=dict)
+    changes: list[Change] = field(default_factory=list)
+    of_bus: list[tuple[str, Change]] = field(default_factory=list)
+    unsolved: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Converted:
+    """A feeder made from another tool's network.
+
+    Attributes
+    ----------
+    tables
+        The feeder.
+    changes
+        What could not be carried over as it was.
+    state
+        What the source's tool found at its own loads.
+    unchecked
+        Why there is no state.
+    """
+
+    tables: FeederTables
+    changes: tuple[Change, ...]
+    state: SourceState | None
+    unchecked: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """What a busbar feeds.
+
+    Attributes
+    ----------
+    busbar
+        Its bus.
+    inside
+        The buses, nearest first, and how many lines away each is.
+    lines
+        Rows of lines.csv, pointing away from the busbar.
+    draws
+        Loads and generators, and what flows into transformers.
+    changes
+        What could not be carried over as it was.
+    """
+
+    busbar: str
+    inside: dict[str, int]
+    lines: list[LineRow]
+    draws: list[Draw]
+    changes: list[Change]
+
+
+def feeder_of(
+    network: Network,
+    name: str,
+    *,
+    root: str | None = None,
+    opened: Sequence[str] = (),
+    droop: str | None = None,
+) -> Converted:
+    """Return the feeder below a bus of a network.
+
+    Parameters
+    ----------
+    network
+        The network.
+    name
+        Of the feeder.
+    root
+        Bus that becomes the metered busbar; None: the first below the source that has lines.
+    opened
+        Lines to take as open, so that the feeder is radial.
+    droop
+        Preset of the generators' inverters; None: by their size.
+
+    Raises
+    ------
+    FeederInvalid
+        With every reason why there is no feeder.
+    """
+    part = below(network, root, opened)
+    volt = network.nominal[part.busbar]
+    rows, power = customers_of(part.draws, volt, droop, part.changes)
+    rows = with_meters(rows)
+    meta = FeederMeta(
+        format=1,
+        name=name,
+        title=name,
+        voltage_volt=round(volt, 6),
+        base_kva=base_kva(volt, sum(row.load_kw for row in rows)),
+        busbar=part.busbar,
+        busbar_xy=network.xy.get(part.busbar),
+        load=LoadDefaults(power_factor=USUAL_POWER_FACTOR, power_factor_min=0.85),
+    )
+    tables = FeederTables(meta, tuple(part.lines), tuple(rows))
+    return finished(network, part, tables, power)
+
+
+def below(network: Network, root: str | None, opened: Sequence[str]) -> Part:
+    """Cut the part below a bus out of a network.
+
+    Parameters
+    ----------
+    network, root, opened
+        As `feeder_of` takes them.
+
+    Raises
+    ------
+    FeederInvalid
+        If something else feeds it too, or its lines join buses of different nominal voltages.
+    GridsecError
+        If there is no such bus, or more than one that could be meant.
+    """
+    changes = list(network.changes)
+    rows = _opened(network.lines, opened, changes)
+    busbar = _busbar(network, rows, root)
+    inside = _reached(busbar, rows)
+    problems = _infeeds(network, rows, busbar, inside)
+    volt = network.nominal[busbar]
+    problems += [
+        f"bus {bus!r} has a nominal voltage of {network.nominal[bus]:.6g} V and the busbar {busbar!r} of "
+        f"{volt:.6g} V, though lines join them; expected one voltage"
+        for bus in inside
+        if abs(network.nominal.get(bus, volt) - volt) > 1e-6 * volt
+    ]
+    if problems:
+        raise FeederInvalid(problems)
+    kept = _kept(network, rows, inside, changes)
+    draws = [draw for draw in network.draws if draw.bus in inside]
+    draws += _behind(network, rows, inside, changes)
+    changes.extend(change for bus, change in network.of_bus if bus in inside)
+    return Part(busbar, inside, merged(kept, busbar, changes), draws, changes)
+
+
+def finished(network: Network, part: Part, tables: FeederTables, power: Mapping[str, complex]) -> Converted:
+    """Put a conversion together.
+
+    Parameters
+    ----------
+    network, part
+        Where it is from.
+    tables
+        The feeder.
+    power
+        What each customer draws in the source's power flow, kVA.
+    """
+    accepted = accepting(tables, part.changes)
+    if not network.volts:
+        return Converted(accepted, tuple(part.changes), None, network.unsolved)
+    state = SourceState(
+        tool=network.tool,
+        power_kva=power,
+        busbar_volt=network.volts[part.busbar],
+        volts={bus: np.abs(network.volts[bus]) for bus in part.inside if bus in network.volts},
+        as_found={bus: np.abs(network.as_found[bus]) for bus in part.inside if bus in network.as_found},
+    )
+    return Converted(accepted, tuple(part.changes), state)
+
+
+def accepting(tables: FeederTables, changes: list[Change]) -> FeederTables:
+    """Accept what is doubtful only because it might be in the wrong unit: the source's tool knows its units.
+
+    Parameters
+    ----------
+    tables
+        A feeder.
+    changes
+        Takes every value that was doubted.
+    """
+    doubts: set[str] = set()
+    for problem in validate(tables):
+        sentence, found, doubt = problem.partition(' (if it is right: accept = ["')
+        if found:
+            doubts.add(doubt.partition('"')[0])
+            changes.append(Change("feeder", sentence, "accepted", "as the source has it"))
+    accept = tuple(name for name in SUSPICIONS if name in doubts)
+    return replace(tables, meta=replace(tables.meta, accept=accept)) if accept else tables
+
+
+def _opened(lines: Iterable[LineRow], opened: Sequence[str], changes: list[Change]) -> list[LineRow]:
+    """Open the lines that were asked for."""
+    rows = list(lines)
+    unknown = sorted(set(opened) - {row.line for row in rows})
+    if unknown:
+        raise FeederInvalid(f"there is no line {line!r} to open" for line in unknown)
+    changes.extend(
+        Change(f"line {line}", "closed", "changed", "open, as asked for; the check shows what that does")
+        for line in opened
+    )
+    return [replace(row, closed=False) if row.line in opened else row for row in rows]
+
+
+def _reached(start: str, rows: Iterable[LineRow], without: str | None = None) -> dict[str, int]:
+    """Return the buses that closed lines connect, with how many lines away; nothing passes `without`."""
+    near: dict[str, list[str]] = defaultdict(list)
+    for row in rows:
+        if row.closed:
+            near[row.from_bus].append(row.to_bus)
+            near[row.to_bus].append(row.from_bus)
+    level = {start: 0}
+    order = [start]
+    for bus in order:
+        for other in near[bus]:
+            if other not in level and bus != without:
+                level[other] = level[bus] + 1
+                order.append(other)
+    return level
+
+
+def _as_rows(couplings: Iterable[Coupling]) -> list[LineRow]:
+    """Couplings as lines, where only what is connected matters."""
+    return [
+        LineRow(each.name, each.buses[0], other, 0.0, 0.0) for each in couplings for other in each.buses[1:]
+    ]
+
+
+def _busbar(network: Network, rows: list[LineRow], root: str | None) -> str:
+    """Return the bus asked for, or the first from the source on that has lines."""
+    if root is not None:
+        hits = [bus for bus in network.nominal if bus == root] or [
+            bus for bus in network.nominal if bus.lower() == root.lower()
+        ]
+        if len(hits) != 1:
+            raise GridsecError(f"there is no bus {root!r}")
+        return hits[0]
+    if len(network.sources) != 1:
+        names = ", ".join(network.sources) or "none"
+        raise GridsecError(f"the busbar is not clear, voltage sources at: {names}; name it with root")
+    way = _way_down(network, rows)
+    if not _has_lines(way[-1], rows):
+        beyond = ", ".join(sorted(_beyond(network, way))) or "none"
+        raise GridsecError(f"the busbar is not clear, candidates: {beyond}; name it with root")
+    return way[-1]
+
+
+def below_source(network: Network) -> str | None:
+    """Return the bus of the only source's only transformer on its other side; None if there is no such bus.
+
+    Parameters
+    ----------
+    network
+        The network.
+    """
+    way = _way_down(network, network.lines) if len(network.sources) == 1 else []
+    return way[-1] if len(way) > 1 and _has_lines(way[-1], network.lines) else None
+
+
+def _way_down(network: Network, rows: list[LineRow]) -> list[str]:
+    """Follow transformers from the source, as long as there is only one way and no line."""
+    way = [network.sources[0]]
+    while not _has_lines(way[-1], rows):
+        beyond = _beyond(network, way)
+        if len(beyond) != 1:
+            break
+        way.append(beyond.pop())
+    return way
+
+
+def _has_lines(bus: str, rows: list[LineRow]) -> bool:
+    return any(row.closed and bus in (row.from_bus, row.to_bus) for row in rows)
+
+
+def _beyond(network: Network, way: list[str]) -> set[str]:
+    return {bus for each in network.couplings if way[-1] in each.buses for bus in each.buses} - set(way)
+
+
+def _infeeds(network: Network, rows: list[LineRow], busbar: str, inside: Mapping[str, int]) -> list[str]:
+    """Return what else feeds the feeder besides its busbar."""
+    problems = []
+    everything = [*rows, *_as_rows(network.couplings)]
+    for source in network.sources:
+        if source in inside and source != busbar:
+            problems.append(
+                f"bus {source!r} has another voltage source; the feeder is fed by its busbar {busbar!r} alone"
+            )
+        elif source != busbar:
+            above = _reached(source, everything, without=busbar)
+            ways = [bus for bus in inside if bus != busbar and bus in above]
+            if ways:
+                problems.append(
+                    f"{len(ways)} of the feeder's buses can be reached from the source {source!r} not only "
+                    f"through the busbar {busbar!r}, among them {', '.join(ways[:5])}: a mesh; "
+                    "open a line of it, or name another busbar with root"
+                )
+    return problems
+
+
+def _kept(
+    network: Network, rows: list[LineRow], inside: Mapping[str, int], changes: list[Change]
+) -> list[LineRow]:
+    """Lines of the feeder, each pointing away from the busbar, with positions."""
+    kept = []
+    for row in rows:
+        a, b = row.from_bus in inside, row.to_bus in inside
+        if a and b:
+            turned = inside[row.to_bus] < inside[row.from_bus]
+            away = replace(row, from_bus=row.to_bus, to_bus=row.from_bus) if turned else row
+            place = network.xy.get(away.to_bus)
+            kept.append(replace(away, to_x=place[0], to_y=place[1]) if place else away)
+        elif a or b:
+            changes.append(
+                Change(f"line {row.line}", WHOLE, "left out", "open towards what the busbar does not feed")
+            )
+    outside = len(network.nominal.keys() - inside.keys())
+    if outside:
+        changes.append(
+            Change(
+                _buses(outside),
+                WHOLE,
+                "left out",
+                "above the busbar, behind a transformer or without supply",
+            )
+        )
+    return kept
+
+
+def _buses(count: int) -> str:
+    return f"{count} bus{'es' if count != 1 else ''}"
+
+
+def _behind(
+    network: Network, rows: list[LineRow], inside: Mapping[str, int], changes: list[Change]
+) -> list[Draw]:
+    """Couplings below the busbar, as what flows into them."""
+    busbar = next(iter(inside))
+    everything = [*rows, *_as_rows(network.couplings)]
+    above = {bus for source in network.sources for bus in _reached(source, everything, without=busbar)}
+    draws = []
+    for each in network.couplings:
+        ends = [k for k, bus in enumerate(each.buses) if bus in inside]
+        if not ends or any(bus in above and bus not in inside for bus in each.buses):
+            continue
+        far = {
+            bus
+            for end in each.buses
+            if end not in inside
+            for bus in _reached(
+                end, [row for row in everything if not {row.from_bus, row.to_bus} & inside.keys()]
+            )
+        }
+        if not np.isfinite(np.array([each.power_kva[k] for k in ends])).all():
+            effect = f"{_buses(len(far))}; what flows there is not known"
+            changes.append(Change(each.name, "load side", "left out", effect))
+            continue
+        for k in ends:
+            power = each.power_kva[k]
+            name = each.name if len(ends) == 1 else f"{each.name} {each.buses[k]}"
+            draws.append(Draw(name, each.buses[k], power, even=is_even(power)))
+        total = sum((each.power_kva[k].sum() for k in ends), start=0j)
+        changes.append(
+            Change(
+                each.name,
+                "load side",
+                "changed",
+                f"{_buses(len(far))} became a customer that draws what flows there, "
+                f"{total.real:.4g} kW and {total.imag:.4g} kvar; exact at these loads only",
+            )
+        )
+    return draws

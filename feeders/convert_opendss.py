@@ -1,0 +1,402 @@
+"""OpenDSS master files, read by OpenDSS itself: its matrices of the lines, its power flow.
+
+OpenDSS is one global state. Everything here runs in an engine of its own, which is cleared before and after,
+opens no windows, starts no programs and writes nothing outside a temporary folder.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from feeders.convert_changes import WHOLE, Change
+from feeders.convert_draws import Draw
+from feeders.convert_lines import capacitor, line_row, open_end
+from feeders.convert_network import Coupling, Network
+from feeders.schema import LineRow
+from gridsec.arrays import Floats, Phasors
+from gridsec.errors import FeederInvalid, GridsecError
+
+PHASES: Final = 3
+SOLVER: Final = ("set mode=snap", "set tolerance=1e-11", "set maxiterations=1000", "set maxcontroliter=200")
+CONSTANT_POWER: Final = (
+    "set controlmode=off",
+    "batchedit load..* model=1 vminpu=0.01 vlowpu=0.005 vmaxpu=10",
+    "batchedit generator..* model=1 vminpu=0.01 vmaxpu=10",
+)
+DEAD: Final = 1e-4
+"""Voltage, pu, below which nothing energises a phase: only open lines end there."""
+
+SERIES: Final = {"line", "reactor"}
+COUPLINGS: Final = {"transformer", "autotrans"}
+LOADS: Final = {"load"}
+GENERATORS: Final = {"generator", "pvsystem", "storage"}
+SILENT: Final = {"monitor", "energymeter", "sensor"}
+"""Only measure, and change nothing."""
+CONTROLS: Final = {
+    "regcontrol": "taps stand where the source's power flow left them",
+    "capcontrol": "switched as the source's power flow left them",
+    "swtcontrol": "stays as the source's power flow left it",
+    "fuse": "never blows",
+    "relay": "never trips",
+    "recloser": "never trips",
+    "invcontrol": "inverters follow the droop curve of the customer",
+    "expcontrol": "inverters follow the droop curve of the customer",
+    "storagecontroller": "storage stays as the source's power flow left it",
+    "gendispatcher": "generators stay as the source's power flow left them",
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Element:
+    """One element of the circuit as solved, terminal by terminal."""
+
+    name: str
+    kind: str
+    buses: tuple[str, ...]
+    nodes: tuple[tuple[int, ...], ...]
+    power_kva: tuple[Phasors, ...]
+    enabled: bool
+    on: tuple[int, ...]
+
+    @property
+    def closed(self) -> bool:
+        """Whether it is connected at all its ends."""
+        return self.enabled and len(self.on) == len(self.buses)
+
+
+@contextmanager
+def _engine() -> Iterator[Any]:
+    """Yield an OpenDSS engine of its own, empty and without effects on anything else."""
+    try:
+        from opendssdirect import dss
+    except ImportError as error:
+        raise GridsecError(
+            "OpenDSS files need the extra 'convert': pip install 'gridsec[convert]'"
+        ) from error
+    with tempfile.TemporaryDirectory() as scratch:
+        engine = dss.NewContext()
+        engine.Basic.AllowForms(False)
+        engine.Basic.AllowEditor(False)
+        engine.Basic.AllowDOScmd(False)
+        engine.Basic.AllowChangeDir(False)
+        engine.Basic.DataPath(scratch)
+        engine.Basic.ClearAll()
+        try:
+            yield engine
+        finally:
+            engine.Basic.ClearAll()
+
+
+def read_opendss(path: Path) -> Network:
+    """Read and solve a master file.
+
+    Parameters
+    ----------
+    path
+        The file that defines the circuit and its voltage bases.
+
+    Raises
+    ------
+    GridsecError
+        If OpenDSS cannot read or solve it.
+    FeederInvalid
+        With everything in it that no feeder can be.
+    """
+    with _engine() as dss:
+        try:
+            return _read(dss, path)
+        except (FeederInvalid, GridsecError):
+            raise
+        except Exception as error:  # whatever the foreign engine raises on a foreign file
+            raise GridsecError(f"{path}: OpenDSS: {' '.join(str(error).split())}") from error
+
+
+def _read(dss: Any, path: Path) -> Network:
+    dss.Text.Command(f'redirect "{path.resolve()}"')
+    if not dss.Basic.NumCircuits():
+        raise GridsecError(f"{path}: OpenDSS finds no circuit in it; expected 'new circuit...'")
+    problems: list[str] = []
+    _run(dss, SOLVER)
+    found = _solved(dss)
+    if not found:
+        raise GridsecError(f"{path}: OpenDSS's own power flow does not converge")
+    elements = [_element(dss, name, problems) for name in dss.Circuit.AllElementNames()]
+    changes = _voltage_dependence(dss)
+    _run(dss, CONSTANT_POWER)
+    volts = _solved(dss)
+    if volts:
+        elements = [_element(dss, name, problems) for name in dss.Circuit.AllElementNames()]
+    nominal = _nominal(dss, problems)
+    network = Network(
+        tool=f"OpenDSS {version('dss_python_backend')}",
+        sources=[each.buses[0] for each in elements if each.kind == "vsource" and each.enabled],
+        nominal=nominal,
+        volts=volts,
+        as_found=found if changes else {},
+        xy=_positions(dss),
+        unsolved="with loads of constant power OpenDSS's own power flow does not converge",
+    )
+    network.of_bus.extend(changes)
+    _build_everything(dss, elements)
+    for each in elements:
+        _take(dss, each, network, problems)
+    if problems:
+        raise FeederInvalid(f"{path.name}: {problem}" for problem in dict.fromkeys(problems))
+    return network
+
+
+def _run(dss: Any, commands: tuple[str, ...]) -> None:
+    for command in commands:
+        dss.Text.Command(command)
+
+
+def _solved(dss: Any) -> dict[str, Phasors]:
+    """Solve, and return the voltages of all buses, V; none if there is no solution."""
+    dss.Solution.Solve()
+    if not dss.Solution.Converged():
+        return {}
+    volts: dict[str, Phasors] = {}
+    for bus in dss.Circuit.AllBusNames():
+        dss.Circuit.SetActiveBus(bus)
+        parts = np.array(dss.Bus.Voltages()).reshape(-1, 2)
+        v = np.full(PHASES, np.nan, dtype=np.complex128)
+        for node, (real, imaginary) in zip(dss.Bus.Nodes(), parts, strict=True):
+            live = abs(complex(real, imaginary)) > DEAD * 1000.0 * float(dss.Bus.kVBase())
+            if 1 <= node <= PHASES and live:
+                v[node - 1] = complex(real, imaginary)
+        volts[bus] = v
+    return volts
+
+
+def _nominal(dss: Any, problems: list[str]) -> dict[str, float]:
+    nominal = {}
+    for bus in dss.Circuit.AllBusNames():
+        dss.Circuit.SetActiveBus(bus)
+        nominal[bus] = 1000.0 * float(dss.Bus.kVBase())
+    bare = [bus for bus, volt in nominal.items() if volt <= 0]
+    if bare:
+        problems.append(
+            f"{len(bare)} bus(es) have no nominal voltage, among them {', '.join(bare[:5])}; "
+            "expected 'set voltagebases=[...]' and 'calcvoltagebases' in the file"
+        )
+    return nominal
+
+
+def _positions(dss: Any) -> dict[str, tuple[float, float]]:
+    places = {}
+    for bus in dss.Circuit.AllBusNames():
+        dss.Circuit.SetActiveBus(bus)
+        if dss.Bus.Coorddefined():
+            places[bus] = (round(float(dss.Bus.X()), 6), round(float(dss.Bus.Y()), 6))
+    return places
+
+
+def _voltage_dependence(dss: Any) -> list[tuple[str, Change]]:
+    """Loads that are not of constant power, and those that follow a shape, each with its bus."""
+    changes = []
+    for name in dss.Loads.AllNames():
+        if name.lower() == "none":
+            continue
+        dss.Loads.Name(name)
+        bus = str(dss.CktElement.BusNames()[0]).partition(".")[0].lower()
+        if int(dss.Loads.Model()) != 1:
+            change = Change(
+                f"load {name}",
+                f"model {int(dss.Loads.Model())}",
+                "approximated",
+                "depends on the voltage in the source; taken as constant power",
+            )
+            changes.append((bus, change))
+    return changes
+
+
+def _element(dss: Any, full: str, problems: list[str]) -> _Element:
+    dss.Circuit.SetActiveElement(full)
+    kind, _, name = full.partition(".")
+    kind = kind.lower()
+    element = dss.CktElement
+    enabled = bool(element.Enabled())
+    buses = tuple(str(bus).partition(".")[0].lower() for bus in element.BusNames())
+    conductors = int(element.NumConductors())
+    order = list(element.NodeOrder()) if enabled else []
+    nodes = tuple(tuple(order[k * conductors : (k + 1) * conductors]) for k in range(len(buses)))
+    parts = np.array(element.Powers()).reshape(-1, 2) if enabled else np.empty((0, 2))
+    flat = parts[:, 0] + 1j * parts[:, 1]
+    powers = []
+    for k, here in enumerate(nodes):
+        power = np.zeros(PHASES, dtype=np.complex128)
+        for node, kva in zip(here, flat[k * conductors : (k + 1) * conductors], strict=True):
+            if 1 <= node <= PHASES:
+                power[node - 1] += kva
+        powers.append(power)
+    if enabled and kind not in COUPLINGS and any(node > PHASES for here in nodes for node in here):
+        problems.append(
+            f"{kind} {name} has a conductor besides the phases 1, 2, 3 and the grounded neutral 0; "
+            "expected none"
+        )
+    on = tuple(k for k in range(len(buses)) if enabled and not element.IsOpen(k + 1, 0))
+    return _Element(name, kind, buses, nodes, tuple(powers), enabled, on)
+
+
+def _build_everything(dss: Any, elements: list[_Element]) -> None:
+    """Close what is open, after everything else has been read: matrices are only of what is closed."""
+    for each in elements:
+        if each.kind in SERIES and each.enabled and not each.closed:
+            dss.Circuit.SetActiveElement(f"{each.kind}.{each.name}")
+            for terminal in range(1, len(each.buses) + 1):
+                dss.CktElement.Close(terminal, 0)
+    dss.Solution.BuildYMatrix(1, 0)
+
+
+def _take(dss: Any, each: _Element, network: Network, problems: list[str]) -> None:
+    """Add an element to the network, or say what becomes of it."""
+    label = f"{each.kind} {each.name}"
+    if not each.enabled:
+        network.changes.append(Change(label, WHOLE, "left out", "disabled in the source"))
+    elif each.kind in {"capacitor", "reactor"} and _is_shunt(each):
+        _shunt(dss, each, network)
+    elif each.kind in SERIES:
+        _line(dss, each, network, problems)
+    elif each.kind == "capacitor":
+        problems.append(f"{label} is in series between {each.buses[0]} and {each.buses[1]}; expected a shunt")
+    elif each.kind in COUPLINGS:
+        network.couplings.append(Coupling(label, each.buses, each.power_kva))
+    elif each.kind in LOADS | GENERATORS:
+        _draw(dss, each, network)
+    elif each.kind in CONTROLS:
+        bus = each.buses[0] if each.buses else ""
+        network.of_bus.append((bus, Change(label, WHOLE, "left out", CONTROLS[each.kind])))
+    elif each.kind not in SILENT and each.kind != "vsource":
+        change = Change(label, WHOLE, "left out", "has no place in a feeder; the check shows what that does")
+        network.of_bus.append((each.buses[0], change))
+
+
+def _is_shunt(each: _Element) -> bool:
+    return len(each.buses) == 1 or each.buses[0] == each.buses[1] or set(each.nodes[-1]) == {0}
+
+
+def _yprim(dss: Any, each: _Element) -> Phasors:
+    dss.Circuit.SetActiveElement(f"{each.kind}.{each.name}")
+    flat = np.array(dss.CktElement.YPrim())
+    size = round((flat.size // 2) ** 0.5)
+    matrix: Phasors = (flat[0::2] + 1j * flat[1::2]).reshape(size, size)
+    return matrix
+
+
+def _line(dss: Any, each: _Element, network: Network, problems: list[str]) -> None:
+    """A line or a series reactor: its series impedance and its charging from its primitive admittances."""
+    label = each.name if each.kind == "line" else f"{each.kind}.{each.name}"
+    here, there = each.nodes
+    if here != there or len(set(here)) != len(here) or not all(1 <= node <= PHASES for node in here):
+        if all(1 <= node <= PHASES for node in (*here, *there)):
+            problems.append(
+                f"line {label} joins the phases {'.'.join(map(str, here))} of {each.buses[0]} to "
+                f"{'.'.join(map(str, there))} of {each.buses[1]}; expected the same phases at both ends"
+            )
+        elif 0 in (*here, *there):
+            problems.append(f"line {label} has a conductor to ground; expected phases 1, 2, 3")
+        return
+    matrix, count = _yprim(dss, each), len(here)
+    series = np.asarray(
+        np.linalg.inv(-0.5 * (matrix[:count, count:] + matrix[count:, :count].T)), dtype=np.complex128
+    )
+    shunt: Floats = (
+        matrix[:count, :count] + matrix[count:, count:] + matrix[:count, count:] + matrix[count:, :count]
+    ).imag
+    order = np.argsort(here)
+    phases = np.array(here)[order] - 1
+    if min(series.real.diagonal().min(), series.imag.diagonal().min()) < 0:
+        problems.append(f"line {label} has a negative resistance or reactance; expected none")
+        return
+    changes: list[Change] = []
+    row = line_row(
+        label,
+        (each.buses[0], each.buses[1]),
+        phases,
+        series=series[np.ix_(order, order)],
+        shunt=shunt[np.ix_(order, order)],
+        changes=changes,
+    )
+    network.of_bus.extend((each.buses[0], change) for change in changes)
+    row = _rated(dss, each, row)
+    network.lines.append(row)
+    if len(each.on) == 1:
+        bus = each.buses[each.on[0]]
+        stub = open_end(row, bus, network.nominal[bus])
+        network.lines += [stub] if stub else []
+
+
+def _rated(dss: Any, each: _Element, row: LineRow) -> LineRow:
+    limit = 0.0
+    if each.kind == "line":
+        dss.Lines.Name(each.name)
+        limit = float(dss.Lines.NormAmps())
+    return replace(row, closed=each.closed, rating_a=limit if limit > 0 else None)
+
+
+def _shunt(dss: Any, each: _Element, network: Network) -> None:
+    """A capacitor at a bus becomes the charging of a line to nowhere; a reactor is left out."""
+    label, bus = f"{each.kind} {each.name}", each.buses[0]
+    kvar = -sum(power.sum() for power in each.power_kva).imag
+    if not each.closed or each.kind == "reactor" or kvar <= 0:
+        effect = f"{-kvar:.4g} kvar" if each.closed else "switched off in the source"
+        network.of_bus.append((bus, Change(label, WHOLE, "left out", effect)))
+        return
+    here = [k for k, node in enumerate(each.nodes[0]) if 1 <= node <= PHASES]
+    block = _yprim(dss, each)[np.ix_(here, here)].imag
+    own = block.sum(axis=1) if len(here) < PHASES else np.full(PHASES, block.diagonal().mean())
+    mutual = float(block[0, 1]) if len(here) > 1 else 0.0
+    delta = abs(mutual) > 1e-6 * float(block.diagonal().max())
+    if delta and len(here) == PHASES:
+        own = np.full(PHASES, block.diagonal().mean() - mutual)
+    change = Change(
+        label,
+        "connection",
+        "approximated" if delta else "changed",
+        f"{kvar:.4g} kvar as the charging of a line to nowhere"
+        + (", in star instead of delta; exact where the voltages are balanced" if delta else ""),
+    )
+    network.of_bus.append((bus, change))
+    for k, siemens in zip(here, own, strict=True):
+        phase = "abc" if len(here) == PHASES else "abc"[each.nodes[0][k] - 1]
+        name = each.name if len(here) != 2 else f"{each.name}-{phase}"
+        if siemens > 0:
+            network.lines.append(capacitor(f"capacitor.{name}", bus, float(siemens), phase))
+        if phase == "abc":
+            return
+
+
+def _draw(dss: Any, each: _Element, network: Network) -> None:
+    power = each.power_kva[0]
+    used = [node for node in each.nodes[0] if 1 <= node <= PHASES]
+    even = len(used) == PHASES
+    label = f"{each.kind} {each.name}"
+    apart = float(np.abs(power - power.mean()).max()) if even else 0.0
+    if (even and apart > 1e-9 * float(np.abs(power).max(initial=0.0))) or len(used) == 2:
+        effect = (
+            "in star, its power split evenly; exact where the voltages are balanced"
+            if even
+            else "in star, its phases' powers as the source's power flow has them; exact at these loads only"
+        )
+        network.of_bus.append((each.buses[0], Change(label, "delta", "approximated", effect)))
+    rating = None
+    if each.kind in GENERATORS:
+        rating = float(np.abs(power.sum()))
+        dss.Circuit.SetActiveElement(f"{each.kind}.{each.name}")
+        given = (
+            dss.Properties.Value("kva")
+            if "kva" in [n.lower() for n in dss.Element.AllPropertyNames()]
+            else ""
+        )
+        rating = max(rating, float(given or 0.0)) if each.kind == "pvsystem" else 0.0
+        effect = "a customer with generation; its fixed reactive power is that of its droop curve"
+        network.of_bus.append((each.buses[0], Change(label, "control", "changed", effect)))
+    network.draws.append(Draw(each.name, each.buses[0], power, even=even, rating_kva=rating))

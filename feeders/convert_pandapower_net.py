@@ -1,0 +1,323 @@
+"""A pandapower net as a network: its lines, switches and transformers, and its own power flow."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import warnings
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from importlib.metadata import version
+from typing import Any, Final
+
+import numpy as np
+
+from feeders.convert_changes import WHOLE, Change
+from feeders.convert_customers import rounded
+from feeders.convert_draws import Draw
+from feeders.convert_lines import capacitor, open_end
+from feeders.convert_network import Coupling, Network
+from feeders.schema import LineRow
+from gridsec.arrays import Phasors
+
+# Tables that are carried over, or told about one by one; every other row in the feeder earns a note.
+CARRIED: Final = {
+    "bus", "line", "load", "asymmetric_load", "asymmetric_sgen", "sgen", "switch", "trafo", "trafo3w",
+    "ext_grid", "gen", "storage", "motor", "ward", "shunt",
+}  # fmt: skip
+FIXED: Final = {"gen": -1.0, "storage": 1.0, "motor": 1.0, "ward": 1.0}
+"""Tables of what becomes a customer as the source's power flow has it, and the sign of its results."""
+
+UNLIMITED_KA: Final = 1000.0
+TURN: Final = np.exp(-2j * np.pi / 3.0 * np.arange(3))
+SIDES: Final = {"trafo": ("hv", "lv"), "trafo3w": ("hv", "mv", "lv")}
+
+
+def ids(table: Any, noun: str, taken: Iterable[str] = ()) -> dict[int, str]:
+    """Return an id per row: the source's name where there is a unique one, otherwise with its index.
+
+    Parameters
+    ----------
+    table
+        A table of a net.
+    noun
+        What a row is called that has no name.
+    taken
+        Names that others have.
+    """
+    given = {int(i): _clean(name) for i, name in zip(table.index, table["name"], strict=True)}
+    count = Counter([*given.values(), *taken])
+    found: dict[int, str] = {}
+    for i, name in given.items():
+        own = name if name and count[name] == 1 else f"{name or noun}-{i}"
+        while own != name and count[own]:
+            own += "'"
+        found[i] = own
+        count[own] += own != name
+    return found
+
+
+def _clean(name: object) -> str:
+    text = "" if name is None or name != name else str(name)  # noqa: PLR0124  # NaN is the table's None
+    return "".join(c if c.isprintable() else " " for c in text).strip()[:100]
+
+
+def network_of(net: Any) -> Network:
+    """Return a net as a network; its loads and static generators are left to `feeders.convert_pandapower`.
+
+    Parameters
+    ----------
+    net
+        A pandapower net; stays as it is.
+    """
+    buses = ids(net.bus, "bus")
+    nominal = {buses[int(i)]: float(kv) * 1000.0 / math.sqrt(3.0) for i, kv in net.bus.vn_kv.items()}
+    feeds = net.ext_grid.bus[net.ext_grid.in_service.astype(bool)]
+    network = Network(
+        f"pandapower {version('pandapower')}",
+        list(dict.fromkeys(buses[int(bus)] for bus in feeds)),
+        nominal,
+    )
+    network.xy = {buses[int(i)]: place for i in net.bus.index if (place := _place(net, int(i))) is not None}
+    network.lines = [*_line_rows(net, buses, network), *_switch_rows(net, buses)]
+    solved = _solve(net, buses, network)
+    _transformers(net, solved, buses, network)
+    _fixed(net, solved, buses, network)
+    _shunts(net, buses, network)
+    _rest(net, buses, network)
+    return network
+
+
+def _place(net: Any, bus: int) -> tuple[float, float] | None:
+    geo = net.bus.at[bus, "geo"] if "geo" in net.bus.columns else None
+    if not isinstance(geo, str):
+        return None
+    x, y = json.loads(geo)["coordinates"][:2]
+    return round(float(x), 6), round(float(y), 6)
+
+
+# --- lines and switches -------------------------------------------------------------------------
+
+
+def _line_rows(net: Any, buses: dict[int, str], network: Network) -> Iterator[LineRow]:
+    names = ids(net.line, "line")
+    opened = _opened(net, "l")
+    dead = {int(bus) for bus in net.bus.index[~net.bus.in_service.astype(bool)]}
+    omega = 2.0 * math.pi * float(net.f_hz)
+    for i, row in zip(map(int, net.line.index), net.line.to_dict("records"), strict=True):
+        length, parallel = float(row["length_km"]), float(row["parallel"])
+        limit = float(row["max_i_ka"]) * float(row["df"]) * parallel
+        ends = int(row["from_bus"]), int(row["to_bus"])
+        charging = rounded(omega * float(row["c_nf_per_km"]) * length * parallel * 1e-3)
+        on = [bus for bus in ends if (i, bus) not in opened and bus not in dead and row["in_service"]]
+        closed = len(on) == 2
+        _side_effects(row, f"line {names[i]}", buses[ends[0]], closed, network)
+        made = LineRow(
+            line=names[i],
+            from_bus=buses[ends[0]],
+            to_bus=buses[ends[1]],
+            r_ohm=rounded(float(row["r_ohm_per_km"]) * length / parallel),
+            x_ohm=rounded(float(row["x_ohm_per_km"]) * length / parallel),
+            r0_ohm=_zero_sequence(row, "r0_ohm_per_km", length / parallel),
+            x0_ohm=_zero_sequence(row, "x0_ohm_per_km", length / parallel),
+            b_us=charging,
+            closed=closed,
+            rating_a=rounded(limit * 1000.0) if 0.0 < limit < UNLIMITED_KA else None,
+        )
+        yield made
+        stub = open_end(made, buses[on[0]], network.nominal[buses[on[0]]]) if len(on) == 1 else None
+        if stub is not None:
+            yield stub
+
+
+def _opened(net: Any, kind: str) -> set[tuple[int, int]]:
+    """Elements of a kind, each with a bus at which a switch disconnects it."""
+    switches = net.switch[(net.switch.et == kind) & ~net.switch.closed.astype(bool)]
+    return {(int(element), int(bus)) for element, bus in zip(switches.element, switches.bus, strict=True)}
+
+
+def _side_effects(row: dict[str, Any], label: str, bus: str, closed: bool, network: Network) -> None:
+    """Say what a row of lines.csv cannot hold."""
+    length, parallel = float(row["length_km"]), float(row["parallel"])
+    if row["g_us_per_km"] > 0 and closed:
+        effect = f"{row['g_us_per_km'] * length * parallel:.3g} microsiemens"
+        network.of_bus.append((bus, Change(label, "shunt conductance", "left out", effect)))
+    zero = row.get("c0_nf_per_km", math.nan)
+    if closed and math.isfinite(zero) and abs(zero - row["c_nf_per_km"]) > 1e-7 * row["c_nf_per_km"]:
+        effect = "that of the positive sequence; exact where the voltages are balanced"
+        network.of_bus.append((bus, Change(label, "zero-sequence charging", "approximated", effect)))
+
+
+def _zero_sequence(row: dict[str, Any], column: str, factor: float) -> float | None:
+    value = float(row.get(column, math.nan))
+    return rounded(value * factor) if math.isfinite(value) else None
+
+
+def _switch_rows(net: Any, buses: dict[int, str]) -> Iterator[LineRow]:
+    names = ids(net.switch, "switch", ids(net.line, "line").values())
+    for i in map(int, net.switch.index):
+        row = net.switch.loc[i]
+        if row.et == "b":
+            ohm = float(row.z_ohm) if "z_ohm" in row and row.z_ohm > 0 else 0.0
+            yield LineRow(
+                line=names[i],
+                from_bus=buses[int(row.bus)],
+                to_bus=buses[int(row.element)],
+                r_ohm=rounded(ohm),
+                x_ohm=0.0,
+                closed=bool(row.closed),
+            )
+
+
+# --- the power flow of pandapower -----------------------------------------------------------------
+
+
+def unbalanced(net: Any) -> bool:
+    """Return whether a net has loads or generators of single phases."""
+    return any(
+        len(net[table]) and net[table].in_service.any() for table in ("asymmetric_load", "asymmetric_sgen")
+    )
+
+
+def _solve(net: Any, buses: dict[int, str], network: Network) -> Any:
+    """Run the net's own power flow; the solved copy, or None with the reason in the network."""
+    import pandapower
+
+    solved = copy.deepcopy(net)
+    dependent = [
+        column for column in net.load.columns if column.startswith("const_") and (net.load[column] > 0).any()
+    ]
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            if unbalanced(net):
+                pandapower.runpp_3ph(solved, numba=False, tolerance_mva=1e-11)
+            else:
+                if dependent:
+                    pandapower.runpp(solved, numba=False, tolerance_mva=1e-10)
+                    network.as_found = _volts(solved, buses)
+                pandapower.runpp(solved, numba=False, tolerance_mva=1e-10, voltage_depend_loads=False)
+        network.volts = _volts(solved, buses)
+    except Exception as error:  # noqa: BLE001  # whatever the foreign solver raises on a foreign net
+        text = " ".join(str(error).split()) or type(error).__name__
+        network.unsolved = f"pandapower's own power flow fails: {text[:200]}"
+        return None
+    return solved
+
+
+def _volts(net: Any, buses: dict[int, str]) -> dict[str, Phasors]:
+    base = net.bus.vn_kv.to_numpy()[:, None] * 1000.0 / math.sqrt(3.0)
+    if unbalanced(net):
+        found = net.res_bus_3ph.loc[net.bus.index]
+        size = found[[f"vm_{phase}_pu" for phase in "abc"]].to_numpy()
+        angle = found[[f"va_{phase}_degree" for phase in "abc"]].to_numpy()
+        v = base * size * np.exp(1j * np.deg2rad(angle))
+    else:
+        found = net.res_bus.loc[net.bus.index]
+        one = found.vm_pu.to_numpy() * np.exp(1j * np.deg2rad(found.va_degree.to_numpy()))
+        v = base * one[:, None] * TURN
+    return {buses[int(i)]: row for i, row in zip(net.bus.index, v, strict=True)}
+
+
+def _flow(solved: Any, table: str, index: int, side: str) -> Phasors:
+    """What flows into an element, by phase, kVA."""
+    tail = f"_{side}" if side else ""
+    if unbalanced(solved):
+        row = solved[f"res_{table}_3ph"].loc[index]
+        s = [complex(row[f"p_{phase}{tail}_mw"], row[f"q_{phase}{tail}_mvar"]) for phase in "abc"]
+        return np.asarray(np.array(s) * 1e3, dtype=np.complex128)
+    row = solved[f"res_{table}"].loc[index]
+    return np.full(3, complex(row[f"p{tail}_mw"], row[f"q{tail}_mvar"]) * 1e3 / 3.0)
+
+
+def _transformers(net: Any, solved: Any, buses: dict[int, str], network: Network) -> None:
+    for table, sides in SIDES.items():
+        names = ids(net[table], table)
+        opened = _opened(net, "t" if table == "trafo" else "t3")
+        for i, row in net[table].iterrows():
+            ends = [(side, int(row[f"{side}_bus"])) for side in sides]
+            ends = [(side, bus) for side, bus in ends if (int(i), bus) not in opened]
+            label = f"{'transformer' if table == 'trafo' else 'three-winding transformer'} {names[int(i)]}"
+            if not row.in_service or len(ends) < 2:
+                network.changes.append(Change(label, WHOLE, "left out", "switched off in the source"))
+                continue
+            network.couplings.append(
+                Coupling(
+                    label,
+                    tuple(buses[bus] for _, bus in ends),
+                    tuple(_known_flow(solved, table, int(i), side) for side, _ in ends),
+                )
+            )
+
+
+def _known_flow(solved: Any, table: str, index: int, side: str) -> Phasors:
+    unknown: Phasors = np.full(3, np.nan, dtype=np.complex128)
+    if solved is None:
+        return unknown
+    try:
+        return _flow(solved, table, index, side)
+    except KeyError:  # not every table has results in three phases
+        return unknown
+
+
+def _fixed(net: Any, solved: Any, buses: dict[int, str], network: Network) -> None:
+    """What draws or feeds in by rules of its own becomes a customer at the source's operating point."""
+    for table, sign in FIXED.items():
+        names = ids(net[table], table)
+        for i in map(int, net[table].index):
+            bus, label = buses[int(net[table].at[i, "bus"])], f"{table} {names[i]}"
+            power = sign * _known_flow(solved, table, i, "")
+            if not np.isfinite(power).all():
+                effect = (
+                    "its power is not known; the check shows what that does"
+                    if solved is not None
+                    else "unknown"
+                )
+                network.of_bus.append((bus, Change(label, WHOLE, "left out", effect)))
+                continue
+            network.draws.append(Draw(label, bus, power, rating_kva=0.0 if power.real.sum() < 0 else None))
+            effect = f"a customer that draws {power.real.sum():.4g} kW and {power.imag.sum():.4g} kvar"
+            network.of_bus.append((bus, Change(label, "control", "changed", effect)))
+    names = ids(net.asymmetric_sgen, "asymmetric_sgen")
+    for i in map(int, net.asymmetric_sgen.index):
+        row = net.asymmetric_sgen.loc[i]
+        scale = -1e3 * float(row.scaling) * float(row.in_service)
+        each = [scale * complex(row[f"p_{p}_mw"], row[f"q_{p}_mvar"]) for p in "abc"]
+        power = np.array(each, dtype=np.complex128)
+        network.draws.append(Draw(names[i], buses[int(row.bus)], power, even=False, rating_kva=0.0))
+
+
+def _shunts(net: Any, buses: dict[int, str], network: Network) -> None:
+    """Capacitors become the charging of lines to nowhere."""
+    names = ids(net.shunt, "shunt")
+    for i in map(int, net.shunt.index):
+        row = net.shunt.loc[i]
+        bus, label = buses[int(row.bus)], f"shunt {names[i]}"
+        if not row.in_service:
+            network.of_bus.append((bus, Change(label, WHOLE, "left out", "switched off in the source")))
+            continue
+        p, q = (float(row[name]) * float(row.step) for name in ("p_mw", "q_mvar"))
+        if p != 0:
+            network.of_bus.append((bus, Change(label, "conductance", "left out", f"{1e3 * p:.4g} kW")))
+        if q > 0:
+            network.of_bus.append((bus, Change(label, "inductance", "left out", f"{1e3 * q:.4g} kvar")))
+        elif q < 0:
+            network.lines.append(capacitor(label, bus, -q / float(row.vn_kv) ** 2))
+            effect = f"{-1e3 * q:.4g} kvar as the charging of a line to nowhere"
+            network.of_bus.append((bus, Change(label, "connection", "changed", effect)))
+
+
+def _rest(net: Any, buses: dict[int, str], network: Network) -> None:
+    """Name every other table with rows: what is there has no place in the format."""
+    for table in sorted(net.keys()):
+        content = net[table]
+        if table in CARRIED or not hasattr(content, "columns") or table.startswith("res_"):
+            continue
+        ends = [column for column in ("bus", "from_bus", "to_bus") if column in content.columns]
+        for i in content.index if ends else ():
+            change = Change(f"{table} {i}", WHOLE, "left out", "has no place in a feeder")
+            network.of_bus.append((buses[int(content.at[i, ends[0]])], change))
+    if "controller" in net and len(net.controller):
+        effect = "taps and set points stand as the file has them"
+        network.changes.append(Change(f"{len(net.controller)} controller(s)", WHOLE, "left out", effect))

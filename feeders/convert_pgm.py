@@ -1,0 +1,322 @@
+"""Input data of power-grid-model in its JSON format, solved by power-grid-model itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from power_grid_model import CalculationMethod, PowerGridModel
+from power_grid_model.utils import json_deserialize  # type: ignore[attr-defined]  # documented, but not re-exported
+from power_grid_model.validation import validate_input_data
+
+from feeders.convert_changes import WHOLE, Change
+from feeders.convert_customers import rounded
+from feeders.convert_draws import Draw
+from feeders.convert_lines import capacitor, line_row, open_end
+from feeders.convert_network import Coupling, Network
+from feeders.records import some
+from feeders.schema import LineRow
+from gridsec.arrays import Floats, Phasors
+from gridsec.errors import FeederInvalid, GridsecError
+
+OMEGA: Final = 2.0 * np.pi * 50.0
+"""power-grid-model's angular frequency; its files do not say another."""
+
+LOADS: Final = ("sym_load", "asym_load")
+GENERATORS: Final = ("sym_gen", "asym_gen")
+COUPLINGS: Final = {
+    "transformer": (("from_node", "p_from", "q_from"), ("to_node", "p_to", "q_to")),
+    "three_winding_transformer": tuple((f"node_{k}", f"p_{k}", f"q_{k}") for k in (1, 2, 3)),
+    "generic_branch": (("from_node", "p_from", "q_from"), ("to_node", "p_to", "q_to")),
+}
+STATUS: Final = ("status", "from_status", "to_status", "status_1", "status_2", "status_3")
+TOLERANCES: Final = (1e-11, 1e-9, 1e-7)
+"""Largest voltage corrections of the last Newton step, pu; links, almost short circuits, limit them."""
+TURN: Final = np.exp(-2j * np.pi / 3.0 * np.arange(3))
+
+Tables = dict[str, Any]
+
+
+def read_pgm(path: Path) -> Network:
+    """Read and solve a file of input data.
+
+    Parameters
+    ----------
+    path
+        JSON as power-grid-model serialises a dataset of the type `input`.
+
+    Raises
+    ------
+    GridsecError
+        If power-grid-model cannot read or solve it.
+    FeederInvalid
+        With everything that is wrong with its data.
+    """
+    tables = _tables(path)
+    symmetric = not any(
+        len(tables[kind]) for kind in ("asym_load", "asym_gen", "asym_line") if kind in tables
+    )
+    problems = validate_input_data(tables, symmetric=symmetric)
+    if problems:
+        raise FeederInvalid(f"{path.name}: {problem} Ids: {_shown(problem.ids)}" for problem in problems)
+    dependent = [kind for kind in (*LOADS, *GENERATORS) if kind in tables and tables[kind]["type"].any()]
+    found = _solve(path, tables, symmetric) if dependent else {}
+    network = Network(f"power-grid-model {version('power-grid-model')}", [], _nominal(tables))
+    for kind in dependent:
+        for row in tables[kind][tables[kind]["type"] != 0]:
+            law = "impedance" if row["type"] == 1 else "current"
+            change = Change(
+                f"{kind} {row['id']}",
+                f"constant {law}",
+                "approximated",
+                "depends on the voltage in the source; taken as constant power",
+            )
+            network.of_bus.append((str(row["node"]), change))
+        tables[kind]["type"] = 0
+    solved = _solve(path, tables, symmetric)
+    network.volts = _volts(tables, solved)
+    network.as_found = _volts(tables, found) if found else {}
+    network.sources = [str(row["node"]) for row in _rows(tables, "source") if row["status"]]
+    _lines(tables, network)
+    _asymmetric_lines(tables, network)
+    _couplings(tables, solved, network)
+    _draws(tables, network)
+    _shunts(tables, solved, network)
+    _rest(tables, network)
+    return network
+
+
+def _tables(path: Path) -> Tables:
+    try:
+        data = json_deserialize(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise GridsecError(f"{path}: cannot be read: {error}") from error
+    except Exception as error:  # whatever the foreign reader raises on a foreign file
+        raise GridsecError(
+            f"{path}: power-grid-model cannot read it: {' '.join(str(error).split())}"
+        ) from error
+    tables = {kind.value: rows for kind, rows in data.items()}
+    problems = [
+        f"{path.name}: the table {kind!r} is missing" for kind in ("node", "source") if kind not in tables
+    ]
+    if any(not isinstance(rows, np.ndarray) or rows.ndim != 1 for rows in tables.values()):
+        problems.append(f"{path.name}: is a batch; expected one set of input data")
+    elif any("u_rated" not in (rows.dtype.names or ()) for kind, rows in tables.items() if kind == "node"):
+        problems.append(f"{path.name}: is not of the type 'input'; expected input data")
+    if problems:
+        raise FeederInvalid(problems)
+    return tables
+
+
+def _solve(path: Path, tables: Tables, symmetric: bool) -> Tables:
+    for tolerance in TOLERANCES:
+        try:
+            result = PowerGridModel(tables).calculate_power_flow(
+                symmetric=symmetric,
+                error_tolerance=tolerance,
+                max_iterations=30,
+                calculation_method=CalculationMethod.newton_raphson,
+            )
+        except Exception as error:  # whatever the foreign solver raises on foreign data
+            if tolerance == TOLERANCES[-1]:
+                text = " ".join(str(error).split()).partition(" Try ")[0]
+                raise GridsecError(f"{path}: power-grid-model's own power flow fails: {text}") from error
+        else:
+            return {kind.value: rows for kind, rows in result.items()}
+    raise AssertionError("the last tolerance has returned or raised")
+
+
+def _shown(ids: Iterable[Any] | None) -> str:
+    return some([str(each if isinstance(each, int) else each[-1]) for each in ids or ()])
+
+
+def _rows(tables: Tables, kind: str) -> list[Any]:
+    return list(tables.get(kind, ()))
+
+
+def _nominal(tables: Tables) -> dict[str, float]:
+    return {str(row["id"]): float(row["u_rated"]) / 3.0**0.5 for row in tables["node"]}
+
+
+def _volts(tables: Tables, solved: Tables) -> dict[str, Phasors]:
+    nodes = solved["node"]
+    v: Phasors = nodes["u_pu"] * np.exp(1j * nodes["u_angle"])
+    if v.ndim == 1:
+        v = v[:, None] * TURN
+    v = v * (tables["node"]["u_rated"] / 3.0**0.5)[:, None]
+    fed = nodes["energized"].astype(bool)
+    return {
+        str(row): volt if on else np.full(3, np.nan + 0j)
+        for row, volt, on in zip(nodes["id"], v, fed, strict=True)
+    }
+
+
+def _closed(row: Any) -> bool:
+    return bool(row["from_status"] and row["to_status"])
+
+
+def _finite(value: float) -> float | None:
+    return rounded(float(value)) if np.isfinite(value) else None
+
+
+def _lines(tables: Tables, network: Network) -> None:
+    for kind in ("line", "link"):
+        for row in _rows(tables, kind):
+            name, ends = f"{kind} {row['id']}", (str(row["from_node"]), str(row["to_node"]))
+            if kind == "link":
+                network.lines.append(LineRow(name, *ends, 0.0, 0.0, closed=_closed(row)))
+                continue
+            b1, b0 = OMEGA * float(row["c1"]), OMEGA * float(row["c0"])
+            if row["tan1"] > 0 and b1 > 0:
+                effect = f"{1e6 * b1 * float(row['tan1']):.3g} microsiemens"
+                network.of_bus.append((ends[0], Change(name, "shunt conductance", "left out", effect)))
+            _zero_charging(network, name, ends[0], b1, b0)
+            limit = _finite(row["i_n"])
+            made = LineRow(
+                name,
+                *ends,
+                rounded(float(row["r1"])),
+                rounded(float(row["x1"])),
+                r0_ohm=_finite(row["r0"]),
+                x0_ohm=_finite(row["x0"]),
+                b_us=rounded(1e6 * b1),
+                closed=_closed(row),
+                rating_a=limit if limit else None,
+            )
+            _add_line(row, made, network)
+
+
+def _add_line(row: Any, made: LineRow, network: Network) -> None:
+    network.lines.append(made)
+    if bool(row["from_status"]) != bool(row["to_status"]):
+        bus = made.from_bus if row["from_status"] else made.to_bus
+        stub = open_end(made, bus, network.nominal[bus])
+        network.lines += [stub] if stub else []
+
+
+def _zero_charging(network: Network, name: str, bus: str, b1: float, b0: float) -> None:
+    if np.isfinite(b0) and abs(b0 - b1) > 1e-7 * max(b0, b1):
+        effect = "that of the positive sequence; exact where the voltages are balanced"
+        network.of_bus.append((bus, Change(name, "zero-sequence charging", "approximated", effect)))
+
+
+def _asymmetric_lines(tables: Tables, network: Network) -> None:
+    """Lines given by matrices; a neutral is grounded at both ends and eliminated."""
+    for row in _rows(tables, "asym_line"):
+        name, ends = f"asym_line {row['id']}", (str(row["from_node"]), str(row["to_node"]))
+        letters = "abc" if np.isnan(row["r_na"]) else "abcn"
+        z = np.zeros((len(letters),) * 2, dtype=np.complex128)
+        for i, one in enumerate(letters):
+            for j, other in enumerate(letters[: i + 1]):
+                z[i, j] = z[j, i] = complex(row[f"r_{one}{other}"], row[f"x_{one}{other}"])
+        if len(letters) > 3:
+            z = z[:3, :3] - np.outer(z[:3, 3], z[3, :3]) / z[3, 3]
+        changes: list[Change] = []
+        made = line_row(name, ends, np.arange(3), series=z, shunt=_capacitances(row), changes=changes)
+        network.of_bus.extend((ends[0], change) for change in changes)
+        limit = _finite(row["i_n"])
+        _add_line(row, replace(made, closed=_closed(row), rating_a=limit if limit else None), network)
+
+
+def _capacitances(row: Any) -> Floats:
+    if np.isnan(row["c_aa"]):
+        own, mutual = (2.0 * row["c1"] + row["c0"]) / 3.0, (row["c0"] - row["c1"]) / 3.0
+        return np.asarray(OMEGA * (mutual * np.ones((3, 3)) + (own - mutual) * np.eye(3)))
+    c = np.zeros((3, 3))
+    for i, one in enumerate("abc"):
+        for j, other in enumerate("abc"[: i + 1]):
+            c[i, j] = c[j, i] = row[f"c_{one}{other}"]
+    return np.asarray(OMEGA * c)
+
+
+def _couplings(tables: Tables, solved: Tables, network: Network) -> None:
+    for kind, sides in COUPLINGS.items():
+        for row, flow in zip(_rows(tables, kind), _rows(solved, kind), strict=True):
+            label = f"{kind} {row['id']}"
+            if kind == "generic_branch" and _plain(row):
+                network.lines.append(_plain_line(row, label))
+                continue
+            on = [bool(row[name]) for name in STATUS[1:3] if name in row.dtype.names] or [
+                bool(row[name]) for name in STATUS[3:]
+            ]
+            joined = [k for k, ok in enumerate(on) if ok]
+            if len(joined) < 2:
+                network.changes.append(Change(label, WHOLE, "left out", "switched off in the source"))
+                continue
+            network.couplings.append(
+                Coupling(
+                    label,
+                    tuple(str(row[sides[k][0]]) for k in joined),
+                    tuple(_by_phase(flow[sides[k][1]], flow[sides[k][2]]) for k in joined),
+                )
+            )
+
+
+def _plain(row: Any) -> bool:
+    neutral = all(np.isnan(row[name]) or row[name] == value for name, value in (("k", 1.0), ("theta", 0.0)))
+    return bool(neutral and not row["g1"] > 0)
+
+
+def _plain_line(row: Any, label: str) -> LineRow:
+    return LineRow(
+        label,
+        str(row["from_node"]),
+        str(row["to_node"]),
+        rounded(float(row["r1"])),
+        rounded(float(row["x1"])),
+        b_us=rounded(1e6 * float(np.nan_to_num(row["b1"]))),
+        closed=_closed(row),
+    )
+
+
+def _by_phase(p: Any, q: Any) -> Phasors:
+    s = (np.asarray(p) + 1j * np.asarray(q)) * 1e-3
+    return np.asarray(np.full(3, s / 3.0) if s.ndim == 0 else s, dtype=np.complex128)
+
+
+def _draws(tables: Tables, network: Network) -> None:
+    for kind in (*LOADS, *GENERATORS):
+        sign = -1.0 if kind in GENERATORS else 1.0
+        for row in _rows(tables, kind):
+            power = sign * float(row["status"]) * _by_phase(row["p_specified"], row["q_specified"])
+            even = bool((power == power[0]).all())
+            rating = float(np.abs(power.sum())) if kind in GENERATORS else None
+            network.draws.append(Draw(f"{kind} {row['id']}", str(row["node"]), power, even, rating))
+
+
+def _shunts(tables: Tables, solved: Tables, network: Network) -> None:
+    for row, flow in zip(_rows(tables, "shunt"), _rows(solved, "shunt"), strict=True):
+        label, bus = f"shunt {row['id']}", str(row["node"])
+        p, q = (1e-3 * float(np.sum(flow[name])) for name in ("p", "q"))
+        if not row["status"]:
+            network.of_bus.append((bus, Change(label, WHOLE, "left out", "switched off in the source")))
+            continue
+        if row["g1"] != 0:
+            network.of_bus.append((bus, Change(label, "conductance", "left out", f"{p:.4g} kW")))
+        if row["b1"] > 0:
+            network.lines.append(capacitor(f"{label}", bus, float(row["b1"])))
+            effect = f"{-q:.4g} kvar as the charging of a line to nowhere"
+            network.of_bus.append((bus, Change(label, "connection", "changed", effect)))
+            _zero_charging(network, label, bus, float(row["b1"]), float(row["b0"]))
+        elif row["b1"] < 0:
+            network.of_bus.append((bus, Change(label, "inductance", "left out", f"{q:.4g} kvar")))
+
+
+def _rest(tables: Tables, network: Network) -> None:
+    """Name the tables that say nothing about the network itself."""
+    for kind, rows in tables.items():
+        if not len(rows):
+            continue
+        if kind.endswith("_sensor"):
+            effect = "every customer has a meter of the feeder's own kind instead"
+        elif kind == "transformer_tap_regulator":
+            effect = "taps stand as the file has them"
+        elif kind == "fault":
+            effect = "not part of a power flow"
+        else:
+            continue
+        network.changes.append(Change(f"{len(rows)} {kind}(s)", WHOLE, "left out", effect))

@@ -1,0 +1,313 @@
+"""Drawings as lists of marks, and as SVG: small, with text that stays text, the same bytes every time.
+
+A mark says what it is by the name of a look; colours come from two palettes, for light and for dark
+surroundings. Marks know nothing of feeders.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import Final
+
+__all__ = [
+    "DARK",
+    "LIGHT",
+    "LOOKS",
+    "STEPS",
+    "Area",
+    "Disc",
+    "Drawing",
+    "Line",
+    "Look",
+    "Mark",
+    "Text",
+    "regular",
+    "style",
+    "svg",
+    "width_of",
+]
+
+Point = tuple[float, float]
+
+STEPS: Final = 5
+"""How many steps a scale of sizes has; each has its own colour, and its own size."""
+
+LIGHT: Final = {
+    "card": "#ffffff",
+    "ink": "#16202b",
+    "quiet": "#5a6673",
+    "line": "#d9dfe5",
+    "soft": "#edf0f3",
+    "wire": "#8793a0",
+    "a": "#0b5cad",
+    "b": "#b45309",
+    "c": "#1c6b50",
+    "d": "#8a3d7d",
+    "bad": "#a1182f",
+    "on": "#ffffff",
+    "s0": "#f4ead9",
+    "s1": "#efc78f",
+    "s2": "#e2933f",
+    "s3": "#b85714",
+    "s4": "#6f2a00",
+}
+DARK: Final = {
+    "card": "#18212a",
+    "ink": "#e8edf2",
+    "quiet": "#9dabb8",
+    "line": "#2c3844",
+    "soft": "#26313b",
+    "wire": "#687685",
+    "a": "#6db3f8",
+    "b": "#f0a04b",
+    "c": "#7fdcb4",
+    "d": "#e0a3d6",
+    "bad": "#ff98a5",
+    "on": "#0f151b",
+    "s0": "#3b342a",
+    "s1": "#6b4c26",
+    "s2": "#a86c28",
+    "s3": "#e39a41",
+    "s4": "#ffd796",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """How a mark looks. Colours are names of the palettes; empty: none."""
+
+    fill: str = ""
+    stroke: str = ""
+    width: float = 1.0
+    dash: str = ""
+    bold: bool = False
+    halo: bool = False
+
+
+LOOKS: Final[dict[str, Look]] = {
+    "axis": Look(stroke="quiet"),
+    "grid": Look(stroke="line"),
+    "limit": Look(stroke="bad", width=1.5, dash="6 4"),
+    "wire": Look(stroke="wire", width=2.2),
+    "drop": Look(stroke="wire", width=1.2),
+    "busbar": Look(stroke="ink", width=5.0),
+    "text": Look(fill="ink"),
+    "strong": Look(fill="ink", bold=True),
+    "quiet": Look(fill="quiet"),
+    "label": Look(fill="ink", halo=True),
+    "on": Look(fill="on", bold=True),
+    "none": Look(fill="card", stroke="wire", width=1.2),
+    "plain": Look(fill="card", stroke="ink", width=1.4),
+    "solid": Look(fill="a", stroke="a", width=1.4),
+    "shield": Look(fill="c", stroke="c", width=1.4),
+    "tick": Look(stroke="on", width=1.8),
+    "alarm": Look(fill="bad", stroke="bad", width=1.4),
+    "band0": Look(fill="s1"),
+    "band1": Look(fill="s0", stroke="s2", width=0.8),
+    "band2": Look(fill="soft", stroke="wire", width=0.8),
+    "fill-a": Look(fill="a"),
+    "fill-b": Look(fill="b"),
+    "fill-c": Look(fill="c"),
+    "fill-d": Look(fill="d"),
+    "fill-bad": Look(fill="bad"),
+    "fill-soft": Look(fill="line"),
+    "fill-ink": Look(fill="ink"),
+    "fill-wire": Look(fill="wire"),
+    "line-a": Look(stroke="a", width=2.0),
+    "line-b": Look(stroke="b", width=2.0, dash="7 3"),
+    "line-c": Look(stroke="c", width=2.0, dash="2 3"),
+    "line-d": Look(stroke="d", width=2.0, dash="9 3 2 3"),
+    "line-ink": Look(stroke="ink", width=1.4),
+    "line-bad": Look(stroke="bad", width=2.0, dash="12 4"),
+    "line-wire": Look(stroke="wire", width=2.4, dash="4 4"),
+    "line-s": Look(stroke="s3", width=2.0, dash="1 4"),
+    **{f"step{k}": Look(fill=f"s{k}", stroke="ink", width=0.9) for k in range(STEPS)},
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A polyline; `tip` is shown to whoever points at it."""
+
+    points: tuple[Point, ...]
+    look: str
+    tip: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Area:
+    """A polygon."""
+
+    points: tuple[Point, ...]
+    look: str
+    tip: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Disc:
+    """A circle of radius r."""
+
+    x: float
+    y: float
+    r: float
+    look: str
+    tip: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Text:
+    """A line of text; y is its base line, `anchor` one of start, middle, end."""
+
+    x: float
+    y: float
+    text: str
+    look: str = "text"
+    anchor: str = "start"
+    size: float = 12.0
+
+
+Mark = Line | Area | Disc | Text
+
+
+@dataclass(frozen=True, slots=True)
+class Drawing:
+    """Marks on a sheet, in px from its upper left corner."""
+
+    width: float
+    height: float
+    marks: tuple[Mark, ...]
+
+
+def regular(x: float, y: float, r: float, corners: int, *, turn: float = 0.0) -> tuple[Point, ...]:
+    """Corners of a regular polygon around (x, y); the first is above the centre, turned by `turn` corners."""
+    angles = [2.0 * math.pi * (k + turn) / corners - 0.5 * math.pi for k in range(corners)]
+    return tuple((x + r * math.cos(angle), y + r * math.sin(angle)) for angle in angles)
+
+
+def width_of(text: str, size: float = 12.0) -> float:
+    """About how wide a text is, px: letters of a plain sans serif, rather too wide than too narrow."""
+    narrow = sum(letter in "iljtf.,:;'|!()[] " for letter in text)
+    wide = sum(letter in "mwMW%@" or ord(letter) > 0x2E80 for letter in text)
+    return size * (0.59 * (len(text) - narrow - wide) + 0.34 * narrow + 0.95 * wide)
+
+
+def style(scope: str = "") -> str:
+    """The style sheet of all looks, light and dark.
+
+    Parameters
+    ----------
+    scope
+        Selector of what holds the drawings; empty: the whole document is one drawing.
+    """
+    root = scope or ":root"
+    before = f"{scope} " if scope else ""
+    lines = [f"{root} {{ {_variables(LIGHT)} }}"]
+    lines.append(f"@media screen and (prefers-color-scheme: dark) {{ {root} {{ {_variables(DARK)} }} }}")
+    fonts = "system-ui, 'Segoe UI', Roboto, 'Noto Sans', 'DejaVu Sans', sans-serif"
+    lines.append(f"{before}text {{ font-family: {fonts}; }}")
+    lines += [f"{before}.g-{name} {{ {_rule(look)} }}" for name, look in LOOKS.items()]
+    return "\n".join(lines)
+
+
+def _variables(palette: dict[str, str]) -> str:
+    return " ".join(f"--g-{name}: {colour};" for name, colour in palette.items())
+
+
+def _rule(look: Look) -> str:
+    parts = [f"fill: {f'var(--g-{look.fill})' if look.fill else 'none'};"]
+    if look.stroke:
+        parts.append(f"stroke: var(--g-{look.stroke}); stroke-width: {look.width:g}; stroke-linejoin: round;")
+    if look.stroke and not look.dash:
+        parts.append("stroke-linecap: round;")
+    if look.dash:
+        parts.append(f"stroke-dasharray: {look.dash};")
+    if look.bold:
+        parts.append("font-weight: 650;")
+    if look.halo:
+        parts.append("paint-order: stroke; stroke: var(--g-card); stroke-width: 3px; stroke-linejoin: round;")
+    return " ".join(parts)
+
+
+def svg(drawing: Drawing, *, title: str, text: str, key: str, alone: bool = False) -> str:
+    """Write a drawing as SVG.
+
+    Parameters
+    ----------
+    drawing
+        What to write.
+    title, text
+        Its title, and what it shows, in words for those who cannot see it.
+    key
+        Makes ids unique in a document: letters, digits and hyphens.
+    alone
+        As a file of its own, with its style sheet and background.
+    """
+    width, height = _number(drawing.width), _number(drawing.height)
+    head = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" '
+        f'height="{height}" role="img" aria-labelledby="{key}-t {key}-d">',
+        f'<title id="{key}-t">{_plain(title)}</title>',
+        f'<desc id="{key}-d">{_plain(text)}</desc>',
+    ]
+    if alone:
+        head.append(f"<style>{style()}</style>")
+        head.append(f'<rect width="{width}" height="{height}" style="fill: var(--g-card)"/>')
+    return "\n".join([*head, *_merged(drawing.marks), "</svg>"]) + "\n"
+
+
+def _merged(marks: Sequence[Mark]) -> Iterable[str]:
+    """Write marks; neighbours of the same look without a tip share one path."""
+    held: tuple[str, list[str]] | None = None
+    for mark in marks:
+        if isinstance(mark, Line | Area) and not mark.tip:
+            if held is not None and held[0] == mark.look:
+                held[1].append(_path(mark))
+                continue
+            if held is not None:
+                yield _one_path(*held)
+            held = (mark.look, [_path(mark)])
+            continue
+        if held is not None:
+            yield _one_path(*held)
+            held = None
+        yield _element(mark)
+    if held is not None:
+        yield _one_path(*held)
+
+
+def _one_path(look: str, parts: list[str]) -> str:
+    return f'<path class="g-{look}" d="{"".join(parts)}"/>'
+
+
+def _element(mark: Mark) -> str:
+    if isinstance(mark, Text):
+        anchor = "" if mark.anchor == "start" else f' text-anchor="{mark.anchor}"'
+        return (
+            f'<text class="g-{mark.look}" x="{_number(mark.x)}" y="{_number(mark.y)}" '
+            f'font-size="{_number(mark.size)}"{anchor}>{_plain(mark.text)}</text>'
+        )
+    tip = f"<title>{_plain(mark.tip)}</title>" if mark.tip else ""
+    if isinstance(mark, Disc):
+        x, y, r = map(_number, (mark.x, mark.y, mark.r))
+        what = f'<circle class="g-{mark.look}" cx="{x}" cy="{y}" r="{r}"'
+        return f"{what}>{tip}</circle>" if tip else f"{what}/>"
+    what = f'<path class="g-{mark.look}" d="{_path(mark)}"'
+    return f"{what}>{tip}</path>" if tip else f"{what}/>"
+
+
+def _path(mark: Line | Area) -> str:
+    steps = " ".join(f"{_number(x)} {_number(y)}" for x, y in mark.points)
+    return f"M{steps}{'Z' if isinstance(mark, Area) else ''}"
+
+
+def _number(value: float) -> str:
+    text = f"{value:.2f}".rstrip("0").rstrip(".")
+    return "0" if text == "-0" else text
+
+
+def _plain(text: str) -> str:
+    """Text for XML: escaped, and without the characters that XML does not have."""
+    return escape("".join(c if c >= " " and c not in "\ufffe\uffff" else "\ufffd" for c in text))

@@ -1,0 +1,220 @@
+"""Section of the droop fleet: whether it is stable, keeps the voltage band, and what it hosts."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import TYPE_CHECKING
+
+from feeders.report.charts import LINES, Bar, Curve, Row, curves, rows
+from feeders.report.drawing import Drawing
+from feeders.report.figure import Figure
+from feeders.report.section import Question, Section
+from feeders.report.words import Finding, Sentence, Standing, Value, least, listed, number
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from feeders.load import Site
+    from feeders.studies.droop import DroopStudy
+
+__all__ = ["droop"]
+
+ROWS = 30
+"""So many customers a chart has at most: those whose voltage can move most."""
+
+STABLE, UNSTABLE, KEPT, VIOLATED, UNDECIDED = "stable", "unstable", "kept", "violated", "undecided"
+
+
+def droop(site: Site, found: DroopStudy) -> Section:
+    """Whether the inverters are stable and keep the voltage band.
+
+    Parameters
+    ----------
+    site, found
+        The feeder, and what was found.
+    """
+    given, own = found.options, site.tables.meta.limits
+    limits = [
+        site.feeder.base_volt * (mine if asked is None else asked)
+        for asked, mine in ((given.v_min, own.v_min_pu), (given.v_max, own.v_max_pu))
+    ]
+    band = f"{number(limits[0], 1)} to {number(limits[1], 1)} V"
+    every = "continuously" if not given.interval_s else f"every {given.interval_s:g} s"
+    delay = f", with a dead time of {given.dead} intervals" if given.dead else ""
+    return Section(
+        title="The inverters",
+        answers={Question.FLEET: _fleet(found, band)},
+        figures=_figures(found, band),
+        tables=found.tables,
+        columns={
+            "verdict": "stable: proved to come to one rest from every state; unstable: leaves its rest, "
+            "proved and simulated; undecided: neither is proved",
+            "gain, growth": "of the loop at rest; factor of a small deviation in one update",
+            "margin": "all curves stay proved stable up to this factor on their slopes",
+            "certified, unstable": "the same for these curves made steeper: proved up to the one, unstable "
+            "from the other on",
+            "longest interval s": "longest sampling interval found that is proved stable; ∞: every one",
+            "rest, always": "is the band kept while loads move slowly, and however they move",
+            "low volt, high volt": "proved limits of the voltage",
+            "part, alone": "share of the loop gain; what one inverter's slope may be multiplied with",
+        },
+        assumptions=(
+            f"Inverters: {given.preset or 'as in the files'}; they act {every}{delay}. Balanced power flow.",
+            f"Any loads up to {100.0 * given.load_high:g} % and generation up to {100.0 * given.pv_high:g} % "
+            f"of their peaks; busbar from {given.v0_low:g} to {given.v0_high:g} pu; band {band}.",
+        ),
+    )
+
+
+# --- sentences ----------------------------------------------------------------------------------
+
+
+def _fleet(found: DroopStudy, band: str) -> Finding:
+    stability, kept = found.tables["stability"], found.tables["band"].to_dict("records")
+    fleet = {str(name): value for name, value in kept[0].items()}
+    verdict, rest, always = str(found.verdict), str(fleet["rest"]), str(fleet["always"])
+    sentences = [_stability(stability, verdict), _band(fleet, rest, always, band)]
+    without = [row for row in kept if row["case"] == "without"]
+    if without and (rest, always) != (str(without[0]["rest"]), str(without[0]["always"])):
+        told = str(without[0]["always"])
+        word = "not proved to be kept, nor broken" if told == UNDECIDED else told
+        sentences.append((f"Without the inverters' reactive power the band is {word}.",))
+    sentences += _hosting(found)
+    open_ = [verdict == UNDECIDED, UNDECIDED in (rest, always)]
+    standing = Standing.OPEN if all(open_) else Standing.PART if any(open_) else Standing.PROVED
+    return Finding(standing, tuple(sentences))
+
+
+def _stability(stability: pd.DataFrame, verdict: str) -> Sentence:
+    name = "droop-stability"
+    if verdict == STABLE:
+        margin: Sentence = ()
+        if math.isfinite(float(stability["margin"].min())):
+            times = least(stability, name, "margin", "", 1)
+            margin = (" All curves could be ", times, " times as steep and still be proved stable.")
+        return ("Stable: proved for constant loads anywhere within their limits.", *margin)
+    which = [str(p) for p, v in zip(stability["point"], stability["verdict"], strict=True) if v == verdict]
+    count = Value(len(which), str(len(which)), f"{name}:verdict:count {verdict}")
+    where: Sentence = (" (", count, f" of {len(stability)} cases: {listed(which)})")
+    if verdict == UNSTABLE:
+        return ("Unstable: the fleet leaves its rest, in the proof and in AC simulation", *where, ".")
+    why = listed(list(dict.fromkeys(str(w) for w in stability["why"].dropna() if w)))
+    reason = f": {why}" if why else ""
+    return ("Whether the fleet is stable is not proved", *where, f"{reason}. It may oscillate.")
+
+
+def _band(fleet: dict[str, object], rest: str, always: str, band: str) -> Sentence:
+    proved = _limits(fleet, "")
+    if always == KEPT:
+        return (f"The band from {band} is kept, however loads move within their limits", *proved, ".")
+    if rest == KEPT:
+        broken = always == VIOLATED
+        sudden = "sudden changes can break it" if broken else "during sudden changes that is not proved"
+        lead = f"The band from {band} is kept while loads move slowly; {sudden}"
+        return (lead, *_limits(fleet, "_rest"), ".")
+    if VIOLATED in (rest, always):
+        when = "at rest" if rest == VIOLATED else "while loads change"
+        return (f"The band from {band} can be broken {when}: loads that do so are among the tables.",)
+    return (f"Whether the band from {band} is kept is not proved, and no loads that break it were found.",)
+
+
+def _limits(fleet: dict[str, object], which: str) -> Sentence:
+    low, high = (float(str(fleet[f"{end}{which}_volt"])) for end in ("low", "high"))
+    if not (math.isfinite(low) and math.isfinite(high)):
+        return ()
+    return (
+        "; proved limits ",
+        Value(low, f"{number(low, 1)} V", f"droop-band:low{which}_volt:row 0"),
+        " and ",
+        Value(high, f"{number(high, 1)} V", f"droop-band:high{which}_volt:row 0"),
+    )
+
+
+def _hosting(found: DroopStudy) -> list[Sentence]:
+    table = found.tables.get("hosting")
+    if table is None:
+        return []
+    words: list[str | Value] = ["Generation that the feeder hosts before something breaks: "]
+    for k, row in enumerate(table.to_dict("records")):
+        kw = float(row["capacity_kw"])
+        name = "without reactive power" if row["preset"] == "none" else f"with {row['preset']}"
+        words += ["; " if k else "", Value(kw, f"{number(kw, 0)} kW", f"droop-hosting:capacity_kw:row {k}")]
+        words.append(f" {name} ({row['limit'] or 'no limit found'})")
+    return [(*words, ".")]
+
+
+# --- figures ------------------------------------------------------------------------------------
+
+
+def _figures(found: DroopStudy, band: str) -> tuple[Figure, ...]:
+    customers, tables = found.tables["customers"], found.tables
+    out = []
+    known = customers[[math.isfinite(v) for v in customers["low_volt"] + customers["high_volt"]]]
+    if len(known):
+        some = f" The {ROWS} widest of {len(known)}." if len(known) > ROWS else ""
+        out.append(
+            Figure(
+                "droop-band",
+                "Proved limits of every customer's voltage",
+                f"With any loads and generation within their limits. The band is {band}.{some}",
+                partial(_band_chart, known),
+            )
+        )
+    if {"steps", "trajectories"} <= tables.keys() and len(tables["trajectories"]):
+        steps = [f"{row['step']}: {row['outcome']}" for row in tables["steps"].to_dict("records")]
+        out.append(
+            Figure(
+                "droop-steps",
+                "What happens after a step",
+                f"AC simulation, at the customer with the worst voltage in the end. {'; '.join(steps)}.",
+                partial(_steps_chart, tables["steps"], tables["trajectories"]),
+            )
+        )
+    if "hosting_probability" in tables:
+        out.append(
+            Figure(
+                "droop-hosting",
+                "How much generation the feeder hosts",
+                "Share of random orders in which so much generation breaks a limit, by preset.",
+                partial(_hosting_chart, tables["hosting_probability"]),
+            )
+        )
+    return tuple(out)
+
+
+def _band_chart(customers: pd.DataFrame, width: float) -> Drawing:
+    wide = (customers["high_volt"] - customers["low_volt"]).sort_values(ascending=False, kind="stable")
+    data = []
+    for row in customers.loc[wide.index[:ROWS]].to_dict("records"):
+        low, high, low_rest, high_rest = (
+            float(row[k]) for k in ("low_volt", "high_volt", "low_rest_volt", "high_rest_volt")
+        )
+        bars = [Bar(low, high, "band1", "at all times")]
+        if math.isfinite(low_rest + high_rest):
+            bars.append(Bar(low_rest, high_rest, "fill-a", "while loads move slowly", inset=6.0))
+        data.append(Row(str(row["customer"]), tuple(bars), f"{number(low, 1)} to {number(high, 1)} V"))
+    span = float(customers["high_volt"].max() - customers["low_volt"].min())
+    return rows(data, width, axis="voltage, V", start=float(customers["low_volt"].min()) - 0.05 * span)
+
+
+def _steps_chart(steps: pd.DataFrame, runs: pd.DataFrame, width: float) -> Drawing:
+    drawn = []
+    for k, row in enumerate(steps.to_dict("records")):
+        own = runs[(runs["step"] == row["step"]) & (runs["customer"] == row["worst_customer"])]
+        x, y = (tuple(float(v) for v in own[name]) for name in ("t_s", "v_volt"))
+        meaning = f"{row['step']}: {row['outcome']}"
+        drawn.append(Curve(x, y, LINES[k % len(LINES)], meaning))
+    return curves(drawn, width, x="s after the step", y="voltage, V")
+
+
+def _hosting_chart(table: pd.DataFrame, width: float) -> Drawing:
+    drawn = []
+    for k, (preset, some) in enumerate(table.groupby("preset", sort=False)):
+        x, y = [0.0], [0.0]
+        for kw, share in zip(some["capacity_kw"], some["probability"], strict=True):
+            x += [float(kw)] * 2
+            y += [y[-1], 100.0 * float(share)]
+        name = "without reactive power" if preset == "none" else str(preset)
+        drawn.append(Curve(tuple(x), tuple(y), LINES[k % len(LINES)], name))
+    return curves(drawn, width, x="generation, kW", y="orders in which a limit is broken, %", high=100.0)

@@ -1,0 +1,316 @@
+"""Sections of the studies of lies and of protection: detectable, protect."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from feeders.report.charts import Bar, Row, rows
+from feeders.report.drawing import Drawing
+from feeders.report.figure import Figure
+from feeders.report.maps import Shape, Spot, draw_map
+from feeders.report.section import Question, Section
+from feeders.report.spots import names_of, size_map
+from feeders.report.words import (
+    Finding,
+    Sentence,
+    Standing,
+    Value,
+    least,
+    listed,
+    most,
+    number,
+    plural,
+)
+from feeders.report.words import rows as how_many
+from feeders.studies.protect import Goal
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from feeders.load import Site
+    from feeders.studies.detectable import Detectable
+    from feeders.studies.protect import Protect
+
+__all__ = ["detectable", "protect"]
+
+ROWS = 30
+"""So many rows a chart has at most; the largest are shown."""
+
+
+# --- detectable ---------------------------------------------------------------------------------
+
+
+def detectable(site: Site, found: Detectable) -> Section:
+    """Which lies stay unnoticed, in volts; and what they do to the picture.
+
+    Parameters
+    ----------
+    site, found
+        The feeder, and what was found.
+    """
+    liars, sure = found.max_attacked, f"{100.0 * (1.0 - found.risk):.6g} %"
+    return Section(
+        title="How large a lie must be",
+        answers={
+            Question.LIES: _sizes(found.meters, liars, sure),
+            Question.PICTURE: _picture(site, found.customers, liars),
+        },
+        figures=(
+            Figure(
+                "detectable-sizes",
+                "What becomes of a lie, by its size",
+                f"Each meter lying together with at most {liars - 1} more. Left: nobody is named. "
+                "Middle: it depends on the honest errors of the moment. From the end of the last bar on the "
+                f"lying meter is named.{_largest_only(found.meters)}",
+                partial(_sizes_chart, found.meters),
+            ),
+            Figure(
+                "detectable-map",
+                "Where lies may stay unnoticed",
+                f"Size from which a lie is surely noticed, V, {liars} {plural(liars, 'liar')} together. "
+                f"Larger discs, larger lies. Largest at {_extreme(found.meters, 'meter', 'noticed')}.",
+                partial(size_map, site, found.meters, who="meter", column="noticed"),
+            ),
+            Figure(
+                "detectable-picture",
+                "How wrong the picture of the voltage can be",
+                f"Largest error of each customer's reconstructed voltage under {liars} unnoticed "
+                f"{plural(liars, 'liar')}, V. Largest at {_extreme(found.customers, 'customer', 'error')}.",
+                partial(size_map, site, found.customers, who="customer", column="error"),
+            ),
+        ),
+        tables=found.tables,
+        columns={
+            "hidden": f"up to this, V, with probability {sure} at any one moment, nobody is named",
+            "noticed": "beyond this somebody is beyond a limit, with that probability",
+            "named": "beyond this the lying meter is named, whoever else lies",
+            "fits": "up to this the readings are those of some honest feeder, all errors at their worst: "
+            "no test without false alarms can object",
+            "identified": "beyond this every explanation by so few liars accuses the meter",
+            "… alone": "the same without accomplices",
+            "error": "largest error of the monitor's reconstructed voltage, V",
+            "error fits": "how far apart two voltages can be that fit to the same readings, V",
+        },
+        assumptions=(
+            f"At most {liars} {plural(liars, 'meter lies', 'meters lie')} together; liars know the feeder, "
+            "but not the honest errors of the moment.",
+            "Sequential monitor, before it has learned the fixed errors of its meters; balanced model; "
+            "inverters in their deadbands; nominal voltage.",
+            "Where the search for the worst collusion was cut short, sizes are what was proved until there: "
+            "on the safe side.",
+        ),
+    )
+
+
+def _sizes(meters: pd.DataFrame, liars: int, sure: str) -> Finding:
+    name = "detectable-meters"
+    together = "alone" if liars == 1 else f"with up to {liars} lying together"
+    never = meters[[math.isinf(v) or math.isnan(v) for v in meters["noticed"]]]
+    lead: Sentence = (
+        "All ",
+        how_many(meters, name),
+        f" meters, {together}, can be lied about by a little: for lies up to ",
+        least(meters, name, "hidden", "V"),
+        f" ({_which(meters, 'hidden', smallest=True)}) to ",
+        most(meters, name, "hidden", "V"),
+        f" ({_which(meters, 'hidden')}) nobody is named, with {sure} at any one moment.",
+    )
+    if len(never):
+        noticed: Sentence = (
+            f"For {listed(never['meter'].tolist())} no size is proved to be noticed. "
+            "That is no proof that lies there are harmless.",
+        )
+        return Finding(Standing.PART, (lead, noticed))
+    noticed = (
+        "Larger lies may go unnoticed, depending on the honest errors of the moment; somebody is surely "
+        "noticed from ",
+        least(meters, name, "noticed", "V"),
+        f" ({_which(meters, 'noticed', smallest=True)}) to ",
+        most(meters, name, "noticed", "V"),
+        f" ({_which(meters, 'noticed')}) on.",
+    )
+    if not all(math.isfinite(v) for v in meters["named"]):
+        named: Sentence = ("Not every liar is proved to be named, however large the lie.",)
+        return Finding(Standing.PART, (lead, noticed, named))
+    named = (
+        "The lying meter itself is surely named from ",
+        least(meters, name, "named", "V"),
+        " to ",
+        most(meters, name, "named", "V"),
+        " on.",
+    )
+    return Finding(Standing.PROVED, (lead, noticed, named))
+
+
+def _picture(site: Site, customers: pd.DataFrame, liars: int) -> Finding:
+    name = "detectable-customers"
+    who = "a single lying meter" if liars == 1 else f"{liars} meters that lie together"
+    lead: Sentence = (
+        f"Unnoticed, {who} can shift the voltage that the monitor shows by at most ",
+        most(customers, name, "error", "V"),
+        f" (at {_extreme(customers, 'customer', 'error')}) and nowhere by less than ",
+        least(customers, name, "error", "V"),
+        f", honest errors included. Nominal voltage is {number(float(site.feeder.base_volt), 1)} V.",
+    )
+    if not all(math.isfinite(v) for v in customers["error"]):
+        return Finding(Standing.OPEN, (("No bound of the error is proved for every customer.",),))
+    whoever: Sentence = (
+        "Whatever the method, two voltages up to ",
+        most(customers, name, "error_fits", "V"),
+        " apart can fit to the same readings.",
+    )
+    return Finding(Standing.PROVED, (lead, whoever))
+
+
+def _which(table: pd.DataFrame, column: str, *, smallest: bool = False) -> str:
+    order = table[column]
+    at = int(order.argmin() if smallest else order.argmax())
+    return str(table["meter"].iloc[at])
+
+
+def _extreme(table: pd.DataFrame, who: str, column: str) -> str:
+    return str(table[who].iloc[int(table[column].argmax())])
+
+
+def _largest_only(table: pd.DataFrame) -> str:
+    return f" The {ROWS} largest of {len(table)} are shown." if len(table) > ROWS else ""
+
+
+def _sizes_chart(meters: pd.DataFrame, width: float) -> Drawing:
+    shown = meters.sort_values(["named", "meter"], ascending=[False, True]).head(ROWS)
+    finite = [v for v in shown[["hidden", "noticed", "named"]].to_numpy().ravel() if math.isfinite(v)]
+    end = 1.15 * max(finite, default=1.0)
+    data = []
+    for _, row in shown.iterrows():
+        a, b, c = (float(row[k]) if math.isfinite(row[k]) else end for k in ("hidden", "noticed", "named"))
+        bars = (
+            Bar(0.0, a, "fill-bad", "nobody is named", f"to {number(row['hidden'])} V nobody is named"),
+            Bar(
+                a,
+                b,
+                "band0",
+                "it depends on honest errors",
+                f"surely noticed from {number(row['noticed'])} V on",
+            ),
+            Bar(
+                b,
+                max(b, c),
+                "band2",
+                "noticed, not yet surely named",
+                f"named from {number(row['named'])} V on",
+            ),
+        )
+        data.append(Row(str(row["meter"]), bars, f"{number(row['named'])} V"))
+    return rows(data, width, axis="size of the lie, V at nominal voltage")
+
+
+# --- protect ------------------------------------------------------------------------------------
+
+
+def protect(site: Site, found: Protect) -> Section:
+    """Which meters to protect.
+
+    Parameters
+    ----------
+    site, found
+        The feeder, and what was found.
+    """
+    chosen = set(found.meters["meter"]) if len(found.meters) else set()
+    return Section(
+        title="Which meters to protect",
+        answers={Question.PROTECT: _protection(site, found)},
+        figures=(
+            Figure(
+                "protect-map",
+                "Meters to protect",
+                f"Shields: {listed(sorted(chosen))}."
+                if chosen
+                else "None needs protection for what was asked.",
+                partial(_protect_map, site, chosen),
+            ),
+        ),
+        tables=found.tables,
+        columns={
+            "before, after": "largest hidden lie, V"
+            if found.goal is Goal.BOUND
+            else "fewest liars that stay invisible, without and with protection",
+            "least": "no fewer protected meters suffice",
+            "attacks": "in how many of the listed attacks the meter takes part",
+            "liars": "meters whose attack rules out anything cheaper",
+        },
+        assumptions=(
+            f"At most {found.max_attacked} of the other meters lie; a protected meter cannot.",
+            *(
+                ("All errors at their worst, inverters in their deadbands.",)
+                if found.goal is Goal.BOUND
+                else (f"Attacks that count: {found.attack}. Loads of metered customers are known.",)
+            ),
+        ),
+    )
+
+
+def _protection(site: Site, found: Protect) -> Finding:
+    count, liars = len(found.meters), found.max_attacked
+    others = f"any {liars} liars" if liars > 1 else "any single liar"
+    purpose = {
+        Goal.IDENTIFY: f"{others} among the other meters would be identified",
+        Goal.NOTICE: f"the lies of {others} among the other meters would be noticed",
+        Goal.BOUND: f"no lie above {number(found.lie_volt)} V of {others} fits to an honest feeder",
+    }[found.goal]
+    scope = "" if found.goal is Goal.BOUND else " by someone who knows all other loads and errors exactly"
+    if not count:
+        lead: Sentence = (f"None for this purpose: even without protection, {purpose}{scope}.",)
+    else:
+        who = how_many(found.meters, "protect-meters")
+        lead = (
+            "Protect ",
+            who,
+            f" of {site.meters.size} meters: {listed(found.meters['meter'].tolist())}. "
+            f"Then {purpose}{scope}.",
+        )
+    effect: Sentence = (
+        "Largest lie that can hide: " if found.goal is Goal.BOUND else "Fewest liars that stay invisible: ",
+        _cell(found.before, "protect-summary:before:row 0", found.goal),
+        " before, ",
+        _cell(found.after, "protect-summary:after:row 0", found.goal),
+        " after.",
+    )
+    proof: Sentence = ("No fewer suffice; other choices of as many may be as good.",)
+    if not count and not math.isnan(found.before):
+        return Finding(Standing.PROVED, (lead,) if math.isinf(found.before) else (lead, effect))
+    if found.gap:
+        needed = Value(found.least, str(found.least), "protect-summary:least:row 0")
+        proof = (
+            "These suffice, but that they are the fewest is not proved; at least ",
+            needed,
+            " are needed.",
+        )
+    return Finding(Standing.PART if found.gap else Standing.PROVED, (lead, effect, proof))
+
+
+def _cell(value: float, source: str, goal: Goal) -> Value:
+    if math.isnan(value):
+        return Value(value, "not known", source)
+    if goal is Goal.BOUND:
+        return Value(value, f"{number(value)} V", source)
+    return Value(value, "none, however many" if math.isinf(value) else number(value), source)
+
+
+def _protect_map(site: Site, chosen: set[Any], width: float) -> Drawing:
+    ids = names_of(site, "meter")
+    crowd = len(ids) > 60
+    spots = [
+        Spot(Shape.PROTECTED, name, f"{name}: protect", weight=1.0)
+        if name in chosen
+        else Spot(Shape.METER, "" if crowd else name, f"{name}")
+        if name
+        else Spot(Shape.NONE, tip=site.feeder.customers[k])
+        for k, name in enumerate(ids)
+    ]
+    legend = {"protect": Spot(Shape.PROTECTED)} if chosen else {}
+    legend |= {"meter": Spot(Shape.METER)}
+    if "" in ids:
+        legend["customer without a meter"] = Spot(Shape.NONE)
+    return draw_map(site, spots, width, legend=legend)

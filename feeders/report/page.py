@@ -1,0 +1,351 @@
+"""The report as one HTML page: nothing is fetched from anywhere, and no name of a feeder becomes markup."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from feeders.report.drawing import style, svg
+from feeders.report.figure import NARROW, WIDE, Figure
+from feeders.report.markup import Markup, el, join
+from feeders.report.section import Question, Section
+from feeders.report.sections import ANSWERS, Outcome
+from feeders.report.words import Finding, Standing, Value, number
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+__all__ = ["About", "Chapter", "page"]
+
+MOST_COLUMNS: Final = 13
+"""It shows so many columns at most, and more than FEW_COLUMNS in small print."""
+FEW_COLUMNS: Final = 8
+OPEN_ROWS: Final = 14
+"""Tables up to this many rows are open."""
+MOST_ROWS: Final = 500
+HEAD_ROWS: Final = 60
+"""Of tables with more than MOST_ROWS rows the page shows the first ones; the files beside it have all."""
+
+MARK: Final = Markup(
+    '<svg viewBox="0 0 24 24" aria-hidden="true"><path d="M3 4v16M3 8h11M3 16h7"/>'
+    '<circle cx="17" cy="8" r="2.6"/><circle class="bang" cx="14" cy="16" r="2.8"/></svg>'
+)
+
+
+@dataclass(frozen=True, slots=True)
+class About:
+    """What the report says of itself.
+
+    Attributes
+    ----------
+    made
+        When it was made, as it is to be written.
+    command
+        Makes it again.
+    versions
+        Of gridsec and of what computes in it.
+    seeds
+        Everything random began with these.
+    folder
+        Name of the folder beside the page with figures and tables; empty: there is none.
+    """
+
+    made: str
+    command: str
+    versions: Mapping[str, str]
+    seeds: Mapping[str, int]
+    folder: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chapter:
+    """A section, and the study it is about."""
+
+    outcome: Outcome
+    section: Section
+
+
+def page(
+    title: str, facts: Mapping[str, str], chart: Figure, chapters: Sequence[Chapter], about: About
+) -> str:
+    """Write the page.
+
+    Parameters
+    ----------
+    title
+        The feeder's.
+    facts
+        What there is to say of the feeder in general.
+    chart
+        Its map.
+    chapters
+        What its studies found.
+    about
+        What the report says of itself.
+    """
+    script = _file("sort.js")
+    seal = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    policy = (
+        "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'; "
+        f"script-src 'sha256-{seal}'"
+    )
+    head = el(
+        "head",
+        el("meta", charset="utf-8"),
+        el("meta", http_equiv="Content-Security-Policy", content=policy),
+        el("meta", name="viewport", content="width=device-width, initial-scale=1"),
+        el("meta", name="color-scheme", content="light dark"),
+        el("title", f"{title}: how far its meters can be trusted"),
+        el("style", Markup(_file("style.css") + style("figure svg"))),
+    )
+    body = el(
+        "main",
+        _front(title, facts, chapters, about),
+        _contents(chapters),
+        _feeder(facts, chart),
+        [_chapter(each, about.folder) for each in chapters],
+        _made(about, chapters),
+    )
+    document = el("html", head, el("body", body, el("script", Markup(script))), lang="en")
+    return f"<!DOCTYPE html>\n{document}\n"
+
+
+def _file(name: str) -> str:
+    return (files("feeders.report") / name).read_text(encoding="utf-8")
+
+
+# --- the first page -----------------------------------------------------------------------------
+
+
+def _front(title: str, facts: Mapping[str, str], chapters: Sequence[Chapter], about: About) -> Markup:
+    few = " · ".join(facts[name] for name in ("customers", "meters", "inverters") if name in facts)
+    return el(
+        "section",
+        el("div", MARK, "gridsec", class_="brand"),
+        el("h1", title),
+        el("p", f"How far its meters can be trusted. {few}. {about.made}", class_="lead"),
+        el("ul", [_answer(*each) for each in _answers(chapters)], class_="answers"),
+        class_="card front",
+        id="summary",
+    )
+
+
+def _answers(chapters: Sequence[Chapter]) -> list[tuple[Question, str, Finding]]:
+    """What every question of a committee gets: an answer, or that there is none."""
+    out: list[tuple[Question, str, Finding]] = []
+    for question in Question:
+        given = [
+            (chapter.outcome.study, chapter.section.answers[question])
+            for chapter in chapters
+            if question in chapter.section.answers
+        ]
+        out += [(question, study, finding) for study, finding in given]
+        asked = [study for study, questions in ANSWERS.items() if question in questions]
+        if not given and asked and question is not Question.RECORDS:
+            words = f"This report does not answer it; gridsec study {asked[0]} does."
+            out.append((question, "", Finding(Standing.ABSENT, ((words,),))))
+    return out
+
+
+def _answer(question: Question, study: str, finding: Finding) -> Markup:
+    asked: Markup | str = el("a", question.value, href=f"#{_id(study)}") if study else question.value
+    return el(
+        "li",
+        el("div", el("span", asked), _standing(finding), class_="question"),
+        el("div", _sentences(finding), class_="answer"),
+    )
+
+
+def _standing(finding: Finding) -> Markup:
+    return el("span", finding.standing.value, class_="standing", data_standing=finding.standing.value)
+
+
+def _sentences(finding: Finding) -> list[Markup]:
+    return [el("p", [_part(part) for part in sentence]) for sentence in finding.sentences]
+
+
+def _part(part: str | Value) -> str:
+    if isinstance(part, str):
+        return part
+    return el("data", part.shown, value=repr(float(part.value)), data_source=part.source)
+
+
+def _contents(chapters: Sequence[Chapter]) -> Markup:
+    links = [("feeder", "The feeder"), *((_id(c.outcome.study), c.section.title) for c in chapters)]
+    links.append(("made", "How this was made"))
+    items = [el("li", el("a", name, href=f"#{key}")) for key, name in links]
+    return el("nav", el("ul", items), class_="card", aria_label="Contents")
+
+
+def _id(study: str) -> str:
+    return "study-" + "".join(c if c.isascii() and (c.isalnum() or c == "-") else "-" for c in study)
+
+
+# --- sections -----------------------------------------------------------------------------------
+
+
+def _feeder(facts: Mapping[str, str], chart: Figure) -> Markup:
+    told = [el("div", el("dt", name), el("dd", value)) for name, value in facts.items()]
+    return el(
+        "section",
+        el("div", el("h2", "The feeder"), class_="head"),
+        el("dl", told, class_="facts"),
+        _figure(chart),
+        class_="card",
+        id="feeder",
+    )
+
+
+def _chapter(chapter: Chapter, folder: str) -> Markup:
+    outcome, told = chapter.outcome, chapter.section
+    alone = len(told.answers) == 1
+    answers = [
+        join(
+            [
+                None if alone else el("div", question.value, _standing(finding), class_="question"),
+                el("div", _sentences(finding), class_="answer"),
+            ]
+        )
+        for question, finding in told.answers.items()
+    ]
+    pill = [_standing(finding) for finding in told.answers.values()] if alone else None
+    meanings = [join([el("dt", name), el("dd", text)]) for name, text in told.columns.items()]
+    return el(
+        "section",
+        el("div", el("h2", told.title), pill, class_="head"),
+        answers,
+        [_figure(figure) for figure in told.figures],
+        el("h3", "Numbers") if told.tables else None,
+        [
+            _table(outcome.study, name, table, folder, told.shown.get(name, ()))
+            for name, table in told.tables.items()
+        ],
+        el("dl", meanings, class_="columns") if meanings else None,
+        el("h3", "What was assumed") if told.assumptions else None,
+        el("ul", [el("li", each) for each in told.assumptions], class_="plain") if told.assumptions else None,
+        el("h3", "To run it again") if outcome.command else None,
+        el("pre", outcome.command) if outcome.command else None,
+        class_="card",
+        id=_id(outcome.study),
+    )
+
+
+def _figure(figure: Figure) -> Markup:
+    """Twice, for two widths; the style sheet shows one."""
+    drawings = [
+        el(
+            "div",
+            Markup(
+                svg(figure.draw(width), title=figure.title, text=figure.text, key=f"{figure.name}-{kind}")
+            ),
+            class_=kind,
+        )
+        for kind, width in (("wide", WIDE), ("narrow", NARROW))
+    ]
+    caption = el("figcaption", el("b", figure.title), figure.text)
+    return el("figure", caption, drawings, id=figure.name)
+
+
+def _table(study: str, name: str, table: pd.DataFrame, folder: str, chosen: Sequence[str]) -> Markup:
+    """A table; long ones are closed, and what is too long or too wide for a page stays in its file."""
+    said = [column for column in table.columns if table.empty or not table[column].map(_silent).all()]
+    kept = [column for column in chosen or said if column in said][:MOST_COLUMNS]
+    shown = table[kept].head(len(table) if len(table) <= MOST_ROWS else HEAD_ROWS)
+    numeric = {column: _numeric(shown[column]) for column in kept}
+    head = [
+        el(
+            "th",
+            el("button", str(column).replace("_", " "), type="button"),
+            class_="n" if numeric[column] else None,
+            scope="col",
+        )
+        for column in kept
+    ]
+    body = [el("tr", [_td(cell) for cell in row]) for row in shown.itertuples(index=False, name=None)]
+    crowded = "wide" if len(kept) > FEW_COLUMNS else None
+    crowded = "wide" if len(kept) > FEW_COLUMNS else None
+    rows = el("table", el("thead", el("tr", head)), el("tbody", body), class_=crowded)
+    grid = el("div", rows, class_="scroll", tabindex="0")
+    size = f"{name.replace('_', ' ')}: {len(table)} row{'s' * (len(table) != 1)}"
+    if len(table) > MOST_ROWS:
+        size += f", the first {HEAD_ROWS} shown"
+    if len(kept) < len(said):
+        size += f", {len(kept)} of {len(said)} columns"
+    where = f"{folder}/tables/{study}-{name}.csv" if folder else ""
+    note = el("span", f" · {where}", class_="quiet") if where else None
+    return el("details", el("summary", size, note), grid, open=0 < len(table) <= OPEN_ROWS)
+
+
+def _silent(cell: Any) -> bool:
+    return cell is None or cell == ""
+
+
+def _numeric(column: pd.Series[Any]) -> bool:
+    kind = column.dtype
+    return bool(kind != np.bool_ and np.issubdtype(kind, np.number)) if isinstance(kind, np.dtype) else False
+
+
+def _td(cell: Any) -> Markup:
+    if isinstance(cell, bool | np.bool_):
+        return el("td", "yes" if cell else "no")
+    if isinstance(cell, float | np.floating):
+        key = "" if math.isnan(cell) else repr(float(cell)).replace("inf", "Infinity")
+        return el("td", _written(float(cell)), class_="n", data_key=key)
+    if isinstance(cell, int | np.integer):
+        return el("td", str(cell).replace("-", "−"), class_="n", data_key=str(cell))
+    return el("td", "–" if cell is None or cell == "" else str(cell))
+
+
+def _written(value: float) -> str:
+    """A number of a table, to four digits."""
+    if not math.isfinite(value) or value.is_integer():
+        return number(value)
+    return f"{value:.4g}".replace("-", "−")
+
+
+# --- the last page ------------------------------------------------------------------------------
+
+
+def _made(about: About, chapters: Sequence[Chapter]) -> Markup:
+    seeds = ", ".join(f"{name} {seed}" for name, seed in about.seeds.items()) or "nothing is random"
+    took = [
+        el(
+            "li",
+            f"{c.outcome.study}: {_seconds(c.outcome.seconds)}",
+            ", with work kept from before" * c.outcome.resumed,
+        )
+        for c in chapters
+    ]
+    files_ = (
+        el("p", f"Every figure as SVG and PNG and every table as CSV and Parquet: folder {about.folder}.")
+        if about.folder
+        else None
+    )
+    return el(
+        "section",
+        el("div", el("h2", "How this was made"), class_="head"),
+        el("h3", "The whole report again"),
+        el("pre", about.command),
+        el("h3", "Versions"),
+        el("p", ", ".join(f"{name} {version}" for name, version in about.versions.items())),
+        el("h3", "Seeds"),
+        el("p", seeds),
+        el("h3", "Duration"),
+        el("ul", took, class_="plain"),
+        files_,
+        class_="card",
+        id="made",
+    )
+
+
+def _seconds(seconds: float) -> str:
+    if seconds < 99.5:
+        return f"{seconds:.1f} s" if seconds < 9.95 else f"{seconds:.0f} s"
+    return f"{seconds / 60.0:.0f} min"

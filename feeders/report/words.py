@@ -1,0 +1,138 @@
+"""Sentences with numbers that know where they come from, and how numbers are written.
+
+A number in a sentence names the table it was taken from, so that whoever doubts it can look, and a test can.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+__all__ = [
+    "MANY",
+    "Finding",
+    "Sentence",
+    "Standing",
+    "Value",
+    "count",
+    "least",
+    "listed",
+    "most",
+    "number",
+    "plural",
+    "rows",
+    "said",
+]
+
+MANY: Final = 12
+"""So many names are listed in a sentence at most."""
+
+
+class Standing(Enum):
+    """How sure an answer is."""
+
+    PROVED = "proved"
+    MEASURED = "measured"
+    PART = "partly proved"
+    OPEN = "not proved"
+    FAILED = "no answer"
+    ABSENT = "not studied"
+
+
+@dataclass(frozen=True, slots=True)
+class Value:
+    """A number in a sentence.
+
+    Attributes
+    ----------
+    value
+        The number.
+    shown
+        As it is written, with its unit.
+    source
+        Table, column, and what was done with it: `detectable-meters:noticed:max`.
+    """
+
+    value: float
+    shown: str
+    source: str
+
+
+Sentence = tuple[str | Value, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """An answer of a study.
+
+    Attributes
+    ----------
+    standing
+        How sure it is.
+    sentences
+        The answer, the most important first.
+    """
+
+    standing: Standing
+    sentences: tuple[Sentence, ...]
+
+
+def said(sentence: Sentence) -> str:
+    """A sentence as plain text."""
+    return "".join(part if isinstance(part, str) else part.shown for part in sentence)
+
+
+def number(value: Any, digits: int = 2) -> str:
+    """Write a number: ∞ for none that is finite, a question mark for one that is not known."""
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return "?"
+    if math.isinf(value):
+        return "∞" if value > 0 else "−∞"
+    text = f"{value:.{digits}f}" if not float(value).is_integer() or digits < 0 else f"{value:.0f}"
+    if digits and not float(value).is_integer() and float(text) == 0.0:
+        text = f"{value:.2g}"
+    return text.replace("-", "−")
+
+
+def plural(size: float, one: str, several: str = "") -> str:
+    """One meter, two meters: the noun that goes with a number."""
+    return one if size == 1 else several or f"{one}s"
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names in a sentence; from too many on, the first and how many more."""
+    some = list(names)
+    if len(some) > MANY:
+        return f"{', '.join(some[: MANY - 2])} and {len(some) - MANY + 2} more"
+    return " and ".join([", ".join(some[:-1]), some[-1]] if len(some) > 1 else some)
+
+
+def rows(table: pd.DataFrame, name: str) -> Value:
+    """How many rows a table has."""
+    return Value(len(table), str(len(table)), f"{name}:rows")
+
+
+def count(table: pd.DataFrame, name: str, column: str, value: float) -> Value:
+    """How many rows have a value."""
+    found = int((table[column] == value).sum())
+    return Value(found, str(found), f"{name}:{column}:count {value:g}")
+
+
+def most(table: pd.DataFrame, name: str, column: str, unit: str = "", digits: int = 2) -> Value:
+    """The largest of a column."""
+    return _of(table[column].max(), unit, digits, f"{name}:{column}:max")
+
+
+def least(table: pd.DataFrame, name: str, column: str, unit: str = "", digits: int = 2) -> Value:
+    """The smallest of a column."""
+    return _of(table[column].min(), unit, digits, f"{name}:{column}:min")
+
+
+def _of(value: Any, unit: str, digits: int, source: str) -> Value:
+    return Value(float(value), f"{number(float(value), digits)} {unit}".strip(), source)

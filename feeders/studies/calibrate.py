@@ -1,0 +1,267 @@
+"""What recorded readings say against a feeder's files: proposals with confidence, never applied unasked.
+
+References
+----------
+docs/theory-studies.md, Calibration.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import pandas as pd
+
+from feeders.load import digest, find
+from feeders.schema import write
+from feeders.studies import calibrate_tables
+from feeders.studies.calibrate_readings import Frames, frames
+from feeders.studies.calibrate_search import (
+    LENGTH_SPREAD,
+    SHORTEST,
+    Correction,
+    Kind,
+    Round,
+    State,
+    Verdict,
+    apply,
+    compare,
+    correction,
+    prepare,
+)
+from feeders.studies.journal import Journal, Progress
+
+if TYPE_CHECKING:
+    from feeders.load import Site
+    from feeders.load_phases import ThreePhaseSite
+    from feeders.recording import Recording
+
+__all__ = ["Calibrate", "OtherFeeder", "calibrate"]
+
+MOST_ERRORS: Final = 24
+"""After so many errors the files are another feeder's."""
+
+
+class OtherFeeder(ValueError):
+    """A folder holds another feeder than the one that was studied."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibrate:
+    """What `calibrate` found.
+
+    Attributes
+    ----------
+    feeder, digest
+        The feeder's name, and its content.
+    frames, span_h
+        How many moments were compared, and over what time, h.
+    risk
+        Probability of any proposal if the files are right.
+    meters
+        One row for each meter: `meter`, `customer`, `frames` (readings used), `bias_percent`, `std_percent`,
+        `low_percent`, `high_percent` (95 %; of the voltage, relative to the busbar's meter: an error that all
+        have in common cannot be told), `verdict`.
+    lines
+        One row for each line, or lines in series: `lines`, `from_bus`, `to_bus`, `factor`, `std`, `low`,
+        `high` (of the length in the files, if all others are right), `same` (lines whose effect is the same),
+        `verdict`.
+    customers
+        One row for each customer: `customer`, `meter`, `bus`, `phases` (as corrected), `alternative` (the
+        best other place), `log_factor` (of it against this one), `open` (places that are not ruled out),
+        `verdict`.
+    loads
+        One row for each customer: `customer`, `power_factor`, `low`, `high`, `p_gain_percent`,
+        `p_gain_std_percent`, `verdict`.
+    errors
+        `quantity`, `estimate`, `low`, `high`, `unit`, `verdict`: standard deviations and correlation time of
+        the errors of the customers' powers, and the meters' noise relative to what they promise.
+    proposals
+        What to correct, in the order it was found: `kind`, `what`, `now`, `proposed`, `estimate`, `std` (of a
+        length, the factor; otherwise how much of the proposed change the readings show: 1 is all), `low`,
+        `high`, `log_factor` (gain of the log-likelihood), `confidence`, `verdict`, `alternatives`.
+    corrections
+        The proposals that are sure, in the words of the files.
+    """
+
+    feeder: str
+    digest: str
+    frames: int
+    span_h: float
+    risk: float
+    meters: pd.DataFrame
+    lines: pd.DataFrame
+    customers: pd.DataFrame
+    loads: pd.DataFrame
+    errors: pd.DataFrame
+    proposals: pd.DataFrame
+    corrections: tuple[Correction, ...]
+
+    @property
+    def tables(self) -> dict[str, pd.DataFrame]:
+        """All tables by name."""
+        names = ("proposals", "meters", "lines", "customers", "loads", "errors")
+        return {name: getattr(self, name) for name in names}
+
+    def corrected(self, site_folder: Path | str, out: Path | str) -> None:
+        """Write a corrected copy of a feeder's folder; only what is sure is corrected.
+
+        Parameters
+        ----------
+        site_folder
+            The feeder that was studied: its folder, or its name.
+        out
+            A new or empty folder.
+
+        Raises
+        ------
+        OtherFeeder
+            If it is not the feeder that was studied.
+        FileExistsError
+            If there is something in the folder.
+        FeederInvalid, OSError
+            If it cannot be read or written.
+        """
+        tables, target = find(site_folder), Path(out)
+        if digest(tables) != self.digest:
+            raise OtherFeeder(f"{site_folder}: not the feeder that was studied, or changed since")
+        if target.exists() and (not target.is_dir() or any(target.iterdir())):
+            raise FileExistsError(f"{target}: already there; a corrected copy goes into a new folder")
+        for wrong in self.corrections:
+            tables = apply(tables, wrong)
+        write(tables, target)
+
+
+def calibrate(
+    site: Site | ThreePhaseSite,
+    readings: pd.DataFrame | Recording | Path | str,
+    *,
+    risk: float = 0.05,
+    tolerance: float = 0.02,
+    exclude: Sequence[str] = (),
+    kinds: Sequence[Kind] = tuple(Kind),
+    journal: Path | None = None,
+    progress: Progress | None = None,
+) -> Calibrate:
+    """Compare recorded readings with a feeder's files.
+
+    Parameters
+    ----------
+    site
+        The feeder, balanced or of three phases.
+    readings
+        A recording, a table with its columns, or a Parquet or CSV file.
+    risk
+        Probability of any proposal if the files are right, 0 to 1.
+    tolerance
+        Relative error (1 sigma) of lines' lengths that is no mistake.
+    exclude
+        Meters that are not trusted. Their powers are still believed.
+    kinds
+        Which errors to look for; fewer take less time, and what is not looked for may pass for another.
+    journal
+        File in which each error that is found is kept; an interrupted study goes on from it.
+    progress
+        Told how much of the present comparison is done.
+
+    Raises
+    ------
+    RecordingInvalid
+        If the readings are another feeder's, name unknown meters, lack the busbar, or are too few.
+    ValueError
+        If there is no such meter, or a number is out of range.
+    OtherStudy
+        If the journal is another study's.
+    """
+    if not 0.0 < risk < 1.0:
+        raise ValueError(f"risk is {risk}; it must be between 0 and 1")
+    if not 0.0 < tolerance < LENGTH_SPREAD:
+        raise ValueError(f"tolerance is {tolerance}; it must be between 0 and {LENGTH_SPREAD}")
+    unknown = sorted(set(exclude) - set(site.meter_ids))
+    if unknown:
+        raise ValueError(f"{site.feeder.name} has no meter {', '.join(unknown)}")
+    given = frames(site, readings)
+    kept = Journal(
+        journal, _subject(site, given, risk, tolerance) | {"exclude": sorted(exclude), "kinds": sorted(kinds)}
+    )
+    state, found = State(site.tables, tuple(exclude)), list[dict[str, Any]]()
+    while True:
+        now = prepare(state, given, tolerance=tolerance, errors=True)
+        said: list[Verdict] = []
+
+        def work(now: Round = now, said: list[Verdict] = said) -> dict[str, Any] | None:
+            said.append(compare(now, given, risk, progress or _quiet, kinds))
+            return _best(now, said[0], risk)
+
+        row = kept.get(f"error {len(found)}", work)
+        if row is None or len(found) == MOST_ERRORS:
+            break
+        wrong = _read(row["correction"])
+        state = state.after(wrong)
+        found.append(row)
+    verdict = said[0] if said else compare(now, given, risk, progress or _quiet, kinds)
+    lines, ids = calibrate_tables.lines(now, tolerance)
+    wrongs = [_read(row["correction"]) for row in found]
+    rows, sure = calibrate_tables.final(found, wrongs, lines, ids)
+    return Calibrate(
+        feeder=site.feeder.name,
+        digest=site.digest,
+        frames=given.t.size,
+        span_h=float(given.t[-1] - given.t[0]) / 3600.0,
+        risk=risk,
+        meters=calibrate_tables.meters(now, risk),
+        lines=lines,
+        customers=calibrate_tables.customers(now, verdict, rows, risk),
+        loads=calibrate_tables.loads(now),
+        errors=calibrate_tables.errors(now),
+        proposals=rows,
+        corrections=sure,
+    )
+
+
+def _quiet(done: int, total: int) -> None:
+    """Tell nobody."""
+
+
+def _subject(site: Site | ThreePhaseSite, given: Frames, risk: float, tolerance: float) -> dict[str, Any]:
+    content = hashlib.sha256()
+    for values in (given.t, given.v_volt, given.p_kw, given.q_kvar, given.v0_volt, given.count):
+        content.update(np.ascontiguousarray(values).tobytes())
+    return {
+        "study": "calibrate",
+        "digest": site.digest,
+        "readings": content.hexdigest(),
+        "risk": risk,
+        "tolerance": tolerance,
+    }
+
+
+def _best(now: Round, said: Verdict, risk: float) -> dict[str, Any] | None:
+    """The error that the readings speak for most; None where they speak for none."""
+    if said.any < math.log(1.0 / risk):
+        return None
+    best = int(said.kept[0])
+    guess, g, h = said.guesses[best], float(said.found.g[best]), float(said.found.h[best])
+    shift = g / (h + LENGTH_SPREAD**-2) if guess.kind is Kind.LENGTH else 0.0
+    wrong = correction(now, guess, max(1.0 + shift, SHORTEST))
+    others = [correction(now, said.guesses[k]) for k in said.kept[1:]]
+    return {
+        "correction": asdict(wrong),
+        "estimate": g / h if h > 0.0 else 0.0,
+        "std": h**-0.5 if h > 0.0 else math.inf,
+        "log_factor": float(said.found.log_factor[best]),
+        "confidence": float(said.confidence[best]),
+        "now": calibrate_tables.present(now, wrong),
+        "since": guess.since,
+        "until": guess.until,
+        "alternatives": [calibrate_tables.told(other) for other in others],
+    }
+
+
+def _read(row: dict[str, Any]) -> Correction:
+    return Correction(Kind(row["kind"]), tuple(row["names"]), row["bus"], row["phases"], row["factor"])

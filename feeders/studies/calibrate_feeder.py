@@ -1,0 +1,397 @@
+"""A feeder, balanced or of three phases, as `gridsec.studies.calibrate_model` compares it with readings."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from feeders.load import Site, find, from_tables
+from feeders.load_phases import ThreePhaseSite, three_phase
+from feeders.topology import Edge, tree
+from gridsec import phases as three
+from gridsec.arrays import Bools, Floats, Ints
+from gridsec.droop import voltage_curve
+from gridsec.feeder import Feeder, bus_voltages, lindistflow
+from gridsec.phases import PHASES, ThreePhaseFeeder, lindist3flow
+from gridsec.studies.calibrate_model import Doubts, Places, Series
+from gridsec.studies.calibrate_noise import Field
+
+if TYPE_CHECKING:
+    from feeders.schema import FeederTables
+    from feeders.studies.calibrate_readings import Frames
+
+__all__ = ["Network", "network", "site_of"]
+
+MOST_BUSES: Final = 150
+"""In larger feeders lines in series without customers between them are one."""
+
+IDLE: Final = 0.25
+"""Share of its peak that a customer without meter is taken to draw."""
+
+CLOUDS: Final = 0.2
+"""Relative error of a roof's generation that is taken from the other roofs."""
+
+STEEP_PU: Final = 0.003
+"""Half of the voltage over which the slope of an inverter's curve is taken, pu."""
+
+_STEPS: Final = 2
+_CHUNK: Final = 64
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Network:
+    """A feeder whose lines in series are merged where that is needed.
+
+    Attributes
+    ----------
+    site
+        The feeder as its files say.
+    feeder
+        Its tree, merged.
+    lines : (L,)
+        The lines of each branch, indices into the tables.
+    place : (Q, 2)
+        Bus of the merged tree and phase of each place.
+    places
+        What readings see of it.
+    """
+
+    site: Site | ThreePhaseSite
+    feeder: Feeder | ThreePhaseFeeder
+    lines: tuple[tuple[int, ...], ...]
+    place: Ints
+    places: Places
+
+    @property
+    def meter_of(self) -> dict[int, int]:
+        """Meter of each customer with one."""
+        return {int(customer): j for j, customer in enumerate(self.site.meters)}
+
+    def weight(self, bus: int, phases: str) -> Floats:
+        """Weights (Q,) of a customer at a bus of the merged tree."""
+        at = self.place[:, 0] == bus
+        if self.places.phase.max() > 0:
+            at &= np.isin(self.place[:, 1], [PHASES.index(phase) for phase in phases])
+        return np.asarray(at / at.sum())
+
+    def reaches(self, bus: int, phases: str) -> bool:
+        """Whether a bus of the merged tree has these phases."""
+        if isinstance(self.feeder, Feeder):
+            return True
+        return bool(all(self.feeder.phases[bus][PHASES.index(phase)] for phase in phases))
+
+
+def site_of(path_or_name: Path | str) -> Site | ThreePhaseSite:
+    """Load a feeder, balanced or of three phases.
+
+    Parameters
+    ----------
+    path_or_name
+        As in `feeders.load.load`, which says what it raises.
+    """
+    return _site(find(path_or_name))
+
+
+def _site(tables: FeederTables) -> Site | ThreePhaseSite:
+    unbalanced = any(line.phases != "abc" for line in tables.lines)
+    unbalanced |= any(row.phases != "abc" for row in tables.customers)
+    return three_phase(tables) if unbalanced else from_tables(tables)
+
+
+def network(tables: FeederTables) -> Network:
+    """Prepare a feeder.
+
+    Parameters
+    ----------
+    tables
+        Its files; with single-phase customers or zero-sequence impedances it is one of three phases.
+
+    Raises
+    ------
+    FeederInvalid
+        With every problem of the files.
+    """
+    site = _site(tables)
+    closed = [k for k, line in enumerate(tables.lines) if line.closed]
+    rows = [tables.lines[k] for k in closed]
+    edges = [Edge(row.line, row.from_bus, row.to_bus, row.r_ohm == row.x_ohm == 0.0) for row in rows]
+    each: tuple[tuple[int, ...], ...] = tuple((closed[k],) for k in tree(tables.meta.busbar, edges).branch)
+    feeder, lines = _merged(site.feeder, each)
+    if isinstance(feeder, Feeder):
+        place = np.column_stack([np.arange(len(feeder.buses)), np.zeros(len(feeder.buses))]).astype(np.intp)
+    else:
+        place = np.argwhere(feeder.phases)
+    return Network(site, feeder, lines, place, _places(site, feeder, place))
+
+
+def _merged(
+    feeder: Feeder | ThreePhaseFeeder, lines: tuple[tuple[int, ...], ...]
+) -> tuple[Feeder | ThreePhaseFeeder, tuple[tuple[int, ...], ...]]:
+    """Join lines in series without customers between them, in large feeders."""
+    count = len(feeder.buses)
+    if count <= MOST_BUSES:
+        return feeder, lines
+    children = np.bincount(feeder.parent, minlength=count)
+    keep = children != 1
+    keep[0] = True
+    keep[feeder.bus] = True
+    if isinstance(feeder, ThreePhaseFeeder):
+        for k, above in enumerate(feeder.parent.tolist()):
+            keep[above] |= bool((feeder.phases[k + 1] != feeder.phases[above]).any())
+    new = np.cumsum(keep) - 1
+    above_of, chain = np.zeros(count, dtype=np.intp), list[tuple[int, ...]]([()] * count)
+    impedances = {name: np.array(getattr(feeder, name)) for name in _impedances(feeder)}
+    for k, above in enumerate(feeder.parent.tolist()):
+        chain[k + 1] = lines[k]
+        above_of[k + 1] = above
+        if not keep[above]:
+            chain[k + 1] = chain[above] + lines[k]
+            above_of[k + 1] = above_of[above]
+            for values in impedances.values():
+                values[k] += values[above - 1]
+    kept = np.flatnonzero(keep)
+    change: dict[str, Any] = {name: values[kept[1:] - 1] for name, values in impedances.items()}
+    change |= {"parent": new[above_of[kept[1:]]], "bus": new[feeder.bus]}
+    change |= {"buses": tuple(feeder.buses[k] for k in kept)}
+    if isinstance(feeder, ThreePhaseFeeder):
+        change["phases"] = feeder.phases[kept]
+    return replace(feeder, **change), tuple(chain[k] for k in kept[1:])
+
+
+def _impedances(feeder: Feeder | ThreePhaseFeeder) -> tuple[str, ...]:
+    return ("r", "x", "charging") if isinstance(feeder, Feeder) else ("z", "charging")
+
+
+def _places(site: Site | ThreePhaseSite, feeder: Feeder | ThreePhaseFeeder, place: Ints) -> Places:
+    bus, phase = place.T
+    ids = tuple(map(str, range(bus.size)))
+    weight = np.zeros((len(feeder.customers), bus.size))
+    if isinstance(feeder, Feeder):
+        flow = lindistflow(replace(feeder, bus=bus, customers=ids))
+        active, reactive = 2.0 * flow.R, 2.0 * flow.X
+        weight[np.arange(feeder.bus.size), feeder.bus] = 1.0
+    else:
+        everywhere = replace(feeder, bus=bus, customers=ids, connected=phase[:, None] == np.arange(3))
+        flow3 = lindist3flow(everywhere)
+        # Powers in units of the three-phase base instead of a third of it.
+        active, reactive = 6.0 * flow3.R, 6.0 * flow3.X
+        at = {(int(k), int(f)): q for q, (k, f) in enumerate(place)}
+        where = [at[int(k), int(f)] for k, f in zip(feeder.at, feeder.phase, strict=True)]
+        weight[feeder.of, where] = feeder.share
+    start = feeder.start[bus][:, None]
+    behind = (feeder.start[1:] <= start) & (start < feeder.stop[1:])
+    return Places(active, reactive, phase, behind, weight, site.meters)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Powers:
+    """What the readings and the files say of the customers' powers. T frames, N customers, pu.
+
+    Attributes
+    ----------
+    p, q, load, roof, steep : (T, N)
+        See `gridsec.studies.calibrate_model.Series`.
+    metered_q : (N,)
+        Whose reactive power is metered.
+    missing : (T, N)
+        Powers of a customer with a meter that were interpolated.
+    """
+
+    p: Floats
+    q: Floats
+    load: Floats
+    roof: Floats
+    steep: Floats
+    metered_q: Bools
+    missing: Bools
+
+
+def powers(site: Site | ThreePhaseSite, given: Frames) -> Powers:
+    """Powers of all customers.
+
+    Without a reading of q it is that of the load, by the middle of the limits of its power factor, less what
+    the inverter's curve gives at the voltage read.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    given
+        The readings.
+    """
+    model, base, T = site.loads, site.feeder.base_kva, given.t.size
+    N = model.load_peak.size
+    order = [given.meter_ids.index(name) for name in site.meter_ids]
+    draws = np.broadcast_to(IDLE * model.load_peak, (T, N)).copy()
+    missing = np.zeros((T, N), dtype=np.bool_)
+    metered_q = np.zeros(N, dtype=np.bool_)
+    q_read, v = np.zeros((T, N)), np.full((T, N), site.feeder.base_volt)
+    for j, customer in zip(order, site.meters.tolist(), strict=True):
+        there = np.isfinite(given.p_kw[:, j])
+        if there.any():
+            draws[:, customer] = np.interp(given.t, given.t[there], given.p_kw[there, j]) / base
+            missing[:, customer] = ~there
+        there = np.isfinite(given.q_kvar[:, j])
+        metered_q[customer] = 2 * there.sum() > T
+        if metered_q[customer]:
+            q_read[:, customer] = np.interp(given.t, given.t[there], given.q_kvar[there, j]) / base
+        there = np.isfinite(given.v_volt[:, j])
+        if there.any():
+            v[:, customer] = np.interp(given.t, given.t[there], given.v_volt[there, j])
+    v /= site.feeder.base_volt
+    low = np.maximum(draws, 0.0)
+    tan = 0.5 * (model.tan_min + model.tan_max)
+    roof = model.pv_peak * _sun(draws, model.pv_peak)[:, None]
+    load = np.clip(draws + roof, low, np.maximum(low, model.load_peak))
+    q = tan * load
+    steep = np.zeros((T, N))
+    own = site.droop.customer
+    if own.size:
+        at = v[:, own]
+        q[:, own] -= voltage_curve(site.droop, at)
+        slope = voltage_curve(site.droop, at + STEEP_PU) - voltage_curve(site.droop, at - STEEP_PU)
+        steep[:, own] = slope / (2.0 * STEEP_PU) / (2.0 * at)
+    return Powers(
+        p=-draws,
+        q=-np.where(metered_q, q_read, q),
+        load=np.where(metered_q, 0.0, load),
+        roof=np.where(metered_q, 0.0, tan * roof),
+        steep=np.where(metered_q, 0.0, steep),
+        metered_q=metered_q,
+        missing=missing,
+    )
+
+
+def _sun(draws: Floats, pv_peak: Floats) -> Floats:
+    """Generation relative to its peak: the largest that any roof feeds in beyond its load, (T,)."""
+    roofs = pv_peak > 0.0
+    feeds = -draws[:, roofs] / pv_peak[roofs]
+    return np.asarray(np.clip(feeds.max(axis=1, initial=0.0), 0.0, 1.0))
+
+
+def series(net: Network, given: Frames, drawn: Powers, excluded: Collection[str]) -> Series:
+    """Readings and power flow of a feeder.
+
+    Parameters
+    ----------
+    net
+        The feeder.
+    given
+        The readings.
+    drawn
+        From `powers`.
+    excluded
+        Meters whose voltages are not looked at.
+    """
+    site = net.site
+    order = [given.meter_ids.index(name) for name in site.meter_ids]
+    v = given.v_volt[:, order] / site.feeder.base_volt
+    seen = np.isfinite(v) & ~np.isin(site.meter_ids, list(excluded))
+    U = _voltages(net.feeder, drawn.p, drawn.q, (given.v0_volt / site.feeder.base_volt) ** 2)
+    bus, phase = net.place.T
+    return Series(
+        t=given.t,
+        y=np.where(seen, v**2, 1.0),
+        seen=seen,
+        p=drawn.p,
+        q=drawn.q,
+        load=drawn.load,
+        roof=drawn.roof,
+        steep=drawn.steep,
+        places=U[:, phase, bus],
+        drop=U[:, :, net.feeder.parent] - U[:, :, 1:],
+    )
+
+
+def _voltages(feeder: Feeder | ThreePhaseFeeder, p: Floats, q: Floats, v0_squared: Floats) -> Floats:
+    """Squared voltages of all buses with their losses, (T, F, b + 1)."""
+    if isinstance(feeder, Feeder):
+        return bus_voltages(feeder, p, q, v0_squared, steps=_STEPS)[:, None, :]
+    busbar = np.repeat(v0_squared[:, None], 3, axis=1)
+    parts = [slice(k, k + _CHUNK) for k in range(0, v0_squared.size, _CHUNK)]
+    # 1 pu of a phase's power is a third of the feeder's base.
+    p3, q3 = (3.0 * feeder.connections(power) for power in (p, q))
+    return np.concatenate(
+        [three.bus_voltages(feeder, p3[some], q3[some], busbar[some], steps=_STEPS) for some in parts]
+    )
+
+
+def doubts(net: Network, drawn: Powers, tolerance: float, free: Collection[int], spread: float) -> Doubts:
+    """What the files leave open; uniform within the limits they state.
+
+    Parameters
+    ----------
+    net
+        The feeder.
+    drawn
+        From `powers`.
+    tolerance
+        Relative error of lines' lengths that is no mistake.
+    free
+        Branches whose length is estimated.
+    spread
+        Prior of their relative error.
+    """
+    site, model = net.site, net.site.loads
+    without = np.ones(model.load_peak.size, dtype=np.bool_)
+    without[site.meters] = False
+    unmetered = ~drawn.metered_q
+    length = np.full(len(net.lines), tolerance)
+    length[list(free)] = spread
+    half = 0.5 * (model.tan_max - model.tan_min)
+    root = np.sqrt(3.0)
+    return Doubts(
+        bias=site.accuracy.class_fraction / root,
+        p_gain=np.where(without, 0.0, model.p_fraction / root),
+        q_gain=np.where(unmetered, 0.0, model.q_fraction / root),
+        tan=np.where(unmetered, half / root, 0.0),
+        roof=np.where(unmetered & (model.pv_peak > 0.0), CLOUDS, 0.0),
+        p_level=np.where(without, IDLE * model.load_peak, 0.0),
+        q_level=np.where(unmetered, model.q_floor / root, 0.0),
+        length=length,
+    )
+
+
+def field(net: Network, drawn: Powers) -> Field:
+    """What errors of the loads do at the meters.
+
+    Parameters
+    ----------
+    net
+        The feeder.
+    drawn
+        From `powers`.
+    """
+    site, model = net.site, net.site.loads
+    A, B = net.places.at_meters
+    metered = np.zeros(model.load_peak.size)
+    metered[site.meters] = 1.0
+    hidden_q = CLOUDS**2 * np.mean(drawn.roof**2, axis=0)
+    hidden_p = np.where(metered > 0.0, 0.0, (IDLE * model.load_peak) ** 2)
+    return Field(
+        active=(A * metered) @ A.T,
+        reactive=(B * metered) @ B.T,
+        known=(A * hidden_p) @ A.T + (B * hidden_q) @ B.T,
+    )
+
+
+def meter_noise(net: Network, given: Frames) -> tuple[Floats, Floats]:
+    """Variances of the readings' own noise (T, p), and of the busbar's (T,), squared pu^2."""
+    site, accuracy = net.site, net.site.accuracy
+    order = [given.meter_ids.index(name) for name in site.meter_ids]
+    own = 4.0 * (accuracy.jitter**2 + accuracy.resolution**2 / 12.0)
+    busbar = 4.0 * (accuracy.busbar_jitter**2 + accuracy.busbar_resolution**2 / 12.0)
+    count = np.maximum(given.count[:, order], 1.0)
+    return own / count, busbar / np.maximum(given.count[:, -1], 1.0)
+
+
+def gaps(net: Network, drawn: Powers) -> list[Floats]:
+    """What interpolated powers of each frame may do, T times (p, g): their changes from frame to frame."""
+    A, B = net.places.at_meters
+    change_p, change_q = (np.diff(power, axis=0).std(axis=0) for power in (drawn.p, drawn.q))
+    effect = A * change_p + B * np.where(drawn.metered_q, change_q, 0.0)
+    return [effect[:, np.flatnonzero(row)] for row in drawn.missing]

@@ -1,0 +1,170 @@
+"""Readings of a recording or a table as frames of all meters, ready to be compared with a feeder."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+import pandas as pd
+
+from feeders.meters import BUSBAR
+from feeders.recording import REQUIRED, RecordingInvalid, read_recording
+from gridsec.arrays import Floats, Ints
+
+if TYPE_CHECKING:
+    from feeders.load import Site
+    from feeders.load_phases import ThreePhaseSite
+    from feeders.recording import Recording
+
+__all__ = ["Frames", "frames", "open_readings"]
+
+MOST_FRAMES: Final = 720
+"""More frames than these are averaged."""
+
+FEWEST_FRAMES: Final = 48
+"""Fewer frames than these say nothing about what varies."""
+
+FEWEST_SPANS: Final = 6.0
+"""The recording is at least so many correlation times of the loads' errors long."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frames:
+    """Readings of T frames in SI, net import positive. p meters; NaN where there is none.
+
+    Attributes
+    ----------
+    meter_ids : (p,)
+        Ids of the meters.
+    t : (T,)
+        Middle of each frame, Unix s.
+    v_volt, p_kw, q_kvar : (T, p)
+        Means of the readings.
+    v0_volt : (T,)
+        The busbar's.
+    count : (T, p + 1)
+        Readings of each mean, the busbar's last.
+    step_s
+        Interval between readings, s.
+    """
+
+    meter_ids: tuple[str, ...]
+    t: Floats
+    v_volt: Floats
+    p_kw: Floats
+    q_kvar: Floats
+    v0_volt: Floats
+    count: Floats
+    step_s: float
+
+
+def open_readings(path: Path | str) -> pd.DataFrame | Recording:
+    """Open a recording (Parquet, ours or a foreign one) or a CSV table with the same columns.
+
+    Raises
+    ------
+    RecordingInvalid
+        If it is neither.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".csv":
+        return read_recording(path)
+    try:
+        return pd.read_csv(path, dtype={"meter": "string"}, keep_default_na=True)
+    except (OSError, ValueError) as error:
+        raise RecordingInvalid(f"{path}: no table of readings: {error}") from error
+
+
+def frames(site: Site | ThreePhaseSite, readings: pd.DataFrame | Recording | Path | str) -> Frames:
+    """Put readings into frames.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    readings
+        A recording, a table, or a file with one.
+
+    Raises
+    ------
+    RecordingInvalid
+        If columns are missing, meters are unknown, the recording is another feeder's, the busbar has no
+        reading, or there are too few.
+    """
+    given = open_readings(readings) if isinstance(readings, (Path, str)) else readings
+    if not isinstance(given, pd.DataFrame):
+        if given.feeder is not None and given.feeder != site.feeder.name:
+            raise RecordingInvalid(f"{given.path}: recorded on {given.feeder}, not on {site.feeder.name}")
+        given = given.frame()
+    missing = [name for name in REQUIRED if name not in given.columns]
+    if missing:
+        raise RecordingInvalid(f"readings: columns {', '.join(missing)} are missing")
+    meter = given["meter"].astype("string").fillna(BUSBAR)
+    known = {name: k for k, name in enumerate((*site.meter_ids, BUSBAR))}
+    column = meter.map(known)
+    unknown = sorted(set(meter[column.isna()]))
+    if unknown:
+        shown = ", ".join(unknown[:10]) + (f" and {len(unknown) - 10} more" if len(unknown) > 10 else "")
+        raise RecordingInvalid(f"readings of meters that {site.feeder.name} does not have: {shown}")
+    if not (column == len(site.meter_ids)).any():
+        raise RecordingInvalid("readings: none of the busbar (an empty meter); nothing to compare with")
+    return _binned(site, given, np.asarray(column, dtype=np.intp))
+
+
+def _binned(site: Site | ThreePhaseSite, given: pd.DataFrame, column: Ints) -> Frames:
+    t = given["t"].to_numpy(dtype=np.float64)
+    width, step = len(site.meter_ids) + 1, _step(t, column)
+    first = float(t.min())
+    # Clocks are off by a little: frames are centred on the first tick.
+    number = np.floor((t - first) / step + 0.5).astype(np.intp)
+    together = max(1, int(np.ceil((number.max() + 1) / MOST_FRAMES)))
+    tau = site.tables.meta.load.correlation_s
+    together = max(1, min(together, int(tau / 3.0 / step))) if together > 1 else 1
+    number //= together
+    size = (int(number.max()) + 1, width)
+    cell = number * width + column
+    values = {}
+    for name in ("v_volt", "p_kw", "q_kvar"):
+        x = pd.to_numeric(given[name]).to_numpy(dtype=np.float64, na_value=np.nan) if name in given else None
+        values[name] = _means(cell, np.full(t.size, np.nan) if x is None else x, size)
+    v, count = values["v_volt"]
+    there = (np.isfinite(v[:, :-1]).mean(axis=1) >= 0.3) & np.isfinite(v[:, -1])
+    T = int(there.sum())
+    span, wanted = T * step * together, max(FEWEST_FRAMES * step * together, FEWEST_SPANS * tau)
+    if T < FEWEST_FRAMES or span < wanted:
+        raise RecordingInvalid(
+            f"too little data: {T} frames over {span / 3600:.3g} h; at least {FEWEST_FRAMES} frames over "
+            f"{wanted / 3600:.3g} h are needed, and days tell more than hours"
+        )
+    middle = first + (np.arange(size[0]) * together + 0.5 * (together - 1)) * step
+    return Frames(
+        meter_ids=site.meter_ids,
+        t=middle[there],
+        v_volt=v[there, :-1],
+        p_kw=values["p_kw"][0][there, :-1],
+        q_kvar=values["q_kvar"][0][there, :-1],
+        v0_volt=v[there, -1],
+        count=np.maximum(count[there], 1.0),
+        step_s=step * together,
+    )
+
+
+def _step(t: Floats, column: Ints) -> float:
+    """Interval between readings of the same meter: the median."""
+    order = np.lexsort((t, column))
+    gap = np.diff(t[order])[np.diff(column[order]) == 0]
+    gap = gap[gap > 0.0]
+    if not gap.size or not np.isfinite(t).all():
+        raise RecordingInvalid("too little data: no meter has two readings at different times")
+    return float(np.median(gap))
+
+
+def _means(cell: Ints, x: Floats, size: tuple[int, int]) -> tuple[Floats, Floats]:
+    """Mean of the finite values of each cell, NaN where there is none; and how many there are."""
+    good = np.isfinite(x)
+    count = np.bincount(cell[good], minlength=size[0] * size[1]).astype(np.float64)
+    total = np.bincount(cell[good], weights=x[good], minlength=size[0] * size[1])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return (total / count).reshape(size), count.reshape(size)

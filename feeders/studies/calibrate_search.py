@@ -1,0 +1,450 @@
+"""One error of a feeder's files after the other: which of all that can be do the readings speak for.
+
+References
+----------
+docs/theory-studies.md, Calibration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from functools import partial
+from itertools import combinations
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from feeders.schema import LineRow
+from feeders.studies import calibrate_feeder as model
+from gridsec.arrays import Floats, Ints
+from gridsec.feeder import Feeder
+from gridsec.phases import PHASES
+from gridsec.studies.calibrate import Evidence, Fit, evidence, fit, weigh
+from gridsec.studies.calibrate_model import Regressors, Series, lengthened, regressors, steps
+from gridsec.studies.calibrate_noise import LoadErrors, Whitening, increments, learn, whitening
+
+if TYPE_CHECKING:
+    from feeders.schema import FeederTables
+    from feeders.studies.calibrate_feeder import Network, Powers
+    from feeders.studies.calibrate_readings import Frames
+
+__all__ = [
+    "Correction",
+    "Guess",
+    "Kind",
+    "Round",
+    "State",
+    "Verdict",
+    "apply",
+    "compare",
+    "correction",
+    "longer",
+    "prepare",
+]
+
+LENGTH_SPREAD: Final = 0.3
+"""Prior standard deviation of the relative error of a length that is a mistake."""
+
+CHANGE_SPREAD: Final = 0.005
+"""The same of a change of a meter's relative error."""
+
+SHORTEST: Final = 0.05
+"""No line is shorter than this part of what its files say."""
+
+PIECES: Final = 8
+"""Stretches of time in which a meter's error may differ."""
+
+_CHUNK: Final = 128
+_REFIT: Final = 3
+_NOISE_ROUNDS: Final = 2
+
+
+class Kind(StrEnum):
+    """What may be wrong."""
+
+    BUS = "bus"
+    PHASE = "phase"
+    SWAP = "swap"
+    LENGTH = "length"
+    METER = "meter"
+
+
+@dataclass(frozen=True, slots=True)
+class Guess:
+    """An error of the files that is looked at.
+
+    Attributes
+    ----------
+    kind
+        What it is.
+    subject
+        Customer, customer and customer of a swap, meter, or branch; by index in the present network.
+    other
+        The second customer, the bus of the merged tree, or nothing: -1.
+    phases
+        Phases of the customer.
+    since, until
+        When the meter's error is different, Unix s.
+    """
+
+    kind: Kind
+    subject: int
+    other: int = -1
+    phases: str = ""
+    since: float = np.nan
+    until: float = np.nan
+
+
+@dataclass(frozen=True, slots=True)
+class Correction:
+    """An error of the files in their own words.
+
+    Attributes
+    ----------
+    kind
+        What it is.
+    names
+        The customer, both customers of a swap, the meter, or the lines.
+    bus, phases
+        Where the customer is.
+    factor
+        On the lines' length.
+    """
+
+    kind: Kind
+    names: tuple[str, ...]
+    bus: str = ""
+    phases: str = ""
+    factor: float = 1.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """Files as corrected so far, and what is left out of account.
+
+    Attributes
+    ----------
+    tables
+        The files.
+    excluded
+        Meters whose errors change, or that the caller does not trust.
+    lengths
+        Factor on each line that was found to be of another length, by its id.
+    """
+
+    tables: FeederTables
+    excluded: tuple[str, ...] = ()
+    lengths: dict[str, float] = field(default_factory=dict)
+
+    def after(self, wrong: Correction) -> State:
+        """Correct one error more."""
+        if wrong.kind is Kind.METER:
+            return replace(self, excluded=(*self.excluded, *wrong.names))
+        lengths = dict(self.lengths)
+        if wrong.kind is Kind.LENGTH:
+            lengths |= {name: lengths.get(name, 1.0) * wrong.factor for name in wrong.names}
+        return replace(self, tables=apply(self.tables, wrong), lengths=lengths)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Round:
+    """All that is known with the files as corrected so far."""
+
+    state: State
+    net: Network
+    drawn: Powers
+    series: Series
+    noise: LoadErrors
+    whiten: Whitening
+    given: Regressors
+    fit: Fit
+    readings: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Verdict:
+    """What comparing all guesses has brought.
+
+    Attributes
+    ----------
+    guesses
+        All of them.
+    found
+        What the readings say about each.
+    confidence : (H,)
+        See `gridsec.studies.calibrate.Weighed`.
+    any
+        Logarithm of the mean Bayes factor.
+    kept : (k,)
+        The guesses that cannot be told apart, the best first.
+    """
+
+    guesses: list[Guess]
+    found: Evidence
+    confidence: Floats
+    any: float
+    kept: Ints
+
+
+def prepare(state: State, frames: Frames, *, tolerance: float, errors: bool = False) -> Round:
+    """Fit the meters, loads and lines of files that are taken to be right.
+
+    Parameters
+    ----------
+    state
+        The files.
+    frames
+        The readings.
+    tolerance
+        Relative error of a line's length that is no mistake.
+    errors
+        Whether the standard errors of the loads' errors are wanted.
+    """
+    net = model.network(state.tables)
+    drawn = model.powers(net.site, frames)
+    series = model.series(net, frames, drawn, state.excluded)
+    free = [
+        k
+        for k, chain in enumerate(net.lines)
+        if any(state.tables.lines[row].line in state.lengths for row in chain)
+    ]
+    priors = model.doubts(net, drawn, tolerance, free, LENGTH_SPREAD)
+    given = regressors(net.places, series, priors)
+    used = np.flatnonzero(given.spread > 0.0)
+    white, common = model.meter_noise(net, frames)
+    own, gap = model.field(net, drawn), model.gaps(net, drawn)
+    rest = series.residual(net.places)
+    size = _typical(net)
+    noise = LoadErrors(size, size, net.site.tables.meta.load.correlation_s, 1.0, np.full(4, np.nan))
+    guess, left = noise, rest
+    for turn in range(_NOISE_ROUNDS):
+        last = errors and turn == _NOISE_ROUNDS - 1
+        products = increments(series.t, series.seen, left)
+        noise = learn(
+            products, own, white.mean(axis=0), float(common.mean()), guess, errors=last, start=noise
+        )
+        S = noise.covariance(own)
+        whiten = whitening(
+            series.t,
+            series.seen,
+            S,
+            time_s=noise.time_s,
+            white=noise.white**2 * white,
+            common=common,
+            gaps=gap,
+        )
+        both = whiten(np.concatenate([given.columns[:, :, used], rest[:, :, None]], axis=2))
+        flat = both.reshape(-1, used.size + 1)
+        found = fit(flat[:, -1], flat[:, :-1], given.spread[used], int(series.seen.sum()))
+        left = np.where(series.seen, rest - given.columns[:, :, used] @ found.estimate, 0.0)
+    return Round(
+        state, net, drawn, series, noise, whiten, given, _spread_out(found, used, given), flat[:, -1]
+    )
+
+
+def _typical(net: Network) -> float:
+    return 0.02 * float(np.median(net.site.loads.load_peak[net.site.meters]))
+
+
+def _spread_out(found: Fit, used: Ints, given: Regressors) -> Fit:
+    """Coefficients that are known to be 0 take their places again."""
+    estimate, std = np.zeros((2, given.spread.size))
+    estimate[used], std[used] = found.estimate, found.std
+    return replace(found, estimate=estimate, std=std)
+
+
+def compare(
+    now: Round,
+    frames: Frames,
+    risk: float,
+    tell: Callable[[int, int], None],
+    kinds: Collection[Kind] = tuple(Kind),
+) -> Verdict:
+    """Weigh every error of the files that can be thought of.
+
+    Parameters
+    ----------
+    now
+        The present files.
+    frames
+        The readings.
+    risk
+        Probability of a proposal for files without errors.
+    tell
+        Told how far it is.
+    kinds
+        What to look for.
+    """
+    guesses: list[Guess] = []
+    parts: list[Evidence] = []
+    chunks = list(_chunks(now, kinds))
+    for k, (some, make, spread) in enumerate(chunks):
+        tell(k, len(chunks))
+        z = now.whiten(make())
+        parts.append(evidence(now.fit, z.reshape(-1, len(some)), np.full(len(some), spread)))
+        guesses.extend(some)
+    tell(len(chunks), len(chunks))
+    g, h, factor = (np.concatenate([getattr(part, n) for part in parts]) for n in ("g", "h", "log_factor"))
+    kind = np.array([list(Kind).index(guess.kind) for guess in guesses], dtype=np.intp)
+    exact = factor.copy()
+    for k in [k for k in np.argsort(-factor)[: 2 * _REFIT] if guesses[k].kind in _MOVES][:_REFIT]:
+        if factor[k] > 0.0:
+            exact[k] = _exactly(now, frames, guesses[k])
+    weighed = weigh(exact, kind, risk)
+    return Verdict(guesses, Evidence(g, h, exact), weighed.confidence, weighed.any, weighed.kept)
+
+
+_MOVES: Final = (Kind.BUS, Kind.PHASE, Kind.SWAP)
+
+Chunk = tuple[list[Guess], Callable[[], Floats], float]
+
+
+def _chunks(now: Round, kinds: Collection[Kind]) -> Iterator[Chunk]:
+    """Guesses of like kind, and how their effects are made; (T, p, H)."""
+    net, series = now.net, now.series
+    trusted = np.flatnonzero(series.seen.any(axis=0)).tolist()
+    moves = {Kind.BUS: _buses, Kind.PHASE: _phases, Kind.SWAP: _swaps}
+    guesses = [guess for kind, made in moves.items() if kind in kinds for guess in made(net, trusted)]
+    for first in range(0, len(guesses), _CHUNK):
+        some = guesses[first : first + _CHUNK]
+        yield some, partial(_moves, now, some), 0.0
+    if Kind.LENGTH in kinds:
+        lengths = [Guess(Kind.LENGTH, k) for k in range(len(net.lines))]
+        yield lengths, partial(_seen, now, lengthened(net.places, series)), LENGTH_SPREAD
+    for j in trusted if Kind.METER in kinds else ():
+        columns, times = steps(series, j, PIECES)
+        changes = [Guess(Kind.METER, j, since=since, until=until) for since, until in times]
+        yield changes, partial(_seen, now, columns), CHANGE_SPREAD
+
+
+def _buses(net: Network, trusted: list[int]) -> list[Guess]:
+    out = []
+    rows = net.site.tables.customers
+    for j in trusted:
+        customer = int(net.site.meters[j])
+        phases = rows[customer].phases
+        out += [
+            Guess(Kind.BUS, customer, bus, phases)
+            for bus in range(len(net.feeder.buses))
+            if bus != net.feeder.bus[customer] and net.reaches(bus, phases)
+        ]
+    return out
+
+
+def _phases(net: Network, trusted: list[int]) -> list[Guess]:
+    out = []
+    if not isinstance(net.feeder, Feeder):
+        for j in trusted:
+            customer = int(net.site.meters[j])
+            bus, phases = int(net.feeder.bus[customer]), net.site.tables.customers[customer].phases
+            if len(phases) == 1:
+                others = [phase for phase in PHASES if phase != phases and net.reaches(bus, phase)]
+                out += [Guess(Kind.PHASE, customer, bus, phase) for phase in others]
+    return out
+
+
+def _swaps(net: Network, trusted: list[int]) -> list[Guess]:
+    W = net.places.weight
+    customers = [int(net.site.meters[j]) for j in trusted]
+    return [Guess(Kind.SWAP, a, b) for a, b in combinations(customers, 2) if (W[a] != W[b]).any()]
+
+
+def _moves(now: Round, guesses: list[Guess]) -> Floats:
+    net, series = now.net, now.series
+    out = np.empty((*series.y.shape, len(guesses)))
+    for h, guess in enumerate(guesses):
+        if guess.kind is Kind.SWAP:
+            W = net.places.weight
+            change = {guess.subject: W[guess.other], guess.other: W[guess.subject]}
+        else:
+            change = {guess.subject: net.weight(guess.other, guess.phases)}
+        out[:, :, h] = net.places.moved(series, change)
+    return _seen(now, out)
+
+
+def _seen(now: Round, columns: Floats) -> Floats:
+    return np.where(now.series.seen[:, :, None], columns, 0.0)
+
+
+def _exactly(now: Round, frames: Frames, guess: Guess) -> float:
+    """Gain of the log-likelihood with the power flow of the files as corrected."""
+    after = model.network(apply(now.state.tables, correction(now, guess)))
+    drawn = model.powers(after.site, frames)
+    series = model.series(after, frames, drawn, now.state.excluded)
+    # The meters of a swap have changed places; their readings are compared in the old order.
+    order = [after.site.meter_ids.index(name) for name in now.net.site.meter_ids]
+    rest = series.residual(after.places)[:, order]
+    z = now.readings - now.whiten(rest[:, :, None]).ravel()
+    return float(evidence(now.fit, z[:, None], np.zeros(1)).log_factor[0])
+
+
+def correction(now: Round, guess: Guess, factor: float = 1.0) -> Correction:
+    """A guess in the words of the files.
+
+    Parameters
+    ----------
+    now
+        The files that it is about.
+    guess
+        The error.
+    factor
+        On the length, for a length.
+    """
+    net, tables = now.net, now.state.tables
+    if guess.kind is Kind.METER:
+        return Correction(guess.kind, (net.site.meter_ids[guess.subject],))
+    if guess.kind is Kind.LENGTH:
+        return Correction(
+            guess.kind, tuple(tables.lines[k].line for k in net.lines[guess.subject]), factor=factor
+        )
+    names = tables.customers[guess.subject].customer
+    if guess.kind is Kind.SWAP:
+        return Correction(guess.kind, (names, tables.customers[guess.other].customer))
+    return Correction(guess.kind, (names,), net.feeder.buses[guess.other], guess.phases)
+
+
+def apply(tables: FeederTables, wrong: Correction) -> FeederTables:
+    """Correct the files.
+
+    Parameters
+    ----------
+    tables
+        The files.
+    wrong
+        Their error; that of a meter changes nothing in them.
+    """
+    if wrong.kind is Kind.METER:
+        return tables
+    if wrong.kind is Kind.LENGTH:
+        rows = (longer(row, wrong.factor) if row.line in wrong.names else row for row in tables.lines)
+        return replace(tables, lines=tuple(rows))
+    customers = {row.customer: row for row in tables.customers}
+    one = customers[wrong.names[0]]
+    if wrong.kind is Kind.SWAP:
+        other = customers[wrong.names[1]]
+        changed = [replace(one, meter=other.meter), replace(other, meter=one.meter)]
+    elif wrong.kind is Kind.PHASE:
+        changed = [replace(one, phases=wrong.phases)]
+    else:
+        changed = [replace(one, bus=wrong.bus)]
+    customers |= {row.customer: row for row in changed}
+    return replace(tables, customers=tuple(customers.values()))
+
+
+def longer(line: LineRow, factor: float) -> LineRow:
+    """A line of another length.
+
+    Parameters
+    ----------
+    line
+        The line.
+    factor
+        On its length.
+    """
+    scaled: dict[str, Any] = {
+        name: None if (value := getattr(line, name)) is None else value * factor
+        for name in ("r_ohm", "x_ohm", "r0_ohm", "x0_ohm", "b_us")
+    }
+    return replace(line, **scaled)

@@ -1,0 +1,354 @@
+"""One scene of a campaign: its cases are played against full AC power flow, and watched.
+
+Until its onset a case is to the last bit the scene without lies: that is watched once, and each case goes on
+from the state in which the estimator then is; states are values. Lies of meters do not change the truth:
+it is computed once for each scene; what inverters do, and powers that are told wrong, are played in full.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from feeders.campaign import NoSuchAttack
+from feeders.estimators import Watcher, design
+from feeders.scenario import Scenario
+from feeders.studies.campaign_lies import attacks
+from feeders.studies.campaign_plan import CLEAN, LEARN_STEP_S, Case, Plan
+from feeders.trials import Trial, Truth, frames
+from gridsec.arrays import Bools, Floats
+from gridsec.attack import Attack, Coordinated, Reports, apply_all, manipulated, reach
+from gridsec.online import Decision, Frame
+from gridsec.sequential import Commission
+
+if TYPE_CHECKING:
+    from feeders.load import Site
+
+__all__ = ["Prepared", "prepare", "risings", "watch"]
+
+ERROR_PERCENTILE = 95.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prepared:
+    """What all scenes of a campaign share.
+
+    Attributes
+    ----------
+    site
+        The feeder.
+    plan
+        The campaign.
+    stated
+        The feeder whose files say how wrong loads and meters are.
+    watchers
+        By false-alarm rate.
+    learners
+        The same, with the interval of the readings that they learn from; none where nothing is learned.
+    """
+
+    site: Site
+    plan: Plan
+    stated: Site
+    watchers: dict[float, Watcher]
+    learners: dict[float, Watcher]
+
+
+def prepare(site: Site, plan: Plan) -> Prepared:
+    """Design the estimators of a campaign.
+
+    Parameters
+    ----------
+    site, plan
+        The feeder, and the campaign.
+
+    Raises
+    ------
+    NotObservable, DesignInfeasible, EstimatorUnusable, FeederInvalid, ValueError
+        If the estimator cannot watch this feeder with these settings.
+    """
+    scene = plan.trial(site, plan.moment(0))
+    watchers = _designed(plan, scene.stated)
+    learners = _designed(plan, replace(scene, step_s=LEARN_STEP_S).stated) if plan.learn_s else {}
+    if any(watcher.learner is None for watcher in learners.values()):
+        raise ValueError(f"{plan.estimator} does not learn its meters' fixed errors")
+    return Prepared(site, plan, scene.stated, watchers, learners)
+
+
+def _designed(plan: Plan, stated: Site) -> dict[float, Watcher]:
+    return {rate: design(plan.watched(stated, rate)) for rate in plan.alarms_per_year}
+
+
+def watch(given: Prepared, scene: int) -> list[dict[str, Any]]:
+    """Play and watch all cases of one scene.
+
+    Parameters
+    ----------
+    given
+        From `prepare`.
+    scene
+        Its number.
+
+    Returns
+    -------
+    list of dict
+        One for each case and false-alarm rate; values that JSON can hold. See `campaign.Campaign`.
+    """
+    plan, moment, cases = given.plan, given.plan.moment(scene), given.plan.cases(scene)
+    trial = plan.trial(given.site, moment)
+    honest = replace(trial.scenario, season=moment.season)
+    played = _Played.of(list(frames(trial, honest)))
+    onsets = {round(case.onset_s / plan.step_s) for case in cases[1:]}
+    known = _learned(given, trial, honest) if plan.learn_s else {}
+    clean, states = {}, {}
+    for rate, watcher in given.watchers.items():
+        clean[rate], states[rate] = _clean(
+            watcher, watcher.init(honest.start, known.get(rate)), played, onsets
+        )
+    head = {
+        "scene": scene,
+        "season": str(moment.season),
+        "hour": moment.profile_s % 86_400.0 / 3600.0,
+        "weekday": int(moment.profile_s // 86_400.0) % 7,
+    }
+    rows = [_told(given, head, cases[0], rate, seen, played, 0) for rate, seen in clean.items()]
+    for case in cases[1:]:
+        onset = round(case.onset_s / plan.step_s)
+        try:
+            lied = _lied(given, played, honest, case)
+        except NoSuchAttack as error:
+            rows += [_row(head, case, rate, reason=str(error)) for rate in given.watchers]
+            continue
+        for rate, watcher in given.watchers.items():
+            seen, _ = _step(watcher, states[rate][onset], lied.frames[onset:])
+            rows.append(_told(given, head, case, rate, seen, lied, onset))
+    return rows
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Played:
+    """What is watched, and the truth. T frames, N customers, p meters, m inverters."""
+
+    frames: list[Frame]
+    v2: Floats  # (T, N)
+    liars: Bools  # (T, p)
+    shift: Floats  # (T, p) reported minus honest voltage, pu
+    inverters: Bools  # (T, m)
+
+    @classmethod
+    def of(cls, played: list[tuple[Frame, Truth]]) -> _Played:
+        return cls(
+            [frame for frame, _ in played],
+            np.array([truth.v2 for _, truth in played]),
+            np.array([truth.liars for _, truth in played]),
+            np.array([_shift(frame.y, truth.attack) for frame, truth in played]),
+            np.array([truth.inverters for _, truth in played]),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Seen:
+    """What an estimator said. T frames."""
+
+    named: Bools  # (T, p)
+    inverters: Bools  # (T, m)
+    clean: Bools  # (T,)
+    undecided: Bools  # (T,)
+    v2: Floats  # (T, N)
+
+
+def _learned(given: Prepared, trial: Trial, honest: Scenario) -> dict[float, Commission]:
+    """What estimators learn of their meters in the honest time before a scene."""
+    learn_s = given.plan.learn_s
+    # One frame more than what is asked for, and quasi-static inverters: they settle between two readings.
+    before = replace(
+        honest,
+        start=honest.start - learn_s - LEARN_STEP_S,
+        profile_s=honest.profile_s - learn_s - LEARN_STEP_S,
+        duration_s=learn_s + LEARN_STEP_S,
+        dt_s=LEARN_STEP_S,
+        substep_s=LEARN_STEP_S,
+    )
+    states = {rate: watcher.init(before.start) for rate, watcher in given.learners.items()}
+    for frame, _ in frames(replace(trial, step_s=LEARN_STEP_S), before):
+        for rate, watcher in given.learners.items():
+            states[rate], _, _ = watcher.step(states[rate], frame)
+    found = {}
+    for rate, watcher in given.learners.items():
+        if watcher.learner is not None:
+            found[rate] = watcher.learner.commission(states[rate])
+    return found
+
+
+def _clean(watcher: Watcher, state: Any, played: _Played, onsets: set[int]) -> tuple[_Seen, dict[int, Any]]:
+    """Watch the scene without lies, and keep the states before some frames."""
+    states, parts, begin = {}, [], 0
+    for end in sorted({*onsets, len(played.frames)}):
+        seen, state = _step(watcher, state, played.frames[begin:end])
+        states[end], begin = state, end
+        parts.append(seen)
+    columns = (
+        [getattr(part, name) for part in parts] for name in ("named", "inverters", "clean", "undecided", "v2")
+    )
+    return _Seen(*(np.concatenate(column) for column in columns)), states
+
+
+def _step(watcher: Watcher, state: Any, some: list[Frame]) -> tuple[_Seen, Any]:
+    named, inverters, decisions, v2 = [], [], [], []
+    for frame in some:
+        state, estimate, verdict = watcher.step(state, frame)
+        named.append(verdict.suspects)
+        inverters.append(verdict.inverters)
+        decisions.append(verdict.decision)
+        v2.append(estimate.v2)
+    clean = np.array([each is Decision.CLEAN for each in decisions], dtype=np.bool_)
+    undecided = np.array([each is Decision.UNDECIDED for each in decisions], dtype=np.bool_)
+    return _Seen(np.array(named), np.array(inverters), clean, undecided, np.array(v2)), state
+
+
+# ------------------------------------------------------------------------------------------ what is told
+
+
+def _lied(given: Prepared, played: _Played, honest: Scenario, case: Case) -> _Played:
+    """The scene with the lies of a case."""
+    some, wrong = attacks(given.stated, given.plan, case, honest)
+    if wrong or not all(_simple(attack, honest.start) for attack in some):
+        trial = given.plan.trial(given.site, given.plan.moment(case.number // given.plan.together))
+        lying = replace(honest, attacks=some, inverter_attacks=wrong)
+        return _Played.of(list(frames(trial, lying)))
+    t = np.array([frame.t for frame in played.frames])
+    # The root of a rounded square is the number itself.
+    v = np.sqrt(np.array([frame.y for frame in played.frames]))
+    nothing = np.zeros_like(v)
+
+    def past(when: Floats) -> Floats:
+        # Half a microsecond of slack, as in scenarios: the difference of two times is rarely exact.
+        row = np.floor((when - honest.start + 5e-7) / honest.dt_s).astype(np.intp)
+        return np.asarray(v[row])
+
+    told = apply_all(some, t, Reports(v, nothing, nothing), past).v
+    lies = manipulated(some, t, v.shape[1])
+    y, some_lie = told * np.abs(told), np.any(lies, axis=1).tolist()
+    return replace(
+        played,
+        frames=[
+            replace(frame, y=row) if lying else frame
+            for frame, row, lying in zip(played.frames, y, some_lie, strict=True)
+        ],
+        liars=lies,
+        shift=told - v,
+    )
+
+
+def _shift(y: Floats, attack: Floats) -> Floats:
+    """Reported minus honest voltage, pu, of squared ones."""
+    return np.asarray(np.sqrt(y) - np.sqrt(y - attack))
+
+
+def _simple(attack: Attack, start: float) -> bool:
+    """Whether only voltages are told wrong, by what the scene itself has seen."""
+    powers = isinstance(attack, Coordinated) and bool(attack.p_shift.any() or attack.q_shift.any())
+    return not powers and reach(attack, attack.t_on) <= attack.t_on - start
+
+
+# --------------------------------------------------------------------------------------- what came of it
+
+
+def _row(head: dict[str, Any], case: Case, rate: float, *, reason: str = "") -> dict[str, Any]:
+    return {
+        "scenario": case.number,
+        **head,
+        "alarms_per_year": rate,
+        "kind": case.kind,
+        "size": case.size,
+        "liars": case.liars,
+        "place": str(case.place),
+        "onset_s": case.onset_s if case.kind != CLEAN else float("nan"),
+        "reason": reason,
+    }
+
+
+def _told(  # noqa: PLR0917  # one row needs all that is known of the case
+    given: Prepared, head: dict[str, Any], case: Case, rate: float, seen: _Seen, played: _Played, begin: int
+) -> dict[str, Any]:
+    """One row: what an estimator made of a case from frame `begin` on."""
+    plan, site, step_s = given.plan, given.site, given.plan.step_s
+    wrong = played.inverters[begin:]
+    inverters = seen.inverters if seen.inverters.shape[1] else np.zeros_like(wrong)
+    names = (*site.meter_ids, *(site.feeder.customers[k] for k in site.droop.customer))
+    lies, named = np.hstack([played.liars[begin:], wrong]), np.hstack([seen.named, inverters])
+    told = _each(played, begin, site, lies, named, names, step_s)
+    # A name that stays a while after the lie is not false.
+    wrong_names = named & ~np.logical_or.accumulate(lies, axis=0)
+    false = wrong_names.any(axis=0)
+    delays = np.array([one["delay_s"] for one in told])
+    missed = [one["who"] for one in told if np.isinf(one["delay_s"])]
+    lying: Bools = np.any(lies, axis=1)
+    after = np.flatnonzero(lying)[-1] + 1 if lying.any() else len(lying)
+    quiet = np.flatnonzero(~named[after:].any(axis=1))
+    ended = after < len(lying)
+    row = _row(head, case, rate) | {
+        "exact": not missed and not false.any(),
+        "named": len(told) - len(missed),
+        "missed": " ".join(missed),
+        "falsely_named": " ".join(np.array(names)[false]),
+        "false_events": risings(wrong_names),
+        "delay_s": float(delays.max()) if delays.size else float("nan"),
+        "clear_s": (float(quiet[0] * step_s) if quiet.size else float("inf")) if ended else float("nan"),
+        "most_named": int(named.sum(axis=1).max(initial=0)),
+        "watched_s": len(lying) * step_s,
+        "undecided_s": float(seen.undecided.sum() * step_s),
+        "clean_lying_s": float((seen.clean & lying & ~named.any(axis=1)).sum() * step_s),
+    }
+    return row | _errors(plan, site, seen, played, begin, lies) | {"each": told}
+
+
+def risings(flags: Bools) -> int:
+    """How often any of some flags goes up, from down before the first row.
+
+    Parameters
+    ----------
+    flags : (T, k)
+        The flags over time.
+    """
+    before = np.vstack([np.zeros((1, flags.shape[1]), dtype=np.bool_), flags[:-1]])
+    return int(np.count_nonzero(flags & ~before))
+
+
+def _each(  # noqa: PLR0917  # meters and inverters alike
+    played: _Played, begin: int, site: Site, lies: Bools, named: Bools, names: tuple[str, ...], step_s: float
+) -> list[dict[str, Any]]:
+    """One row for every liar."""
+    rows = []
+    for j in np.flatnonzero(lies.any(axis=0)):
+        lying = lies[:, j]
+        caught = np.flatnonzero(named[:, j] & lying)
+        delay = (caught[0] - np.argmax(lying)) * step_s if caught.size else np.inf
+        inverter = bool(j >= site.meters.size)
+        volt = np.nan if inverter else np.abs(played.shift[begin:, j]).max() * site.feeder.base_volt
+        rows.append({"who": names[j], "inverter": inverter, "lie_volt": float(volt), "delay_s": float(delay)})
+    return rows
+
+
+def _errors(  # noqa: PLR0917  # the same
+    plan: Plan, site: Site, seen: _Seen, played: _Played, begin: int, lies: Bools
+) -> dict[str, float]:
+    """Errors of the voltage, % of nominal, at liars while they lie and at everybody else."""
+    with np.errstate(invalid="ignore"):
+        error = 100.0 * np.abs(np.sqrt(seen.v2) - np.sqrt(played.v2[begin:]))
+    error = np.where(np.isfinite(error), error, np.inf)
+    lying: Bools = np.any(lies, axis=1)
+    first = int(np.argmax(lying)) if lying.any() else 0
+    use = np.arange(len(lying)) >= first + round(plan.settling_s / plan.step_s)
+    at_liars = np.zeros(error.shape, dtype=np.bool_)
+    at_liars[:, site.meters] = played.liars[begin:]
+    out = {}
+    for where, some in (("liars", at_liars & use[:, None]), ("others", ~at_liars & use[:, None])):
+        values = error[some]
+        out[f"error_{where}"] = float(np.max(values)) if values.size else float("nan")
+        out[f"error_{where}_95"] = (
+            float(np.percentile(values, ERROR_PERCENTILE, method="higher")) if values.size else float("nan")
+        )
+    return out

@@ -1,0 +1,263 @@
+"""How readings would change if a meter, a load, a line or a customer's place were other than the files say.
+
+Squared voltages at Q places (a bus, or a phase of a bus), from power flow with the losses, and linear
+sensitivities from powers at one place to the voltage at another. One class for balanced feeders and for
+those of three phases: a customer is connected to places with weights that add up to 1.
+
+With U the squared voltages that the files and the metered powers give, the readings less U are to first
+order
+
+    2 y_j b_j                       bias b_j of meter j, relative to the busbar's
+    -(drop of U along branch l)     per unit of its length, at the places behind it
+    A_ji p_i, B_ji q_i              errors of the gain of power registers
+    -B_ji load_i                    error of tan(phi) where q is not metered; -B_ji: what q is at p = 0
+    -B_ji roof_i                    error of the generation, where only load less generation is metered
+
+and for customers at other places, exactly in the linear flow, ``W'(U + dU) - W U`` with W, W' the weights.
+
+References
+----------
+docs/theory-studies.md, Calibration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats, Ints
+
+__all__ = ["Doubts", "Places", "Regressors", "Series", "regressors", "steps"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Places:
+    """A feeder as readings see it. Q places, N customers, p meters, L branches, F phases (1 or 3).
+
+    Attributes
+    ----------
+    active, reactive : (Q, Q)
+        Change of the squared voltage at a place per power injected at another, pu; the 2 is in it.
+    phase : (Q,)
+        Phase of each place, 0 to F - 1.
+    behind : (Q, L)
+        Whether a place is behind a branch.
+    weight : (N, Q)
+        Where each customer is connected; rows add up to 1.
+    meters : (p,)
+        Customer of each meter.
+    """
+
+    active: Floats
+    reactive: Floats
+    phase: Ints
+    behind: Bools
+    weight: Floats
+    meters: Ints
+
+    @property
+    def at_meters(self) -> tuple[Floats, Floats]:
+        """Sensitivities of the meters to the customers' powers, (p, N) each."""
+        W = self.weight[self.meters]
+        return W @ self.active @ self.weight.T, W @ self.reactive @ self.weight.T
+
+    def moved(self, series: Series, change: Mapping[int, Floats]) -> Floats:
+        """How the meters' squared voltages change when customers are elsewhere, (T, p).
+
+        Parameters
+        ----------
+        series
+            Voltages and powers.
+        change
+            New weights (Q,) of each customer that moves.
+        """
+        W = self.weight[self.meters].copy()
+        away: Floats = np.zeros((series.t.size, W.shape[0]))
+        for j, customer in enumerate(self.meters.tolist()):
+            if customer in change:
+                away[:, j] = series.places @ (change[customer] - W[j])
+                W[j] = change[customer]
+        used = np.flatnonzero(W.any(axis=0))
+        for customer, new in change.items():
+            shift = new - self.weight[customer]
+            some = np.flatnonzero(shift)
+            for matrix, power in ((self.active, series.p), (self.reactive, series.q)):
+                gain = W[:, used] @ (matrix[np.ix_(used, some)] @ shift[some])
+                away += np.outer(power[:, customer], gain)
+        return away
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Series:
+    """What was read, and what the files make of it. T frames.
+
+    Attributes
+    ----------
+    t : (T,)
+        Times, s.
+    y : (T, p)
+        Squared voltages read, pu; any number where not seen.
+    seen : (T, p)
+        Which there are.
+    p, q : (T, N)
+        Net injections, pu.
+    load : (T, N)
+        What draws reactive power by its power factor, pu.
+    roof : (T, N)
+        Generation times tan(phi) of the load, where only their difference is metered, pu.
+    steep : (T, N)
+        Derivative of the inverter's q in the squared voltage read; 0 without one, or with q metered.
+    places : (T, Q)
+        Squared voltages by power flow, pu.
+    drop : (T, F, L)
+        Their drop along each branch, pu.
+    """
+
+    t: Floats
+    y: Floats
+    seen: Bools
+    p: Floats
+    q: Floats
+    load: Floats
+    roof: Floats
+    steep: Floats
+    places: Floats
+    drop: Floats
+
+    def residual(self, places: Places) -> Floats:
+        """Readings less power flow, (T, p); 0 where there is none."""
+        model = self.places @ places.weight[places.meters].T
+        return np.where(self.seen, self.y - model, 0.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Doubts:
+    """Standard deviations of what is not known exactly, before any reading; 0: known.
+
+    Attributes
+    ----------
+    bias : (p,)
+        Relative fixed error of each meter, 1.
+    p_gain, q_gain : (N,)
+        Relative error of the power registers, 1.
+    tan : (N,)
+        Error of tan(phi) where q is not metered, 1.
+    roof : (N,)
+        Relative error of the generation that the load is found by, 1.
+    p_level, q_level : (N,)
+        Constant error of the powers, pu.
+    length : (L,)
+        Relative error of a branch's length that is no mistake, 1.
+    """
+
+    bias: Floats
+    p_gain: Floats
+    q_gain: Floats
+    tan: Floats
+    roof: Floats
+    p_level: Floats
+    q_level: Floats
+    length: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Regressors:
+    """Columns by kind, one after the other.
+
+    Attributes
+    ----------
+    columns : (T, p, K)
+        Effect of a unit of each coefficient, squared pu.
+    spread : (K,)
+        Prior standard deviations.
+    where : kind -> (k,)
+        Which columns; the names are those of `Doubts`. As many as the feeder has of the kind.
+    """
+
+    columns: Floats
+    spread: Floats
+    where: dict[str, Ints]
+
+
+def regressors(places: Places, series: Series, doubts: Doubts) -> Regressors:
+    """All regressors of a feeder whose files are right.
+
+    Parameters
+    ----------
+    places
+        The feeder.
+    series
+        What was read.
+    doubts
+        Their priors.
+    """
+    A, B = places.at_meters
+    seen = series.seen[:, :, None]
+
+    def spatial(matrix: Floats, power: Floats) -> Floats:
+        return np.asarray(matrix[None] * power[:, None, :])
+
+    p, T = series.y.shape[1], series.t.size
+    bias = np.zeros((T, p, p))
+    twice = np.where(series.seen, 2.0 * series.y, 0.0)
+    bias[:, np.arange(p), np.arange(p)] = twice
+    # What an inverter's reactive power is taken to be follows its own meter's reading.
+    bias -= spatial(B[:, places.meters], twice * series.steep[:, places.meters])
+    parts = {
+        "bias": bias,
+        "p_gain": spatial(A, series.p),
+        "q_gain": spatial(B, series.q),
+        "tan": spatial(B, -series.load),
+        "roof": spatial(B, -series.roof),
+        "p_level": spatial(A, np.ones_like(series.p)),
+        "q_level": spatial(B, np.ones_like(series.p)),
+        "length": lengthened(places, series),
+    }
+    count = np.cumsum([0, *(part.shape[2] for part in parts.values())])
+    return Regressors(
+        columns=np.where(seen, np.concatenate(list(parts.values()), axis=2), 0.0),
+        spread=np.concatenate([getattr(doubts, name) for name in parts]),
+        where={name: np.arange(a, b) for name, a, b in zip(parts, count[:-1], count[1:], strict=True)},
+    )
+
+
+def lengthened(places: Places, series: Series) -> Floats:
+    """What the meters' squared voltages lose if a branch is longer by its own length, negative, (T, p, L)."""
+    W = places.weight[places.meters]
+    phases = series.drop.shape[1]
+    by_phase = [W[:, places.phase == f] @ places.behind[places.phase == f] for f in range(phases)]
+    return -sum(
+        (part[None] * series.drop[:, f, None, :] for f, part in enumerate(by_phase)),
+        np.zeros((1, 1, 1)),
+    )
+
+
+def steps(series: Series, meter: int, pieces: int) -> tuple[Floats, list[tuple[float, float]]]:
+    """Times in which one meter's error may differ from its usual: pieces of the recording, and its rest.
+
+    Parameters
+    ----------
+    series
+        What was read.
+    meter
+        The meter.
+    pieces
+        Into how many stretches of equally many readings time is cut.
+
+    Returns
+    -------
+    (T, p, H), [H pairs]
+        Effect of a relative error in it, and its beginning and end, s.
+    """
+    T, p = series.y.shape
+    cuts = np.linspace(0, T, pieces + 1).astype(np.intp)
+    spans = [(cuts[a], cuts[a + 1]) for a in range(pieces)] + [(cuts[a], T) for a in range(1, pieces - 1)]
+    spans += [(cuts[a], cuts[a + 2]) for a in range(pieces - 2)]
+    out = np.zeros((T, p, len(spans)))
+    twice = np.where(series.seen[:, meter], 2.0 * series.y[:, meter], 0.0)
+    for h, (first, end) in enumerate(spans):
+        out[first:end, meter, h] = twice[first:end]
+    times = [(float(series.t[first]), float(series.t[end - 1])) for first, end in spans]
+    return out, times

@@ -1,0 +1,351 @@
+"""The AC power flow of a balanced feeder, and a proven range of its sensitivities over a box of powers.
+
+With the complex impedances Z between customers and the no-load profile E (charging included), the AC
+equations are `V = E v0 + Z conj(s / V)`. From a solution V*, s* in the middle of a box follow, in closed
+form, how far any other solution in the box can be away, and how far its sensitivities `d|V|/dp`, `d|V|/dq`:
+no linear model and no sampling stands between the bound and the AC power flow.
+
+References
+----------
+docs/theory-studies.md, section on the droop fleet. The equation in this form: S. Bolognani and S. Zampieri,
+"On the existence and linear approximation of the power flow solution in power distribution networks", IEEE
+Trans. Power Systems 31(1), 2016; C. Wang, A. Bernstein, J.-Y. Le Boudec, M. Paolone, "Explicit conditions on
+existence and uniqueness of load-flow solutions in distribution networks", IEEE Trans. Smart Grid 9(2), 2018.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gridsec.arrays import Floats
+from gridsec.errors import DesignInfeasible
+from gridsec.feeder import Feeder, common_paths
+
+__all__ = [
+    "Box",
+    "Complex",
+    "Network",
+    "Region",
+    "Sensitivity",
+    "currents",
+    "network",
+    "region",
+    "sensitivity",
+    "solve",
+]
+
+Complex = NDArray[np.complex128]
+
+_TOL = 1e-13
+"""Largest change of a voltage at which the fixed-point iteration has arrived, pu."""
+
+_ROUNDS = 400
+
+_GROWTH = 1e-3
+"""What is added to a radius, relatively, so that the box it spans is mapped strictly into itself."""
+
+_SLACK = 1e-9
+"""Room for the rounding of a solved power flow in a proven voltage, pu."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Network:
+    """`V = E v0 + Z conj(s / V)` at the customers, and at all buses. N customers, b + 1 buses.
+
+    Attributes
+    ----------
+    Z, E : (N, N), (N,)
+        Impedances between customers, and their voltages without load for 1 pu at the busbar.
+    Z_bus, E_bus : (b + 1, N), (b + 1,)
+        The same for every bus.
+    """
+
+    Z: Complex
+    E: Complex
+    Z_bus: Complex
+    E_bus: Complex
+
+
+def network(feeder: Feeder) -> Network:
+    """The impedances of a feeder, `(I + j Z0 B)^-1 Z0` with Z0 from the series impedances and B the charging.
+
+    Parameters
+    ----------
+    feeder
+        The feeder.
+    """
+    everywhere = np.arange(len(feeder.buses))
+    Z0 = common_paths(feeder, feeder.r, everywhere) + 1j * common_paths(feeder, feeder.x, everywhere)
+    loaded = np.eye(everywhere.size) + 1j * Z0 * feeder.half
+    unloaded = np.column_stack([Z0[:, feeder.bus], np.ones(everywhere.size)])
+    both = np.asarray(np.linalg.solve(loaded, unloaded), dtype=np.complex128)
+    Z_bus, E_bus = both[:, :-1], both[:, -1]
+    return Network(Z_bus[feeder.bus], E_bus[feeder.bus], Z_bus, E_bus)
+
+
+def solve(net: Network, s: Complex, v0: Floats | float) -> Complex:
+    """Voltages of the customers by AC power flow; NaN where the iteration finds none.
+
+    Parameters
+    ----------
+    net
+        From `network`.
+    s : (…, N)
+        Net complex injections (generation positive), pu.
+    v0 : (…) or scalar
+        Voltage of the busbar, pu.
+
+    Returns
+    -------
+    (…, N)
+        Complex voltages, pu; the busbar has angle 0.
+    """
+    base = np.asarray(v0, dtype=np.float64)[..., None] * net.E
+    V = np.array(np.broadcast_to(base, np.broadcast_shapes(base.shape, s.shape)))
+    flown, through = np.conj(s), net.Z.T
+    change = np.full(V.shape[:-1], np.inf)
+    with np.errstate(all="ignore"):
+        for _ in range(_ROUNDS):
+            new = base + (flown / np.conj(V)) @ through
+            change = np.max(np.abs(new - V), axis=-1, initial=0.0)
+            V = new
+            if not np.any(change > _TOL):
+                break
+    V[~(change <= _TOL)] = np.nan
+    return V
+
+
+def currents(feeder: Feeder, net: Network, s: Complex, V: Complex, v0: Floats | float) -> Floats:
+    """Largest current at either end of every branch, pu.
+
+    Parameters
+    ----------
+    feeder, net, s, V, v0
+        As in `solve`, with its result.
+
+    Returns
+    -------
+    (…, b)
+        Magnitudes, in units of `base_kva / (3 base_volt)`.
+    """
+    at = np.asarray(v0, dtype=np.float64)[..., None] * net.E_bus + np.conj(s / V) @ net.Z_bus.T
+    above, here = at[..., feeder.parent], at[..., 1:]
+    series = (above - here) / (feeder.r + 1j * feeder.x)
+    shunt = 0.5j * feeder.charging
+    return np.maximum(np.abs(series + shunt * above), np.abs(series - shunt * here))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sensitivity:
+    """The linearised AC power flow at a solution, relative voltages `xi = dV / V`.
+
+    Attributes
+    ----------
+    a, b : (N, N)
+        `xi = a c + b conj(c)` for a change c of the conjugate injections.
+    busbar : (N,)
+        xi for 1 pu more at the busbar.
+    v : (N,)
+        Voltage magnitudes, pu.
+    """
+
+    a: Complex
+    b: Complex
+    busbar: Complex
+    v: Floats
+
+    @property
+    def p(self) -> Complex:
+        """Relative voltages xi for 1 pu more of active injection, (N, N)."""
+        return self.a + self.b
+
+    @property
+    def q(self) -> Complex:
+        """Relative voltages xi for 1 pu more of reactive injection, (N, N)."""
+        return -1j * (self.a - self.b)
+
+    @property
+    def dv_dq(self) -> Floats:
+        """Voltage magnitudes for 1 pu more of reactive injection, (N, N)."""
+        return np.asarray(self.v[:, None] * self.q.real)
+
+
+def sensitivity(net: Network, s: Complex, V: Complex) -> Sensitivity:
+    """Linearise the AC power flow at a solution.
+
+    `xi + M conj(xi) = Zr c` with `Zr_ij = Z_ij / (V_i conj(V_j))` and `M = Zr diag(conj(s))`, hence
+    `(I - M conj(M)) xi = Zr c - M conj(Zr c)`.
+
+    Parameters
+    ----------
+    net, s, V
+        As in `solve`, one operating point, with its result.
+
+    Raises
+    ------
+    DesignInfeasible
+        If there is no solution there.
+    """
+    if not np.isfinite(V).all():
+        raise DesignInfeasible("sensitivities of the feeder", "the AC power flow has no solution there")
+    relative = net.Z / V[:, None] / np.conj(V)
+    M = relative * np.conj(s)
+    source = net.E / V
+    inverse = np.linalg.inv(np.eye(V.size) - M @ np.conj(M))
+    return Sensitivity(
+        a=inverse @ relative,
+        b=-inverse @ M @ np.conj(relative),
+        busbar=inverse @ (source - M @ np.conj(source)),
+        v=np.abs(V),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Box:
+    """Injections and busbar voltages between limits, pu.
+
+    Attributes
+    ----------
+    p_low, p_high, q_low, q_high : (N,)
+        Limits of the net injections (generation positive), inverters included.
+    v0_low, v0_high
+        Limits of the busbar's voltage.
+    """
+
+    p_low: Floats
+    p_high: Floats
+    q_low: Floats
+    q_high: Floats
+    v0_low: float
+    v0_high: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Region:
+    """What the AC power flow can do in a box.
+
+    Every chord of the AC power flow in the box, `v - v' = Jp (p - p') + Jq (q - q') + J0 (v0 - v0')`, has
+    coefficients within the errors of those given here.
+
+    Attributes
+    ----------
+    dv_dp, dv_dq : (N, N)
+        Sensitivities of the voltage magnitudes in the middle of the box.
+    p_error, q_error : (N, N)
+        How far those anywhere in the box are off, entry by entry.
+    dv_dv0, v0_error : (N,)
+        The same for the voltage of the busbar.
+    low, high : (N,)
+        Proven limits of the voltage magnitudes in the box, pu.
+    """
+
+    dv_dp: Floats
+    dv_dq: Floats
+    p_error: Floats
+    q_error: Floats
+    dv_dv0: Floats
+    v0_error: Floats
+    low: Floats
+    high: Floats
+
+
+def region(net: Network, box: Box) -> Region:
+    """Bound voltages and sensitivities of the AC power flow over a box of injections.
+
+    Parameters
+    ----------
+    net
+        From `network`.
+    box
+        The injections.
+
+    Raises
+    ------
+    DesignInfeasible
+        If the box is so large, or so near collapse, that nothing can be said of all of it.
+    """
+    middle, half = _split(box)
+    s, v0 = middle[0] + 1j * middle[1], 0.5 * (box.v0_low + box.v0_high)
+    at = sensitivity(net, s, solve(net, s, v0))
+    swing = 0.5 * (box.v0_high - box.v0_low)
+    gain, away = np.abs(at.a) + np.abs(at.b), np.hypot(*half)
+    r = _radius(gain, np.abs(s), away, np.abs(at.busbar) * swing)
+    feedback = gain * ((away + np.abs(s) * (2.0 + r) * r) / (1.0 - r) ** 2)
+    amplify = _neumann(feedback)
+    tilt = gain * (r / (1.0 - r))
+
+    def error(xi: Complex, own: Floats) -> Floats:
+        # The change of d xi, and the turn of the direction in which a voltage's magnitude grows.
+        change = own + feedback @ (amplify @ (np.abs(xi) + own))
+        turned = (1.0 - np.sqrt(1.0 - r**2))[:, None] * np.abs(xi.real) + r[:, None] * np.abs(xi.imag)
+        return np.asarray(at.v[:, None] * (change + turned))
+
+    columns = [(at.p, tilt), (at.q, tilt), (at.busbar[:, None], np.zeros((r.size, 1)))]
+    J = np.hstack([at.v[:, None] * xi.real for xi, _ in columns])
+    off = np.hstack([error(xi, own) for xi, own in columns])
+    low, high = _limits(net, box, at.v, J, off)
+    n = r.size
+    p, q, busbar = slice(n), slice(n, 2 * n), 2 * n
+    return Region(
+        dv_dp=J[:, p],
+        dv_dq=J[:, q],
+        p_error=off[:, p],
+        q_error=off[:, q],
+        dv_dv0=J[:, busbar],
+        v0_error=off[:, busbar],
+        low=low,
+        high=high,
+    )
+
+
+def _split(box: Box) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
+    """Middles and half-widths of p and q."""
+    return (
+        (0.5 * (box.p_low + box.p_high), 0.5 * (box.q_low + box.q_high)),
+        (0.5 * (box.p_high - box.p_low), 0.5 * (box.q_high - box.q_low)),
+    )
+
+
+def _radius(gain: Floats, s: Floats, away: Floats, source: Floats) -> Floats:
+    """A radius r with `gain (away + |s| r^2) / (1 - r) + source <= r < 1`: no solution is further away."""
+
+    def reach(r: Floats) -> Floats:
+        return np.asarray(gain @ ((away + s * r**2) / (1.0 - r)) + source)
+
+    r = source
+    for _ in range(_ROUNDS):
+        larger = reach(r)
+        settled = bool(np.all(larger <= (1.0 + 0.1 * _GROWTH) * r))
+        r = larger
+        if settled or not np.all(r < 0.9):
+            break
+    r = (1.0 + _GROWTH) * r
+    if not (np.all(r < 0.9) and np.all(reach(r) <= r)):
+        raise DesignInfeasible("voltages over all powers in the box", "it reaches too near to collapse")
+    return r
+
+
+def _neumann(feedback: Floats) -> Floats:
+    """`(I - feedback)^-1`, which exists and is not negative exactly if the spectral radius is below 1."""
+    size = feedback.shape[0]
+    inverse = np.linalg.inv(np.eye(size) - feedback)
+    # x = (I - F)^-1 1 with x >= 1 and F x < x proves it, by Perron and Frobenius.
+    x = inverse @ np.ones(size)
+    if not (np.all(x >= 0.5) and np.all(feedback @ x < x)):
+        raise DesignInfeasible("sensitivities over all powers in the box", "it reaches too near to collapse")
+    return np.asarray(np.maximum(inverse, 0.0))
+
+
+def _limits(net: Network, box: Box, middle: Floats, J: Floats, off: Floats) -> tuple[Floats, Floats]:
+    """The better of two bounds: from the middle, and from the corner that is extreme if no J is negative."""
+    width = np.concatenate([box.p_high - box.p_low, box.q_high - box.q_low, [box.v0_high - box.v0_low]])
+    spread = (np.abs(J) + off) @ (0.5 * width)
+    fall = np.minimum(J - off, 0.0) @ width
+    bottom = np.abs(solve(net, box.p_low + 1j * box.q_low, box.v0_low))
+    top = np.abs(solve(net, box.p_high + 1j * box.q_high, box.v0_high))
+    low = np.fmax(middle - spread, bottom + fall) - _SLACK
+    high = np.fmin(middle + spread, top - fall) + _SLACK
+    return low, high

@@ -1,0 +1,207 @@
+"""`gridsec study campaign`: thousands of simulated attacks, on all cores or on a Dask cluster."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from enum import StrEnum
+from typing import TYPE_CHECKING, Annotated, TypeVar
+
+import typer
+from rich.markup import escape
+
+from service import console
+from service.cli_plan import Journal, Out, bar, said, show
+from service.console import Feeder
+from service.tables import write_tables
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from feeders.load import Site
+    from feeders.studies.campaign import Campaign
+    from feeders.studies.campaign_plan import Kind, Plan
+    from feeders.studies.campaign_run import Runner
+
+TOGETHER = 16
+"""Scenarios of a scene, where more than as many are asked for."""
+
+Scenarios = Annotated[int, typer.Option(help="How many, about a sixteenth of them without a lie.", min=1)]
+Seed = Annotated[int, typer.Option(help="Chooses everything random.", min=0)]
+Kinds = Annotated[
+    list[str] | None,
+    typer.Option(help="A kind of lie and its sizes, like bias:1,3; may be repeated. [default: six kinds]"),
+]
+Promised = Annotated[
+    bool,
+    typer.Option(
+        "--promised",
+        help="Lies of the sizes that `study detectable` finds, for M = 2, in place of the six kinds.",
+    ),
+]
+Liars = Annotated[
+    list[int] | None, typer.Option(help="How many lie; may be repeated. [default: 1 and 3]", min=1)
+]
+Places = Annotated[
+    list[str] | None,
+    typer.Option(help="random, street, sensitive or colluding; may be repeated. [default: all]"),
+]
+Seasons = Annotated[list[str] | None, typer.Option(help="May be repeated. [default: all four]")]
+Duration = Annotated[float, typer.Option(help="Length of a scenario, s.", min=30.0)]
+DesignOf = Annotated[str, typer.Option(help="factorial or random combinations.")]
+Estimator = Annotated[str, typer.Option(help="Who watches; see `gridsec feeders estimators`.")]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="A setting of [monitor], like max_attacked=2; may be repeated. [default: the feeder's]"
+    ),
+]
+AlarmsPerYear = Annotated[
+    list[float] | None,
+    typer.Option(help="False alarms it may raise in a year; may be repeated, for a curve. [default: 1]"),
+]
+Learned = Annotated[
+    float, typer.Option(help="Hours over which it has learned its meters' fixed errors before.", min=0.0)
+]
+MetersAs = Annotated[str, typer.Option(help="Errors of the meters: site, real or white.")]
+LoadErrorKw = Annotated[
+    float, typer.Option(help="What nobody knows of each customer's active power, 1 sigma.", min=0.0)
+]
+LoadErrorKvar = Annotated[float, typer.Option(help="The same of its reactive power, 1 sigma.", min=0.0)]
+Workers = Annotated[int | None, typer.Option(help="Processes. [default: all cores]", min=1)]
+DaskAt = Annotated[str | None, typer.Option(help="Address of a Dask scheduler, in place of processes here.")]
+
+
+def campaign(
+    feeder: Feeder = "simbench-lv-rural1",
+    *,
+    scenarios: Scenarios = 160,
+    seed: Seed = 0,
+    kind: Kinds = None,
+    promised: Promised = False,
+    liars: Liars = None,
+    place: Places = None,
+    season: Seasons = None,
+    duration: Duration = 600.0,
+    design: DesignOf = "factorial",
+    estimator: Estimator = "sequential",
+    setting: Settings = None,
+    alarms_per_year: AlarmsPerYear = None,
+    learned: Learned = 0.0,
+    meters: MetersAs = "site",
+    load_error_kw: LoadErrorKw = 0.1,
+    load_error_kvar: LoadErrorKvar = 0.05,
+    workers: Workers = None,
+    dask: DaskAt = None,
+    journal: Journal = None,
+    out: Out = None,
+) -> None:
+    """Simulate attacks over days of profiles: who is named, missed or falsely named, and how soon."""
+    from feeders.load import load
+    from feeders.profiles import Season
+    from feeders.studies.campaign import campaign as study
+    from feeders.studies.campaign_plan import KINDS, Design, Place, Plan
+    from feeders.trials import LoadError, Meters
+
+    site, together = load(feeder), min(scenarios, TOGETHER)
+    with said():
+        plan = Plan(
+            scenes=-(-scenarios // together),
+            together=together,
+            seed=seed,
+            kinds=tuple(_kind(each) for each in kind or ()) or KINDS,
+            liars=tuple(liars or (1, 3)),
+            places=_each(place, Place, "--place"),
+            design=_each([design], Design, "--design")[0],
+            duration_s=duration,
+            onset_s=(0.1 * duration, 0.3 * duration),
+            lying_s=0.5 * duration,
+            seasons=_each(season, Season, "--season"),
+            estimator=estimator,
+            alarms_per_year=tuple(sorted(set(alarms_per_year or (1.0,)))),
+            learn_s=3600.0 * learned,
+            settings=tuple(_setting(each) for each in setting or ()),
+            meters=_each([meters], Meters, "--meters")[0],
+            load_error=LoadError(load_error_kw, load_error_kvar),
+        )
+        if promised:
+            plan = _with_promised(site, plan, plan.kinds if kind else ())
+        with bar("scenarios") as tell:
+            found = study(site, plan, runner=_runner(workers, dask), journal=journal, progress=tell)
+    _print(found)
+    write_tables(out, found.tables)
+
+
+def _print(found: Campaign) -> None:
+    plan, impossible = found.plan, int((found.scenarios["reason"] != "").sum())
+    told = f"{plan.scenarios} scenarios of {plan.duration_s:g} s watched by {plan.estimator}"
+    note = f"; {impossible} cannot be played, see `reason`" if impossible else ""
+    console.out.print(escape(f"{found.feeder}: {told}{note}"))
+    show("By kind and size", _short(found.by_size))
+    show("By place", _short(found.by_place))
+    show("By number of liars", _short(found.by_liars))
+    show("False names while nobody lies, and liars named", found.false_names)
+
+
+def _with_promised(site: Site, plan: Plan, others: tuple[Kind, ...]) -> Plan:
+    from feeders.studies.campaign_plan import promised
+    from feeders.studies.detectable import detectable
+
+    stated = plan.trial(site, plan.moment(0)).stated
+    with bar("lies of meters, errors of customers") as tell:
+        found = detectable(stated, max_attacked=2, progress=tell)
+    return replace(plan, kinds=(*others, *promised(found)))
+
+
+def _short(table: pd.DataFrame) -> pd.DataFrame:
+    """What fits on a terminal; everything is in the files."""
+    limits = [name for name in table.columns if name.endswith(("_low", "_high")) and name != "false_high"]
+    return table.drop(columns=[*limits, "liars_told", "error_liars_worst", "error_others_worst"])
+
+
+Choice = TypeVar("Choice", bound=StrEnum)
+
+
+def _each(chosen: list[str] | None, known: type[Choice], option: str) -> tuple[Choice, ...]:
+    if chosen is None:
+        return tuple(known)
+    for name in chosen:
+        if name not in tuple(known):
+            raise typer.BadParameter(f"{name!r}: expected one of {', '.join(known)}", param_hint=option)
+    return tuple(known(name) for name in dict.fromkeys(chosen))
+
+
+def _kind(text: str) -> Kind:
+    from feeders.lies import Trick
+    from feeders.studies.campaign_plan import KINDS, Kind
+
+    name, _, sizes = text.partition(":")
+    (trick,) = _each([name], Trick, "--kind")
+    if not sizes:
+        usual = [kind for kind in KINDS if kind.trick is trick]
+        sizes = ",".join(str(size) for kind in usual for size in kind.sizes)
+    try:
+        return Kind(name, trick, tuple(float(size) for size in sizes.split(",")))
+    except ValueError as error:
+        raise typer.BadParameter(
+            f"{text!r}: expected something like bias:1,3", param_hint="--kind"
+        ) from error
+
+
+def _setting(text: str) -> tuple[str, float]:
+    name, _, value = text.partition("=")
+    try:
+        return name, float(value)
+    except ValueError as error:
+        raise typer.BadParameter(f"{text!r}: expected NAME=NUMBER", param_hint="--setting") from error
+
+
+def _runner(workers: int | None, dask: str | None) -> Runner:
+    from feeders.studies.campaign_run import Dask, Here, Processes
+
+    if dask is not None:
+        if workers is not None:
+            raise typer.BadParameter("a Dask cluster has its own workers", param_hint="--workers")
+        return Dask(dask)
+    count = workers or os.cpu_count() or 1
+    return Processes(count) if count > 1 else Here()

@@ -1,0 +1,132 @@
+"""`gridsec study droop`: is the droop fleet stable, does it keep the band, how much generation is hosted."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.markup import escape
+
+from service import console
+from service.cli_plan import Journal, Out, bar, said, show
+from service.console import Feeder
+from service.tables import write_tables
+
+if TYPE_CHECKING:
+    from feeders.studies.droop import DroopOptions, DroopStudy
+
+TITLES = {
+    "stability": "Stability",
+    "inverters": "Who makes the loop gain",
+    "steps": "Steps, simulated",
+    "band": "The band of voltages, proven limits, V",
+    "witness": "Loads that break the band",
+    "presets": "Presets",
+    "time_constants": "Time constants",
+    "hosting": "Hosting capacity",
+}
+"""Tables that are printed; all are written with --out."""
+
+
+def droop(
+    feeder: Feeder = "simbench-lv-rural1",
+    *,
+    preset: Annotated[
+        str | None, typer.Option(help="Equip customers with this preset. [default: the feeder's inverters]")
+    ] = None,
+    who: Annotated[str, typer.Option(help="Whom presets equip: pv (with generation) or all.")] = "pv",
+    interval: Annotated[
+        float, typer.Option(help="Sampling interval of inverters, s; 0: continuous filters.", min=0.0)
+    ] = 1.0,
+    dead: Annotated[int, typer.Option(help="Their dead time, whole intervals.", min=0)] = 0,
+    busbar: Annotated[tuple[float, float], typer.Option(help="Limits of the busbar's voltage, pu.")] = (
+        1.0,
+        1.0,
+    ),
+    band: Annotated[
+        tuple[float, float] | None, typer.Option(help="Allowed voltages, pu. [default: as in the file]")
+    ] = None,
+    load_high: Annotated[float, typer.Option(help="Largest load, share of the peak.", min=0.0)] = 1.0,
+    pv_high: Annotated[float, typer.Option(help="Largest generation, share of the peak.", min=0.0)] = 1.0,
+    compare: Annotated[
+        list[str] | None, typer.Option(help="A preset to compare; may be repeated. [default: all]")
+    ] = None,
+    tau_factor: Annotated[
+        list[float] | None, typer.Option(help="Factor on all time constants to compare; may be repeated.")
+    ] = None,
+    hosting: Annotated[bool, typer.Option("--hosting", help="Look for hosting capacities.")] = False,
+    hosting_preset: Annotated[
+        list[str] | None,
+        typer.Option(help="Preset of new inverters, or none; may be repeated. [default: none, ieee1547-b]"),
+    ] = None,
+    hosting_load: Annotated[
+        float, typer.Option(help="Share of their peak that loads draw meanwhile.", min=0.0)
+    ] = 0.1,
+    at: Annotated[
+        list[str] | None,
+        typer.Option(help="A customer who gets the generation; may be repeated. [default: as it is]"),
+    ] = None,
+    unit_kw: Annotated[float, typer.Option(help="Generation that comes at random places, kW.")] = 5.0,
+    draws: Annotated[int, typer.Option(help="Random orders of places.", min=0)] = 30,
+    seed: Annotated[int, typer.Option(help="Chooses what is random.", min=0)] = 0,
+    journal: Journal = None,
+    out: Out = None,
+) -> None:
+    """Is the volt/VAR fleet stable, with what margins; does it keep the band; how much more is hosted."""
+    from feeders.load import load
+    from feeders.studies.droop import DroopOptions
+    from feeders.studies.droop import droop as study
+    from feeders.studies.droop_fleets import Who
+    from gridsec.droop import PRESETS
+
+    _see(who, tuple(Who), "--who")
+    for option, names in (("--preset", [preset or PRESETS[0]]), ("--compare", compare or [])):
+        for name in names:
+            _see(name, PRESETS, option)
+    fleets = hosting_preset or ["none", "ieee1547-b"]
+    for name in fleets:
+        _see(name, ("none", *PRESETS), "--hosting-preset")
+    usual = DroopOptions()
+    options = DroopOptions(
+        preset=preset,
+        who=Who(who),
+        interval_s=interval,
+        dead=dead,
+        v0_low=busbar[0],
+        v0_high=busbar[1],
+        v_min=band[0] if band else None,
+        v_max=band[1] if band else None,
+        load_high=load_high,
+        pv_high=pv_high,
+        presets=tuple(compare) if compare else usual.presets,
+        tau_factors=tuple(tau_factor) if tau_factor else usual.tau_factors,
+        hosting=hosting,
+        hosting_presets=tuple("" if name == "none" else name for name in fleets),
+        hosting_load=hosting_load,
+        hosting_customers=tuple(at) if at else None,
+        unit_kw=unit_kw,
+        draws=draws,
+    )
+    site = load(feeder)
+    with bar("fleets, steps and loads") as tell, said():
+        found = study(site, options, seed=seed, journal=journal, progress=tell)
+    _tell(found, options)
+    write_tables(out, found.tables)
+
+
+def _see(name: str, known: tuple[str, ...], option: str) -> None:
+    if name not in known:
+        raise typer.BadParameter(f"{name!r}: expected one of {', '.join(known)}", param_hint=option)
+
+
+def _tell(found: DroopStudy, options: DroopOptions) -> None:
+    """Print the answer, and the tables behind it."""
+    sampled = f"sampled every {options.interval_s:g} s" if options.interval_s else "continuous"
+    console.out.print(escape(f"{found.feeder}: the fleet ({sampled}) is {found.verdict}"))
+    console.out.print(f"The band is {found.rest} while loads move slowly, {found.always} however they move.")
+    for name, title in TITLES.items():
+        if name in found.tables:
+            show(title, found.tables[name])
+    if "hosting_draws" in found.tables:
+        draws = found.tables["hosting_draws"].groupby("preset", sort=False)["capacity_kw"]
+        show("Random places, kW", draws.describe(percentiles=[0.1, 0.5, 0.9]).reset_index())

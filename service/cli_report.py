@@ -1,0 +1,157 @@
+"""`gridsec study report`: what all studies say of a feeder, on one page for people who decide."""
+
+from __future__ import annotations
+
+import math
+import os
+import shlex
+from dataclasses import MISSING, fields, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.markup import escape
+
+from service import console
+from service.cli_plan import bar
+from service.console import FAILED, Feeder, complain
+
+if TYPE_CHECKING:
+    from service.study_report import Asked
+
+
+def report(
+    feeder: Feeder = "simbench-lv-rural1",
+    *,
+    out: Annotated[
+        Path, typer.Option(help="The page; figures, tables and journals go into a folder beside it.")
+    ] = Path("report.html"),
+    studies: Annotated[
+        str | None,
+        typer.Option(help="Names of studies, with commas between them. [default: all there is data for]"),
+    ] = None,
+    max_attacked: Annotated[int, typer.Option(help="M: how many meters lie together at most.", min=1)] = 2,
+    goal: Annotated[
+        str, typer.Option(help="Protect so that liars are named: identify; noticed: notice; small: bound.")
+    ] = "identify",
+    lie_volt: Annotated[
+        float | None, typer.Option(help="For bound: largest lie that may stay unnoticed, V.")
+    ] = None,
+    unknown: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="A customer whose powers nobody knows; may be repeated. [default: those without a meter]"
+        ),
+    ] = None,
+    silent: Annotated[
+        list[str] | None, typer.Option(help="A meter that is missing; may be repeated.")
+    ] = None,
+    busbar_unknown: Annotated[
+        bool, typer.Option("--busbar-unknown", help="The busbar's voltage is not metered.")
+    ] = False,
+    scenarios: Annotated[int, typer.Option(help="How many attacks are simulated.", min=1)] = 160,
+    seed: Annotated[int, typer.Option(help="Chooses everything random.", min=0)] = 0,
+    workers: Annotated[
+        int | None, typer.Option(help="Processes for simulated attacks. [default: all cores]", min=1)
+    ] = None,
+    hosting: Annotated[bool, typer.Option("--hosting", help="Look for hosting capacities too.")] = False,
+    readings: Annotated[
+        Path | None, typer.Option(help="A recording (Parquet or CSV) to compare the files with.")
+    ] = None,
+    at: Annotated[
+        str | None,
+        typer.Option(help="Date and time that the report bears, like 2026-11-21T12:00Z. [default: now]"),
+    ] = None,
+) -> None:
+    """Run studies and write a report on the feeder: one HTML file, to print or to send.
+
+    Interrupted, the same command goes on where it was. What a study cannot answer, the report says.
+    """
+    from feeders.load import load
+    from feeders.report.book import report as make
+    from feeders.report.page import About
+    from feeders.studies.protect import Goal
+    from service.study_report import STUDIES, Asked, outcome, seeds, versions, write
+
+    chosen = _studies(studies, tuple(STUDIES), recorded=readings is not None)
+    if goal not in tuple(Goal):
+        raise typer.BadParameter(f"{goal!r}: expected one of {', '.join(Goal)}", param_hint="--goal")
+    if (goal == Goal.BOUND) != (lie_volt is not None):
+        raise typer.BadParameter("goes with --goal bound, and that with it", param_hint="--lie-volt")
+    made = _moment(at)
+    asked = Asked(
+        feeder=feeder,
+        max_attacked=max_attacked,
+        goal=goal,
+        lie_volt=math.nan if lie_volt is None else lie_volt,
+        unknown=None if not unknown else tuple(unknown),
+        silent=tuple(silent or ()),
+        busbar_unknown=busbar_unknown,
+        scenarios=scenarios,
+        seed=seed,
+        workers=workers or os.cpu_count() or 1,
+        hosting=hosting,
+        readings=readings,
+    )
+    site = load(feeder)
+    folder = out.with_name(f"{out.stem}-files")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    outcomes = [outcome(name, site, asked, journals=folder / "journals", bar=bar) for name in chosen]
+    about = About(made, _command(asked, out, studies), versions(), seeds(chosen, asked), folder.name)
+    write(make(site, outcomes, about), out, folder)
+    console.out.print(escape(f"{out}: {len(outcomes)} studies; figures and tables in {folder}"))
+    failed = [each for each in outcomes if each.result is None]
+    for each in failed:
+        complain(f"{each.study}: {each.problem}")
+    if failed:
+        raise typer.Exit(FAILED)
+
+
+def _studies(text: str | None, known: tuple[str, ...], *, recorded: bool) -> tuple[str, ...]:
+    """Names of studies, each once; calibration only where there are readings."""
+    if text is None:
+        return tuple(name for name in known if recorded or name != "calibrate")
+    names = [name.strip() for name in text.split(",")]
+    for name in names:
+        if name not in known:
+            raise typer.BadParameter(f"{name!r}: expected some of {', '.join(known)}", param_hint="--studies")
+    if "calibrate" in names and not recorded:
+        raise typer.BadParameter("calibrate needs --readings", param_hint="--studies")
+    return tuple(name for name in known if name in names)
+
+
+def _moment(text: str | None) -> str:
+    """The time that the report bears."""
+    if text is None:
+        return f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"
+    try:
+        given = datetime.fromisoformat(text)
+    except ValueError as error:
+        raise typer.BadParameter(
+            f"{text!r}: expected a date and time of ISO 8601", param_hint="--at"
+        ) from error
+    return f"{given.astimezone(UTC) if given.tzinfo else given:%Y-%m-%d %H:%M} UTC"
+
+
+def _command(asked: Asked, out: Path, studies: str | None) -> str:
+    """The command line that makes the report again: what differs from the defaults."""
+    usual = replace(
+        asked, **{each.name: each.default for each in fields(asked) if each.default is not MISSING}
+    )
+    words = ["gridsec", "study", "report", asked.feeder, "--out", str(out)]
+    words += [] if studies is None else ["--studies", studies]
+    for each in fields(asked):
+        value = getattr(asked, each.name)
+        if each.name in ("feeder", "workers") or value in (getattr(usual, each.name), None):
+            continue
+        if isinstance(value, float) and math.isnan(value):
+            continue
+        option = f"--{each.name.replace('_', '-')}"
+        if value is True:
+            words.append(option)
+        elif isinstance(value, tuple):
+            words += [word for name in value for word in (option, name)]
+        else:
+            words += [option, f"{value:g}" if isinstance(value, float) else str(value)]
+    return shlex.join(words)

@@ -1,0 +1,301 @@
+"""Runs the studies of a report, each with its journal, and writes the report's files."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import platform
+import shlex
+import time
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from feeders.report.book import Report
+from feeders.report.sections import Outcome, Result
+from feeders.studies.journal import OtherStudy
+from gridsec.errors import GridsecError
+from service.tables import write_tables
+
+if TYPE_CHECKING:
+    from feeders.load import Site
+    from feeders.studies.journal import Progress
+
+__all__ = ["STUDIES", "Asked", "Study", "outcome", "versions", "write"]
+
+LIBRARIES: Final = (
+    *("gridsec", "numpy", "scipy", "pandas", "cvxpy", "clarabel", "highspy", "power-grid-model"),
+    *("pyarrow", "matplotlib"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What a report is about; every study takes what concerns it.
+
+    Attributes
+    ----------
+    feeder
+        As on the command line.
+    max_attacked
+        M.
+    goal, lie_volt
+        What protection is for, and the bound of a lie, V, if it is for that.
+    unknown, silent, busbar_unknown
+        What nobody knows; meters that are missing.
+    scenarios, seed, workers
+        Of simulated attacks; the seed is for all that is random.
+    hosting
+        Whether to look for hosting capacities.
+    readings
+        A recording to compare the files with.
+    """
+
+    feeder: str
+    max_attacked: int = 2
+    goal: str = "identify"
+    lie_volt: float = math.nan
+    unknown: tuple[str, ...] | None = None
+    silent: tuple[str, ...] = ()
+    busbar_unknown: bool = False
+    scenarios: int = 160
+    seed: int = 0
+    workers: int = 1
+    hosting: bool = False
+    readings: Path | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Study:
+    """How a report runs a study.
+
+    Attributes
+    ----------
+    run
+        Runs it.
+    options
+        The options of its own command that do the same.
+    what
+        For the progress bar: which pieces of work are counted.
+    seeded
+        Whether it uses the seed.
+    """
+
+    run: Callable[[Site, Asked, Path | None, Progress | None], Result]
+    options: Callable[[Asked], list[str]]
+    what: str
+    seeded: bool = False
+
+
+def _detectable(site: Site, asked: Asked, journal: Path | None, tell: Progress | None) -> Result:
+    from feeders.studies.detectable import detectable
+
+    return detectable(site, max_attacked=asked.max_attacked, journal=journal, progress=tell)
+
+
+def _protect(site: Site, asked: Asked, journal: Path | None, tell: Progress | None) -> Result:
+    from feeders.studies.protect import Goal, protect
+
+    return protect(
+        site,
+        max_attacked=asked.max_attacked,
+        goal=Goal(asked.goal),
+        lie_volt=asked.lie_volt,
+        unknown=asked.unknown,
+        busbar_known=not asked.busbar_unknown,
+        journal=journal,
+        progress=None if tell is None else lambda known, done: tell(done, known),
+    )
+
+
+def _redundancy(site: Site, asked: Asked, journal: Path | None, tell: Progress | None) -> Result:
+    from feeders.studies.redundancy import redundancy
+
+    return redundancy(
+        site,
+        unknown=asked.unknown,
+        silent=asked.silent,
+        busbar_known=not asked.busbar_unknown,
+        journal=journal,
+        progress=tell,
+    )
+
+
+def _droop(site: Site, asked: Asked, journal: Path | None, tell: Progress | None) -> Result:
+    from feeders.studies.droop import DroopOptions, droop
+
+    options = DroopOptions(hosting=asked.hosting)
+    return droop(site, options, seed=asked.seed, journal=journal, progress=tell)
+
+
+def _calibrate(site: Site, asked: Asked, journal: Path | None, tell: Progress | None) -> Result:
+    from feeders.studies.calibrate import calibrate
+
+    if asked.readings is None:
+        raise ValueError("there are no recorded readings to compare with")
+    return calibrate(site, asked.readings, journal=journal, progress=tell)
+
+
+def _campaign(site: Site, asked: Asked, journal: Path | None, tell: Progress | None) -> Result:
+    from feeders.studies.campaign import campaign
+    from feeders.studies.campaign_plan import Plan
+    from feeders.studies.campaign_run import Here, Processes
+
+    usual = Plan()
+    together = min(asked.scenarios, usual.together)
+    plan = Plan(
+        scenes=-(-asked.scenarios // together),
+        together=together,
+        seed=asked.seed,
+        liars=tuple(sorted({1, asked.max_attacked})),
+        settings=(("max_attacked", asked.max_attacked),),
+    )
+    runner = Processes(asked.workers) if asked.workers > 1 else Here()
+    return campaign(site, plan, runner=runner, journal=journal, progress=tell)
+
+
+def _liars(asked: Asked) -> list[str]:
+    return ["--max-attacked", str(asked.max_attacked)]
+
+
+def _known(asked: Asked) -> list[str]:
+    who = [word for name in asked.unknown or () for word in ("--unknown", name)]
+    return who + ["--busbar-unknown"] * asked.busbar_unknown
+
+
+def _protection(asked: Asked) -> list[str]:
+    bound = [] if math.isnan(asked.lie_volt) else ["--lie-volt", f"{asked.lie_volt:g}"]
+    return [*_liars(asked), "--goal", asked.goal, *bound, *_known(asked)]
+
+
+def _campaigned(asked: Asked) -> list[str]:
+    count = [word for number in sorted({1, asked.max_attacked}) for word in ("--liars", str(number))]
+    setting = ["--setting", f"max_attacked={asked.max_attacked}"]
+    return ["--scenarios", str(asked.scenarios), "--seed", str(asked.seed), *count, *setting]
+
+
+def _fleet(asked: Asked) -> list[str]:
+    return ["--seed", str(asked.seed)] + ["--hosting"] * asked.hosting
+
+
+STUDIES: Final[dict[str, Study]] = {
+    "detectable": Study(_detectable, _liars, "lies of meters, errors of customers"),
+    "protect": Study(_protect, _protection, "meters protected, against attacks"),
+    "droop": Study(_droop, _fleet, "fleets, steps and loads", seeded=True),
+    "campaign": Study(_campaign, _campaigned, "simulated attacks", seeded=True),
+    "redundancy": Study(
+        _redundancy,
+        lambda asked: [word for name in asked.silent for word in ("--silent", name)] + _known(asked),
+        "searching for liars that stay invisible",
+    ),
+    "calibrate": Study(
+        _calibrate,
+        lambda asked: [] if asked.readings is None else ["--readings", str(asked.readings)],
+        "errors that the readings may speak for",
+    ),
+}
+"""Studies of a report, in the order of its sections."""
+
+
+def outcome(
+    name: str,
+    site: Site,
+    asked: Asked,
+    *,
+    journals: Path,
+    bar: Callable[[str], AbstractContextManager[Progress]],
+) -> Outcome:
+    """Run a study; whatever goes wrong with it becomes part of the report.
+
+    Parameters
+    ----------
+    name
+        One of STUDIES.
+    site, asked
+        The feeder, and what was asked.
+    journals
+        Folder in which finished work is kept.
+    bar
+        Shows how far it is.
+    """
+    study = STUDIES[name]
+    words = ["gridsec", "study", name, asked.feeder, *study.options(asked)]
+    journal = journals / f"{name}-{_key(site, words)}.jsonl"
+    journals.mkdir(parents=True, exist_ok=True)
+    resumed = journal.exists() and len(journal.read_bytes().splitlines()) > 1
+    start = time.perf_counter()
+    found: Result | None = None
+    problem = ""
+    with bar(study.what) as tell:
+        try:
+            found = _run(study, site, asked, journal, tell)
+        except (GridsecError, ValueError) as error:
+            problem = str(error)
+    return Outcome(name, found, problem, shlex.join(words), time.perf_counter() - start, resumed)
+
+
+def _run(study: Study, site: Site, asked: Asked, journal: Path, tell: Progress) -> Result:
+    """Go on from a journal; one that is another study's, of an earlier program, is laid aside."""
+    try:
+        return study.run(site, asked, journal, tell)
+    except OtherStudy:
+        journal.replace(journal.with_suffix(".other"))
+        return study.run(site, asked, journal, tell)
+
+
+def _key(site: Site, words: list[str]) -> str:
+    """Another feeder, other arguments or other versions need another journal."""
+    subject = json.dumps([site.digest, words[4:], versions()], sort_keys=True)
+    return hashlib.sha256(subject.encode()).hexdigest()[:12]
+
+
+def versions() -> dict[str, str]:
+    """Versions of everything that numbers and pictures depend on."""
+    found = {"python": platform.python_version()}
+    for name in LIBRARIES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def write(made: Report, out: Path, folder: Path) -> None:
+    """Write the files of a report; the page last, when all that it speaks of is there.
+
+    Parameters
+    ----------
+    made
+        The report.
+    out, folder
+        The page, and the folder beside it.
+
+    Raises
+    ------
+    OSError
+        If something cannot be written.
+    """
+    figures = folder / "figures"
+    figures.mkdir(parents=True, exist_ok=True)
+    for name, data in made.pictures.items():
+        (figures / name).write_bytes(data)
+    write_tables(folder / "tables", made.tables)
+    new = out.with_name(f".{out.name}.new")
+    new.write_text(made.html, encoding="utf-8")
+    os.replace(new, out)
+
+
+def seeds(names: Iterable[str], asked: Asked) -> Mapping[str, int]:
+    """With what everything random began, by study.
+
+    Parameters
+    ----------
+    names, asked
+        The studies, and what was asked.
+    """
+    return {name: asked.seed for name in names if STUDIES[name].seeded}

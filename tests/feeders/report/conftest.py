@@ -1,0 +1,64 @@
+"""A report of small feeders, made once."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from feeders.lies import Trick
+from feeders.load import Site, from_tables, load
+from feeders.report.book import Report, report
+from feeders.report.sections import Outcome
+from feeders.studies.campaign import Campaign, campaign
+from feeders.studies.campaign_plan import Kind, Place, Plan
+from feeders.studies.detectable import detectable
+from feeders.studies.protect import Goal, protect
+from feeders.studies.redundancy import redundancy
+from tests.feeders.report.about import ABOUT, HOSTILE
+
+
+@pytest.fixture(scope="session")
+def site() -> Site:
+    return load("cigre-lv")
+
+
+@pytest.fixture(scope="session")
+def played(site: Site) -> Campaign:
+    plan = Plan(
+        scenes=1,
+        together=8,
+        kinds=(Kind("bias", Trick.BIAS, (1.0, 5.0)), Kind("replay", Trick.REPLAY, (20.0,))),
+        liars=(1, 2),
+        places=(Place.RANDOM,),
+        duration_s=60.0,
+        onset_s=(20.0, 25.0),
+        lying_s=25.0,
+    )
+    return campaign(site, plan, seed=3)
+
+
+@pytest.fixture(scope="session")
+def outcomes(site: Site, played: Campaign) -> list[Outcome]:
+    """All that there is, and a study that failed."""
+    return [
+        Outcome("detectable", detectable(site, max_attacked=2), command="gridsec study detectable cigre-lv"),
+        Outcome("protect", protect(site, max_attacked=2, goal=Goal.BOUND, lie_volt=4.6)),
+        Outcome("campaign", played, seconds=1.0, resumed=True),
+        Outcome("redundancy", redundancy(site, silent=["m02"])),
+        Outcome("droop", None, problem="droop of cigre-lv: no equilibrium <b>here</b>"),
+    ]
+
+
+@pytest.fixture(scope="session")
+def made(site: Site, outcomes: list[Outcome]) -> Report:
+    return report(site, outcomes, ABOUT)
+
+
+@pytest.fixture(scope="session")
+def hostile(site: Site) -> Site:
+    """The same feeder with names that try to become markup."""
+    tables = site.tables
+    customers = tuple(replace(row, customer=f"{row.customer}{HOSTILE}") for row in tables.customers)
+    meta = replace(tables.meta, title=HOSTILE)
+    return from_tables(replace(tables, customers=customers, meta=meta))

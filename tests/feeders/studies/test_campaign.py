@@ -1,0 +1,414 @@
+"""Campaigns: what a row says is what a full play of the case shows; the same anywhere; nothing is lost."""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.stats import beta
+
+from feeders.estimators import design
+from feeders.lies import Trick
+from feeders.load import load
+from feeders.profiles import Season
+from feeders.studies.campaign import Campaign, campaign
+from feeders.studies.campaign_lies import attacks, liars
+from feeders.studies.campaign_plan import CLEAN, Case, Kind, Place, Plan, promised
+from feeders.studies.campaign_promises import rehearse_everywhere
+from feeders.studies.campaign_run import (
+    ClusterUnusable,
+    Dask,
+    Here,
+    Processes,
+    WorkerLost,
+    agree,
+    versions,
+)
+from feeders.studies.campaign_tables import false_names, grouped, scenarios
+from feeders.studies.campaign_watch import risings
+from feeders.studies.detectable import detectable
+from feeders.studies.journal import OtherStudy
+from feeders.studies.rehearsal import rehearse
+from feeders.trials import frames, judge
+from gridsec.feeder import lindistflow
+
+SITE = load("cigre-lv")
+PLAN = Plan(
+    scenes=3,
+    together=4,
+    seed=3,
+    duration_s=24.0,
+    onset_s=(8.0, 11.0),
+    lying_s=9.0,
+    settling_s=3.0,
+    kinds=(
+        Kind("bias", Trick.BIAS, (3.0,)),
+        Kind("replay", Trick.REPLAY, (6.0,)),
+        Kind("late", Trick.CLOCK_SHIFT, (20.0,)),
+        Kind("coordinated-power", Trick.COORDINATED_POWER, (2.0,)),
+        Kind("inverter", Trick.INVERTER, (100.0,)),
+    ),
+    liars=(1,),
+    places=(Place.RANDOM, Place.STREET),
+    alarms_per_year=(1.0, 1e5),
+)
+
+
+@pytest.fixture(scope="module")
+def here() -> Campaign:
+    return campaign(SITE, PLAN)
+
+
+def same(one: Campaign, other: Campaign) -> None:
+    """To the last bit."""
+    for name, table in one.tables.items():
+        pd.testing.assert_frame_equal(table, other.tables[name], check_exact=True, obj=name)
+
+
+# ------------------------------------------------------------------------------------------------ truth
+
+
+def test_every_row_is_what_the_full_play_of_its_case_shows(here: Campaign) -> None:
+    """Nothing is shared in the oracle: each case is simulated and watched from its first frame on."""
+    seen = set()
+    for scene in range(PLAN.scenes):
+        moment = PLAN.moment(scene)
+        trial = PLAN.trial(SITE, moment)
+        honest = replace(trial.scenario, season=moment.season)
+        for case in PLAN.cases(scene):
+            told, wrong = attacks(trial.stated, PLAN, case, honest) if case.kind != CLEAN else ((), ())
+            played = list(frames(trial, replace(honest, attacks=told, inverter_attacks=wrong)))
+            for rate in PLAN.alarms_per_year:
+                watcher = design(PLAN.watched(trial.stated, rate))
+                full = judge(watcher, trial, played=played, settling_s=PLAN.settling_s)
+                rows = here.scenarios
+                (row,) = rows[(rows["scenario"] == case.number) & (rows["alarms_per_year"] == rate)].to_dict(
+                    "records"
+                )
+                each = here.liars[
+                    (here.liars["scenario"] == case.number) & (here.liars["alarms_per_year"] == rate)
+                ]
+                delays = np.concatenate([full.delay_s, full.inverter_delay_s])
+                assert each["delay_s"].tolist() == delays.tolist()
+                assert row["named"] == np.isfinite(delays).sum()
+                # Honest frames before the onset are those of the clean case.
+                before = round(case.onset_s / PLAN.step_s) if case.kind != CLEAN else 0
+                assert row["undecided_s"] == full.undecided[before:].sum()
+                assert row["clean_lying_s"] == full.clean_while_lying.sum()
+                if case.kind not in (CLEAN, "inverter"):
+                    assert row["error_liars"] == full.error_liars.max()
+                    assert math.isfinite(row["error_liars"])
+                blamed = full.accused.any() or full.accused_inverters.any()
+                assert row["exact"] == (full.missed == 0 and not blamed)
+                seen.add(case.kind)
+    assert seen == {CLEAN, *(kind.name for kind in PLAN.kinds)}
+
+
+def test_lies_are_as_large_as_they_are_said_to_be(here: Campaign) -> None:
+    told = here.liars.set_index("kind")
+    assert told.loc[["bias"], "lie_volt"].to_numpy() == pytest.approx(0.03 * SITE.feeder.base_volt)
+    assert told.loc[["inverter"], "lie_volt"].isna().all()
+
+
+def test_cases_follow_from_their_numbers_alone() -> None:
+    longer = replace(PLAN, scenes=9)
+    assert longer.cases(2) == PLAN.cases(2)
+    assert longer.moment(2) == PLAN.moment(2)
+    combined = [(case.kind, case.place) for k in range(9) for case in longer.cases(k) if case.kind != CLEAN]
+    # 27 attacks: eight combinations come up three times, and three of them once more.
+    counts = pd.Series(combined).value_counts()
+    assert len(counts) == 8
+    assert set(counts) == {3, 4}
+    moments = [replace(PLAN, seasons=(Season.WINTER,), seed=seed).moment(0) for seed in range(50)]
+    assert {moment.season for moment in moments} == {Season.WINTER}
+    assert len({int(moment.profile_s // 86_400.0) for moment in moments}) == 7
+
+
+def test_places() -> None:
+    site = load("kerber-dorfnetz")
+    model = lindistflow(site.feeder)
+    own = np.diagonal(model.R)
+    random = np.random.default_rng(1)
+
+    def chosen(place: Place) -> tuple[np.ndarray, np.ndarray]:
+        return liars(site, Case(1, "bias", 1.0, 4, str(place), 0.0, (1,)), random)
+
+    street, signs = chosen(Place.STREET)
+    assert set(np.abs(signs)) == {1.0}
+    apart = own[:, None] + own - 2.0 * model.R
+    within = apart[np.ix_(site.meters[street], site.meters[street])].min(axis=0)
+    some_one = [
+        set(np.argsort(apart[k][site.meters], kind="stable")[:4]) == set(street)
+        or apart[np.ix_([k], site.meters[street])].max() <= np.sort(apart[k][site.meters])[3]
+        for k in site.meters[street]
+    ]
+    assert any(some_one)
+    assert within.max() >= 0.0
+    far, _ = chosen(Place.SENSITIVE)
+    felt = np.sqrt((model.R**2).sum(axis=1) + (model.X**2).sum(axis=1))[site.meters]
+    assert felt[far].min() >= np.delete(felt, far).max()
+    together, signs = chosen(Place.COLLUDING)
+    assert len(together) == 4
+    assert len(set(signs)) == 1
+    anywhere = {tuple(chosen(Place.RANDOM)[0]) for _ in range(20)}
+    assert len(anywhere) > 15
+
+
+def test_what_cannot_be_played_says_why() -> None:
+    plan = replace(PLAN, scenes=1, kinds=(Kind("bias", Trick.BIAS, (1.0,)),), liars=(99,))
+    found = campaign(SITE, plan)
+    reasons = found.scenarios.loc[found.scenarios["kind"] == "bias", "reason"]
+    assert reasons.str.contains("6 of what 99 should lie").all()
+    assert found.by_kind["kind"].tolist() == [CLEAN, CLEAN]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "why"),
+    [
+        ({"scenes": 0}, "needs scenes"),
+        ({"liars": (0,)}, "must be positive"),
+        ({"onset_s": (10.0, 24.0)}, "before the last"),
+        ({"estimator": "oracle"}, "does not exist"),
+        ({"alarms_per_year": ()}, "false-alarm rate"),
+        ({"kinds": ()}, "no kinds"),
+        ({"learn_s": 5.0}, "0 or from 10 s on"),
+    ],
+)
+def test_wrong_plans_are_told(wrong: dict[str, object], why: str) -> None:
+    with pytest.raises(ValueError, match=why):
+        replace(PLAN, **wrong)  # type: ignore[arg-type]
+
+
+def test_settings_reach_the_estimator() -> None:
+    plan = replace(PLAN, estimator="exact-bank", settings=(("max_attacked", 2.0),))
+    assert design(plan.watched(plan.trial(SITE, plan.moment(0)).stated, 1.0)).max_attacked == 2
+    with pytest.raises(ValueError, match="'colour' is no setting"):
+        campaign(SITE, replace(PLAN, settings=(("colour", 1.0),)))
+
+
+def test_lies_inside_the_class_are_named_once_meters_are_learned() -> None:
+    """A meter of class 0.5 that changes by 0.7 % may only be told when its own fixed error is known."""
+    kinds = (Kind("bias", Trick.BIAS, (0.7,)),)
+    plan = replace(
+        PLAN, scenes=2, together=3, kinds=kinds, lying_s=12.0, duration_s=23.0, alarms_per_year=(1.0,)
+    )
+    unknown = campaign(SITE, plan).liars
+    learned = campaign(SITE, replace(plan, learn_s=3600.0)).liars
+    assert learned[["scenario", "who", "lie_volt"]].equals(unknown[["scenario", "who", "lie_volt"]])
+    assert np.isinf(unknown["delay_s"]).any()
+    assert np.isfinite(learned["delay_s"]).all()
+    with pytest.raises(ValueError, match="exact-bank does not learn"):
+        campaign(SITE, replace(plan, learn_s=3600.0, estimator="exact-bank"))
+
+
+# --------------------------------------------------------------------------------------------- promises
+
+
+def test_promised_sizes_are_kept() -> None:
+    """None of the hidden size is named, none of the named size missed, under full AC power flow."""
+    plan = replace(
+        PLAN,
+        scenes=4,
+        together=5,
+        duration_s=20.0,
+        lying_s=12.0,
+        places=(Place.RANDOM,),
+        alarms_per_year=(1.0,),
+    )
+    stated = plan.trial(SITE, plan.moment(0)).stated
+    found = detectable(stated, max_attacked=2)
+    told = campaign(SITE, replace(plan, kinds=promised(found))).liars
+    volts = found.meters.set_index("meter")
+    assert set(told["kind"]) == {"hidden", "named"}
+    for lie in told.to_dict("records"):
+        column = "hidden_alone" if lie["kind"] == "hidden" else "named"
+        assert lie["lie_volt"] == pytest.approx(lie["size"] * volts.loc[lie["who"], column])
+        assert math.isinf(lie["delay_s"]) == (lie["kind"] == "hidden")
+    # The same promise at one operating point, in pieces.
+    whole = rehearse_everywhere(stated, found, trials=5, piece=3)
+    parts = [rehearse(stated, found, trials=n, seed=seed) for n, seed in ((3, 0), (2, 3))]
+    assert (whole.trials, whole.hidden_named, whole.large_missed) == (5, 0, 0)
+    assert whole.honest_named == sum(part.honest_named for part in parts)
+
+
+# ----------------------------------------------------------------------------------------------- tables
+
+
+def test_false_names_are_counted_when_they_appear() -> None:
+    flags = np.array([[1, 0], [1, 0], [0, 1], [1, 1], [0, 0]], dtype=np.bool_)
+    assert risings(flags) == 3
+    assert risings(flags[:0]) == 0
+
+
+def row(**values: object) -> dict[str, object]:
+    plain = {
+        "scenario": 0,
+        "alarms_per_year": 1.0,
+        "kind": "bias",
+        "size": 3.0,
+        "liars": 2,
+        "place": "random",
+        "reason": "",
+        "exact": True,
+        "falsely_named": "",
+        "false_events": 0,
+        "delay_s": 1.0,
+        "clear_s": 5.0,
+        "watched_s": 100.0,
+        "undecided_s": 10.0,
+        "error_liars": 0.2,
+        "error_liars_95": 0.1,
+        "error_others": 0.2,
+        "error_others_95": 0.1,
+    }
+    return plain | values
+
+
+def test_shares_and_their_limits() -> None:
+    named = {"who": "a", "inverter": False, "lie_volt": 1.0, "delay_s": 2.0}
+    missed = {**named, "who": "b", "delay_s": math.inf}
+    rows = [row(scenario=k, exact=k > 0, each=[named, missed if k == 0 else named]) for k in range(5)]
+    (group,) = grouped(*scenarios(rows), ["kind"]).to_dict("records")
+    assert (group["scenarios"], group["liars_told"]) == (5, 10)
+    assert (group["exact"], group["named"], group["false"]) == (0.8, 0.9, 0.0)
+    # Clopper and Pearson by the quantiles of the beta distribution.
+    assert group["exact_low"] == pytest.approx(beta.ppf(0.025, 4, 2))
+    assert group["exact_high"] == pytest.approx(beta.ppf(0.975, 5, 1))
+    assert group["false_high"] == pytest.approx(1.0 - 0.025 ** (1 / 5))
+    assert group["undecided"] == pytest.approx(0.1)
+    assert group["delay_median_s"] == 2.0
+
+
+def test_false_names_per_year() -> None:
+    year = 365.25 * 86_400.0
+    clean = {"kind": CLEAN, "size": 0.0, "liars": 0, "place": "", "each": []}
+    rows = [row(scenario=k, watched_s=year, false_events=0, **clean) for k in range(3)]
+    (none,) = false_names(*scenarios(rows)).to_dict("records")
+    # Nothing in three years: e^(-3 rate) = 0.025.
+    assert (none["per_year"], none["per_year_low"]) == (0.0, 0.0)
+    assert none["per_year_high"] == pytest.approx(-math.log(0.025) / 3.0)
+    rows[0]["false_events"] = 1
+    (one,) = false_names(*scenarios(rows)).to_dict("records")
+    assert one["per_year"] == pytest.approx(1 / 3)
+    assert one["per_year_low"] == pytest.approx(-math.log(0.975) / 3.0)
+
+
+# ---------------------------------------------------------------------------------------------- runners
+
+
+def test_a_killed_process_loses_nothing(here: Campaign, tmp_path: Path) -> None:
+    killed: list[int] = []
+
+    def kill(done: int, total: int) -> None:
+        if not killed and 0 < done < total:
+            victim = multiprocessing.active_children()[0]
+            victim.kill()
+            killed.append(done)
+
+    found = campaign(SITE, PLAN, runner=Processes(2), journal=tmp_path / "journal", progress=kill)
+    assert killed
+    same(here, found)
+    assert not multiprocessing.active_children()
+
+
+def test_a_piece_that_always_kills_its_process_is_given_up() -> None:
+    with pytest.raises(WorkerLost, match="piece 7 died 2 times"):
+        list(Processes(1, retries=1).run(os._exit, [7]))
+
+
+def test_whoever_stops_listening_stops_the_processes() -> None:
+    made = Processes(2).run(time.sleep, [0, 100, 100])
+    assert next(made) == (0, None)
+    begun = time.monotonic()
+    made.close()
+    for child in multiprocessing.active_children():
+        child.join(60.0)
+    assert not multiprocessing.active_children()
+    assert time.monotonic() - begun < 60.0
+
+
+def test_a_dask_cluster_gives_the_same_also_when_a_worker_is_killed(here: Campaign) -> None:
+    distributed = pytest.importorskip("distributed")
+    killed: list[int] = []
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None, host="127.0.0.1", silence_logs=50
+    ) as cluster:
+
+        def kill(done: int, total: int) -> None:
+            if not killed and done < total:
+                pid = cluster.workers[0].pid
+                os.kill(pid, signal.SIGKILL)
+                killed.append(pid)
+
+        same(here, campaign(SITE, PLAN, runner=Dask(cluster.scheduler_address), progress=kill))
+    assert killed
+
+
+def test_no_cluster_is_told() -> None:
+    pytest.importorskip("distributed")
+    with pytest.raises(ClusterUnusable, match="no Dask scheduler answers at tcp"):
+        list(Dask("tcp://127.0.0.1:1", timeout_s=0.2).run(abs, [0]))
+
+
+@pytest.mark.parametrize("theirs", [versions() | {"numpy": "1.0"}, ModuleNotFoundError("no gridsec")])
+def test_a_worker_that_computes_otherwise_is_refused(theirs: object) -> None:
+    agree("tcp://a:1", versions())
+    with pytest.raises(ClusterUnusable, match=r"tcp://a:1 are .*(1.0|no gridsec)"):
+        agree("tcp://a:1", theirs)
+
+
+# ----------------------------------------------------------------------------------------- interruptions
+
+
+def test_an_interruption_loses_what_was_in_hand_only(here: Campaign, tmp_path: Path) -> None:
+    journal = tmp_path / "journal"
+
+    def interrupt(done: int, _: int) -> None:
+        if done == PLAN.together:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        campaign(SITE, PLAN, runner=Here(), journal=journal, progress=interrupt)
+    kept = journal.read_text(encoding="utf-8")
+    assert kept.count("\n") == 2
+    # Killed while it wrote: half a line.
+    journal.write_text(kept + '["scene|1", [{"scen', encoding="utf-8")
+    told: list[int] = []
+    same(here, campaign(SITE, PLAN, journal=journal, progress=lambda done, _: told.append(done)))
+    assert told[0] == PLAN.together
+    with pytest.raises(OtherStudy):
+        campaign(SITE, PLAN, seed=8, journal=journal)
+
+
+PROGRAM = """
+import sys
+from pathlib import Path
+from feeders.studies.campaign import campaign
+sys.path.insert(0, {here!r})
+from test_campaign import PLAN, SITE
+campaign(SITE, PLAN, journal=Path({journal!r}))
+"""
+
+
+def test_a_killed_campaign_goes_on(here: Campaign, tmp_path: Path) -> None:
+    journal = tmp_path / "journal"
+    program = PROGRAM.format(here=str(Path(__file__).parent), journal=str(journal))
+    child = subprocess.Popen([sys.executable, "-c", program])
+    deadline = time.monotonic() + 120.0
+    while not (journal.exists() and journal.read_text(encoding="utf-8").count("\n") >= 2):
+        assert child.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    child.kill()
+    child.wait()
+    same(here, campaign(SITE, PLAN, journal=journal))

@@ -1,0 +1,253 @@
+"""OpenDSS master files: against OpenDSS's own power flow, and nothing dropped in silence."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from feeders.convert import check_against_source, convert
+from feeders.convert_check import BALANCED_PU, UNBALANCED_PU
+from feeders.schema import read, write
+from gridsec.errors import FeederInvalid, GridsecError
+from tests.feeders.foreign import opendss
+
+pytest.importorskip("opendssdirect", reason="the extra `convert` is not installed")
+
+HEAD = """
+clear
+new circuit.x basekv=11 pu=1.02 mvasc3=100 mvasc1=100 bus1=Grid
+new transformer.t windings=2 buses=(Grid,Board) conns=(delta,wye) kvs=(11,0.4) kvas=(800,800) xhl=4
+new linecode.lc nphases=3 r1=0.4 x1=0.1 r0=1.6 x0=0.4 c1=250 c0=250 units=km
+new line.main bus1=Board bus2=B1 linecode=lc length=200 units=m normamps=150
+new load.shop bus1=B1 phases=3 kv=0.4 kw=15 pf=0.95
+"""
+TAIL = """
+set voltagebases=[11,0.4,0.2]
+calcvoltagebases
+solve
+"""
+
+
+def master(folder: Path, body: str, *, tail: str = TAIL) -> str:
+    path = folder / "master.dss"
+    path.write_text(HEAD + body + tail)
+    return str(path)
+
+
+@pytest.mark.parametrize(("buses", "balanced"), [(40, True), (40, False)])
+def test_voltages_are_opendss_own(buses: int, balanced: bool, tmp_path: Path) -> None:
+    source = opendss(tmp_path / "town.dss", buses, balanced=balanced)
+    done = convert(str(source), tmp_path / "town")
+    assert done.check is not None
+    assert done.check.buses == buses
+    assert done.check.three_phase is not balanced
+    assert done.check.largest_pu < (BALANCED_PU if balanced else UNBALANCED_PU)
+    assert {each.done for each in done.changes} == {"left out"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("balanced", [True, False])
+def test_large_networks(balanced: bool, tmp_path: Path) -> None:
+    done = convert(str(opendss(tmp_path / "city.dss", 600, balanced=balanced)), tmp_path / "city")
+    assert done.check is not None
+    assert done.check.buses == 600
+    assert done.check.largest_pu < (BALANCED_PU if balanced else UNBALANCED_PU)
+
+
+def test_everything_is_carried_over_or_named(tmp_path: Path) -> None:
+    source = master(
+        tmp_path,
+        """
+new line.twin bus1=Board bus2=B1 linecode=lc length=300 units=m
+new line.spur bus1=B1.2 bus2=B2.2 phases=1 r1=0.5 x1=0.1 r0=0.5 x0=0.1 c1=0 c0=0 length=0.1
+new line.pair bus1=B1.3.1 bus2=B3.3.1 phases=2 rmatrix=(.3|.1 .3) xmatrix=(.4|.2 .4) cmatrix=(0|0 0) length=.1
+new line.coupler bus1=B1 bus2=B4 switch=yes c1=0 c0=0
+new line.tie bus1=B4 bus2=B3 phases=3 r1=0.1 x1=0.1 r0=0.1 x0=0.1 c1=0 c0=0 length=1
+open line.tie 1
+open line.tie 2
+new line.gone bus1=B4 bus2=B1 r1=0.1 x1=0.1 length=1 enabled=no
+new load.home bus1=B2.2 phases=1 kv=0.231 kw=5 pf=0.95
+new load.lamp bus1=B3.3 phases=1 kv=0.231 kw=4 pf=0.95 model=2
+new load.welder bus1=B3.1.3 phases=1 kv=0.4 kw=6 pf=0.95
+new capacitor.bank bus1=B1 phases=3 kv=0.4 kvar=20
+new capacitor.small bus1=B3.1 phases=1 kv=0.231 kvar=3
+new reactor.coil bus1=B4 phases=3 kv=0.4 kvar=0.001
+new pvsystem.roof bus1=B4 phases=3 kv=0.4 kva=8 pmpp=6 irradiance=0.9
+new transformer.low windings=2 buses=(B4,C1) conns=(delta,wye) kvs=(0.4,0.208) kvas=(80,80) xhl=4
+new load.hut bus1=C1 phases=3 kv=0.208 kw=9 pf=0.9
+new capcontrol.auto element=line.main capacitor=bank type=voltage onsetting=1 offsetting=500 ptratio=1
+new energymeter.m element=line.main
+""",
+    )
+    done = convert(source, tmp_path / "x")
+    assert done.check is not None
+    # All that is approximated is exact at the source's own loads but the coil of 1 var.
+    assert done.check.largest_pu < UNBALANCED_PU
+    assert done.check.as_found_pu is not None
+    assert done.check.as_found_pu > UNBALANCED_PU
+    tables = read(tmp_path / "x")
+    lines = {line.line: line for line in tables.lines}
+    main = lines["main"]
+    # 200 m beside 300 m: 120 m of each.
+    found = [main.r_ohm, main.x_ohm, main.r0_ohm, main.x0_ohm]
+    np.testing.assert_allclose(found, [0.048, 0.012, 0.192, 0.048])
+    assert main.b_us == pytest.approx(2e-3 * np.pi * 60.0 * 250 * 0.5)
+    assert (lines["spur"].phases, lines["spur"].r_ohm) == ("b", pytest.approx(0.05))
+    assert (lines["pair"].r_ohm, lines["pair"].x0_ohm) == (pytest.approx(0.02), pytest.approx(0.08))
+    assert lines["tie"].closed is False
+    assert lines["tie"].r_ohm == pytest.approx(0.1)
+    assert "gone" not in lines
+    customers = {row.customer: row for row in tables.customers}
+    assert (customers["home"].phases, customers["home"].load_kw) == ("b", pytest.approx(5.0))
+    assert (customers["roof"].pv_kw, customers["roof"].inverter_kva) == (pytest.approx(5.4, rel=0.05), 8.0)
+    # Its delta draws unevenly from uneven voltages.
+    behind = sum(customers[f"transformer low-{phase}"].load_kw for phase in "abc")
+    assert behind == pytest.approx(9.0, rel=0.05)
+    assert {"welder-a", "welder-c"} <= set(customers)
+    said = "\n".join(done.notes)
+    for part in (
+        "left out: line gone; disabled in the source",
+        "model 2 of load lamp; depends on the voltage",
+        "delta of load welder",
+        "phases of line pair; of two phases",
+        "capacitor bank",
+        "capacitor small",
+        "left out: reactor coil",
+        "lines main + twin; in parallel",
+        "load side of transformer low; 1 bus became a customer",
+        "droop curve of generator roof",
+        "left out: capcontrol auto; switched as",
+        "left out: 2 buses",
+    ):
+        assert part in said, part
+    table = (tmp_path / "x" / "conversion.csv").read_text().splitlines()
+    assert table[0] == "element,property,done,effect"
+    assert len(table) == len(done.changes) + 1
+    source_md = " ".join((tmp_path / "x" / "SOURCE.md").read_text().split())
+    assert all(note in source_md for note in done.notes)
+    assert done.check.sentence in source_md
+
+
+def test_untransposed_lines_are_approximated_and_the_check_says_by_how_much(tmp_path: Path) -> None:
+    source = master(
+        tmp_path,
+        """
+new line.bare bus1=B1 bus2=B2 phases=3 rmatrix=(.4|.1 .5|.1 .2 .4) xmatrix=(.6|.2 .7|.3 .2 .6)
+~ cmatrix=(0|0 0|0 0 0) length=1
+new load.home bus1=B2 phases=3 kv=0.4 kw=8 pf=0.95
+""",
+    )
+    done = convert(source, tmp_path / "x")
+    assert any(each.prop == "impedance matrix" and each.done == "approximated" for each in done.changes)
+    assert done.check is not None
+    assert done.check.largest_pu > UNBALANCED_PU
+    assert not done.check.exact
+    assert done.check.at == "b2"
+    assert "(bus b2)" in done.check.sentence
+
+
+def test_a_wrong_impedance_shows_in_the_check(tmp_path: Path) -> None:
+    """A check that a wrong feeder passed would be none: 1 % of one line's resistance is seen."""
+    source = master(tmp_path, "")
+    done = convert(source, tmp_path / "x")
+    assert done.check is not None
+    assert done.check.exact
+    tables = read(tmp_path / "x")
+    (line,) = tables.lines
+    write(replace(tables, lines=(replace(line, r_ohm=1.01 * line.r_ohm),)), tmp_path / "x")
+    assert not check_against_source(source, tmp_path / "x").exact
+
+
+def test_mesh_is_named_and_opened_when_asked(tmp_path: Path) -> None:
+    body = """
+new line.east bus1=B1 bus2=B2 linecode=lc length=100 units=m
+new line.west bus1=B1 bus2=B3 linecode=lc length=100 units=m
+new line.south bus1=B2 bus2=B3 linecode=lc length=100 units=m
+new load.home bus1=B3 phases=3 kv=0.4 kw=8 pf=0.95
+"""
+    source = master(tmp_path, body)
+    with pytest.raises(FeederInvalid, match="form a loop") as caught:
+        convert(source, tmp_path / "x")
+    assert all(name in str(caught.value) for name in ("east", "west", "south"))
+    assert not (tmp_path / "x").exists()
+    done = convert(source, tmp_path / "x", opened=["south"])
+    assert done.check is not None
+    assert not done.check.exact  # the source still has it closed
+    assert "line south" in "\n".join(done.notes)
+    radial = master(tmp_path, body + "open line.south 1\nopen line.south 2\n")
+    assert check_against_source(radial, tmp_path / "x").exact
+    with pytest.raises(FeederInvalid, match="no line 'north'"):
+        convert(source, tmp_path / "y", opened=["north"])
+
+
+@pytest.mark.parametrize(
+    ("body", "tail", "words"),
+    [
+        ("new nonsense.a b=1\n", TAIL, "OpenDSS: .*nonsense"),
+        ("new line.l bus1=B1.1.2.3.4 bus2=B2.1.2.3.4 phases=4 r1=1\n", TAIL, "besides the phases"),
+        ("new line.l bus1=B1.1.2.3 bus2=B2.2.3.1 linecode=lc\n", TAIL, "the same phases at both ends"),
+        ("new vsource.second bus1=B1 basekv=0.4\n", TAIL, "voltage sources at: grid, b1"),
+        ("", "solve\n", "voltagebases"),
+    ],
+)
+def test_what_is_no_feeder_is_told(body: str, tail: str, words: str, tmp_path: Path) -> None:
+    with pytest.raises(GridsecError, match=words):
+        convert(master(tmp_path, body, tail=tail), tmp_path / "x")
+    assert not (tmp_path / "x").exists()
+
+
+def test_without_a_solution_of_the_source_nothing_is_checked(tmp_path: Path) -> None:
+    """OpenDSS lets a load beyond the line's capacity become an impedance; constant power has no solution."""
+    done = convert(master(tmp_path, "new load.big bus1=B1 kv=0.4 kw=9e4 pf=1\n"), tmp_path / "x")
+    assert done.check is None
+    assert "does not converge" in done.unchecked
+    assert "Not checked" in (tmp_path / "x" / "SOURCE.md").read_text()
+
+
+def test_all_problems_at_once(tmp_path: Path) -> None:
+    source = master(
+        tmp_path,
+        """
+new line.turned bus1=B1.1.2.3 bus2=B2.2.3.1 linecode=lc length=1
+new line.four bus1=B1.1.2.3.4 bus2=B3.1.2.3.4 phases=4 r1=1
+new capacitor.series bus1=B1 bus2=B5 phases=3 kv=0.4 kvar=100
+""",
+    )
+    with pytest.raises(FeederInvalid) as caught:
+        convert(source, tmp_path / "x")
+    said = str(caught.value)
+    assert all(name in said for name in ("line turned", "line four", "capacitor series"))
+
+
+def test_no_circuit_and_no_file(tmp_path: Path) -> None:
+    (tmp_path / "empty.dss").write_text("clear\n")
+    with pytest.raises(GridsecError, match=r"no circuit|OpenDSS"):
+        convert(str(tmp_path / "empty.dss"), tmp_path / "x")
+    with pytest.raises(GridsecError, match="is no source"):
+        convert(str(tmp_path / "absent.dss"), tmp_path / "x")
+
+
+def test_another_engine_and_the_folder_are_left_alone(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """OpenDSS is one global state: whoever uses it beside the conversion notices nothing."""
+    from opendssdirect import dss
+
+    dss.Text.Command("clear")
+    dss.Text.Command("new circuit.mine basekv=1")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "net").mkdir()
+    source = master(tmp_path / "net", "", tail=TAIL + "export voltages\nshow voltages\n")
+    before = set(os.listdir(tmp_path / "net"))
+    capfd.readouterr()
+    convert(source, tmp_path / "x")
+    assert dss.Circuit.Name() == "mine"
+    dss.Text.Command("clear")
+    assert set(os.listdir(tmp_path / "net")) == before
+    assert set(os.listdir(tmp_path)) == {"net", "x"}
+    assert Path.cwd() == tmp_path
+    assert capfd.readouterr() == ("", "")

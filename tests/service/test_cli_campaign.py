@@ -1,0 +1,72 @@
+"""`gridsec study campaign` on the command line."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from service.cli import main
+
+FEW = ("campaign", "cigre-lv", "--scenarios", "3", "--duration", "30", "--workers", "1")
+
+
+def run(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: str
+) -> tuple[int, str, str]:
+    monkeypatch.setattr(sys, "argv", ["gridsec", "study", *arguments])
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as end:
+        main()
+    told = capsys.readouterr()
+    return int(end.value.code or 0), told.out, " ".join(told.err.replace("│", " ").split())
+
+
+def test_tables_are_printed_and_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, journal = tmp_path / "out", tmp_path / "journal"
+    some = ("--kind", "bias:3,5", "--liars", "1", "--place", "random", "--out", str(out))
+    code, told, _ = run(monkeypatch, capsys, *FEW, *some, "--journal", str(journal))
+    assert code == 0
+    assert "cigre-lv: 3 scenarios of 30 s watched by sequential" in told
+    assert "By kind and size" in told
+    found = pd.read_csv(out / "scenarios.csv")
+    assert found["kind"].tolist() == ["clean", "bias", "bias"]
+    assert sorted(found["size"]) == [0.0, 3.0, 5.0]
+    assert pd.read_parquet(out / "by_size.parquet")["scenarios"].sum() == 3
+    assert journal.read_text(encoding="utf-8").count("\n") == 2
+    # Nothing is left to do, and the answer is the same.
+    code, again, _ = run(monkeypatch, capsys, *FEW, *some, "--journal", str(journal))
+    assert (code, again) == (0, told)
+    code, _, told = run(monkeypatch, capsys, *FEW, "--journal", str(journal))
+    assert code == 1
+    assert "not the journal of this study" in told
+
+
+def test_wrong_arguments_are_told(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for wrong, why in (
+        (("--kind", "charm:3"), "'charm': expected one of bias, together"),
+        (("--kind", "bias:x"), "expected something like bias:1,3"),
+        (("--kind", "inverter"), "expected something like bias:1,3"),
+        (("--place", "nowhere"), "expected one of random, street, sensitive, colluding"),
+        (("--season", "carnival"), "expected one of winter, spring, summer, autumn"),
+        (("--estimator", "oracle"), "estimator 'oracle' does not exist"),
+        (("--setting", "colour=3"), "'colour' is no setting"),
+        (("--setting", "colour"), "expected NAME=NUMBER"),
+        (("--dask", "tcp://127.0.0.1:1"), "a Dask cluster has its own workers"),
+    ):
+        code, _, told = run(monkeypatch, capsys, *FEW, *wrong)
+        assert code == 2
+        assert why in told
+
+
+def test_no_cluster_is_told(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("distributed")
+    code, _, told = run(monkeypatch, capsys, *FEW[:4], "--dask", "nonsense://127.0.0.1")
+    assert code == 1
+    assert "no Dask scheduler answers at nonsense://127.0.0.1" in told

@@ -1,0 +1,223 @@
+"""`gridsec study report`: the files it leaves, what it says of failures, how it goes on, how it looks."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from playwright.sync_api import Browser, sync_playwright
+
+from service.cli import main
+
+FLAGS = [
+    *("--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"),
+    *("--disable-component-update", "--disable-sync"),
+]
+FEW = ("--studies", "redundancy,protect")
+
+
+def run(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *words: str
+) -> tuple[int, str, str]:
+    monkeypatch.setattr(sys, "argv", ["gridsec", "study", "report", *words])
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as end:
+        main()
+    told = capsys.readouterr()
+    return int(end.value.code or 0), told.out, told.err
+
+
+def plain(text: str) -> str:
+    return " ".join(text.replace("│", " ").split())
+
+
+def test_a_report_and_everything_beside_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = tmp_path / "new" / "our report.html"
+    words = ("cigre-lv", "--out", str(page), "--silent", "m02", "--at", "2026-11-21T13:00+01:00")
+    code, told, _ = run(monkeypatch, capsys, *words, "--studies", "redundancy, protect,detectable")
+    assert code == 0
+    assert "3 studies" in told
+    html = page.read_text(encoding="utf-8")
+    assert "2026-11-21 12:00 UTC" in html
+    folder = tmp_path / "new" / "our report-files"
+    assert (folder / "figures" / "detectable-sizes.svg").stat().st_size > 1000
+    kept = pd.read_parquet(folder / "tables" / "detectable-meters.parquet")
+    pd.testing.assert_frame_equal(
+        kept, pd.read_csv(folder / "tables" / "detectable-meters.csv", float_precision="round_trip")
+    )
+    assert len(list((folder / "journals").iterdir())) == 3
+    command = re.search(r"<pre>(gridsec study report .*?)</pre>", html)
+    assert command is not None
+    again = shlex.split(command[1].replace("&#x27;", "'"))
+    assert again[3:] == [
+        "cigre-lv",
+        "--out",
+        str(page),
+        "--studies",
+        "redundancy, protect,detectable",
+        "--silent",
+        "m02",
+    ]
+    first = {path.name: path.read_bytes() for path in (folder / "figures").iterdir()}
+
+    code, _, _ = run(monkeypatch, capsys, *again[3:])
+    assert code == 0
+    assert "with work kept from before" in page.read_text(encoding="utf-8")
+    assert {path.name: path.read_bytes() for path in (folder / "figures").iterdir()} == first
+
+
+def test_an_interrupted_report_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Half of a journal, and a line that was being written: the rest is done, the page is the same."""
+    page = tmp_path / "report.html"
+    words = ("cigre-lv", "--out", str(page), "--studies", "redundancy", "--at", "2026-11-21")
+    assert run(monkeypatch, capsys, *words)[0] == 0
+    whole = page.read_text(encoding="utf-8")
+    (journal,) = (tmp_path / "report-files" / "journals").iterdir()
+    lines = journal.read_bytes().splitlines(keepends=True)
+    journal.write_bytes(b"".join(lines[: len(lines) // 2]) + lines[-1][:5])
+    page.unlink()
+    assert run(monkeypatch, capsys, *words)[0] == 0
+
+    def timeless(text: str) -> str:
+        return re.sub(r"redundancy: [0-9.]+ s(, with work kept from before)?", "", text)
+
+    assert timeless(page.read_text(encoding="utf-8")) == timeless(whole)
+    assert journal.read_bytes().splitlines() == [line.strip() for line in lines]
+
+
+def test_a_journal_of_something_else_is_laid_aside(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = tmp_path / "report.html"
+    words = ("cigre-lv", "--out", str(page), "--studies", "protect")
+    assert run(monkeypatch, capsys, *words)[0] == 0
+    (journal,) = (tmp_path / "report-files" / "journals").iterdir()
+    journal.write_text('{"study": "another"}\n', encoding="utf-8")
+    assert run(monkeypatch, capsys, *words)[0] == 0
+    assert journal.with_suffix(".other").read_text(encoding="utf-8") == '{"study": "another"}\n'
+    assert "another" not in journal.read_text(encoding="utf-8")
+
+
+def test_what_a_study_cannot_answer_is_in_the_report(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = tmp_path / "report.html"
+    code, _, told = run(monkeypatch, capsys, "cigre-lv", "--out", str(page), "--silent", "m99", *FEW)
+    assert code == 1
+    assert "redundancy: there is no meter 'm99'" in plain(told)
+    html = page.read_text(encoding="utf-8")
+    assert "No answer: there is no meter &#x27;m99&#x27;" in html
+    assert 'data-standing="no answer"' in html
+    assert "protect-map" in html
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--studies", "protect,palmistry"), "'palmistry': expected some of"),
+        (("--studies", "calibrate"), "calibrate needs --readings"),
+        (("--goal", "all"), "expected one of identify, notice, bound"),
+        (("--goal", "bound"), "goes with --goal bound"),
+        (("--lie-volt", "3"), "goes with --goal bound"),
+        (("--at", "tomorrow"), "expected a date and time of ISO 8601"),
+    ],
+)
+def test_wrong_arguments_are_told_before_the_work(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    words: tuple[str, ...],
+    said: str,
+) -> None:
+    code, _, told = run(monkeypatch, capsys, "cigre-lv", "--out", str(tmp_path / "r.html"), *words)
+    assert code == 2
+    assert said in plain(told)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_feeder_that_is_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, _, told = run(monkeypatch, capsys, "atlantis", "--out", str(tmp_path / "r.html"))
+    assert code == 3
+    assert "atlantis" in told
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    found = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if found is None:
+        pytest.skip("no Chromium on this machine")
+    with sync_playwright() as playwright:
+        made = playwright.chromium.launch(executable_path=found, args=FLAGS)
+        yield made
+        made.close()
+
+
+@pytest.mark.browser
+def test_it_can_be_read_on_a_desk_on_a_phone_and_on_paper(
+    browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page_file = tmp_path / "report.html"
+    words = ("simbench-lv-rural1", "--out", str(page_file), "--silent", "m04", *FEW)
+    assert run(monkeypatch, capsys, *words)[0] == 0
+    complaints: list[str] = []
+    for width, shown, hidden in ((1280, "wide", "narrow"), (390, "narrow", "wide")):
+        context = browser.new_context(viewport={"width": width, "height": 900}, color_scheme="dark")
+        page = context.new_page()
+        page.on("console", lambda message: complaints.append(message.text))
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        page.on("request", lambda r: None if r.url.startswith("file:") else complaints.append(r.url))
+        page.goto(page_file.as_uri())
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        assert page.locator(f"figure .{shown} svg").first.is_visible()
+        assert not page.locator(f"figure .{hidden} svg").first.is_visible()
+        letters = page.evaluate(
+            """[...document.querySelectorAll("figure svg text")]
+               .filter((text) => text.getBoundingClientRect().width)
+               .map((text) => [text.ownerSVGElement, parseFloat(text.getAttribute("font-size"))])
+               .map(([svg, size]) => size * svg.getBoundingClientRect().width / svg.viewBox.baseVal.width)"""
+        )
+        assert min(letters) > 9.0
+        assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(15, 21, 27)"
+        context.close()
+    assert not complaints
+
+
+@pytest.mark.browser
+def test_tables_sort_and_the_summary_is_one_page_of_paper(
+    browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page_file = tmp_path / "report.html"
+    assert run(monkeypatch, capsys, "simbench-lv-rural1", "--out", str(page_file), *FEW)[0] == 0
+    page = browser.new_page()
+    page.goto(page_file.as_uri())
+    details = page.locator("details", has_text="meters: 13 rows").first
+    details.evaluate("(box) => { box.open = true; }")
+    order = "(box) => [...box.querySelectorAll('tbody tr')].map((row) => row.children[4].dataset.key)"
+    details.get_by_role("button", name="index any").click()
+    up = details.evaluate(order)
+    details.get_by_role("button", name="index any").click()
+    down = details.evaluate(order)
+    numbers = [float(cell) for cell in up if cell]
+    assert len(numbers) > 5
+    assert [float(cell) for cell in down if cell] == sorted(numbers, reverse=True)
+    page.set_viewport_size(
+        {"width": 673, "height": 1000}
+    )  # what A4 leaves between its margins, 96 px per inch
+    page.emulate_media(media="print")
+    assert page.evaluate("document.querySelector('.front').getBoundingClientRect().height") < 1003
+    assert page.evaluate("document.documentElement.scrollWidth") <= 673
+    assert len(page.pdf(prefer_css_page_size=True)) > 10_000
+    page.close()
