@@ -35,7 +35,7 @@ from gridsec.feeder import Feeder
 from gridsec.monitor import Plant
 from gridsec.network import Network
 from gridsec.online import Frame
-from gridsec.phases import PHASES, PhasedFeeder
+from gridsec.phases import PHASES, PhasedFeeder, ThreePhaseFeeder
 
 __all__ = [
     "ABSURD_PU",
@@ -97,6 +97,11 @@ class Site:
     xy: Floats | None
     loads: LoadModel
     digest: str
+
+    @property
+    def tree(self) -> Feeder | ThreePhaseFeeder:
+        """The tree of its buses, whatever the number of their phases."""
+        return self.feeder if isinstance(self.feeder, Feeder) else self.feeder.tree
 
     @property
     def balanced(self) -> Feeder:

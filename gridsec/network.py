@@ -123,6 +123,17 @@ def columns(feeder: Network, power: Power, customers: Ints) -> Floats:
     return 2.0 * _matrix(feeder, power)[:, customers]
 
 
+def between(feeder: Network, power: Power) -> Floats:
+    """R or X from every customer's power to every customer's voltage, (N, N).
+
+    Parameters
+    ----------
+    feeder, power
+        The feeder, and which power.
+    """
+    return 0.5 * columns(feeder, power, np.arange(feeder.bus.size))[feeder.bus]
+
+
 def along(feeder: Network, power: Power, customers: Ints, weights: Floats) -> Floats:
     """What each customer's power does to the weighted sum of some customers' voltages, (N,).
 

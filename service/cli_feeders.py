@@ -44,13 +44,12 @@ def feeders_list() -> None:
 def feeders_show(feeder: Feeder) -> None:
     """Show a feeder and its customers."""
     from feeders.load import load
-    from service.voltages import bus_names
 
     site = load(feeder)
     meta = site.tables.meta
     out.print(f"[bold]{escape(meta.name)}[/] {escape(meta.title)}")
     out.print(
-        f"{meta.voltage_volt:g} V phase to neutral, {len(bus_names(site))} buses, "
+        f"{meta.voltage_volt:g} V phase to neutral, {len(site.tree.buses)} buses, "
         f"{len(site.feeder.customers)} customers, {len(site.meter_ids)} meters, "
         f"watched every {meta.monitor.tick_s:g} s for up to {meta.monitor.max_attacked} manipulated meters"
     )

@@ -6,7 +6,6 @@ from typing import Any
 
 from feeders.load import Site
 from feeders.schema import to_json
-from gridsec.feeder import Feeder
 
 
 def summary(site: Site) -> dict[str, Any]:
@@ -39,7 +38,7 @@ def detail(site: Site) -> dict[str, Any]:
         The feeder.
     """
     meta = site.tables.meta
-    tree = site.feeder if isinstance(site.feeder, Feeder) else site.feeder.tree
+    tree = site.tree
     xy = site.xy
     return {
         **summary(site),

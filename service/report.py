@@ -20,7 +20,7 @@ from feeders.load import Site, volts
 from gridsec.arrays import Bools
 from gridsec.online import Cause, Decision, Estimate, Verdict
 from service.align import Tick
-from service.voltages import attack_volts, bus_names, bus_volts, std_volts
+from service.voltages import attack_volts, bus_volts, std_volts
 
 BUSBAR = "substation"
 """The name under which the busbar meter is reported among the silent ones (as in its zenoh key)."""
@@ -239,7 +239,7 @@ def build(site: Site, tick: Tick, max_attacked: int, estimate: Estimate, verdict
             )
         )
     one, phases = bus_volts(site, estimate.v2_bus)
-    buses = zip(bus_names(site), one, strict=True)
+    buses = zip(site.tree.buses, one, strict=True)
     return _whole(
         site,
         tick,
@@ -287,7 +287,7 @@ def blind(site: Site, tick: Tick, max_attacked: int, cause: Cause, reason: str) 
         max_attacked,
         verdict=(Decision.UNDECIDED, cause, reason),
         meters=meters,
-        buses=tuple((bus, None) for bus in bus_names(site)),
+        buses=tuple((bus, None) for bus in site.tree.buses),
         customers=tuple(CustomerReport(customer, None, None) for customer in site.feeder.customers),
         inverters=_inverters(site, None, None),
         explanations=(),

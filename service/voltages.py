@@ -40,17 +40,6 @@ def _busbar(tick: Tick) -> Floats | float:
     return tick.busbar.v_volt if phases is None else np.array(phases)
 
 
-def bus_names(site: Site) -> tuple[str, ...]:
-    """Return the buses of the feeder's tree, whatever the number of their phases, the busbar first.
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    """
-    return site.feeder.buses if isinstance(site.feeder, Feeder) else site.feeder.tree.buses
-
-
 def bus_volts(site: Site, v2_bus: Floats) -> tuple[Floats, Floats]:
     """Return the voltage of every bus, V: in three phases that of the phase furthest from nominal.
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import pandas as pd
 
-from feeders.load import digest, find
+from feeders.equipment import digest, find
 from feeders.schema import write
 from feeders.studies import calibrate_tables
 from feeders.studies.calibrate_readings import Frames, frames

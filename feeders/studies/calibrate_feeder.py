@@ -120,7 +120,7 @@ def network(tables: FeederTables) -> Network:
     rows = [tables.lines[k] for k in closed]
     edges = [Edge(row.line, row.from_bus, row.to_bus, row.r_ohm == row.x_ohm == 0.0) for row in rows]
     each: tuple[tuple[int, ...], ...] = tuple((closed[k],) for k in tree(tables.meta.busbar, edges).branch)
-    feeder, lines = _merged(site.feeder, each)
+    feeder, lines = _merged(site.tree if isinstance(site, Site) else site.feeder, each)
     if isinstance(feeder, Feeder):
         place = np.column_stack([np.arange(len(feeder.buses)), np.zeros(len(feeder.buses))]).astype(np.intp)
     else:

@@ -12,7 +12,7 @@ from feeders.lies import Lie, Trick, each_alone
 from feeders.studies.campaign_plan import Case, Place, Plan
 from gridsec.arrays import Floats, Ints
 from gridsec.attack import Attack, Bias, InverterAttack, load_pattern, most_affected
-from gridsec.feeder import LinDistFlow, lindistflow
+from gridsec.network import Power, between
 
 if TYPE_CHECKING:
     from feeders.load import Site
@@ -89,27 +89,27 @@ def liars(site: Site, case: Case, random: np.random.Generator) -> tuple[Ints, Fl
     signs: Floats = random.choice([-1.0, 1.0], count)
     if case.place == Place.RANDOM:
         return np.sort(random.choice(p, count, replace=False)).astype(np.intp), signs
-    model = lindistflow(site.feeder)
+    R, X = (between(site.feeder, power) for power in Power)
     if case.place == Place.SENSITIVE:
         # What loads of equal and independent uncertainty do to each voltage.
-        felt = np.sqrt((model.R**2).sum(axis=1) + (model.X**2).sum(axis=1))
+        felt = np.sqrt((R**2).sum(axis=1) + (X**2).sum(axis=1))
         return most_affected(felt[site.meters], count), signs
     if case.place == Place.STREET:
-        return _nearest(model, site.meters, int(random.integers(p)), count), signs
-    v = np.ones(model.R.shape[0])
+        return _nearest(R, site.meters, int(random.integers(p)), count), signs
+    v = np.ones(len(R))
     for customer in random.permutation(site.meters):
         ratio = 0.5 * float(site.loads.tan_min[customer] + site.loads.tan_max[customer])
-        pattern = np.abs(load_pattern(model.R, model.X, int(customer), ratio, v)[site.meters])
+        pattern = np.abs(load_pattern(R, X, int(customer), ratio, v)[site.meters])
         some = most_affected(pattern, count)
         if pattern[some].min() > 0.0:
             return some, np.full(count, signs[0])
     raise NoSuchAttack(f"{site.feeder.name} has no load that {count} meters feel")
 
 
-def _nearest(model: LinDistFlow, meters: Ints, one: int, count: int) -> Ints:
+def _nearest(R: Floats, meters: Ints, one: int, count: int) -> Ints:
     """A meter and those with the least resistance between them and it."""
-    own = np.diagonal(model.R)[meters]
-    apart = own[one] + own - 2.0 * model.R[meters[one], meters]
+    own = np.diagonal(R)[meters]
+    apart = own[one] + own - 2.0 * R[meters[one], meters]
     apart[one] = -1.0
     return np.sort(np.argsort(apart, kind="stable")[:count]).astype(np.intp)
 

@@ -100,7 +100,7 @@ def shares_of(site: Site, customers: Sequence[str] | None) -> Floats:
 def ratings_pu(site: Site) -> Floats:
     """Largest current of every branch, pu; infinity where the files give none, (b,)."""
     tables = site.tables
-    group, parent = site.bus_of_file, site.feeder.parent
+    group, parent = site.bus_of_file, site.tree.parent
     out = np.full(parent.size, np.inf)
     base_amps = 1000.0 * site.feeder.base_kva / (3.0 * site.feeder.base_volt)
     for line in tables.lines:
@@ -158,7 +158,7 @@ def checked(subject: Subject, plan: Plan, kw: float, at: Conditions, ratings: Fl
             "broken": "no power flow",
         }
     net, own, v = injected(droop, s, x), droop.customer, np.abs(V)
-    full = currents(site.feeder, subject.net, net, V, at.v0) / ratings
+    full = currents(site.balanced, subject.net, net, V, at.v0) / ratings
     near = 1e-7
     steep = slopes(droop, v[own] - near, v[own] + near)
     J = sensitivity(subject.net, net, V).dv_dq[np.ix_(own, own)]

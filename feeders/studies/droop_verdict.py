@@ -82,7 +82,7 @@ class Subject:
     @classmethod
     def of(cls, site: Site) -> Subject:
         """Both power flows of a feeder."""
-        return cls(site, PowerFlow(site), network(site.feeder))
+        return cls(site, PowerFlow(site), network(site.balanced))
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,6 @@ from service.models import FeederDetail, State
 from service.reading import BadReason
 from service.replay import Tally, replay
 from service.simulate import Pace, payload_of, play
-from service.voltages import bus_names
 from service.watch import known_of
 from service.wire import Decoded, Wire
 from tests.service.running import service, until
@@ -71,7 +70,7 @@ def test_what_is_no_voltage_of_phases(site: Site, phases: object, reason: BadRea
 
 def test_the_layout_is_that_of_the_buses(site: Site) -> None:
     found = FeederDetail.model_validate(detail(site))
-    assert len(found.layout.buses) == len(bus_names(site)) == 906
+    assert len(found.layout.buses) == len(site.tree.buses) == 906
     assert {customer.phase for customer in found.layout.customers} == {"a", "b", "c"}
     assert all(customer.bus in found.layout.buses for customer in found.layout.customers)
 
