@@ -208,6 +208,7 @@ export class Diagram {
     this.report = report;
     this.meters = new Map(report.meters.map((meter) => [meter.meter, meter]));
     this.volts = new Map(report.buses.map((bus) => [bus.bus, bus.v_volt]));
+    this.phases = new Map(report.buses.map((bus) => [bus.bus, bus.v_phases]));
     const all = [...this.volts.values(), ...report.meters.map((m) => m.v_volt_estimated)].filter(isKnown);
     if (this.scale.fit(all, this.feeder.v_nominal_volt)) this.rescale();
     this.paint();
@@ -219,7 +220,9 @@ export class Diagram {
 
   voltAt(customer) {
     const meter = this.meters.get(customer.meter);
-    return isKnown(meter?.v_volt_estimated) ? meter.v_volt_estimated : this.volts.get(customer.bus);
+    if (isKnown(meter?.v_volt_estimated)) return meter.v_volt_estimated;
+    const phases = this.phases.get(customer.bus);
+    return phases ? phases["abc".indexOf(customer.phase)] : this.volts.get(customer.bus);
   }
 
   paint() {
@@ -286,6 +289,7 @@ export class Diagram {
     const now = status(meter, this.limits);
     this.tip.replaceChildren(
       el("b", { text: id }),
+      ...(part.customer.phase ? [el("span", { text: `phase ${part.customer.phase}` })] : []),
       el("span", { class: "state", "data-status": now.key, text: now.text }),
       el("span", { text: `meter says ${volt(meter?.v_volt_reported)}` }),
       el("span", { text: `reconstructed ${volt(this.voltAt(part.customer))}` }),

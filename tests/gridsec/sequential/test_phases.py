@@ -18,7 +18,7 @@ from gridsec.detect import MeterAccuracy
 from gridsec.droop import Droop
 from gridsec.feeder import Feeder
 from gridsec.network import bus_voltages
-from gridsec.online import Decision, Estimate, Frame, Verdict
+from gridsec.online import Cause, Decision, Estimate, Frame, Verdict
 from gridsec.phases import PhasedFeeder, ThreePhaseFeeder
 from gridsec.plant import Plant
 from gridsec.sequential import LoadDoubt, SequentialDesign, SequentialOptions
@@ -206,7 +206,7 @@ class TestTheEuropeanFeeder:
         v, _ = power_flow(site).solve_batch(known + unknown, 0.2 * known + other, v0)
         expected = prior(site.feeder, site.feeder.bus, load_doubt(site), busbar=0.0).between
         found = np.cov((v / site.feeder.base_volt) ** 2, rowvar=False)
-        assert np.linalg.norm(found - expected) < 0.05 * np.linalg.norm(expected)
+        assert np.linalg.norm(found - expected) < 0.1 * np.linalg.norm(expected)
         # Phases that share a cable err against each other: that is no neglected rounding.
         phase = np.array([row.phases for row in site.tables.customers])
         apart = phase[:, None] != phase
@@ -257,3 +257,23 @@ class TestTheEuropeanFeeder:
             assert np.ptp(frame.v0_phases) > 1e-3
             state, _, verdict = watcher.step(state, replace(frame, v0_phases=None))
             assert not verdict.suspects.any()
+
+    def test_absurd_frames_get_an_answer(self) -> None:
+        this = self.trial(None, 12.0)
+        watcher = design_site(this.stated)
+        rng, absurd = np.random.default_rng(8), np.array([np.nan, np.inf, -np.inf, -1.0, 0.0, 1e300, 1.0])
+        state = watcher.init(0.0)
+        for frame, _ in frames(this):
+            broken = {
+                name: np.where(
+                    rng.random(getattr(frame, name).shape) < 0.2, rng.choice(absurd), getattr(frame, name)
+                )
+                for name in ("y", "p", "q", "p_error", "q_error", "v0_phases")
+            }
+            state, estimate, verdict = watcher.step(state, replace(frame, **broken))
+            assert np.isfinite(estimate.v2).all()
+            assert np.isfinite(estimate.std).all()
+            assert verdict.decision is not Decision.CLEAN or verdict.cause is Cause.AGREEMENT
+        # The same frame again is not used.
+        _, _, verdict = watcher.step(state, frame)
+        assert verdict.decision is Decision.UNDECIDED
