@@ -30,6 +30,7 @@ __all__ = [
     "Proof",
     "Reach",
     "Update",
+    "enlarged",
     "factor",
     "growth",
     "loop",
@@ -180,6 +181,19 @@ def steepened(droop: Droop, times: float) -> Droop:
     v[:, 3] = inner[:, 1] + (v[:, 3] - v[:, 2]) / times
     v[:, 1:3] = inner
     return Droop(droop.customer, v, droop.q, droop.tau, droop.vbar)
+
+
+def enlarged(droop: Droop, times: float) -> Droop:
+    """The fleet with all its limits, and with them all slopes, so many times as large: larger inverters.
+
+    Parameters
+    ----------
+    droop
+        The fleet.
+    times
+        Factor, not negative.
+    """
+    return Droop(droop.customer, droop.v, times * droop.q, droop.tau, droop.vbar)
 
 
 # --- certificates ---------------------------------------------------------------------------------------
