@@ -166,9 +166,11 @@ _prepared: list[tuple[str, Prepared]] = []
 def _scene(tables: FeederTables, plan: Plan, scene: int) -> list[dict[str, Any]]:
     """Work on a scene, wherever this is: designs are made once in each process."""
     asked = repr((tables, plan))
-    if not _prepared or _prepared[0][0] != asked:
-        _prepared[:] = [(asked, prepare(from_tables(tables), plan))]
-    return watch(_prepared[0][1], scene)
+    given = next((made for what, made in _prepared if what == asked), None)
+    if given is None:
+        given = prepare(from_tables(tables), plan)
+        _prepared[:] = [(asked, given)]
+    return watch(given, scene)
 
 
 def _campaign(site: Site, plan: Plan, used: dict[str, str], rows: list[dict[str, Any]]) -> Campaign:
