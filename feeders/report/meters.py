@@ -113,9 +113,9 @@ def _sizes(meters: pd.DataFrame, liars: int, sure: str) -> Finding:
         how_many(meters, name),
         f" meters, {together}, can be lied about by a little: for lies up to ",
         least(meters, name, "hidden", "V"),
-        f" ({_which(meters, 'hidden', smallest=True)}) to ",
+        f" ({_extreme(meters, 'meter', 'hidden', smallest=True)}) to ",
         most(meters, name, "hidden", "V"),
-        f" ({_which(meters, 'hidden')}) nobody is named, with {sure} at any one moment.",
+        f" ({_extreme(meters, 'meter', 'hidden')}) nobody is named, with {sure} at any one moment.",
     )
     if len(never):
         noticed: Sentence = (
@@ -127,9 +127,9 @@ def _sizes(meters: pd.DataFrame, liars: int, sure: str) -> Finding:
         "Larger lies may go unnoticed, depending on the honest errors of the moment; somebody is surely "
         "noticed from ",
         least(meters, name, "noticed", "V"),
-        f" ({_which(meters, 'noticed', smallest=True)}) to ",
+        f" ({_extreme(meters, 'meter', 'noticed', smallest=True)}) to ",
         most(meters, name, "noticed", "V"),
-        f" ({_which(meters, 'noticed')}) on.",
+        f" ({_extreme(meters, 'meter', 'noticed')}) on.",
     )
     if not all(math.isfinite(v) for v in meters["named"]):
         named: Sentence = ("Not every liar is proved to be named, however large the lie.",)
@@ -148,11 +148,12 @@ def _picture(site: Site, customers: pd.DataFrame, liars: int) -> Finding:
     name = "detectable-customers"
     who = "a single lying meter" if liars == 1 else f"{liars} meters that lie together"
     lead: Sentence = (
-        f"Unnoticed, {who} can shift the voltage that the monitor shows by at most ",
-        most(customers, name, "error", "V"),
-        f" (at {_extreme(customers, 'customer', 'error')}) and nowhere by less than ",
+        f"Unnoticed, {who} can make the voltage that the monitor shows wrong by at most ",
         least(customers, name, "error", "V"),
-        f", honest errors included. Nominal voltage is {number(float(site.feeder.base_volt), 1)} V.",
+        f" (at {_extreme(customers, 'customer', 'error', smallest=True)}) to ",
+        most(customers, name, "error", "V"),
+        f" (at {_extreme(customers, 'customer', 'error')}), honest errors included. "
+        f"Nominal voltage is {number(float(site.feeder.base_volt), 1)} V.",
     )
     if not all(math.isfinite(v) for v in customers["error"]):
         return Finding(Standing.OPEN, (("No bound of the error is proved for every customer.",),))
@@ -164,14 +165,9 @@ def _picture(site: Site, customers: pd.DataFrame, liars: int) -> Finding:
     return Finding(Standing.PROVED, (lead, whoever))
 
 
-def _which(table: pd.DataFrame, column: str, *, smallest: bool = False) -> str:
+def _extreme(table: pd.DataFrame, who: str, column: str, *, smallest: bool = False) -> str:
     order = table[column]
-    at = int(order.argmin() if smallest else order.argmax())
-    return str(table["meter"].iloc[at])
-
-
-def _extreme(table: pd.DataFrame, who: str, column: str) -> str:
-    return str(table[who].iloc[int(table[column].argmax())])
+    return str(table[who].iloc[int(order.argmin() if smallest else order.argmax())])
 
 
 def _largest_only(table: pd.DataFrame) -> str:
@@ -254,9 +250,10 @@ def protect(site: Site, found: Protect) -> Section:
 def _protection(site: Site, found: Protect) -> Finding:
     count, liars = len(found.meters), found.max_attacked
     others = f"any {liars} liars" if liars > 1 else "any single liar"
+    among = " among the other meters" if count else ""
     purpose = {
-        Goal.IDENTIFY: f"{others} among the other meters would be identified",
-        Goal.NOTICE: f"the lies of {others} among the other meters would be noticed",
+        Goal.IDENTIFY: f"{others}{among} would be identified",
+        Goal.NOTICE: f"the lies of {others}{among} would be noticed",
         Goal.BOUND: f"no lie above {number(found.lie_volt)} V of {others} fits to an honest feeder",
     }[found.goal]
     scope = "" if found.goal is Goal.BOUND else " by someone who knows all other loads and errors exactly"
