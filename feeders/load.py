@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from feeders.profiles import data_root
-from feeders.raw import CUSTOMERS_FILE, LINES_FILE, META_FILE
+from feeders.raw import CUSTOMERS_FILE, LINES_FILE, META_FILE, advice
 from feeders.schema import CustomerRow, FeederTables, LineRow, read, to_json, validate
 from feeders.topology import Edge, Tree, tree
 from gridsec.arrays import Floats, Ints, frozen, frozen_ints
@@ -180,7 +180,10 @@ def find(path_or_name: Path | str) -> FeederTables:
     if len(path.parts) == 1 and path.name not in (".", "..") and bundled.is_dir():
         return read(Path(str(bundled)))
     raise FeederInvalid(
-        [f"{path_or_name}: there is neither such a folder nor such a feeder; there are {', '.join(names())}"]
+        [
+            f"{path_or_name}: there is neither such a folder nor such a feeder; "
+            f"there are {', '.join(names())}{advice(path_or_name)}"
+        ]
     )
 
 
