@@ -50,9 +50,12 @@ def test_a_feeder_without_inverters_says_which_option_helps(
     code, _, told = run(monkeypatch, capsys, folder, *FEW)
     assert code == 3
     assert "--preset" in told
-    code, answer, _ = run(monkeypatch, capsys, folder, *FEW, "--preset", "vde4105", "--interval", "0")
+    code, answer, _ = run(
+        monkeypatch, capsys, folder, *FEW, "--preset", "vde4105", "--interval", "0", "--also", "cigre-lv"
+    )
     assert code == 0
     assert "(continuous) is stable" in answer
+    assert answer.count("│ vde4105") == 2
 
 
 def test_wrong_arguments_are_told(
