@@ -330,7 +330,10 @@ def _made(about: About, chapters: Sequence[Chapter]) -> Markup:
         for c in chapters
     ]
     files_ = (
-        el("p", f"Every figure as SVG and PNG and every table as CSV and Parquet: folder {about.folder}.")
+        el(
+            "p",
+            f"Every table as CSV and Parquet, every figure as SVG (with the extra plot as PNG): {about.folder}.",
+        )
         if about.folder
         else None
     )
