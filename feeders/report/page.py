@@ -332,7 +332,7 @@ def _made(about: About, chapters: Sequence[Chapter]) -> Markup:
     files_ = (
         el(
             "p",
-            f"Every table as CSV and Parquet, every figure as SVG (with the extra plot as PNG): {about.folder}.",
+            f"Every table as CSV and Parquet, every figure as SVG (and PNG, if drawn): {about.folder}.",
         )
         if about.folder
         else None
