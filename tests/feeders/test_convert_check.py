@@ -82,6 +82,27 @@ def test_transformer_capacitor_and_open_cable_are_carried_over() -> None:
     assert not compare(converted.state, replace(converted.tables, lines=bare)).exact
 
 
+def test_parallel_transformers_on_a_coupled_busbar_are_one_infeed() -> None:
+    """Two transformers, a busbar for each, a closed coupler; open, there are two busbars to choose from."""
+    net = village()
+    second = pp.create_bus(net, 20.0, name="root 2")
+    pp.create_transformer(net, 0, second, "25 MVA 110/20 kV")
+    pp.create_switch(net, 1, second, "b", name="coupler")
+    far = pp.create_bus(net, 20.0, name="far")
+    pp.create_line(net, second, far, 2.0, "NA2XS2Y 1x185 RM/25 12/20 kV", name="far")
+    pp.create_load(net, far, 1.0, 0.2, name="farm")
+    net.trafo.loc[1, "in_service"] = False  # that of the low voltage
+    converted = from_pandapower(net, "x")
+    assert converted.tables.meta.busbar == "root"
+    assert converted.state is not None
+    check = compare(converted.state, converted.tables)
+    assert (check.buses, check.largest_pu < BALANCED_PU) == (5, True)
+    net.switch.loc[net.switch.name == "coupler", "closed"] = False
+    with pytest.raises(GridsecError, match="candidates: root, root 2"):
+        from_pandapower(net, "x")
+    assert from_pandapower(net, "x", root="root 2").tables.customers[0].customer == "farm"
+
+
 def test_loop_is_named_and_opened_when_asked(tmp_path: Path) -> None:
     path = tmp_path / "ring.json"
     pp.to_json(village(closed=True), str(path))
