@@ -21,7 +21,6 @@ __all__ = [
     "Side",
     "Standing",
     "Value",
-    "count",
     "least",
     "listed",
     "most",
@@ -132,12 +131,6 @@ def listed(names: Sequence[str]) -> str:
 def rows(table: pd.DataFrame, name: str) -> Value:
     """How many rows a table has."""
     return Value(len(table), str(len(table)), f"{name}:rows")
-
-
-def count(table: pd.DataFrame, name: str, column: str, value: float) -> Value:
-    """How many rows have a value."""
-    found = int((table[column] == value).sum())
-    return Value(found, str(found), f"{name}:{column}:count {value:g}")
 
 
 def most(
