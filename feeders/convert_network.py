@@ -8,7 +8,7 @@ customers that draw what flows into them.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -272,7 +272,12 @@ def _opened(lines: Iterable[LineRow], opened: Sequence[str], changes: list[Chang
     return [replace(row, closed=False) if row.line in opened else row for row in rows]
 
 
-def _reached(start: str, rows: Iterable[LineRow], without: str | None = None) -> dict[str, int]:
+def _fused(bus: str, rows: Iterable[LineRow]) -> dict[str, int]:
+    """Return the buses that closed switches make one with a bus."""
+    return _reached(bus, (row for row in rows if row.r_ohm == row.x_ohm == 0.0))
+
+
+def _reached(start: str, rows: Iterable[LineRow], without: Collection[str] = ()) -> dict[str, int]:
     """Return the buses that closed lines connect, with how many lines away; nothing passes `without`."""
     near: dict[str, list[str]] = defaultdict(list)
     for row in rows:
@@ -283,7 +288,7 @@ def _reached(start: str, rows: Iterable[LineRow], without: str | None = None) ->
     order = [start]
     for bus in order:
         for other in near[bus]:
-            if other not in level and bus != without:
+            if other not in level and bus not in without:
                 level[other] = level[bus] + 1
                 order.append(other)
     return level
@@ -327,14 +332,27 @@ def below_source(network: Network) -> str | None:
     return way[-1] if len(way) > 1 and _has_lines(way[-1], network.lines) else None
 
 
+def one_busbar(buses: Collection[str], rows: Iterable[LineRow]) -> bool:
+    """Return whether buses are one, joined by closed switches.
+
+    Parameters
+    ----------
+    buses
+        Some buses.
+    rows
+        The network's lines.
+    """
+    return bool(buses) and _fused(min(buses), rows).keys() >= set(buses)
+
+
 def _way_down(network: Network, rows: list[LineRow]) -> list[str]:
     """Follow transformers from the source, as long as there is only one way and no line."""
     way = [network.sources[0]]
     while not _has_lines(way[-1], rows):
         beyond = _beyond(network, way)
-        if len(beyond) != 1:
+        if not one_busbar(beyond, rows):
             break
-        way.append(beyond.pop())
+        way.append(min(beyond))
     return way
 
 
@@ -350,14 +368,15 @@ def _infeeds(network: Network, rows: list[LineRow], busbar: str, inside: Mapping
     """Return what else feeds the feeder besides its busbar."""
     problems = []
     everything = [*rows, *_as_rows(network.couplings)]
+    fused = _fused(busbar, rows)
     for source in network.sources:
         if source in inside and source != busbar:
             problems.append(
                 f"bus {source!r} has another voltage source; the feeder is fed by its busbar {busbar!r} alone"
             )
         elif source != busbar:
-            above = _reached(source, everything, without=busbar)
-            ways = [bus for bus in inside if bus != busbar and bus in above]
+            above = _reached(source, everything, without=fused)
+            ways = [bus for bus in inside if bus not in fused and bus in above]
             if ways:
                 problems.append(
                     f"{len(ways)} of the feeder's buses can be reached from the source {source!r} not only "
@@ -404,9 +423,9 @@ def _behind(
     network: Network, rows: list[LineRow], inside: Mapping[str, int], changes: list[Change]
 ) -> list[Draw]:
     """Couplings below the busbar, as what flows into them."""
-    busbar = next(iter(inside))
+    fused = _fused(next(iter(inside)), rows)
     everything = [*rows, *_as_rows(network.couplings)]
-    above = {bus for source in network.sources for bus in _reached(source, everything, without=busbar)}
+    above = {bus for source in network.sources for bus in _reached(source, everything, without=fused)}
     draws = []
     for each in network.couplings:
         ends = [k for k, bus in enumerate(each.buses) if bus in inside]

@@ -6,6 +6,7 @@ opens no windows, starts no programs and writes nothing outside a temporary fold
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -81,8 +82,10 @@ def _engine() -> Iterator[Any]:
         raise GridsecError(
             "OpenDSS files need the extra 'convert': pip install 'gridsec[convert]'"
         ) from error
+    here = Path.cwd()
     with tempfile.TemporaryDirectory() as scratch:
         engine = dss.NewContext()
+        os.chdir(here)  # a new context goes back to where the process began
         engine.Basic.AllowForms(False)
         engine.Basic.AllowEditor(False)
         engine.Basic.AllowDOScmd(False)
@@ -93,6 +96,7 @@ def _engine() -> Iterator[Any]:
             yield engine
         finally:
             engine.Basic.ClearAll()
+            os.chdir(here)
 
 
 def read_opendss(path: Path) -> Network:

@@ -24,7 +24,7 @@ from feeders.convert_customers import (
     with_meters,
 )
 from feeders.convert_draws import customers_of
-from feeders.convert_network import Converted, Network, below, below_source, finished
+from feeders.convert_network import Converted, Network, below, below_source, finished, one_busbar
 from feeders.convert_pandapower_net import ids, network_of
 from feeders.profiles import envelopes
 from feeders.schema import CustomerRow, FeederMeta, FeederTables, LoadDefaults, MonitorDefaults
@@ -150,7 +150,7 @@ def _root(net: Any, network: Network, names: dict[int, str], wanted: str | None)
     sides = sorted({int(bus) for bus in trafos.lv_bus})
     if not sides:
         sides = sorted({int(bus) for bus in net.ext_grid.bus[net.ext_grid.in_service]})
-    if len(sides) == 1:
+    if one_busbar([names[bus] for bus in sides], network.lines):
         return names[sides[0]]
     found = below_source(network)
     if found is None:

@@ -20,6 +20,7 @@ from feeders.convert_lines import capacitor, open_end
 from feeders.convert_network import Coupling, Network
 from feeders.schema import LineRow
 from gridsec.arrays import Phasors
+from gridsec.errors import FeederInvalid
 
 # Tables that are carried over, or told about one by one; every other row in the feeder earns a note.
 CARRIED: Final = {
@@ -28,6 +29,22 @@ CARRIED: Final = {
 }  # fmt: skip
 FIXED: Final = {"gen": -1.0, "storage": 1.0, "motor": 1.0, "ward": 1.0}
 """Tables of what becomes a customer as the source's power flow has it, and the sign of its results."""
+
+COLUMNS: Final = {
+    "bus": "name vn_kv in_service",
+    "line": "name from_bus to_bus length_km r_ohm_per_km x_ohm_per_km c_nf_per_km g_us_per_km max_i_ka df "
+    "parallel in_service",
+    "switch": "name bus element et closed",
+    "load": "name bus p_mw q_mvar scaling in_service",
+    "asymmetric_load": "name bus p_a_mw p_b_mw p_c_mw q_a_mvar q_b_mvar q_c_mvar scaling in_service",
+    "sgen": "name bus p_mw q_mvar sn_mva scaling in_service",
+    "asymmetric_sgen": "name bus p_a_mw p_b_mw p_c_mw q_a_mvar q_b_mvar q_c_mvar scaling in_service",
+    "ext_grid": "bus in_service",
+    "trafo": "name hv_bus lv_bus in_service",
+    "trafo3w": "name hv_bus mv_bus lv_bus in_service",
+    "shunt": "name bus p_mw q_mvar vn_kv step in_service",
+}
+"""What is needed of a net's tables."""
 
 UNLIMITED_KA: Final = 1000.0
 TURN: Final = np.exp(-2j * np.pi / 3.0 * np.arange(3))
@@ -63,6 +80,39 @@ def _clean(name: object) -> str:
     return "".join(c if c.isprintable() else " " for c in text).strip()[:100]
 
 
+def problems_of(net: Any) -> list[str]:
+    """Return everything that keeps a net's tables from being read.
+
+    Parameters
+    ----------
+    net
+        What a file held.
+    """
+    missing = [
+        f"the table {table!r} is missing" for table in COLUMNS if not hasattr(net.get(table), "columns")
+    ]
+    if missing:
+        return missing
+    problems = [
+        f"{table}: the column {column!r} is missing"
+        for table, columns in COLUMNS.items()
+        for column in columns.split()
+        if column not in net[table].columns
+    ]
+    if problems:
+        return problems
+    for table, columns in COLUMNS.items():
+        ends = [name for name in columns.split() if name == "bus" or name.endswith("_bus")]
+        for column in ends:
+            strange = net[table].index[~net[table][column].isin(net.bus.index)]
+            problems += [f"{table} {i}: {column} {net[table].at[i, column]} is no bus" for i in strange]
+    for column in ("length_km", "r_ohm_per_km", "x_ohm_per_km", "c_nf_per_km"):
+        values = net.line[column].astype(float)
+        bad = net.line.index[~(values >= 0) | np.isinf(values)]
+        problems += [f"line {i}: {column} is {net.line.at[i, column]}; expected at least 0" for i in bad]
+    return problems
+
+
 def network_of(net: Any) -> Network:
     """Return a net as a network; its loads and static generators are left to `feeders.convert_pandapower`.
 
@@ -70,7 +120,15 @@ def network_of(net: Any) -> Network:
     ----------
     net
         A pandapower net; stays as it is.
+
+    Raises
+    ------
+    FeederInvalid
+        With everything that keeps its tables from being read.
     """
+    problems = problems_of(net)
+    if problems:
+        raise FeederInvalid(problems)
     buses = ids(net.bus, "bus")
     nominal = {buses[int(i)]: float(kv) * 1000.0 / math.sqrt(3.0) for i, kv in net.bus.vn_kv.items()}
     feeds = net.ext_grid.bus[net.ext_grid.in_service.astype(bool)]

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from feeders.profiles import data_root
-from feeders.raw import CUSTOMERS_FILE, LINES_FILE, META_FILE
+from feeders.raw import CUSTOMERS_FILE, LINES_FILE, META_FILE, advice
 from feeders.schema import CustomerRow, FeederTables, read, to_json
 from feeders.topology import Tree
 from gridsec.arrays import Floats, Ints, frozen, frozen_ints
@@ -91,9 +91,9 @@ def find(path_or_name: Path | str) -> FeederTables:
     bundled = data_root() / "feeders" / str(path_or_name)
     if len(path.parts) == 1 and path.name not in (".", "..") and bundled.is_dir():
         return read(Path(str(bundled)))
-    there = ", ".join(names(balanced=False))
+    there, advised = ", ".join(names(balanced=False)), advice(path_or_name)
     raise FeederInvalid(
-        [f"{path_or_name}: there is neither such a folder nor such a feeder; there are {there}"]
+        [f"{path_or_name}: there is neither such a folder nor such a feeder; there are {there}{advised}"]
     )
 
 

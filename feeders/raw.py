@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,8 +14,8 @@ from typing import Any
 from feeders.columns import shown
 
 META_FILE, LINES_FILE, CUSTOMERS_FILE = "feeder.toml", "lines.csv", "customers.csv"
-FOREIGN = {".json", ".dss"}
-"""Endings of files that hold networks of other tools."""
+FOREIGN = re.compile(r".+\.(json|dss)|(pandapower|simbench):.+|.+--[0-9]-(no_)?sw", re.IGNORECASE)
+"""Names of what holds a network of another tool."""
 MAX_BYTES = 64 * 1024 * 1024
 
 # Rows with their numbers as a person counts them.
@@ -34,15 +35,21 @@ class Raw:
     problems: list[str]
 
 
+def advice(source: object) -> str:
+    """Return how to make a feeder of a network of another tool; nothing for any other source."""
+    name = str(source)
+    return f"; make one by: gridsec feeders convert {name} FOLDER" if FOREIGN.fullmatch(name) else ""
+
+
 def from_folder(folder: Path) -> Raw:
     """Read the files of a feeder; what cannot be read is a problem, never an exception."""
     raw = Raw(META_FILE, None, LINES_FILE, None, CUSTOMERS_FILE, None, [])
     if not folder.is_dir():
         what = "is a file, not a folder" if folder.exists() else "does not exist"
-        problem = f"{folder} {what}; expected a folder with {META_FILE}, {LINES_FILE}, {CUSTOMERS_FILE}"
-        if folder.is_file() and folder.suffix.lower() in FOREIGN:
-            problem += f"; made from a network by: gridsec feeders convert {folder} {folder.stem}"
-        raw.problems.append(problem)
+        raw.problems.append(
+            f"{folder} {what}; expected a folder with {META_FILE}, {LINES_FILE}, {CUSTOMERS_FILE}"
+            f"{advice(folder)}"
+        )
         return raw
     text = _file_text(folder / META_FILE, raw.problems)
     if text is not None:

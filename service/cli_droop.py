@@ -51,6 +51,9 @@ def droop(
     compare: Annotated[
         list[str] | None, typer.Option(help="A preset to compare; may be repeated. [default: all]")
     ] = None,
+    also: Annotated[
+        list[str] | None, typer.Option(help="Compare presets on this feeder too; may be repeated.")
+    ] = None,
     tau_factor: Annotated[
         list[float] | None, typer.Option(help="Factor on all time constants to compare; may be repeated.")
     ] = None,
@@ -73,8 +76,10 @@ def droop(
     out: Out = None,
 ) -> None:
     """Is the volt/VAR fleet stable, with what margins; does it keep the band; how much more is hosted."""
+    import pandas as pd
+
     from feeders.load import load
-    from feeders.studies.droop import DroopOptions
+    from feeders.studies.droop import DroopOptions, presets_of
     from feeders.studies.droop import droop as study
     from feeders.studies.droop_fleets import Who
     from gridsec.droop import PRESETS
@@ -107,9 +112,13 @@ def droop(
         unit_kw=unit_kw,
         draws=draws,
     )
-    site = load(feeder)
+    site, others = load(feeder), [load(name) for name in also or ()]
     with bar("fleets, steps and loads") as tell, said():
         found = study(site, options, seed=seed, journal=journal, progress=tell)
+        if others:
+            found.tables["presets"] = pd.concat(
+                [found.tables["presets"], presets_of(others, options, seed=seed)], ignore_index=True
+            )
     _tell(found, options)
     write_tables(out, found.tables)
 

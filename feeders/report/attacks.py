@@ -44,35 +44,10 @@ def campaign(_: Site, found: Campaign) -> Section:
     """
     plan = found.plan
     rate = min(plan.alarms_per_year)
-    figures: tuple[Figure, ...] = ()
-    if len(found.liars):
-        figures = (
-            Figure(
-                "campaign-named",
-                "Who is named, by what they do and how much",
-                "Share of the liars that were named, with the interval that holds the true share in 95 of "
-                "100 cases; sizes are those of the table.",
-                partial(_named_chart, _at(found.by_size, rate)),
-            ),
-            Figure(
-                "campaign-delay",
-                "How soon",
-                "Share of the liars named within some time of the beginning of their lie, by kind. A curve "
-                "that stays below 100 % has liars that were never named.",
-                partial(_delay_chart, _at(found.liars, rate)),
-            ),
-            Figure(
-                "campaign-error",
-                "How wrong the voltage shown was",
-                "Largest error of the reconstructed voltage while somebody lied, % of nominal, by kind; "
-                "liars' own voltages and those of the others.",
-                partial(_error_chart, _at(found.by_kind, rate)),
-            ),
-        )
     return Section(
         title="Simulated attacks",
         answers={Question.MONITOR: _behaved(found, rate)},
-        figures=figures,
+        figures=_figures(found, rate) if len(found.liars) else (),
         tables=found.tables,
         shown={name: (by, *_SHOWN) if by == "kind" else ("kind", by, *_SHOWN) for name, by in _BY.items()}
         | {"scenarios": _SCENARIOS},
@@ -94,6 +69,32 @@ def campaign(_: Site, found: Campaign) -> Section:
             f"within {plan.load_error.p_kw:g} kW and {plan.load_error.q_kvar:g} kvar (1 sigma); "
             f"errors of meters: {plan.meters}.",
             "A simulated attack is one that somebody thought of: others may fare differently.",
+        ),
+    )
+
+
+def _figures(found: Campaign, rate: float) -> tuple[Figure, ...]:
+    return (
+        Figure(
+            "campaign-named",
+            "Who is named, by what they do and how much",
+            "Share of the liars that were named, with the interval that holds the true share in 95 of "
+            "100 cases; sizes are those of the table.",
+            partial(_named_chart, _at(found.by_size, rate)),
+        ),
+        Figure(
+            "campaign-delay",
+            "How soon",
+            "Share of the liars named within some time of the beginning of their lie, by kind. A curve "
+            "that stays below 100 % has liars that were never named.",
+            partial(_delay_chart, _at(found.liars, rate)),
+        ),
+        Figure(
+            "campaign-error",
+            "How wrong the voltage shown was",
+            "Largest error of the reconstructed voltage while somebody lied, % of nominal, by kind; "
+            "liars' own voltages and those of the others.",
+            partial(_error_chart, _at(found.by_kind, rate)),
         ),
     )
 

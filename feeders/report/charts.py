@@ -79,7 +79,7 @@ def rows(data: Sequence[Row], width: float, *, axis: str, start: float = 0.0) ->
     def at(value: float) -> float:
         return left + (value - start) * scale
 
-    marks: list[Mark] = [Text(left, 13.0, axis, "quiet")]
+    marks: list[Mark] = [Text(max(min(left, width - width_of(axis) - 4.0), 2.0), 13.0, axis, "quiet")]
     marks += [Line(((at(v), 24.0), (at(v), bottom)), "grid") for v in steps]
     for k, row in enumerate(data):
         y = 30.0 + _ROW * k

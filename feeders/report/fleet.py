@@ -10,7 +10,7 @@ from feeders.report.charts import LINES, Bar, Curve, Row, curves, rows
 from feeders.report.drawing import Drawing
 from feeders.report.figure import Figure
 from feeders.report.section import Question, Section
-from feeders.report.words import Finding, Sentence, Standing, Value, least, listed, number
+from feeders.report.words import Finding, Sentence, Side, Standing, Value, least, listed, number
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -91,7 +91,7 @@ def _stability(stability: pd.DataFrame, verdict: str) -> Sentence:
     if verdict == STABLE:
         margin: Sentence = ()
         if math.isfinite(float(stability["margin"].min())):
-            times = least(stability, name, "margin", "", 1)
+            times = least(stability, name, "margin", digits=1, side=Side.BELOW)
             margin = (" All curves could be ", times, " times as steep and still be proved stable.")
         return ("Stable: proved for constant loads anywhere within their limits.", *margin)
     which = [str(p) for p, v in zip(stability["point"], stability["verdict"], strict=True) if v == verdict]
@@ -125,9 +125,9 @@ def _limits(fleet: dict[str, object], which: str) -> Sentence:
         return ()
     return (
         "; proved limits ",
-        Value(low, f"{number(low, 1)} V", f"droop-band:low{which}_volt:row 0"),
+        Value(low, f"{number(low, 1, Side.BELOW)} V", f"droop-band:low{which}_volt:row 0"),
         " and ",
-        Value(high, f"{number(high, 1)} V", f"droop-band:high{which}_volt:row 0"),
+        Value(high, f"{number(high, 1, Side.ABOVE)} V", f"droop-band:high{which}_volt:row 0"),
     )
 
 
@@ -139,7 +139,8 @@ def _hosting(found: DroopStudy) -> list[Sentence]:
     for k, row in enumerate(table.to_dict("records")):
         kw = float(row["capacity_kw"])
         name = "without reactive power" if row["preset"] == "none" else f"with {row['preset']}"
-        words += ["; " if k else "", Value(kw, f"{number(kw, 0)} kW", f"droop-hosting:capacity_kw:row {k}")]
+        size = Value(kw, f"{number(kw, 0, Side.BELOW)} kW", f"droop-hosting:capacity_kw:row {k}")
+        words += ["; " if k else "", size]
         words.append(f" {name} ({row['limit'] or 'no limit found'})")
     return [(*words, ".")]
 
@@ -193,7 +194,13 @@ def _band_chart(customers: pd.DataFrame, width: float) -> Drawing:
         bars = [Bar(low, high, "band1", "at all times")]
         if math.isfinite(low_rest + high_rest):
             bars.append(Bar(low_rest, high_rest, "fill-a", "while loads move slowly", inset=6.0))
-        data.append(Row(str(row["customer"]), tuple(bars), f"{number(low, 1)} to {number(high, 1)} V"))
+        data.append(
+            Row(
+                str(row["customer"]),
+                tuple(bars),
+                f"{number(low, 1, Side.BELOW)} to {number(high, 1, Side.ABOVE)} V",
+            )
+        )
     span = float(customers["high_volt"].max() - customers["low_volt"].min())
     return rows(data, width, axis="voltage, V", start=float(customers["low_volt"].min()) - 0.05 * span)
 

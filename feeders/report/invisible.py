@@ -82,7 +82,13 @@ def _invisible(found: Redundancy) -> Finding:
         else:
             who = f": {listed(str(row['liars']).split(' '))}" if row["liars"] else ""
             verb = "liar can" if index == 1 else "liars together can"
-            sentences.append((prefix, value, f" {verb} stay invisible, {kind}{who}; fewer cannot."))
+            sentences.append(
+                (
+                    prefix,
+                    value,
+                    f" {verb} stay invisible, {kind}{who}{'' if index == 1 else '; fewer cannot'}.",
+                )
+            )
         if row["blind"]:
             sentences.append((f"{prefix}No meter tells the voltage of {row['blind']}.",))
     return Finding(Standing.OPEN if open_ else Standing.PROVED, tuple(dict.fromkeys(sentences)))

@@ -15,6 +15,7 @@ from feeders.report.spots import names_of, size_map
 from feeders.report.words import (
     Finding,
     Sentence,
+    Side,
     Standing,
     Value,
     least,
@@ -112,10 +113,10 @@ def _sizes(meters: pd.DataFrame, liars: int, sure: str) -> Finding:
         "All ",
         how_many(meters, name),
         f" meters, {together}, can be lied about by a little: for lies up to ",
-        least(meters, name, "hidden", "V"),
-        f" ({_which(meters, 'hidden', smallest=True)}) to ",
-        most(meters, name, "hidden", "V"),
-        f" ({_which(meters, 'hidden')}) nobody is named, with {sure} at any one moment.",
+        least(meters, name, "hidden", "V", digits=3, side=Side.BELOW),
+        f" ({_extreme(meters, 'meter', 'hidden', smallest=True)}) to ",
+        most(meters, name, "hidden", "V", digits=3, side=Side.BELOW),
+        f" ({_extreme(meters, 'meter', 'hidden')}) nobody is named, with {sure} at any one moment.",
     )
     if len(never):
         noticed: Sentence = (
@@ -126,19 +127,19 @@ def _sizes(meters: pd.DataFrame, liars: int, sure: str) -> Finding:
     noticed = (
         "Larger lies may go unnoticed, depending on the honest errors of the moment; somebody is surely "
         "noticed from ",
-        least(meters, name, "noticed", "V"),
-        f" ({_which(meters, 'noticed', smallest=True)}) to ",
-        most(meters, name, "noticed", "V"),
-        f" ({_which(meters, 'noticed')}) on.",
+        least(meters, name, "noticed", "V", side=Side.ABOVE),
+        f" ({_extreme(meters, 'meter', 'noticed', smallest=True)}) to ",
+        most(meters, name, "noticed", "V", side=Side.ABOVE),
+        f" ({_extreme(meters, 'meter', 'noticed')}) on.",
     )
     if not all(math.isfinite(v) for v in meters["named"]):
         named: Sentence = ("Not every liar is proved to be named, however large the lie.",)
         return Finding(Standing.PART, (lead, noticed, named))
     named = (
         "The lying meter itself is surely named from ",
-        least(meters, name, "named", "V"),
+        least(meters, name, "named", "V", side=Side.ABOVE),
         " to ",
-        most(meters, name, "named", "V"),
+        most(meters, name, "named", "V", side=Side.ABOVE),
         " on.",
     )
     return Finding(Standing.PROVED, (lead, noticed, named))
@@ -148,30 +149,26 @@ def _picture(site: Site, customers: pd.DataFrame, liars: int) -> Finding:
     name = "detectable-customers"
     who = "a single lying meter" if liars == 1 else f"{liars} meters that lie together"
     lead: Sentence = (
-        f"Unnoticed, {who} can shift the voltage that the monitor shows by at most ",
-        most(customers, name, "error", "V"),
-        f" (at {_extreme(customers, 'customer', 'error')}) and nowhere by less than ",
-        least(customers, name, "error", "V"),
-        f", honest errors included. Nominal voltage is {number(float(site.feeder.base_volt), 1)} V.",
+        f"Unnoticed, {who} can make the voltage that the monitor shows wrong by at most ",
+        least(customers, name, "error", "V", side=Side.ABOVE),
+        f" (at {_extreme(customers, 'customer', 'error', smallest=True)}) to ",
+        most(customers, name, "error", "V", side=Side.ABOVE),
+        f" (at {_extreme(customers, 'customer', 'error')}), honest errors included. "
+        f"Nominal voltage is {number(float(site.feeder.base_volt), 1)} V.",
     )
     if not all(math.isfinite(v) for v in customers["error"]):
         return Finding(Standing.OPEN, (("No bound of the error is proved for every customer.",),))
     whoever: Sentence = (
         "Whatever the method, two voltages up to ",
-        most(customers, name, "error_fits", "V"),
+        most(customers, name, "error_fits", "V", side=Side.ABOVE),
         " apart can fit to the same readings.",
     )
     return Finding(Standing.PROVED, (lead, whoever))
 
 
-def _which(table: pd.DataFrame, column: str, *, smallest: bool = False) -> str:
+def _extreme(table: pd.DataFrame, who: str, column: str, *, smallest: bool = False) -> str:
     order = table[column]
-    at = int(order.argmin() if smallest else order.argmax())
-    return str(table["meter"].iloc[at])
-
-
-def _extreme(table: pd.DataFrame, who: str, column: str) -> str:
-    return str(table[who].iloc[int(table[column].argmax())])
+    return str(table[who].iloc[int(order.argmin() if smallest else order.argmax())])
 
 
 def _largest_only(table: pd.DataFrame) -> str:
@@ -186,23 +183,29 @@ def _sizes_chart(meters: pd.DataFrame, width: float) -> Drawing:
     for _, row in shown.iterrows():
         a, b, c = (float(row[k]) if math.isfinite(row[k]) else end for k in ("hidden", "noticed", "named"))
         bars = (
-            Bar(0.0, a, "fill-bad", "nobody is named", f"to {number(row['hidden'])} V nobody is named"),
+            Bar(
+                0.0,
+                a,
+                "fill-bad",
+                "nobody is named",
+                f"to {number(row['hidden'], 3, Side.BELOW)} V nobody is named",
+            ),
             Bar(
                 a,
                 b,
                 "band0",
                 "it depends on honest errors",
-                f"surely noticed from {number(row['noticed'])} V on",
+                f"surely noticed from {number(row['noticed'], 2, Side.ABOVE)} V on",
             ),
             Bar(
                 b,
                 max(b, c),
                 "band2",
                 "noticed, not yet surely named",
-                f"named from {number(row['named'])} V on",
+                f"named from {number(row['named'], 2, Side.ABOVE)} V on",
             ),
         )
-        data.append(Row(str(row["meter"]), bars, f"{number(row['named'])} V"))
+        data.append(Row(str(row["meter"]), bars, f"{number(row['named'], 2, Side.ABOVE)} V"))
     return rows(data, width, axis="size of the lie, V at nominal voltage")
 
 
@@ -254,9 +257,10 @@ def protect(site: Site, found: Protect) -> Section:
 def _protection(site: Site, found: Protect) -> Finding:
     count, liars = len(found.meters), found.max_attacked
     others = f"any {liars} liars" if liars > 1 else "any single liar"
+    among = " among the other meters" if count else ""
     purpose = {
-        Goal.IDENTIFY: f"{others} among the other meters would be identified",
-        Goal.NOTICE: f"the lies of {others} among the other meters would be noticed",
+        Goal.IDENTIFY: f"{others}{among} would be identified",
+        Goal.NOTICE: f"the lies of {others}{among} would be noticed",
         Goal.BOUND: f"no lie above {number(found.lie_volt)} V of {others} fits to an honest feeder",
     }[found.goal]
     scope = "" if found.goal is Goal.BOUND else " by someone who knows all other loads and errors exactly"
@@ -294,7 +298,7 @@ def _cell(value: float, source: str, goal: Goal) -> Value:
     if math.isnan(value):
         return Value(value, "not known", source)
     if goal is Goal.BOUND:
-        return Value(value, f"{number(value)} V", source)
+        return Value(value, f"{number(value, 2, Side.ABOVE)} V", source)
     return Value(value, "none, however many" if math.isinf(value) else number(value), source)
 
 

@@ -33,6 +33,11 @@ MOST_ROWS: Final = 500
 HEAD_ROWS: Final = 60
 """Of tables with more than MOST_ROWS rows the page shows the first ones; the files beside it have all."""
 
+MEANING: Final = (
+    "Proved: follows from the feeder's model under the assumptions that each section states. Measured: seen "
+    "in simulation or in readings. Not proved, no answer, not studied: it may be either way."
+)
+
 MARK: Final = Markup(
     '<svg viewBox="0 0 24 24" aria-hidden="true"><path d="M3 4v16M3 8h11M3 16h7"/>'
     '<circle cx="17" cy="8" r="2.6"/><circle class="bang" cx="14" cy="16" r="2.8"/></svg>'
@@ -132,6 +137,7 @@ def _front(title: str, facts: Mapping[str, str], chapters: Sequence[Chapter], ab
         el("h1", title),
         el("p", f"How far its meters can be trusted. {few}. {about.made}", class_="lead"),
         el("ul", [_answer(*each) for each in _answers(chapters)], class_="answers"),
+        el("p", MEANING, class_="meaning"),
         class_="card front",
         id="summary",
     )
@@ -324,7 +330,10 @@ def _made(about: About, chapters: Sequence[Chapter]) -> Markup:
         for c in chapters
     ]
     files_ = (
-        el("p", f"Every figure as SVG and PNG and every table as CSV and Parquet: folder {about.folder}.")
+        el(
+            "p",
+            f"Every table as CSV and Parquet, every figure as SVG (and PNG, if drawn): {about.folder}.",
+        )
         if about.folder
         else None
     )

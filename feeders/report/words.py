@@ -18,9 +18,9 @@ __all__ = [
     "MANY",
     "Finding",
     "Sentence",
+    "Side",
     "Standing",
     "Value",
-    "count",
     "least",
     "listed",
     "most",
@@ -88,14 +88,29 @@ def said(sentence: Sentence) -> str:
     return "".join(part if isinstance(part, str) else part.shown for part in sentence)
 
 
-def number(value: Any, digits: int = 2) -> str:
+class Side(Enum):
+    """Where rounding goes: what is proved up to a number is written with a smaller one, and so on."""
+
+    NEAR = "near"
+    BELOW = "below"
+    ABOVE = "above"
+
+
+def number(value: Any, digits: int = 2, side: Side = Side.NEAR) -> str:
     """Write a number: ∞ for none that is finite, a question mark for one that is not known."""
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return "?"
     if math.isinf(value):
         return "∞" if value > 0 else "−∞"
-    text = f"{value:.{digits}f}" if not float(value).is_integer() or digits < 0 else f"{value:.0f}"
-    if digits and not float(value).is_integer() and float(text) == 0.0:
+    if float(value).is_integer():
+        return f"{value:.0f}".replace("-", "−")
+    scale, slack = 10.0**digits, 1e-9 * max(1.0, abs(value))
+    if side is Side.BELOW:
+        value = math.floor((value + slack) * scale) / scale
+    elif side is Side.ABOVE:
+        value = math.ceil((value - slack) * scale) / scale
+    text = f"{value:.{digits}f}"
+    if digits and side is Side.NEAR and float(text) == 0.0:
         text = f"{value:.2g}"
     return text.replace("-", "−")
 
@@ -118,21 +133,17 @@ def rows(table: pd.DataFrame, name: str) -> Value:
     return Value(len(table), str(len(table)), f"{name}:rows")
 
 
-def count(table: pd.DataFrame, name: str, column: str, value: float) -> Value:
-    """How many rows have a value."""
-    found = int((table[column] == value).sum())
-    return Value(found, str(found), f"{name}:{column}:count {value:g}")
-
-
-def most(table: pd.DataFrame, name: str, column: str, unit: str = "", digits: int = 2) -> Value:
+def most(
+    table: pd.DataFrame, name: str, column: str, unit: str = "", *, digits: int = 2, side: Side = Side.NEAR
+) -> Value:
     """The largest of a column."""
-    return _of(table[column].max(), unit, digits, f"{name}:{column}:max")
+    value = float(table[column].max())
+    return Value(value, f"{number(value, digits, side)} {unit}".strip(), f"{name}:{column}:max")
 
 
-def least(table: pd.DataFrame, name: str, column: str, unit: str = "", digits: int = 2) -> Value:
+def least(
+    table: pd.DataFrame, name: str, column: str, unit: str = "", *, digits: int = 2, side: Side = Side.NEAR
+) -> Value:
     """The smallest of a column."""
-    return _of(table[column].min(), unit, digits, f"{name}:{column}:min")
-
-
-def _of(value: Any, unit: str, digits: int, source: str) -> Value:
-    return Value(float(value), f"{number(float(value), digits)} {unit}".strip(), source)
+    value = float(table[column].min())
+    return Value(value, f"{number(value, digits, side)} {unit}".strip(), f"{name}:{column}:min")

@@ -32,8 +32,11 @@ MOST_BUSES: Final = 150
 IDLE: Final = 0.25
 """Share of its peak that a customer without meter is taken to draw."""
 
-CLOUDS: Final = 0.2
-"""Relative error of a roof's generation that is taken from the other roofs."""
+HIDDEN: Final = 0.3
+"""Share of the load that generation may hide beyond what the sunniest roof shows: its usual size."""
+
+CLOUDS: Final = 0.1
+"""The part of that share that comes and goes."""
 
 STEEP_PU: Final = 0.003
 """Half of the voltage over which the slope of an inverter's curve is taken, pu."""
@@ -246,7 +249,8 @@ def powers(site: Site | ThreePhaseSite, given: Frames) -> Powers:
     low = np.maximum(draws, 0.0)
     tan = 0.5 * (model.tan_min + model.tan_max)
     roof = model.pv_peak * _sun(draws, model.pv_peak)[:, None]
-    load = np.clip(draws + roof, low, np.maximum(low, model.load_peak))
+    most = np.maximum(low, np.minimum(draws + model.pv_peak, model.load_peak))
+    load = np.clip(draws + roof, low, most)
     q = tan * load
     steep = np.zeros((T, N))
     own = site.droop.customer
@@ -259,7 +263,7 @@ def powers(site: Site | ThreePhaseSite, given: Frames) -> Powers:
         p=-draws,
         q=-np.where(metered_q, q_read, q),
         load=np.where(metered_q, 0.0, load),
-        roof=np.where(metered_q, 0.0, tan * roof),
+        roof=np.where(metered_q, 0.0, tan * np.maximum(most - load, 0.0)),
         steep=np.where(metered_q, 0.0, steep),
         metered_q=metered_q,
         missing=missing,
@@ -349,7 +353,7 @@ def doubts(net: Network, drawn: Powers, tolerance: float, free: Collection[int],
         p_gain=np.where(without, 0.0, model.p_fraction / root),
         q_gain=np.where(unmetered, 0.0, model.q_fraction / root),
         tan=np.where(unmetered, half / root, 0.0),
-        roof=np.where(unmetered & (model.pv_peak > 0.0), CLOUDS, 0.0),
+        roof=np.where(unmetered & (model.pv_peak > 0.0), HIDDEN, 0.0),
         p_level=np.where(without, IDLE * model.load_peak, 0.0),
         q_level=np.where(unmetered, model.q_floor / root, 0.0),
         length=length,

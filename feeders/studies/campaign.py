@@ -24,11 +24,16 @@ from feeders.studies.campaign_plan import Plan
 from feeders.studies.campaign_run import Here, Runner, versions
 from feeders.studies.campaign_watch import Prepared, prepare, watch
 from feeders.studies.journal import Journal, Progress
+from gridsec.errors import GridsecError
 
 if TYPE_CHECKING:
     from feeders.load import Site
 
-__all__ = ["Campaign", "campaign"]
+__all__ = ["Campaign", "NothingPlayed", "campaign"]
+
+
+class NothingPlayed(GridsecError):
+    """Not one scenario of a campaign could be played."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,8 +128,8 @@ def campaign(
     ------
     NotObservable, DesignInfeasible, EstimatorUnusable, FeederInvalid, ValueError
         If the estimator cannot watch this feeder with these settings, or the plan is none.
-    PowerFlowDiverged, NoEquilibrium
-        If the feeder cannot carry its loads.
+    NothingPlayed
+        If the feeder can carry its loads at no moment that was drawn.
     OtherStudy
         If the journal is another study's.
     ClusterUnusable, WorkerLost
@@ -161,12 +166,16 @@ _prepared: list[tuple[str, Prepared]] = []
 def _scene(tables: FeederTables, plan: Plan, scene: int) -> list[dict[str, Any]]:
     """Work on a scene, wherever this is: designs are made once in each process."""
     asked = repr((tables, plan))
-    if not _prepared or _prepared[0][0] != asked:
-        _prepared[:] = [(asked, prepare(from_tables(tables), plan))]
-    return watch(_prepared[0][1], scene)
+    given = next((made for what, made in _prepared if what == asked), None)
+    if given is None:
+        given = prepare(from_tables(tables), plan)
+        _prepared[:] = [(asked, given)]
+    return watch(given, scene)
 
 
 def _campaign(site: Site, plan: Plan, used: dict[str, str], rows: list[dict[str, Any]]) -> Campaign:
+    if all(row["reason"] for row in rows):
+        raise NothingPlayed(f"{site.feeder.name}: no scenario can be played; the first: {rows[0]['reason']}")
     found, liars = campaign_tables.scenarios(rows)
     by = {
         name: campaign_tables.grouped(found, liars, columns)

@@ -116,7 +116,7 @@ def false_names(found: pd.DataFrame, liars: pd.DataFrame) -> pd.DataFrame:
     """
     rows = []
     for rate, group in found.groupby("alarms_per_year", sort=True):
-        clean = group[group["kind"] == CLEAN]
+        clean = group[(group["kind"] == CLEAN) & (group["reason"] == "")]
         years, events = clean["watched_s"].sum() / YEAR_S, int(clean["false_events"].sum())
         tail = 0.5 * (1.0 - CONFIDENCE)
         low = chi2.ppf(tail, 2 * events) / (2.0 * years) if events else 0.0

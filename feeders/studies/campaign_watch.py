@@ -14,6 +14,8 @@ import numpy as np
 
 from feeders.campaign import NoSuchAttack
 from feeders.estimators import Watcher, design
+from feeders.inverters import NoEquilibrium
+from feeders.powerflow import PowerFlowDiverged
 from feeders.scenario import Scenario
 from feeders.studies.campaign_lies import attacks
 from feeders.studies.campaign_plan import CLEAN, LEARN_STEP_S, Case, Plan
@@ -29,6 +31,9 @@ if TYPE_CHECKING:
 __all__ = ["Prepared", "prepare", "risings", "watch"]
 
 ERROR_PERCENTILE = 95.0
+
+IMPOSSIBLE = (NoSuchAttack, PowerFlowDiverged, NoEquilibrium)
+"""What keeps a case from being played, and the others not."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,27 +104,30 @@ def watch(given: Prepared, scene: int) -> list[dict[str, Any]]:
     plan, moment, cases = given.plan, given.plan.moment(scene), given.plan.cases(scene)
     trial = plan.trial(given.site, moment)
     honest = replace(trial.scenario, season=moment.season)
-    played = _Played.of(list(frames(trial, honest)))
-    onsets = {round(case.onset_s / plan.step_s) for case in cases[1:]}
-    known = _learned(given, trial, honest) if plan.learn_s else {}
-    clean, states = {}, {}
-    for rate, watcher in given.watchers.items():
-        clean[rate], states[rate] = _clean(
-            watcher, watcher.init(honest.start, known.get(rate)), played, onsets
-        )
     head = {
         "scene": scene,
         "season": str(moment.season),
         "hour": moment.profile_s % 86_400.0 / 3600.0,
         "weekday": int(moment.profile_s // 86_400.0) % 7,
     }
+    try:
+        played = _Played.of(list(frames(trial, honest)))
+        known = _learned(given, trial, honest) if plan.learn_s else {}
+    except IMPOSSIBLE as error:
+        return [_row(head, case, rate) | _nothing(error) for case in cases for rate in given.watchers]
+    onsets = {round(case.onset_s / plan.step_s) for case in cases[1:]}
+    clean, states = {}, {}
+    for rate, watcher in given.watchers.items():
+        clean[rate], states[rate] = _clean(
+            watcher, watcher.init(honest.start, known.get(rate)), played, onsets
+        )
     rows = [_told(given, head, cases[0], rate, seen, played, 0) for rate, seen in clean.items()]
     for case in cases[1:]:
         onset = round(case.onset_s / plan.step_s)
         try:
             lied = _lied(given, played, honest, case)
-        except NoSuchAttack as error:
-            rows += [_row(head, case, rate, reason=str(error)) for rate in given.watchers]
+        except IMPOSSIBLE as error:
+            rows += [_row(head, case, rate) | _nothing(error) for rate in given.watchers]
             continue
         for rate, watcher in given.watchers.items():
             seen, _ = _step(watcher, states[rate][onset], lied.frames[onset:])
@@ -256,7 +264,7 @@ def _simple(attack: Attack, start: float) -> bool:
 # --------------------------------------------------------------------------------------- what came of it
 
 
-def _row(head: dict[str, Any], case: Case, rate: float, *, reason: str = "") -> dict[str, Any]:
+def _row(head: dict[str, Any], case: Case, rate: float) -> dict[str, Any]:
     return {
         "scenario": case.number,
         **head,
@@ -266,8 +274,20 @@ def _row(head: dict[str, Any], case: Case, rate: float, *, reason: str = "") -> 
         "liars": case.liars,
         "place": str(case.place),
         "onset_s": case.onset_s if case.kind != CLEAN else float("nan"),
-        "reason": reason,
+        "reason": "",
     }
+
+
+def _nothing(error: Exception) -> dict[str, Any]:
+    """The rest of a row of which there is nothing to tell but why."""
+    nothing = dict.fromkeys(("delay_s", "clear_s", *_ERRORS), float("nan"))
+    times = dict.fromkeys(("watched_s", "undecided_s", "clean_lying_s"), 0.0)
+    counts = dict.fromkeys(("named", "false_events", "most_named"), 0)
+    none = {"exact": False, "missed": "", "falsely_named": "", "each": []}
+    return {"reason": str(error)} | none | counts | times | nothing
+
+
+_ERRORS = ("error_liars", "error_liars_95", "error_others", "error_others_95")
 
 
 def _told(  # noqa: PLR0917  # one row needs all that is known of the case

@@ -35,7 +35,7 @@ from feeders.studies.journal import Journal, Progress, worked
 from gridsec.droop import PRESETS, Droop
 from gridsec.studies.droop_network import Box
 from gridsec.studies.droop_rest import rest
-from gridsec.studies.droop_stability import Update
+from gridsec.studies.droop_stability import Update, enlarged
 
 if TYPE_CHECKING:
     from feeders.load import Site
@@ -119,9 +119,10 @@ class DroopStudy:
     tables
         - `stability`: a row for each operating point, and one for any loads. `verdict`, `proof`, `gain` (of
           the loop at rest), `growth` (of a small deviation in one update), `margin` (all curves with the same
-          limits are stable up to this factor on their slopes), `certified` and `unstable` (this fleet's
-          curves, made steeper: proven up to the one, rest unstable from the other), `longest_interval_s`,
-          `tau_factor` (all time constants may be multiplied with it), `why`.
+          limits are stable up to this factor on their slopes), `slope_certified` and `slope_unstable` (this
+          fleet's curves, made steeper: proven up to the one, rest unstable from the other), `size_certified`
+          and `size_unstable` (the same with larger inverters), `longest_interval_s`, `tau_factor` (all time
+          constants may be multiplied with it), `why`.
         - `inverters`: `part` of the loop gain, and `alone`, what one's slope may be multiplied with.
         - `steps`: `settling_s`, `overshoot_percent`, `change_volt`, by AC simulation.
         - `trajectories`: the voltages of the steps.
@@ -256,11 +257,15 @@ def _stability(study: _Study, name: str, at: Box) -> dict[str, Any]:
     parts = study.subject, study.fleet, study.update, at
     found, longest = judge(*parts, seed=study.seed), longest_interval(*parts)
     tau = study.update.interval_s / longest if longest and study.update.interval_s else math.nan
+    slope, size = edge(*parts), edge(*parts, enlarged)
     return {
         "point": name,
         **{key: value for key, value in asdict(found).items() if key != "why"},
         "margin": margin(*parts),
-        **edge(*parts),
+        "slope_certified": slope[0],
+        "slope_unstable": slope[1],
+        "size_certified": size[0],
+        "size_unstable": size[1],
         "longest_interval_s": longest,
         "tau_factor": 0.0 if math.isinf(longest) else tau,
         "why": found.why,

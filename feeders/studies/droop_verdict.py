@@ -50,7 +50,10 @@ _AWAY: Final = 120
 """Updates in which a fleet that grows is simulated."""
 
 MOST: Final = 1024.0
-"""Slopes are steepened up to this factor."""
+"""Slopes grow up to this factor."""
+
+PLACES: Final = 4
+"""How often an interval of factor 2 is halved: factors are found to 4 %."""
 
 
 class Verdict(StrEnum):
@@ -187,10 +190,14 @@ def _kicked(droop: Droop, x: Floats, seed: int) -> Floats:
 # --- margins --------------------------------------------------------------------------------------------
 
 
-def edge(subject: Subject, droop: Droop, update: Update, loads: Box, *, places: int = 4) -> dict[str, float]:
-    """Between which factors on all slopes a fleet ceases to be stable.
-
-    Curves are made steeper as in `gridsec.studies.droop_stability.steepened`, by doubling and bisection.
+def edge(
+    subject: Subject,
+    droop: Droop,
+    update: Update,
+    loads: Box,
+    change: Callable[[Droop, float], Droop] = steepened,
+) -> tuple[float, float]:
+    """Between which factors on all slopes a fleet ceases to be stable, by doubling and bisection.
 
     Parameters
     ----------
@@ -198,32 +205,31 @@ def edge(subject: Subject, droop: Droop, update: Update, loads: Box, *, places: 
         As in `judge`.
     loads
         An operating point.
-    places
-        How often an interval of factor 2 is halved.
+    change
+        How slopes grow: `steepened` with the same limits, or `enlarged` with the same breakpoints.
 
     Returns
     -------
-    dict
-        `certified`: the largest factor found with which the fleet is proven to be stable, 0 if none;
-        `unstable`: the smallest found with which its rest is unstable, infinity if none up to 1024.
+    tuple
+        The largest factor found with which the fleet is proven to be stable, 0 if none; the smallest found
+        with which its rest is unstable, infinity if none up to 1024.
     """
 
     def proven(times: float) -> bool:
         try:
-            given, _ = _loop(subject.net, steepened(droop, times), update, loads)
+            given, _ = _loop(subject.net, change(droop, times), update, loads)
         except FeederInvalid:
             return False
         return given is not None and bool(proof(given).kind)
 
     def grows(times: float) -> bool:
-        steady = _linearised(subject.net, steepened(droop, times), update, loads)
+        steady = _linearised(subject.net, change(droop, times), update, loads)
         return steady is not None and steady[1][0] > 1.0 + CLEARLY
 
-    certified = _last(proven, places)
+    certified = _last(proven, PLACES)
     # Up to there nothing grows: what is proven need not be looked at again.
-    unstable = _last(lambda times: times <= certified or not grows(times), places)
-    step = 2.0 ** (0.5**places)
-    return {"certified": certified, "unstable": math.inf if unstable >= MOST else unstable * step}
+    unstable = _last(lambda times: times <= certified or not grows(times), PLACES)
+    return certified, math.inf if unstable >= MOST else unstable * 2.0 ** (0.5**PLACES)
 
 
 def _last(holds: Callable[[float], bool], places: int) -> float:

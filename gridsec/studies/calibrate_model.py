@@ -11,7 +11,7 @@ order
     -(drop of U along branch l)     per unit of its length, at the places behind it
     A_ji p_i, B_ji q_i              errors of the gain of power registers
     -B_ji load_i                    error of tan(phi) where q is not metered; -B_ji: what q is at p = 0
-    -B_ji roof_i                    error of the generation, where only load less generation is metered
+    -B_ji roof_i (1, cos, sin)      load hidden by generation, and its daily course
 
 and for customers at other places, exactly in the linear flow, ``W'(U + dU) - W U`` with W, W' the weights.
 
@@ -106,7 +106,7 @@ class Series:
     load : (T, N)
         What draws reactive power by its power factor, pu.
     roof : (T, N)
-        Generation times tan(phi) of the load, where only their difference is metered, pu.
+        Reactive power of the load that generation may hide, where only their difference is metered, pu.
     steep : (T, N)
         Derivative of the inverter's q in the squared voltage read; 0 without one, or with q metered.
     places : (T, Q)
@@ -145,7 +145,7 @@ class Doubts:
     tan : (N,)
         Error of tan(phi) where q is not metered, 1.
     roof : (N,)
-        Relative error of the generation that the load is found by, 1.
+        Share of `Series.roof` that is there, its mean and its daily course, 1.
     p_level, q_level : (N,)
         Constant error of the powers, pu.
     length : (L,)
@@ -210,7 +210,7 @@ def regressors(places: Places, series: Series, doubts: Doubts) -> Regressors:
         "p_gain": spatial(A, series.p),
         "q_gain": spatial(B, series.q),
         "tan": spatial(B, -series.load),
-        "roof": spatial(B, -series.roof),
+        "roof": np.concatenate([spatial(B, -shape * series.roof) for shape in _day(series.t)], axis=2),
         "p_level": spatial(A, np.ones_like(series.p)),
         "q_level": spatial(B, np.ones_like(series.p)),
         "length": lengthened(places, series),
@@ -218,9 +218,15 @@ def regressors(places: Places, series: Series, doubts: Doubts) -> Regressors:
     count = np.cumsum([0, *(part.shape[2] for part in parts.values())])
     return Regressors(
         columns=np.where(seen, np.concatenate(list(parts.values()), axis=2), 0.0),
-        spread=np.concatenate([getattr(doubts, name) for name in parts]),
+        spread=np.concatenate([np.tile(getattr(doubts, name), 3 if name == "roof" else 1) for name in parts]),
         where={name: np.arange(a, b) for name, a, b in zip(parts, count[:-1], count[1:], strict=True)},
     )
+
+
+def _day(t: Floats) -> list[Floats]:
+    """Mean and daily course, (T, 1) each."""
+    turn = 2.0 * np.pi / 86400.0 * t[:, None]
+    return [np.ones_like(turn), np.cos(turn), np.sin(turn)]
 
 
 def lengthened(places: Places, series: Series) -> Floats:

@@ -30,6 +30,7 @@ __all__ = [
     "Proof",
     "Reach",
     "Update",
+    "enlarged",
     "factor",
     "growth",
     "loop",
@@ -180,6 +181,19 @@ def steepened(droop: Droop, times: float) -> Droop:
     v[:, 3] = inner[:, 1] + (v[:, 3] - v[:, 2]) / times
     v[:, 1:3] = inner
     return Droop(droop.customer, v, droop.q, droop.tau, droop.vbar)
+
+
+def enlarged(droop: Droop, times: float) -> Droop:
+    """The fleet with all its limits, and with them all slopes, so many times as large: larger inverters.
+
+    Parameters
+    ----------
+    droop
+        The fleet.
+    times
+        Factor, not negative.
+    """
+    return Droop(droop.customer, droop.v, times * droop.q, droop.tau, droop.vbar)
 
 
 # --- certificates ---------------------------------------------------------------------------------------
@@ -368,6 +382,9 @@ class Proof:
 _MOST: Final = 1e6
 """Factors beyond this are not told apart."""
 
+_SURE: Final = 1e-9
+"""A gain is below 1 if it is by this much, more than it is rounded by."""
+
 _BACKOFF: Final = (0.999, 0.99, 0.95, 0.8)
 """Shares of the factor found at the frequencies that are tried in its proof."""
 
@@ -388,7 +405,7 @@ def proof(given: Loop) -> Proof:
         if share * found > best and verified(given, share * found):
             best = share * found
             break
-    kind = "small-gain" if gain < 1.0 else "circle" if best >= 1.0 else ""
+    kind = "small-gain" if gain < 1.0 - _SURE else "circle" if best >= 1.0 else ""
     return Proof(kind, gain, best)
 
 

@@ -288,6 +288,15 @@ def test_any_pandapower_network_by_name(tmp_path: Path) -> None:
     assert load(tmp_path / "cable").feeder.name == "cable"
 
 
+@pytest.mark.slow
+def test_simbench_code_alone_medium_voltage(tmp_path: Path) -> None:
+    pytest.importorskip("simbench", reason="the extra `convert` is not installed")
+    done = convert("1-MV-comm--0-sw", tmp_path / "mv")
+    assert done.check is not None
+    assert done.check.buses == 105
+    assert done.check.largest_pu < 1e-6
+
+
 def test_unknown_sources(tmp_path: Path) -> None:
     (tmp_path / "text.json").write_text("no json")
     (tmp_path / "list.json").write_text("[1, 2]")

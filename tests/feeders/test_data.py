@@ -48,7 +48,7 @@ def test_files_are_valid_and_say_where_they_are_from(name: str) -> None:
     assert outcome.problems == ()
     assert not [note for note in outcome.notes if "ignored" in note or "accepted" in note]
     source = (folder / "SOURCE.md").read_text(encoding="utf-8")
-    assert f"`gridsec convert {name} data/feeders/{name}`" in source
+    assert f"`gridsec feeders convert {name} data/feeders/{name}`" in source
     assert re.search(r"Source: `(pandapower|simbench):[\w-]+`, (pandapower|simbench) \d+\.\d+", source)
     licence = "Open Database License" if name.startswith("simbench") else "3-clause BSD license"
     assert licence in source

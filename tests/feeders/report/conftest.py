@@ -13,6 +13,7 @@ from feeders.report.sections import Outcome
 from feeders.studies.campaign import Campaign, campaign
 from feeders.studies.campaign_plan import Kind, Place, Plan
 from feeders.studies.detectable import detectable
+from feeders.studies.droop import DroopOptions, DroopStudy, droop
 from feeders.studies.protect import Goal, protect
 from feeders.studies.redundancy import redundancy
 from tests.feeders.report.about import ABOUT, HOSTILE
@@ -39,14 +40,20 @@ def played(site: Site) -> Campaign:
 
 
 @pytest.fixture(scope="session")
-def outcomes(site: Site, played: Campaign) -> list[Outcome]:
+def studied(site: Site) -> DroopStudy:
+    return droop(site, DroopOptions(presets=("ieee1547-b",), tau_factors=(1.0,)))
+
+
+@pytest.fixture(scope="session")
+def outcomes(site: Site, played: Campaign, studied: DroopStudy) -> list[Outcome]:
     """All that there is, and a study that failed."""
     return [
         Outcome("detectable", detectable(site, max_attacked=2), command="gridsec study detectable cigre-lv"),
         Outcome("protect", protect(site, max_attacked=2, goal=Goal.BOUND, lie_volt=4.6)),
         Outcome("campaign", played, seconds=1.0, resumed=True),
         Outcome("redundancy", redundancy(site, silent=["m02"])),
-        Outcome("droop", None, problem="droop of cigre-lv: no equilibrium <b>here</b>"),
+        Outcome("droop", studied),
+        Outcome("calibrate", None, problem="calibrate of cigre-lv: too few readings <b>here</b>"),
     ]
 
 

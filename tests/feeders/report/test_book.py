@@ -14,13 +14,15 @@ from xml.etree import ElementTree
 import numpy as np
 import pandas as pd
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from feeders.load import Site
 from feeders.report.book import Report, report
 from feeders.report.figure import NARROW
 from feeders.report.section import Question
 from feeders.report.sections import Outcome, section
-from feeders.report.words import Standing, said
+from feeders.report.words import Side, Standing, number, said
 from feeders.studies.redundancy import redundancy
 from tests.feeders.report.about import ABOUT, HOSTILE
 
@@ -120,12 +122,16 @@ def looked_up(tables: dict[str, pd.DataFrame], source: str) -> float:
     return OPERATIONS[word](table[column])
 
 
-def shown(text: str) -> float:
-    """A number as people read it."""
+def shown(text: str) -> tuple[float, float]:
+    """A number as people read it, and what its last digit is worth."""
     if text.startswith("none"):
-        return math.inf
-    number = float(text.replace("−", "-").replace("∞", "inf").split(" ")[0])
-    return number / 100.0 if text.endswith(" %") else number
+        return math.inf, 0.0
+    digits = text.replace("−", "-").replace("∞", "inf").split(" ")[0]
+    return float(digits), 10.0 ** -len(digits.partition(".")[2])
+
+
+ABOVE = ("noticed", "named", "error", "error_fits", "high_volt", "before", "after")
+BELOW = ("hidden", "margin", "low_volt", "capacity_kw")
 
 
 def test_every_number_of_a_sentence_is_that_of_its_table(made: Report) -> None:
@@ -135,9 +141,23 @@ def test_every_number_of_a_sentence_is_that_of_its_table(made: Report) -> None:
         number = looked_up(made.tables, source)
         assert float(value) == number or (math.isnan(number) and value == "nan"), source
         if math.isfinite(number):
-            percent_of_nominal = "error_liars" in source
-            given = shown(text) * (100.0 if percent_of_nominal else 1.0)
-            assert given == pytest.approx(number, abs=0.0051 * max(1.0, 0.01 * abs(number))), source
+            read, unit = shown(text)
+            number *= 100.0 if "false_names:named" in source else 1.0
+            assert abs(read - number) < 1.001 * unit, source
+            column = source.split(":")[1]
+            if not source.startswith("campaign"):
+                assert column not in ABOVE or read >= number - 1e-6, source
+                assert column not in BELOW or read <= number + 1e-6, source
+
+
+@given(st.floats(-1e6, 1e6), st.integers(0, 4))
+def test_rounding_keeps_what_is_proved(value: float, digits: int) -> None:
+    def read(side: Side) -> float:
+        return float(number(value, digits, side).replace("−", "-"))
+
+    assert read(Side.BELOW) <= value + 2e-9 * max(1.0, abs(value))
+    assert read(Side.ABOVE) >= value - 2e-9 * max(1.0, abs(value))
+    assert read(Side.ABOVE) - read(Side.BELOW) < 1.001 * 10.0**-digits
 
 
 def test_all_tables_and_figures_are_there_as_files(made: Report, outcomes: list[Outcome]) -> None:
@@ -187,7 +207,7 @@ def test_names_stay_text(hostile: Site) -> None:
 
 def test_no_answer_never_looks_like_no_attack(site: Site, made: Report) -> None:
     assert "This says nothing about whether there is a danger" in made.html
-    assert "no equilibrium &lt;b&gt;here&lt;/b&gt;" in made.html
+    assert "too few readings &lt;b&gt;here&lt;/b&gt;" in made.html
     silent = Page(report(site, [], ABOUT).html)
     told = [a["data-standing"] for _, a in silent.tags if "data-standing" in a]
     assert told == ["not studied"] * (len(Question) - 2)

@@ -21,7 +21,7 @@ from feeders.estimators import design
 from feeders.lies import Trick
 from feeders.load import load
 from feeders.profiles import Season
-from feeders.studies.campaign import Campaign, campaign
+from feeders.studies.campaign import Campaign, NothingPlayed, campaign
 from feeders.studies.campaign_lies import attacks, liars
 from feeders.studies.campaign_plan import CLEAN, Case, Kind, Place, Plan, promised
 from feeders.studies.campaign_promises import rehearse_everywhere
@@ -39,7 +39,8 @@ from feeders.studies.campaign_watch import risings
 from feeders.studies.detectable import detectable
 from feeders.studies.journal import OtherStudy
 from feeders.studies.rehearsal import rehearse
-from feeders.trials import frames, judge
+from feeders.trials import LoadError, frames, judge
+from feeders.variation import Variation
 from gridsec.feeder import lindistflow
 
 SITE = load("cigre-lv")
@@ -170,6 +171,9 @@ def test_what_cannot_be_played_says_why() -> None:
     reasons = found.scenarios.loc[found.scenarios["kind"] == "bias", "reason"]
     assert reasons.str.contains("6 of what 99 should lie").all()
     assert found.by_kind["kind"].tolist() == [CLEAN, CLEAN]
+    assert found.scenarios["exact"].dtype == np.bool_
+    with pytest.raises(NothingPlayed, match="no scenario can be played; the first: the AC power flow"):
+        campaign(SITE, replace(plan, variation=Variation(load_scale=1e3), load_error=LoadError(1e4, 1e4)))
 
 
 @pytest.mark.parametrize(
@@ -310,7 +314,7 @@ def test_a_killed_process_loses_nothing(here: Campaign, tmp_path: Path) -> None:
     killed: list[int] = []
 
     def kill(done: int, total: int) -> None:
-        if not killed and 0 < done < total:
+        if not killed and total - done == PLAN.together:
             victim = multiprocessing.active_children()[0]
             victim.kill()
             killed.append(done)
@@ -345,7 +349,7 @@ def test_a_dask_cluster_gives_the_same_also_when_a_worker_is_killed(here: Campai
     ) as cluster:
 
         def kill(done: int, total: int) -> None:
-            if not killed and done < total:
+            if not killed and 0 < done < total:
                 pid = cluster.workers[0].pid
                 os.kill(pid, signal.SIGKILL)
                 killed.append(pid)

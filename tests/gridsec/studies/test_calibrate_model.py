@@ -94,6 +94,9 @@ def test_columns_of_powers_are_differences_of_the_flow() -> None:
         after = voltages(feeder, series.p + more_p, series.q + more_q)
         expected = (after - base)[:, feeder.bus[places.meters]] * series.seen
         np.testing.assert_allclose(made.columns[:, :, made.where[name][3]], expected, atol=1e-12)
+    midday = np.cos(2.0 * np.pi / 86400.0 * series.t)[:, None]
+    first, course = (made.columns[:, :, made.where["roof"][k]] for k in (3, count + 3))
+    np.testing.assert_allclose(course, first * midday, atol=1e-12)
     assert not made.columns[~series.seen].any()
     bias = made.columns[:, :, made.where["bias"][1]]
     np.testing.assert_allclose(bias[:, 1], 2.0 * series.y[:, 1] * series.seen[:, 1])

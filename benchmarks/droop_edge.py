@@ -1,0 +1,33 @@
+"""Where droop fleets cease to be stable: the largest size that is proven, the smallest that is unstable.
+
+python -m benchmarks.droop_edge cigre-lv kerber-landnetz
+
+Category B inverters at all customers of a feeder, a third of load and generation, the busbar at 1.05 pu; all
+inverters are made larger by a common factor.
+"""
+
+from __future__ import annotations
+
+import sys
+
+from feeders.load import load
+from feeders.studies.droop_fleets import Who, equip, point
+from feeders.studies.droop_verdict import Subject, edge
+from gridsec.studies.droop_stability import Update, enlarged
+
+UPDATES = (Update(60.0), Update(60.0, 2), Update(1.0), Update(1.0, 1))
+
+
+def main() -> None:
+    """Print a row for each feeder and kind of update."""
+    print("feeder, interval s, dead: proven, unstable, ratio")
+    for name in sys.argv[1:] or ["cigre-lv"]:
+        site = load(name)
+        subject, fleet, at = Subject.of(site), equip(site, "ieee1547-b", Who.ALL), point(site, 0.3, 0.3, 1.05)
+        for update in UPDATES:
+            sure, over = edge(subject, fleet, update, at, enlarged)
+            print(f"{name}, {update.interval_s:g}, {update.dead}: {sure:.3g}, {over:.3g}, {over / sure:.3g}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,36 @@
+"""A report: studies of a feeder on one page, with figures and tables, without the command line.
+
+Six meters on the European low-voltage benchmark of CIGRE. A study that fails is part of the report: it says
+that there is no answer, and never looks as if there were nothing to fear.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from feeders.load import load
+from feeders.report.book import report
+from feeders.report.page import About
+from feeders.report.sections import Outcome
+from feeders.studies.protect import Goal, protect
+from feeders.studies.redundancy import redundancy
+
+site = load("cigre-lv")
+outcomes = [
+    Outcome("protect", protect(site, max_attacked=2, goal=Goal.BOUND, lie_volt=4.6)),
+    Outcome("redundancy", redundancy(site, silent=["m02"]), command="gridsec study redundancy cigre-lv"),
+    Outcome("droop", None, problem="left out of this tutorial"),
+]
+about = About(
+    made="2026-11-21 12:00 UTC",  # time is an argument: the same arguments give the same bytes
+    command="python report.py",
+    versions={},
+    seeds={},
+)
+made = report(site, outcomes, about)
+
+Path("report.html").write_text(made.html, encoding="utf-8")
+for name, data in made.pictures.items():
+    Path(name).write_bytes(data)
+print(f"report.html: {len(made.html) // 1000} kB, {len(made.pictures)} pictures")
+print(made.tables["protect-meters"])

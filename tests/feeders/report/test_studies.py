@@ -1,0 +1,165 @@
+"""Sections of fleets and of calibrations, the undecided and the bad included."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from feeders.load import Site
+from feeders.report import records
+from feeders.report.attacks import campaign as attacks
+from feeders.report.figure import NARROW, WIDE
+from feeders.report.fleet import droop as fleet
+from feeders.report.invisible import redundancy as invisible
+from feeders.report.meters import detectable as sizes
+from feeders.report.meters import protect as protection
+from feeders.report.section import Question, Section
+from feeders.report.sections import Outcome
+from feeders.report.words import Standing, said
+from feeders.studies.calibrate import Calibrate
+from feeders.studies.calibrate_tables import PROPOSED, UNTOLD
+from feeders.studies.campaign import Campaign
+from feeders.studies.detectable import Detectable
+from feeders.studies.droop import DroopStudy
+from feeders.studies.droop_safety import Kept
+from feeders.studies.droop_verdict import Verdict
+from feeders.studies.protect import Goal, Protect
+from feeders.studies.redundancy import Redundancy
+
+
+def told(section: Section, question: Question) -> str:
+    return " ".join(said(sentence) for sentence in section.answers[question].sentences)
+
+
+def result(outcomes: list[Outcome], name: str) -> object:
+    return next(each.result for each in outcomes if each.study == name)
+
+
+def test_a_stable_fleet(site: Site, studied: DroopStudy) -> None:
+    section = fleet(site, studied)
+    finding = section.answers[Question.FLEET]
+    if studied.verdict is Verdict.STABLE and studied.always is Kept.KEPT:
+        assert finding.standing is Standing.PROVED
+    assert told(section, Question.FLEET).startswith({"stable": "Stable: proved"}[str(studied.verdict)])
+    for figure in section.figures:
+        assert figure.draw(WIDE).marks
+        assert figure.draw(NARROW).width == NARROW
+
+
+@pytest.mark.parametrize("verdict", list(Verdict))
+@pytest.mark.parametrize("always", list(Kept))
+@pytest.mark.parametrize("rest", list(Kept))
+def test_what_is_said_of_a_fleet_is_what_is_known(
+    site: Site, studied: DroopStudy, verdict: Verdict, rest: Kept, always: Kept
+) -> None:
+    stability = studied.tables["stability"].assign(verdict=str(verdict), margin=math.nan)
+    band = studied.tables["band"].assign(rest=str(rest), always=str(always))
+    tables = {**studied.tables, "stability": stability, "band": band}
+    section = fleet(site, replace(studied, verdict=verdict, rest=rest, always=always, tables=tables))
+    text, finding = told(section, Question.FLEET), section.answers[Question.FLEET]
+    assert ("Stable: proved" in text) == (verdict is Verdict.STABLE)
+    assert ("It may oscillate" in text) == (verdict is Verdict.UNDECIDED)
+    assert ("is kept, however loads move" in text) == (always is Kept.KEPT)
+    if Verdict.UNDECIDED in (verdict, rest, always):
+        assert finding.standing in {Standing.PART, Standing.OPEN}
+
+
+def calibration(site: Site, *, sure: bool) -> Calibrate:
+    p, customers = len(site.meter_ids), list(site.feeder.customers)
+    verdict = PROPOSED if sure else UNTOLD
+    std = np.where(np.arange(p) == 0, math.nan, 0.05)
+    meters = pd.DataFrame({"meter": site.meter_ids, "bias_percent": 0.3, "std_percent": std})
+    meters = meters.assign(low_percent=0.2, high_percent=0.4, verdict=[UNTOLD, *["biased"] * (p - 1)])
+    proposals = pd.DataFrame({"what": [customers[0]], "proposed": ["Bus R1"], "verdict": [verdict]})
+    places = [verdict, UNTOLD, *["as in the files"] * (len(customers) - 2)]
+    lines = pd.DataFrame({"lines": ["one", "two"], "verdict": [UNTOLD, "as in the files"]})
+    nothing = pd.DataFrame()
+    return Calibrate(
+        feeder=site.feeder.name,
+        digest=site.digest,
+        frames=100,
+        span_h=24.0,
+        risk=0.05,
+        meters=meters,
+        lines=lines,
+        customers=pd.DataFrame({"customer": customers, "verdict": places}),
+        loads=nothing,
+        errors=nothing,
+        proposals=proposals,
+        corrections=(),
+    )
+
+
+@pytest.mark.parametrize("sure", [True, False])
+def test_what_cannot_be_told_is_neither_right_nor_wrong(site: Site, *, sure: bool) -> None:
+    section = records.calibrate(site, calibration(site, sure=sure))
+    text = told(section, Question.RECORDS)
+    assert ("1 correction of the files is proposed" in text) == sure
+    assert ("no correction that is sure" in text) == (not sure)
+    assert "1 of 2 lines" in text
+    assert f"{1 if sure else 2} of {site.feeder.bus.size} customers" in text
+    assert "nothing is known, right or wrong" in text
+    assert all(figure.draw(NARROW).marks for figure in section.figures)
+
+
+def test_words_of_the_calibration_are_its_own() -> None:
+    assert (records.UNTOLD, records.PROPOSED) == (UNTOLD, PROPOSED)
+
+
+def test_sizes_that_are_not_proved_are_said_to_be_none(site: Site, outcomes: list[Outcome]) -> None:
+    found = result(outcomes, "detectable")
+    assert isinstance(found, Detectable)
+    meters, customers = found.meters.copy(), found.customers.copy()
+    meters.loc[1, ["noticed", "named"]] = math.inf
+    customers.loc[0, "error"] = math.nan
+    section = sizes(site, replace(found, meters=meters, customers=customers))
+    assert section.answers[Question.LIES].standing is Standing.PART
+    assert f"For {meters['meter'][1]} no size is proved" in told(section, Question.LIES)
+    assert section.answers[Question.PICTURE].standing is Standing.OPEN
+    for figure in section.figures:
+        assert figure.draw(WIDE).marks
+
+
+def test_a_search_that_gave_up_is_not_an_all_clear(site: Site, outcomes: list[Outcome]) -> None:
+    found = result(outcomes, "redundancy")
+    assert isinstance(found, Redundancy)
+    summary, meters = found.summary.copy(), found.meters.copy()
+    summary.loc[0, "index"] = math.nan
+    meters.loc[0, "index_any"] = math.nan
+    section = invisible(site, replace(found, summary=summary, meters=meters))
+    assert section.answers[Question.INVISIBLE].standing is Standing.OPEN
+    assert "is not proved: the search gave up" in told(section, Question.INVISIBLE)
+    drawing = section.figures[0].draw(WIDE)
+    assert any(getattr(mark, "text", "") == "not known" for mark in drawing.marks)
+
+
+def test_protection_with_a_gap_is_not_called_the_fewest(site: Site, outcomes: list[Outcome]) -> None:
+    found = result(outcomes, "protect")
+    assert isinstance(found, Protect)
+    assert len(found.meters)
+    section = protection(site, replace(found, least=len(found.meters) - 1))
+    assert section.answers[Question.PROTECT].standing is Standing.PART
+    assert "is not proved" in told(section, Question.PROTECT)
+    none = replace(
+        found, meters=found.meters.head(0), goal=Goal.NOTICE, before=math.inf, after=math.inf, least=0
+    )
+    assert told(protection(site, none), Question.PROTECT).startswith("None for this purpose")
+
+
+def test_attacks_that_could_not_be_played_are_told(site: Site, played: Campaign) -> None:
+    scenarios = played.scenarios.copy()
+    scenarios.loc[1, "reason"] = "no such place"
+    text = told(attacks(site, replace(played, scenarios=scenarios)), Question.MONITOR)
+    assert "1 scenario could not be played: nothing is known" in text
+    missed = int(np.isinf(played.liars["delay_s"]).sum())
+    assert (f"{missed} were missed" in text) or (f"{missed} was missed" in text) or not missed
+
+
+def test_a_campaign_without_liars_tells_nothing_about_attacks(site: Site, played: Campaign) -> None:
+    section = attacks(site, replace(played, liars=played.liars.head(0)))
+    assert section.answers[Question.MONITOR].standing is Standing.OPEN
+    assert "nothing was learned about attacks" in told(section, Question.MONITOR)

@@ -1,0 +1,186 @@
+"""Calibration by recordings of full AC power flow: planted errors are found, nothing else is proposed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from feeders.load import find, load
+from feeders.load_phases import three_phase
+from feeders.recording import RecordingInvalid
+from feeders.scenario import START
+from feeders.schema import read, write
+from feeders.studies.calibrate import OtherFeeder, calibrate
+from feeders.studies.calibrate_search import Kind
+from feeders.studies.journal import OtherStudy
+from gridsec.attack import Bias, Drift
+from tests.feeders.studies.calibrate_cases import (
+    CIGRE,
+    biases,
+    moved,
+    recorded,
+    scenario,
+    shortened,
+    site,
+    swapped,
+    three_phase_readings,
+)
+
+TABLES = CIGRE.tables
+
+
+def test_clean_recordings_lead_to_no_proposal_and_intervals_cover(tmp_path: Path) -> None:
+    z, powers, proposals = [], [], 0
+    for seed in range(20):
+        given = scenario(seed, hidden_kw=1.0)
+        found = calibrate(CIGRE, recorded(tmp_path, given))
+        proposals += not found.proposals.empty
+        z.append((found.meters["bias_percent"] - biases(given)) / found.meters["std_percent"])
+        lines = found.lines[found.lines["verdict"] != "cannot be told"]
+        z.append((lines["factor"] - 1.0) / lines["std"])
+        error = found.errors.set_index("quantity").loc["error of p"]
+        powers.append(error["low"] < 1.0 < error["high"])
+    # Of 20 recordings at a risk of 5 % one may be accused; more than three would be by chance in 2 % of cases.
+    assert proposals <= 3
+    each = np.concatenate(z)
+    assert 0.6 < np.sqrt(np.mean(each**2)) < 1.4
+    assert np.mean(np.abs(each) < 1.96) > 0.85
+    assert np.mean(powers) > 0.7
+
+
+def test_three_planted_errors_are_found_and_nothing_else(tmp_path: Path) -> None:
+    wrong = moved(swapped(TABLES, "Load R11", "Load R16"), "Load R15", "Bus R17")
+    wrong = shortened(wrong, "Line R6-R16", 1.3)
+    found = calibrate(site(wrong), recorded(tmp_path, scenario(1)))
+    rows = found.proposals.set_index("kind")
+    assert sorted(rows.index) == ["bus", "length", "swap"]
+    assert rows.loc["bus", ["what", "now", "proposed"]].tolist() == ["Load R15", "Bus R17", "Bus R15"]
+    assert rows.loc["swap", "what"] == "Load R11 and Load R16"
+    assert rows.loc["length", "what"] == "Line R6-R16"
+    assert rows.loc["length", "low"] < 1.3 < rows.loc["length", "high"]
+    assert (rows["verdict"] == "proposed").all()
+    assert (rows["confidence"] > 0.95).all()
+    assert (rows["log_factor"] > np.log(20.0)).all()
+
+    folder, out = tmp_path / "wrong", tmp_path / "right"
+    write(wrong, folder)
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    found.corrected(folder, out)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    after = read(out)
+    assert after.customers == TABLES.customers
+    truth = {row.line: row.r_ohm for row in TABLES.lines}
+    for row in after.lines:
+        assert row.r_ohm == pytest.approx(truth[row.line], rel=0.15)
+    with pytest.raises(FileExistsError):
+        found.corrected(folder, out)
+    with pytest.raises(OtherFeeder, match="not the feeder"):
+        found.corrected(out, tmp_path / "again")
+
+
+def test_biases_of_the_size_of_the_class_are_found(tmp_path: Path) -> None:
+    given = scenario(3)
+    half = (
+        Bias(np.array([1]), START, np.inf, np.array([0.005])),
+        Bias(np.array([4]), START, np.inf, np.array([-0.005])),
+    )
+    exact = replace(given, errors=replace(given.errors, bias=0.0), attacks=half)
+    found = calibrate(CIGRE, recorded(tmp_path, exact))
+    assert found.proposals.empty
+    rows = found.meters.set_index("meter")
+    for meter, bias in (("m02", 0.5), ("m05", -0.5)):
+        assert rows.loc[meter, "verdict"] == "biased"
+        assert rows.loc[meter, "low_percent"] < bias < rows.loc[meter, "high_percent"]
+    assert (rows.drop(["m02", "m05"])["verdict"] == "within error").all()
+
+
+def test_lines_in_series_cannot_be_told_apart_and_are_not_corrected(tmp_path: Path) -> None:
+    found = calibrate(site(shortened(TABLES, "Line R1-R2", 1.4)), recorded(tmp_path, scenario(1)))
+    assert found.proposals["verdict"].tolist() == ["cannot be told"]
+    either = found.proposals["what"][0] + found.proposals["alternatives"][0]
+    assert "Line R1-R2" in either
+    assert "Line R2-R3" in either
+    assert found.corrections == ()
+    assert "Line R2-R3" in found.lines.set_index("lines").loc["Line R1-R2", "same"]
+
+
+@pytest.mark.parametrize(
+    "lie",
+    [
+        Bias(np.array([2]), START + 150 * 900.0, np.inf, np.array([0.006])),
+        Drift(np.array([2]), START + 150 * 900.0, np.inf, np.array([1e-7]), np.array([0.02])),
+    ],
+    ids=["bias", "drift"],
+)
+def test_a_meter_whose_error_changes_is_excluded_and_leads_to_no_correction(
+    lie: Bias | Drift, tmp_path: Path
+) -> None:
+    found = calibrate(CIGRE, recorded(tmp_path, scenario(2, attacks=(lie,))))
+    assert found.proposals["kind"].tolist() == ["meter"]
+    assert found.proposals["what"].tolist() == ["m03"]
+    assert found.corrections == ()
+    assert found.meters.set_index("meter").loc["m03", "verdict"] == "excluded"
+    assert found.customers.set_index("meter").loc["m03", "verdict"] == "excluded"
+
+
+@pytest.mark.parametrize(("ticks", "dt_s"), [(7200, 1.0), (2160, 20.0)])
+def test_short_intervals(ticks: int, dt_s: float, tmp_path: Path) -> None:
+    wrong = site(swapped(TABLES, "Load R11", "Load R16"))
+    found = calibrate(wrong, recorded(tmp_path, scenario(5, ticks=ticks, dt_s=dt_s)))
+    assert found.proposals["kind"].tolist() == ["swap"]
+
+
+def test_a_wrong_phase_is_found(tmp_path: Path) -> None:
+    tables = find("ieee-european-lv")
+    readings = three_phase_readings(three_phase(tables), seed=1, ticks=64, dt_s=900.0, hidden_kw=0.1)
+    rows = list(tables.customers)
+    was = rows[4].phases
+    rows[4] = replace(rows[4], phases="abc"[("abc".index(was) + 1) % 3])
+    wrong = three_phase(replace(tables, customers=tuple(rows)))
+    path = tmp_path / "readings.csv"
+    readings.to_csv(path, index=False)
+    found = calibrate(wrong, path, kinds=[Kind.PHASE])
+    assert found.proposals[["kind", "what", "proposed"]].to_numpy().tolist() == [["phase", "LOAD5", was]]
+    assert found.corrections[0].phases == was
+
+
+def test_an_interrupted_study_goes_on_and_another_ones_journal_is_refused(tmp_path: Path) -> None:
+    readings = recorded(tmp_path, scenario(1))
+    wrong = site(moved(TABLES, "Load R15", "Bus R17"))
+    journal = tmp_path / "journal"
+    whole = calibrate(wrong, readings, journal=journal)
+    lines = journal.read_text().splitlines(keepends=True)
+    journal.write_text("".join(lines[:2]) + lines[2][:5])
+    again = calibrate(wrong, readings, journal=journal)
+    for name, table in whole.tables.items():
+        pd.testing.assert_frame_equal(table, again.tables[name])
+    with pytest.raises(OtherStudy):
+        calibrate(wrong, readings, risk=0.01, journal=journal)
+
+
+def test_clear_errors(tmp_path: Path) -> None:
+    few = recorded(tmp_path, scenario(1, ticks=20))
+    with pytest.raises(RecordingInvalid, match=r"too little data: .*; at least 48 frames over 12 h"):
+        calibrate(CIGRE, few)
+    with pytest.raises(RecordingInvalid, match="recorded on cigre-lv, not on kerber-landnetz"):
+        calibrate(load("kerber-landnetz"), few)
+    table = few.frame()
+    with pytest.raises(RecordingInvalid, match="does not have: m99"):
+        calibrate(CIGRE, table.assign(meter=table["meter"].astype(str).replace("m03", "m99")))
+    with pytest.raises(RecordingInvalid, match="none of the busbar"):
+        calibrate(CIGRE, table[table["meter"] != ""])
+    with pytest.raises(RecordingInvalid, match="columns v_volt are missing"):
+        calibrate(CIGRE, table.drop(columns="v_volt"))
+    with pytest.raises(RecordingInvalid, match="no meter has two readings"):
+        calibrate(CIGRE, table.groupby("meter", observed=True).head(1))
+    with pytest.raises(RecordingInvalid, match=r"no table of readings"):
+        calibrate(CIGRE, tmp_path / "none.csv")
+    with pytest.raises(ValueError, match="no meter m99"):
+        calibrate(CIGRE, table, exclude=["m99"])
+    for name, value in (("risk", 0.0), ("tolerance", 0.5)):
+        with pytest.raises(ValueError, match=f"{name} is"):
+            calibrate(CIGRE, table, **{name: value})

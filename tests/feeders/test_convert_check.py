@@ -1,0 +1,217 @@
+"""The round trip of pandapower nets by its own power flow: transformers, capacitors, loops, single phases."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandapower as pp
+import pytest
+from pandapower import networks
+
+from feeders.convert import check_against_source, convert
+from feeders.convert_changes import Change, changes_csv, sentences
+from feeders.convert_check import BALANCED_PU, UNBALANCED_PU, SourceCheck, compare
+from feeders.convert_network import feeder_of
+from feeders.convert_pandapower import from_pandapower
+from feeders.convert_pgm import read_pgm
+from feeders.load_phases import three_phase
+from feeders.powerflow_unbalanced import UnbalancedPowerFlow
+from feeders.schema import read, write
+from gridsec.errors import FeederInvalid, GridsecError
+from tests.feeders.foreign import pgm
+
+
+@pytest.mark.parametrize(
+    ("maker", "root", "buses"),
+    [
+        ("create_cigre_network_mv", "Bus 1", 11),
+        ("create_cigre_network_mv", "Bus 12", 3),
+        ("mv_oberrhein", "Bus 19", 69),
+        ("mv_oberrhein", "Bus 178", 108),
+        ("create_kerber_landnetz_kabel_2", None, 29),
+    ],
+)
+def test_balanced_networks(maker: str, root: str | None, buses: int, tmp_path: Path) -> None:
+    """Medium voltage has charging, open ends of cables, and generators."""
+    check = convert(f"pandapower:{maker}", tmp_path / "x", root=root).check
+    assert check is not None
+    assert (check.buses, check.three_phase) == (buses, False)
+    assert check.largest_pu < BALANCED_PU
+
+
+def village(*, closed: bool = False) -> Any:
+    """20 kV with a transformer to 0.4 kV, a capacitor, loads that depend on the voltage, and a ring."""
+    net = pp.create_empty_network()
+    high, root, a, b = (pp.create_bus(net, kv, name=name) for kv, name in
+                        ((110.0, "high"), (20.0, "root"), (20.0, "A"), (20.0, "B")))  # fmt: skip
+    low, home = (pp.create_bus(net, 0.4, name=name) for name in ("low", "home"))
+    pp.create_ext_grid(net, high, vm_pu=1.02)
+    pp.create_transformer(net, high, root, "25 MVA 110/20 kV")
+    pp.create_transformer(net, b, low, "0.4 MVA 20/0.4 kV", name="T1")
+    kind = "NA2XS2Y 1x185 RM/25 12/20 kV"
+    for name, one, other, km in (("1", root, a, 5.0), ("2", a, b, 4.0), ("ring", root, b, 6.0)):
+        pp.create_line(net, one, other, km, kind, name=name)
+    pp.create_line(net, low, home, 0.1, "NAYY 4x150 SE", name="street")
+    if not closed:
+        pp.create_switch(net, b, 2, "l", closed=False)
+    pp.create_load(net, a, 2.0, 0.5, name="mill", const_z_p_percent=50.0, const_z_q_percent=50.0)
+    pp.create_load(net, home, 0.1, 0.03, name="house")
+    pp.create_shunt(net, a, q_mvar=-0.4, name="bank")
+    pp.create_sgen(net, b, 1.5, sn_mva=2.0, name="wind")
+    return net
+
+
+def test_transformer_capacitor_and_open_cable_are_carried_over() -> None:
+    converted = from_pandapower(village(), "village", root="root")
+    assert converted.state is not None
+    check = compare(converted.state, converted.tables)
+    assert check.largest_pu < BALANCED_PU
+    assert check.as_found_pu is not None
+    assert check.as_found_pu > BALANCED_PU
+    customers = {row.customer: row for row in converted.tables.customers}
+    assert customers["transformer T1"].load_kw == pytest.approx(102.0, abs=1.5)
+    said = "\n".join(sentences(converted.changes))
+    for part in ("load side of transformer T1; 2 buses became", "connection of shunt bank; 400 kvar",
+                 "const_z_p_percent", "droop curve of generator wind"):  # fmt: skip
+        assert part in said, part
+    # Without the capacitor the voltages differ, and the check says so.
+    bare = tuple(line for line in converted.tables.lines if line.line != "shunt bank")
+    assert not compare(converted.state, replace(converted.tables, lines=bare)).exact
+
+
+def test_parallel_transformers_on_a_coupled_busbar_are_one_infeed() -> None:
+    """Two transformers, a busbar for each, a closed coupler; open, there are two busbars to choose from."""
+    net = village()
+    second = pp.create_bus(net, 20.0, name="root 2")
+    pp.create_transformer(net, 0, second, "25 MVA 110/20 kV")
+    pp.create_switch(net, 1, second, "b", name="coupler")
+    far = pp.create_bus(net, 20.0, name="far")
+    pp.create_line(net, second, far, 2.0, "NA2XS2Y 1x185 RM/25 12/20 kV", name="far")
+    pp.create_load(net, far, 1.0, 0.2, name="farm")
+    net.trafo.loc[1, "in_service"] = False  # that of the low voltage
+    converted = from_pandapower(net, "x")
+    assert converted.tables.meta.busbar == "root"
+    assert converted.state is not None
+    check = compare(converted.state, converted.tables)
+    assert (check.buses, check.largest_pu < BALANCED_PU) == (5, True)
+    net.switch.loc[net.switch.name == "coupler", "closed"] = False
+    with pytest.raises(GridsecError, match="candidates: root, root 2"):
+        from_pandapower(net, "x")
+    assert from_pandapower(net, "x", root="root 2").tables.customers[0].customer == "farm"
+
+
+def test_loop_is_named_and_opened_when_asked(tmp_path: Path) -> None:
+    path = tmp_path / "ring.json"
+    pp.to_json(village(closed=True), str(path))
+    with pytest.raises(FeederInvalid, match=r"form a loop"):
+        convert(str(path), tmp_path / "x", root="root")
+    done = convert(str(path), tmp_path / "x", root="root", opened=["ring"])
+    assert done.check is not None
+    assert not done.check.exact
+    assert "--open 'ring'" in (tmp_path / "x" / "SOURCE.md").read_text()
+    pp.to_json(village(), str(path))
+    # What the open cable's end still charges is all that is left between the two.
+    assert check_against_source(str(path), tmp_path / "x", root="root").largest_pu < 1e-3
+
+
+@pytest.mark.slow
+def test_single_phases_with_generators_and_a_folder_again(tmp_path: Path) -> None:
+    net = networks.ieee_european_lv_asymmetric("on_peak_566")
+    pp.create_asymmetric_sgen(net, 200, p_b_mw=0.004, q_b_mvar=0.0, name="roof")
+    path = tmp_path / "european.json"
+    pp.to_json(net, str(path))
+    done = convert(str(path), tmp_path / "x")
+    assert done.check is not None
+    assert (done.check.buses, done.check.three_phase) == (906, True)
+    assert done.check.largest_pu < UNBALANCED_PU
+    roof = {row.customer: row for row in read(tmp_path / "x").customers}["roof"]
+    assert (roof.phases, roof.pv_kw, roof.load_kw) == ("b", pytest.approx(4.0), 0.0)
+    again = convert(str(tmp_path / "x"), tmp_path / "y")
+    assert (again.check, again.changes) == (None, ())
+    assert read(tmp_path / "y") == read(tmp_path / "x")
+
+
+def test_check_compares_what_the_flows_say(tmp_path: Path) -> None:
+    """The reported difference is the one between the two sets of voltages, by hand."""
+    converted = feeder_of(read_pgm(pgm(tmp_path / "town.json", 30, balanced=False)), "x")
+    state = converted.state
+    assert state is not None
+    site = three_phase(converted.tables)
+    power = np.array([state.power_kva[row.customer] for row in converted.tables.customers])
+    _, volts = UnbalancedPowerFlow(site).solve(power.real, power.imag, state.busbar_volt)
+    apart = {bus: np.abs(volts[site.bus_of_file[bus]] - v).max() for bus, v in state.volts.items()}
+    check = compare(state, converted.tables)
+    assert check.at == max(apart, key=lambda bus: apart[bus])
+    assert check.largest_pu == pytest.approx(max(apart.values()) / converted.tables.meta.voltage_volt)
+    shifted = {bus: v + 0.01 * converted.tables.meta.voltage_volt for bus, v in state.volts.items()}
+    assert compare(replace(state, volts=shifted), converted.tables).largest_pu == pytest.approx(
+        0.01, rel=1e-2
+    )
+
+
+def test_all_problems_of_a_net_at_once(tmp_path: Path) -> None:
+    net = village()
+    net.line.loc[0, "from_bus"] = 77
+    net.load.loc[1, "bus"] = 78
+    net.line.loc[1, "length_km"] = np.nan
+    path = tmp_path / "broken.json"
+    pp.to_json(net, str(path))
+    with pytest.raises(FeederInvalid) as caught:
+        convert(str(path), tmp_path / "x")
+    assert len(caught.value.problems) == 3
+    assert all(part in str(caught.value) for part in ("from_bus 77", "bus 78", "line 1: length_km is nan"))
+    net = village()
+    del net["trafo3w"], net["shunt"]
+    net.line = net.line.drop(columns="df")
+    with pytest.raises(FeederInvalid) as caught:
+        from_pandapower(net, "x")
+    assert len(caught.value.problems) == 2
+    fresh = village()
+    fresh.line = fresh.line.drop(columns=["df", "parallel"])
+    with pytest.raises(FeederInvalid) as caught:
+        from_pandapower(fresh, "x")
+    assert len(caught.value.problems) == 2
+
+
+def test_a_source_without_solution_is_converted_and_not_checked(tmp_path: Path) -> None:
+    net = village()
+    net.load.loc[0, "p_mw"] = 5e3
+    path = tmp_path / "heavy.json"
+    pp.to_json(net, str(path))
+    done = convert(str(path), tmp_path / "x", root="root")
+    assert done.check is None
+    assert "own power flow fails" in done.unchecked
+    assert "load side of transformer T1; 2 buses; what flows there is not known" in "\n".join(done.notes)
+    with pytest.raises(GridsecError, match="own power flow fails"):
+        check_against_source(str(path), tmp_path / "x", root="root")
+
+
+def test_a_feeder_without_solution_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "village.json"
+    pp.to_json(village(), str(path))
+    convert(str(path), tmp_path / "x", root="root")
+    tables = read(tmp_path / "x")
+    weak = tuple(replace(line, r_ohm=100 * line.r_ohm, x_ohm=100 * line.x_ohm) for line in tables.lines)
+    meta = replace(tables.meta, accept=("impedance", "ratio", "load"))
+    write(replace(tables, meta=meta, lines=weak), tmp_path / "x")
+    with pytest.raises(GridsecError, match="no solution"):
+        check_against_source(str(path), tmp_path / "x", root="root")
+
+
+def test_sentences_of_a_check_and_of_changes() -> None:
+    check = SourceCheck("Tool 1", 3, three_phase=False, largest_pu=2e-10, at="b", as_found_pu=None)
+    assert check.exact
+    assert check.sentence.endswith("3 buses: |v| differs by less than 1e-08 pu")
+    worse = replace(check, largest_pu=2.5e-4, three_phase=True, as_found_pu=1e-3)
+    assert not worse.exact
+    assert "less than 1e-03 pu (bus b)" in worse.sentence
+    same = [Change(f"load {k}", "model 2", "approximated", "constant power") for k in range(11)]
+    assert sentences(same) == (
+        "approximated: model 2 of "
+        + ", ".join(f"load {k}" for k in range(8))
+        + " and 3 more; constant power",
+    )
+    assert len(changes_csv(same).splitlines()) == 12

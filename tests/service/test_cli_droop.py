@@ -1,0 +1,74 @@
+"""`gridsec study droop` on the command line."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from feeders.schema import write
+from service.cli import main
+from tests.feeders.villages import tables, village_without_inverters
+
+FEW = ("--compare", "vde4105", "--tau-factor", "0.1")
+
+
+def run(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: str
+) -> tuple[int, str, str]:
+    monkeypatch.setattr(sys, "argv", ["gridsec", "study", "droop", *arguments])
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as end:
+        main()
+    told = capsys.readouterr()
+    return int(end.value.code or 0), told.out, told.err
+
+
+def test_the_answer_is_told_and_its_tables_are_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write(tables(), tmp_path / "village")
+    out, journal = tmp_path / "out", tmp_path / "journal"
+    arguments = (str(tmp_path / "village"), *FEW, "--hosting", "--hosting-preset", "none", "--draws", "2")
+    code, told, _ = run(monkeypatch, capsys, *arguments, "--out", str(out), "--journal", str(journal))
+    assert code == 0
+    assert "village: the fleet (sampled every 1 s) is stable" in told
+    assert "Random places, kW" in told
+    written = pd.read_parquet(out / "stability.parquet")
+    assert written["point"].tolist() == ["evening", "noon", "half", "any loads"]
+    assert pd.read_csv(out / "hosting.csv")["capacity_kw"].iloc[0] > 0
+    assert journal.read_text(encoding="utf-8").count("\n") > 10
+
+
+def test_a_feeder_without_inverters_says_which_option_helps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = str(tmp_path / "plain")
+    write(village_without_inverters().tables, folder)
+    code, _, told = run(monkeypatch, capsys, folder, *FEW)
+    assert code == 3
+    assert "--preset" in told
+    code, answer, _ = run(
+        monkeypatch, capsys, folder, *FEW, "--preset", "vde4105", "--interval", "0", "--also", "cigre-lv"
+    )
+    assert code == 0
+    assert "(continuous) is stable" in answer
+    assert answer.count("│ vde4105") == 2
+
+
+def test_wrong_arguments_are_told(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for wrong, why in (
+        (("--preset", "vde"), "ieee1547-a"),
+        (("--who", "me"), "pv, all"),
+        (("--hosting-preset", "x"), "none"),
+        (("--interval", "0", "--dead", "2"), "short interval"),
+        (("--band", "1.1", "0.9"), "band"),
+        (("--hosting", "--at", "me"), "no customer 'me'"),
+    ):
+        code, _, told = run(monkeypatch, capsys, "cigre-lv", *wrong)
+        assert code == 2, told
+        assert why in " ".join(told.replace("│", " ").split())
