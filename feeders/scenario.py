@@ -155,7 +155,8 @@ class Sample:
     v_volt : (N,)
         True voltage at each customer, V.
     v_bus_volt : (b + 1,)
-        True voltage of each bus, the busbar first, V.
+        True voltage of each bus, the busbar first, V; in three phases of each phase of each bus, (3 (b + 1),),
+        NaN where it has none.
     x_kvar : (m,)
         Reactive injection of each inverter as its droop curve has it, kvar; attacks come on top.
     p_kw, q_kvar : (N,)

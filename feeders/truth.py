@@ -50,7 +50,7 @@ class Block:
     v_volt : (T, N)
         Voltage at each customer, V.
     v_bus_volt : (T, b + 1)
-        Voltage of each bus, V.
+        Voltage of each bus, V; in three phases of each phase of each.
     x : (T, m)
         Reactive injection of each inverter as its droop curve has it, pu.
     demand

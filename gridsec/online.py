@@ -141,7 +141,8 @@ class Estimate:
         Half-width of the interval around `v2` that holds the truth while the design's assumptions
         hold, pu.
     v2_bus : (b + 1,)
-        Reconstructed squared voltage of every bus, the busbar first, pu.
+        Reconstructed squared voltage of every bus, the busbar first, pu. In three phases (3 (b + 1),), the
+        phases of a bus side by side.
     trusted : (p,)
         The meters that the estimate rests on.
     x : (m,)

@@ -237,6 +237,25 @@ def test_the_diagram_works_by_keyboard(site: Site) -> None:
     expect(page.locator("#detail-title")).to_have_text("H3")
 
 
+def test_phases_of_meters_and_of_customers_without_one(site: Site) -> None:
+    report = site.village.report(T0, lies={"H3": 9.0})
+    phases = tuple((None, None, 219.5 if bus == "drop-5" else None) for bus in site.village.buses)
+    site.village.customers[3]["phase"] = "b"
+    site.village.customers.append({"customer": "X", "bus": "drop-5", "meter": None, "phase": "c"})
+    site.service.tick(replace(report, bus_phases=phases))
+    page = site.open()
+    liar = page.locator('#diagram .customer[aria-label^="H3, phase b:"]')
+    liar.hover()
+    expect(page.locator("#tip")).to_contain_text("phase b")
+    liar.click()
+    expect(page.locator("#detail-card")).to_contain_text("meter H3, bus drop-3, phase b")
+    expect(page.locator('#diagram .customer[aria-label*="X, phase c:"]')).to_have_attribute(
+        "aria-label", re.compile("reconstructed 219.5 V")
+    )
+    # Balanced meters say nothing of phases.
+    expect(customer(page, "H4")).to_have_count(1)
+
+
 def test_all_meters_as_a_table_with_the_worst_first(site: Site) -> None:
     site.tick(T0, 1, lies={"H9": 8.0}, silent=("H2",))
     page = site.open()
