@@ -14,6 +14,9 @@ HOUSEHOLDS: Final = ("H0-A", "H0-B", "H0-C", "H0-G", "H0-L")
 TRADE: Final = ("G1-A", "G2-A", "G6-A", "L1-A", "L2-A")
 HOUSEHOLD_KW: Final = 30.0
 USUAL_POWER_FACTOR: Final = 0.93
+LEAST_POWER_FACTOR: Final = 0.01
+"""The least that customers.csv can say."""
+
 SMALL_KVA: Final = 4.6
 
 
@@ -38,14 +41,17 @@ def reactive(customer: CustomerRow, power_factor: float | None) -> CustomerRow:
     power_factor
         At the peak, lagging; None: the usual one.
     """
-    factor = USUAL_POWER_FACTOR if power_factor is None else round(power_factor, 4)
+    factor = USUAL_POWER_FACTOR if power_factor is None else max(round(power_factor, 4), LEAST_POWER_FACTOR)
     tan = math.tan(math.acos(factor))
     history = envelopes()[customer.load_profile]
     # Rounded outwards, so that the interval still holds the history.
     return replace(
         customer,
         power_factor=factor,
-        power_factor_min=min(factor, math.floor(1e4 * math.cos(math.atan(history.high * tan))) / 1e4),
+        power_factor_min=min(
+            factor,
+            max(math.floor(1e4 * math.cos(math.atan(history.high * tan))) / 1e4, LEAST_POWER_FACTOR),
+        ),
         power_factor_max=max(factor, math.ceil(1e4 * math.cos(math.atan(history.low * tan))) / 1e4),
         q_floor_kvar=math.ceil(1e4 * history.floor * tan * customer.load_kw) / 1e4,
     )

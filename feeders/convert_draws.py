@@ -97,7 +97,10 @@ def customers_of(
 def _connections(draw: Draw) -> list[tuple[str, complex]]:
     if draw.even:
         return [("abc", complex(draw.power_kva.sum()))]
-    return [(phase, complex(kva)) for phase, kva in zip("abc", draw.power_kva, strict=True) if kva != 0]
+    least = EVEN * float(np.abs(draw.power_kva).max())
+    return [
+        (phase, complex(kva)) for phase, kva in zip("abc", draw.power_kva, strict=True) if abs(kva) > least
+    ]
 
 
 def _unique(draw: Draw, phases: str, taken: Collection[str]) -> str:

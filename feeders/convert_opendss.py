@@ -133,7 +133,7 @@ def _read(dss: Any, path: Path) -> Network:
     if not found:
         raise GridsecError(f"{path}: OpenDSS's own power flow does not converge")
     elements = [_element(dss, name, problems) for name in dss.Circuit.AllElementNames()]
-    changes = _voltage_dependence(dss)
+    changes, shapes = _voltage_dependence(dss)
     _run(dss, CONSTANT_POWER)
     volts = _solved(dss)
     if volts:
@@ -148,7 +148,7 @@ def _read(dss: Any, path: Path) -> Network:
         xy=_positions(dss),
         unsolved="with loads of constant power OpenDSS's own power flow does not converge",
     )
-    network.of_bus.extend(changes)
+    network.of_bus.extend([*changes, *shapes])
     _build_everything(dss, elements)
     for each in elements:
         _take(dss, each, network, problems)
@@ -203,9 +203,9 @@ def _positions(dss: Any) -> dict[str, tuple[float, float]]:
     return places
 
 
-def _voltage_dependence(dss: Any) -> list[tuple[str, Change]]:
+def _voltage_dependence(dss: Any) -> tuple[list[tuple[str, Change]], list[tuple[str, Change]]]:
     """Loads that are not of constant power, and those that follow a shape, each with its bus."""
-    changes = []
+    changes, shapes = [], []
     for name in dss.Loads.AllNames():
         if name.lower() == "none":
             continue
@@ -219,7 +219,11 @@ def _voltage_dependence(dss: Any) -> list[tuple[str, Change]]:
                 "depends on the voltage in the source; taken as constant power",
             )
             changes.append((bus, change))
-    return changes
+        shape = str(dss.Loads.Yearly() or dss.Loads.Daily() or dss.Loads.Duty())
+        if shape:
+            effect = "a household's or a trade's profile of the library instead"
+            shapes.append((bus, Change(f"load {name}", f"load shape {shape}", "left out", effect)))
+    return changes, shapes
 
 
 def _element(dss: Any, full: str, problems: list[str]) -> _Element:

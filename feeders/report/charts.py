@@ -71,8 +71,8 @@ def rows(data: Sequence[Row], width: float, *, axis: str, start: float = 0.0) ->
     left = min(max((width_of(row.label, _LETTERS) for row in data), default=0.0), 0.36 * width) + 12.0
     right = max((width_of(row.shown, _LETTERS) for row in data), default=0.0) + 14.0
     high = max((bar.high for row in data for bar in row.bars), default=1.0)
-    steps = ticks(start, high, 4 if width < 500.0 else 7)
-    end = max(high, steps[-1])
+    steps = [v for v in ticks(start, high, 4 if width < 500.0 else 7) if v >= start - 1e-9 * abs(start)]
+    end = max(high, *steps)
     scale = (width - left - right) / ((end - start) or 1.0)
     bottom = 30.0 + _ROW * len(data)
 

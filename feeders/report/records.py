@@ -120,7 +120,7 @@ def _doubt_map(site: Site, customers: pd.DataFrame, width: float) -> Drawing:
         verdict = verdicts.get(name, UNTOLD)
         shape = shapes.get(verdict, Shape.METER)
         spots.append(Spot(shape, name if shape is Shape.ALARM else "", f"{name}: {verdict}"))
-    legend = {"correct": Shape.ALARM, "cannot be told": Shape.OPEN, "as in the files": Shape.METER}
+    legend = {"to be corrected": Shape.ALARM, "cannot be told": Shape.OPEN, "as in the files": Shape.METER}
     there = {spot.shape for spot in spots}
     return draw_map(
         site, spots, width, legend={name: Spot(shape) for name, shape in legend.items() if shape in there}

@@ -32,8 +32,8 @@ MOST_BUSES: Final = 150
 IDLE: Final = 0.25
 """Share of its peak that a customer without meter is taken to draw."""
 
-HIDDEN: Final = 0.3
-"""Share of the load that generation may hide beyond what the sunniest roof shows: its usual size."""
+HIDDEN: Final = 3.0**-0.5
+"""Share of the load that generation may hide, by which the sunniest roof misleads: uniform in its limits."""
 
 CLOUDS: Final = 0.1
 """The part of that share that comes and goes."""
@@ -263,7 +263,7 @@ def powers(site: Site | ThreePhaseSite, given: Frames) -> Powers:
         p=-draws,
         q=-np.where(metered_q, q_read, q),
         load=np.where(metered_q, 0.0, load),
-        roof=np.where(metered_q, 0.0, tan * np.maximum(most - load, 0.0)),
+        roof=np.where(metered_q, 0.0, tan * (most - low)),
         steep=np.where(metered_q, 0.0, steep),
         metered_q=metered_q,
         missing=missing,

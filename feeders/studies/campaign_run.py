@@ -106,7 +106,7 @@ class Processes:
             while waiting or running:
                 # What is worked on, and one for each to go on with: little is lost with a process.
                 while waiting and len(running) < 2 * self.count:
-                    running[pool.submit(work, waiting[0])] = waiting[0]
+                    running[pool.submit(_single, work, waiting[0])] = waiting[0]
                     waiting.popleft()
                 done = wait(running, return_when=FIRST_COMPLETED).done
                 for future in done:
@@ -124,9 +124,14 @@ class Processes:
 
 
 def _begin() -> None:
-    """Prepare a process: one thread, and whoever interrupts the first process does not interrupt this one."""
-    threadpool_limits(limits=1)
+    """Prepare a process: whoever interrupts the first process does not interrupt this one."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _single(work: Work, piece: int) -> Any:
+    """Work on a piece in a process of its own, with one thread: only now are all libraries loaded."""
+    threadpool_limits(limits=1)
+    return work(piece)
 
 
 def _stop(pool: ProcessPoolExecutor) -> None:
@@ -231,5 +236,4 @@ def agree(worker: str, theirs: Any) -> None:
 
 def _one(work: Work, piece: int) -> tuple[dict[str, str], Any]:
     """Work on a piece in a worker that is not ours."""
-    threadpool_limits(limits=1)
-    return versions(), work(piece)
+    return versions(), _single(work, piece)

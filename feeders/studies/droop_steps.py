@@ -150,7 +150,7 @@ def simulate(
     vs: list[Floats] = []
     outcome = Outcome.OPEN
     still = SETTLED * max(float(np.max(droop.limit, initial=0.0)), 1e-12)
-    window = max(8, updates // 8)
+    window = max(16, updates // 8)
     for k in range(updates + 1):
         try:
             q = loads.q_low + x @ owner

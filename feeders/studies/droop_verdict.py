@@ -46,7 +46,7 @@ KICK: Final = 1e-3
 CLEARLY: Final = 1e-4
 """Growth in one update must be beyond 1 by this before a fleet counts as unstable."""
 
-_AWAY: Final = 120
+_AWAY: Final = 80
 """Updates in which a fleet that grows is simulated."""
 
 MOST: Final = 1024.0

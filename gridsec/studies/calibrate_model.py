@@ -11,7 +11,7 @@ order
     -(drop of U along branch l)     per unit of its length, at the places behind it
     A_ji p_i, B_ji q_i              errors of the gain of power registers
     -B_ji load_i                    error of tan(phi) where q is not metered; -B_ji: what q is at p = 0
-    -B_ji roof_i (1, cos, sin)      load hidden by generation, and its daily course
+    -B_ji roof_i (1, cos, sin, ...) load that generation hides, with its daily course
 
 and for customers at other places, exactly in the linear flow, ``W'(U + dU) - W U`` with W, W' the weights.
 
@@ -218,15 +218,15 @@ def regressors(places: Places, series: Series, doubts: Doubts) -> Regressors:
     count = np.cumsum([0, *(part.shape[2] for part in parts.values())])
     return Regressors(
         columns=np.where(seen, np.concatenate(list(parts.values()), axis=2), 0.0),
-        spread=np.concatenate([np.tile(getattr(doubts, name), 3 if name == "roof" else 1) for name in parts]),
+        spread=np.concatenate([np.tile(getattr(doubts, name), 5 if name == "roof" else 1) for name in parts]),
         where={name: np.arange(a, b) for name, a, b in zip(parts, count[:-1], count[1:], strict=True)},
     )
 
 
 def _day(t: Floats) -> list[Floats]:
-    """Mean and daily course, (T, 1) each."""
+    """Mean and daily course in two harmonics, (T, 1) each: enough for the bell that the sun makes."""
     turn = 2.0 * np.pi / 86400.0 * t[:, None]
-    return [np.ones_like(turn), np.cos(turn), np.sin(turn)]
+    return [np.ones_like(turn), *(wave(k * turn) for k in (1.0, 2.0) for wave in (np.cos, np.sin))]
 
 
 def lengthened(places: Places, series: Series) -> Floats:

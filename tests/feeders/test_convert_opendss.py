@@ -70,7 +70,8 @@ new line.tie bus1=B4 bus2=B3 phases=3 r1=0.1 x1=0.1 r0=0.1 x0=0.1 c1=0 c0=0 leng
 open line.tie 1
 open line.tie 2
 new line.gone bus1=B4 bus2=B1 r1=0.1 x1=0.1 length=1 enabled=no
-new load.home bus1=B2.2 phases=1 kv=0.231 kw=5 pf=0.95
+new loadshape.evening npts=3 interval=8 mult=(0.2 0.4 1.0)
+new load.home bus1=B2.2 phases=1 kv=0.231 kw=5 pf=0.95 daily=evening
 new load.lamp bus1=B3.3 phases=1 kv=0.231 kw=4 pf=0.95 model=2
 new load.welder bus1=B3.1.3 phases=1 kv=0.4 kw=6 pf=0.95
 new capacitor.bank bus1=B1 phases=3 kv=0.4 kvar=20
@@ -113,6 +114,7 @@ new energymeter.m element=line.main
         "left out: line gone; disabled in the source",
         "model 2 of load lamp; depends on the voltage",
         "delta of load welder",
+        "load shape evening of load home",
         "phases of line pair; of two phases",
         "capacitor bank",
         "capacitor small",

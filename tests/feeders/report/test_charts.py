@@ -38,6 +38,14 @@ def test_bars_are_as_long_as_they_say() -> None:
     assert all(0.0 <= x <= 400.0 and 0.0 <= y <= drawing.height for bar in bars for x, y in bar.points)
 
 
+def test_an_axis_that_does_not_begin_at_zero_has_no_ticks_before_its_beginning() -> None:
+    drawing = rows([Row("a", (Bar(-0.38, 0.21, "fill-a", "x"),))], 720.0, axis="%", start=-0.38)
+    left = min(x for m in drawing.marks if isinstance(m, Area) for x, _ in m.points)
+    grid = [m.points[0][0] for m in drawing.marks if isinstance(m, Line)]
+    assert len(grid) >= 4
+    assert min(grid) >= left
+
+
 def test_a_curve_has_a_gap_where_nothing_is_known() -> None:
     curve = Curve((0.0, 1.0, 2.0, 3.0, 4.0), (1.0, 2.0, math.nan, 3.0, 4.0), "line-a", "one")
     lone = Curve((0.0, 1.0), (math.inf, 2.0), "line-b", "two")

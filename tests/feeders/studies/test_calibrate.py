@@ -35,7 +35,7 @@ TABLES = CIGRE.tables
 
 def test_clean_recordings_lead_to_no_proposal_and_intervals_cover(tmp_path: Path) -> None:
     z, powers, proposals = [], [], 0
-    for seed in range(20):
+    for seed in range(12):
         given = scenario(seed, hidden_kw=1.0)
         found = calibrate(CIGRE, recorded(tmp_path, given))
         proposals += not found.proposals.empty
@@ -44,8 +44,8 @@ def test_clean_recordings_lead_to_no_proposal_and_intervals_cover(tmp_path: Path
         z.append((lines["factor"] - 1.0) / lines["std"])
         error = found.errors.set_index("quantity").loc["error of p"]
         powers.append(error["low"] < 1.0 < error["high"])
-    # Of 20 recordings at a risk of 5 % one may be accused; more than three would be by chance in 2 % of cases.
-    assert proposals <= 3
+    # At a risk of 5 % more than two of twelve recordings are accused by chance in 2 % of all cases.
+    assert proposals <= 2
     each = np.concatenate(z)
     assert 0.6 < np.sqrt(np.mean(each**2)) < 1.4
     assert np.mean(np.abs(each) < 1.96) > 0.85
@@ -127,7 +127,7 @@ def test_a_meter_whose_error_changes_is_excluded_and_leads_to_no_correction(
     assert found.customers.set_index("meter").loc["m03", "verdict"] == "excluded"
 
 
-@pytest.mark.parametrize(("ticks", "dt_s"), [(7200, 1.0), (2160, 20.0)])
+@pytest.mark.parametrize(("ticks", "dt_s"), [(3600, 2.0), (1080, 20.0)])
 def test_short_intervals(ticks: int, dt_s: float, tmp_path: Path) -> None:
     wrong = site(swapped(TABLES, "Load R11", "Load R16"))
     found = calibrate(wrong, recorded(tmp_path, scenario(5, ticks=ticks, dt_s=dt_s)))

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import threadpoolctl
 from scipy.stats import beta
 
 from feeders.estimators import design
@@ -328,6 +329,19 @@ def test_a_killed_process_loses_nothing(here: Campaign, tmp_path: Path) -> None:
 def test_a_piece_that_always_kills_its_process_is_given_up() -> None:
     with pytest.raises(WorkerLost, match="piece 7 died 2 times"):
         list(Processes(1, retries=1).run(os._exit, [7]))
+
+
+def threads(_: int) -> list[int]:
+    return [library["num_threads"] for library in threadpoolctl.threadpool_info()]
+
+
+def test_processes_compute_with_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the environment says: sums of several threads have other last bits."""
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+        monkeypatch.setenv(name, "2")
+    ((_, found),) = Processes(1).run(threads, [0])
+    assert found
+    assert set(found) == {1}
 
 
 def test_whoever_stops_listening_stops_the_processes() -> None:

@@ -40,7 +40,7 @@ from tests.feeders.villages import village, village_without_inverters
 FEEDERS, FLEETS = 10, 20
 """The random fleets around the edge of stability: 200."""
 
-STEPS = 300
+STEPS = 260
 
 
 def random_site(seed: int) -> Site:
@@ -74,18 +74,18 @@ def near_the_edge(site: Site, rng: np.random.Generator, loads: Box, update: Upda
     net = network(site.feeder)
     s = loads.p_low + 1j * loads.q_low
     J = sensitivity(net, s, solve(net, s, loads.v0_low)).dv_dq[np.ix_(own, own)]
+    steep = slopes(Droop(own, v, share, tau), np.zeros(own.size), np.full(own.size, 9.0))
     low, high = 1e-6, 1e3
-    for _ in range(40):
+    for _ in range(24):
         size = np.sqrt(low * high)
-        steep = slopes(Droop(own, v, size * share, tau), np.zeros(own.size), np.full(own.size, 9.0))
-        low, high = (size, high) if growth(J, steep, tau, update) < 1.0 else (low, size)
+        low, high = (size, high) if growth(J, size * steep, tau, update) < 1.0 else (low, size)
     return Droop(own, v, low * 2.0 ** rng.uniform(-1.0, 1.0) * share, tau)
 
 
 def run_together(
     site: Site, fleets: list[Droop], updates: list[Update], loads: list[Box], seed: int
 ) -> Floats:
-    """Movement of every fleet in the end, part of its limit; from a random state, by AC power flow."""
+    """Movement of every fleet that does not die out, part of its limit; from a random state, by AC."""
     rng, base = np.random.default_rng(seed), site.feeder
     flow, count = PowerFlow(site), len(base.customers)
     p = np.array([-base.base_kva * b.p_low for b in loads])
@@ -114,9 +114,12 @@ def run_together(
         asked = [*asked[-2:], asks]
         due = np.array(asked)[2 - dead, np.arange(len(fleets))]
         x = (1.0 - alpha) * x + alpha * due
-        last = [*last[-59:], x]
-    moved = np.max(np.ptp(np.array(last), axis=0) / limit, axis=1)
-    return np.where(collapsed, np.inf, moved)
+        last = [*last[-119:], x]
+    before, moved = (
+        np.max(np.ptp(np.array(part), axis=0) / limit, axis=1) for part in (last[:60], last[60:])
+    )
+    # What has become much smaller meanwhile is a slow filter on its way, and no oscillation.
+    return np.where(collapsed, np.inf, np.where(moved < 0.5 * before, 0.0, moved))
 
 
 @pytest.mark.slow
@@ -137,7 +140,7 @@ def test_the_verdict_is_that_of_the_simulation_in_200_fleets_around_the_edge() -
         moves = run_together(site, fleets, updates, loads, seed)
         for fleet, update, at, moved in zip(fleets, updates, loads, moves, strict=True):
             found = judge(subject, fleet, update, at, seed=seed)
-            key = (found.verdict, bool(moved > 1e-3))
+            key = (found.verdict, bool(moved > 1e-5))
             told[key] = told.get(key, 0) + 1
     assert sum(told.values()) == 200
     assert told.get((Verdict.STABLE, True), 0) == 0
