@@ -155,8 +155,8 @@ class Sample:
     v_volt : (N,)
         True voltage at each customer, V.
     v_bus_volt : (b + 1,)
-        True voltage of each bus, the busbar first, V; in three phases of each phase of each bus, (3 (b + 1),),
-        NaN where it has none.
+        True voltage of each bus, the busbar first, V; in three phases (3 (b + 1),), the phases of a bus side by
+        side, NaN for one that it does not have.
     x_kvar : (m,)
         Reactive injection of each inverter as its droop curve has it, kvar; attacks come on top.
     p_kw, q_kvar : (N,)
