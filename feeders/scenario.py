@@ -155,7 +155,7 @@ class Sample:
     v_volt : (N,)
         True voltage at each customer, V.
     v_bus_volt : (b + 1,)
-        True voltage of each bus, the busbar first, V; in three phases (3 (b + 1),), the phases of a bus side by
+        True voltage of each bus, the busbar first, V; in three phases (3 (b + 1),), those of a bus side by
         side, NaN for one that it does not have.
     x_kvar : (m,)
         Reactive injection of each inverter as its droop curve has it, kvar; attacks come on top.
