@@ -9,8 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from gridsec.papers import chong2020, kim2018, lee2018, yang2019, yang2021
-
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PAGES = sorted([DOCS / "papers.md", *(DOCS / "papers").glob("*.md"), *(DOCS / "errata").glob("*.md")])
@@ -251,11 +249,3 @@ def test_numbers_are_told_from_each_other() -> None:
     assert expanded("(5) to (7), (9)") == {"(5)", "(6)", "(7)", "(9)"}
     assert "2.2.2" not in numbered(TABLES)["Theorem"]
     assert "(49)" not in numbered(TABLES)[""]
-
-
-@pytest.mark.slow
-def test_every_figure_has_a_line() -> None:
-    lines = [row[0] for _, _, *rows in tables(DOCS / "papers/README.md") for row in rows]
-    papers = (chong2020, kim2018, lee2018, yang2019, yang2021)
-    drawn = [figure.name for paper in papers for figure in paper.reproduce().figures]
-    assert sorted(drawn) == sorted(re.findall(r"`([^`]+)`", " ".join(lines)))

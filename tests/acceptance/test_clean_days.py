@@ -44,9 +44,9 @@ LOW_VOLTAGE = (
 
 @pytest.mark.slow
 @pytest.mark.parametrize("feeder", LOW_VOLTAGE)
-@pytest.mark.parametrize("hour", range(0, 24, 6))
+@pytest.mark.parametrize("hour", [0, 12])
 def test_a_day_without_an_attack_raises_no_alarm(feeder: str, hour: int) -> None:
-    """Four quarters of a day, each from another season and day of the profiles and with other meters."""
+    """A night and an afternoon, each from another season and day of the profiles and with other meters."""
     tables = load(feeder).tables
     tick_s = LARGE_TICK_S if len(tables.customers) > LARGE else SMALL_TICK_S
     settings = replace(tables.meta.monitor, tick_s=tick_s, on_delay_s=0.0, off_delay_s=0.0, silence_s=60.0)

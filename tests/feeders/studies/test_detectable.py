@@ -40,7 +40,7 @@ def test_the_monitor_keeps_what_is_promised_on_a_small_feeder(cigre: Detectable)
 @pytest.mark.slow
 def test_the_monitor_keeps_what_is_promised() -> None:
     found = detectable(RURAL, max_attacked=2)
-    assert rehearse(RURAL, found, trials=300, seed=1) == Rehearsal(300, 0, 0, 0)
+    assert rehearse(RURAL, found, trials=120, seed=1) == Rehearsal(120, 0, 0, 0)
 
 
 def test_lies_half_as_large_as_the_noticed_are_mostly_not_named(cigre: Detectable) -> None:
