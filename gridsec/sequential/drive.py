@@ -8,21 +8,46 @@ It converges for every trusted set and every switching between them by one certi
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats
+from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import DesignInfeasible
-from gridsec.lure import POLICY, Lure, advance
+from gridsec.lure import POLICY, Lure, Transition, advance, step, transition
 from gridsec.sequential.design import SequentialDesign
 
 _PATIENT = replace(POLICY, settled=0.0)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Free:
+    """The inverters that follow the model, prepared: they stay the same for many steps.
+
+    Attributes
+    ----------
+    rows : (k,)
+        Which inverters.
+    loop
+        They among themselves; its input is what all others and the loads do to their voltages.
+    transition
+        Of the loop, for the last step's length.
+    """
+
+    rows: Ints
+    loop: Lure
+    transition: Transition
+
+
 def drive(  # noqa: PLR0917  # state, what drives it, and for how long
-    design: SequentialDesign, x: Floats, y: Floats, driven: Bools, w: Floats | None, h: float
-) -> Floats:
+    design: SequentialDesign,
+    x: Floats,
+    y: Floats,
+    driven: Bools,
+    w: Floats | None,
+    h: float,
+    before: Free | None = None,
+) -> tuple[Floats, Free | None]:
     """The injections a time h later.
 
     Parameters
@@ -39,6 +64,13 @@ def drive(  # noqa: PLR0917  # state, what drives it, and for how long
         Known input of the others; None where all are driven.
     h
         Step, s.
+    before
+        What the last step prepared; used again while it fits.
+
+    Returns
+    -------
+    (m,), Free or None
+        The injections, and what the next step may use.
 
     References
     ----------
@@ -48,17 +80,31 @@ def drive(  # noqa: PLR0917  # state, what drives it, and for how long
     decay = np.exp(-h / droop.tau)
     target = droop(droop.vbar**2 - y)
     if w is None or driven.all():
-        return np.asarray(target + decay * (x - target))
+        return np.asarray(target + decay * (x - target)), before
     out = np.where(driven, target + decay * (x - target), x)
-    free = np.flatnonzero(~driven)
-    H = design.loop[np.ix_(free, free)]
-    own = droop.customer[free]
+    free = _prepared(design, np.flatnonzero(~driven), h, before)
     # The driven ones take the mean of their way from x to out.
     held = np.where(driven, 0.5 * (x + out), 0.0)
-    at = w[own] + design.loop[free] @ held
-    rate = 1.0 / droop.tau[free]
-    size = free.size
-    loop = Lure(
+    at = w[droop.customer[free.rows]] + design.loop[free.rows] @ held
+    try:
+        out[free.rows] = step(free.transition, free.loop, x[free.rows], at)
+    except DesignInfeasible:
+        out[free.rows] = advance(free.loop, x[free.rows], at, h, _PATIENT)
+    return out, free
+
+
+def _prepared(design: SequentialDesign, rows: Ints, h: float, before: Free | None) -> Free:
+    if before is None or not np.array_equal(before.rows, rows):
+        loop = _among(design, rows)
+        return Free(rows, loop, transition(loop, h))
+    return before if before.transition.h == h else replace(before, transition=transition(before.loop, h))
+
+
+def _among(design: SequentialDesign, rows: Ints) -> Lure:
+    droop = design.plant.droop
+    H = design.loop[np.ix_(rows, rows)]
+    rate, size = 1.0 / droop.tau[rows], rows.size
+    return Lure(
         A=-np.diag(rate),
         G=np.diag(rate),
         H=H,
@@ -66,11 +112,6 @@ def drive(  # noqa: PLR0917  # state, what drives it, and for how long
         B=np.zeros((size, size)),
         C=H,
         D=np.eye(size),
-        slope=droop.slope[free],
-        phi=droop.take(free),
+        slope=droop.slope[rows],
+        phi=droop.take(rows),
     )
-    try:
-        out[free] = advance(loop, x[free], at, h)
-    except DesignInfeasible:
-        out[free] = advance(loop, x[free], at, h, _PATIENT)
-    return out

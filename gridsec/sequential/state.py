@@ -12,6 +12,7 @@ from gridsec.sequential.commission import Commission, Learned, Learning, fresh
 from gridsec.sequential.commission import renew as learn_anew
 from gridsec.sequential.conditional import Fit, Prior
 from gridsec.sequential.design import SequentialDesign
+from gridsec.sequential.drive import Free
 from gridsec.sequential.kinds import Kinds
 from gridsec.sequential.kinds import empty as no_kinds
 from gridsec.sequential.repeats import forget as forget_calm
@@ -94,6 +95,8 @@ class SequentialState:
         Frames used.
     x : (m,) or None
         Injections, pu; None before the first frame.
+    free
+        What was prepared for inverters without a trusted meter; None while there were none.
     v0_squared
         Last squared busbar voltage, pu; in three phases (3,).
     window
@@ -120,6 +123,7 @@ class SequentialState:
     since: float
     ticks: int
     x: Floats | None
+    free: Free | None
     v0_squared: Floats | float
     window: Window
     trust: Trust
@@ -163,6 +167,7 @@ def init(
         since=t,
         ticks=0,
         x=None,
+        free=None,
         v0_squared=design.plant.droop.vbar**2,
         window=empty(design.lengths, p),
         trust=Trust(

@@ -15,7 +15,7 @@ from gridsec.sequential.commission import conclude as learn
 from gridsec.sequential.commission import gather, ripe
 from gridsec.sequential.conclude import Tick, conclude
 from gridsec.sequential.design import SequentialDesign
-from gridsec.sequential.drive import drive
+from gridsec.sequential.drive import Free, drive
 from gridsec.sequential.examine import Examined, ended, examine
 from gridsec.sequential.kinds import Kinds, describe, listen, suspicious
 from gridsec.sequential.loads import prior
@@ -69,7 +69,7 @@ def step(
     kinds = listen(design.shapes, state.kinds, heard.y, heard.live)
     copies = suspicious(kinds) & (design.decoder is None)
     begun = _distrust(state.trust, copies)
-    x = _inverters(design, state, frame, heard)
+    x, free = _inverters(design, state, frame, heard)
     q, v2_bus = _voltages(design, frame, heard, x)
     residual = heard.y - v2_bus[at] - state.learned.bias
     window = push(state.window, design.lengths, residual, heard.live)
@@ -91,6 +91,7 @@ def step(
         since=since,
         ticks=state.ticks + 1,
         x=x,
+        free=free,
         v0_squared=heard.v0_squared,
         window=window,
         trust=trust,
@@ -327,7 +328,9 @@ def _factor(error: Floats, std: Floats, old: Floats) -> Floats:
     return np.where(keep, old, np.where(ratio > _MUCH_LESS, raised, 1.0))
 
 
-def _inverters(design: SequentialDesign, state: SequentialState, frame: Frame, heard: _Heard) -> Floats:
+def _inverters(
+    design: SequentialDesign, state: SequentialState, frame: Frame, heard: _Heard
+) -> tuple[Floats, Free | None]:
     """The injections at this frame: at rest at the first one, a step later at every other."""
     droop, meter = design.plant.droop, design.meter_of
     believed = state.trust.trusted & heard.live
@@ -335,7 +338,7 @@ def _inverters(design: SequentialDesign, state: SequentialState, frame: Frame, h
     here = by_place(design.plant.feeder, heard.v0_squared)[design.plant.feeder.bus[droop.customer]]
     y = np.where(driven, heard.y[meter], here) if meter.size else np.zeros(0)
     if state.x is None:
-        return np.asarray(droop(droop.vbar**2 - y))
+        return np.asarray(droop(droop.vbar**2 - y)), None
     w = None
     if not driven.all():
         v2 = _linear(design, frame, np.zeros(droop.tau.size), heard)
@@ -343,7 +346,7 @@ def _inverters(design: SequentialDesign, state: SequentialState, frame: Frame, h
             # What losses took off at the last frame is close enough for inverters without a meter.
             v2 += state.last[0].v2 - _linear(design, frame, state.x, heard)
         w = droop.vbar**2 - v2
-    return drive(design, state.x, y, driven, w, frame.t - state.t)
+    return drive(design, state.x, y, driven, w, frame.t - state.t, state.free)
 
 
 def _linear(design: SequentialDesign, frame: Frame, x: Floats, heard: _Heard) -> Floats:

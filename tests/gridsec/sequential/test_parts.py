@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
 
 from gridsec.droop import fleet
 from gridsec.feeder import lindistflow
 from gridsec.sequential import LoadDoubt, SequentialOptions, design
 from gridsec.sequential.commission import Learning, begin, conclude, gather, nothing
+from gridsec.sequential.drive import Free, drive
 from gridsec.sequential.loads import injection_doubt, prior
 from gridsec.sequential.windows import empty, forget, push, shift
 from tests.gridsec.street import ac_voltages, accuracy, make_plant, random_tree
@@ -75,6 +77,47 @@ class TestLoads:
         std = 2.0 * np.sqrt(0.005**2 / 3.0 + (0.1 / 230.0) ** 2 / 12.0 + 0.0005**2)
         assert found[0] == pytest.approx(min(droop.slope[0] * std, droop.limit[0]))
         np.testing.assert_array_equal(found[1:], 0.0)
+
+
+class TestInverters:
+    def test_those_without_a_meter_follow_the_model(self) -> None:
+        """Against an adaptive integrator; step lengths change, and what was prepared is used again."""
+        rng = np.random.default_rng(5)
+        plant = make_plant(rng, drop=0.06)
+        doubt = LoadDoubt(np.full(9, 0.01), np.full(9, 0.01), 600.0)
+        made = design(plant, doubt=doubt, step_s=1.0)
+        X, droop = 2.0 * lindistflow(plant.feeder).X, plant.droop
+        w = rng.uniform(-0.08, 0.08, 9)
+        x, free = np.zeros(9), None
+        nobody = np.zeros(9, dtype=np.bool_)
+        for h in (1.0, 1.0, 0.3, 1.0, 4.0):
+            x, free = drive(made, x, np.ones(9), nobody, w, h, free)
+        exact = solve_ivp(
+            lambda _, x: (droop(w - X @ x) - x) / droop.tau, (0.0, 7.3), np.zeros(9), rtol=1e-10, atol=1e-12
+        ).y[:, -1]
+        np.testing.assert_allclose(x, exact, atol=2e-3 * np.abs(exact).max())
+
+    @settings(max_examples=40, deadline=None)
+    @given(
+        steps=st.lists(
+            st.tuples(st.integers(0, 7), st.sampled_from([0.2, 1.0, 60.0, 900.0])), min_size=2, max_size=8
+        )
+    )
+    def test_what_was_prepared_changes_nothing(self, steps: list[tuple[int, float]]) -> None:
+        rng = np.random.default_rng(6)
+        plant = make_plant(rng, drop=0.06)
+        made = design(plant, doubt=LoadDoubt(np.full(9, 0.01), np.full(9, 0.01), 600.0), step_s=1.0)
+        w, y = rng.uniform(-0.08, 0.08, 9), rng.uniform(0.9, 1.1, 9)
+        x, before = np.zeros(9), None
+        for who, h in steps:
+            driven = np.array([(who >> (k % 3)) & 1 for k in range(9)], dtype=np.bool_)
+            anew, _ = drive(made, x, y, driven, w, h)
+            x, free = drive(made, x, y, driven, w, h, before)
+            np.testing.assert_array_equal(x, anew)
+            kept = isinstance(before, Free) and isinstance(free, Free)
+            if kept and np.array_equal(before.rows, free.rows):
+                assert free.loop is before.loop
+            before = free
 
 
 class TestWindows:
