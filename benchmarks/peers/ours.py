@@ -80,7 +80,6 @@ class Ours:
         m = v2 - self.flow(p, q, v0)
         found = identify(known, noise, m, self.live, lies=self.lies, false=false, curved=curved)
         best = found[0]
-        error = np.where(best.liars, self.lies.size**2, 0.0) + noise
-        estimate = v2 - error * best.weights
+        estimate = v2 - best.lies - noise * best.weights
         others = tuple((each.liars, each.probability) for each in found[1:])
         return Answer(best.liars, others, np.sqrt(np.maximum(estimate, 0.0)))

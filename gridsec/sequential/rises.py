@@ -45,14 +45,26 @@ class Lies:
         At most this part of clean snapshots names somebody, where errors are what the model says.
     like
         Explanations no more than this factor less likely than the best are reported.
+    amplitude, differ
+        Of lies that are alike: standard deviation of what they have in common, squared pu, and the part of
+        it by which each differs.
+    apart
+        What each liar after the first costs more where lies are independent.
+    pair, more
+        What the second liar, and each further one, costs more where they are alike.
     """
 
     size: float = 0.2
     each: float = 2.3
     seen: tuple[float, float] = (4.0, 6.0)
     false: float = 3.0
-    rate: float = 0.006
+    rate: float = 0.0095
     like: float = 20.0
+    amplitude: float = 0.1
+    differ: float = 0.15
+    apart: float = 4.0
+    pair: float = 3.5
+    more: float = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

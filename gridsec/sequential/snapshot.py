@@ -34,6 +34,7 @@ import numpy as np
 from scipy.linalg import lapack
 
 from gridsec.arrays import Bools, Floats
+from gridsec.sequential.alike import Set, alike, worth
 from gridsec.sequential.conditional import Prior
 from gridsec.sequential.rises import Curved, FalsePowers, Lies, Problem, State, suspicious
 
@@ -67,6 +68,8 @@ class Explained:
         J.
     weights : (p,)
         ``K^-1 m``; what the readings say about any voltage is its covariance with them times this.
+    lies : (p,)
+        What each liar's reading is expected to be off by, squared pu; 0 elsewhere.
     """
 
     liars: Bools
@@ -74,6 +77,7 @@ class Explained:
     probability: float
     cost: float
     weights: Floats
+    lies: Floats
 
 
 def identify(
@@ -115,8 +119,7 @@ def identify(
     lies = Lies() if lies is None else lies
     if not live.any():
         none = np.zeros(0, dtype=np.bool_)
-        nobody = State(none, none, m[:0], np.zeros((0, 0)), m[:0], 0.0, 0.0)
-        return (_explained(nobody, 0.0, 1.0, live),)
+        return (_explained(Set(none, none, 0.0, m[:0], m[:0]), 1.0, live),)
     if live.all():
         d, y, K = noise, m, prior.between
     else:
@@ -281,23 +284,29 @@ def _more(problem: Problem, at: State, known: dict[bytes, State], false: bool) -
 
 def _reported(problem: Problem, found: list[State], live: Bools, lies: Lies) -> tuple[Explained, ...]:
     """The likeliest of them as explanations of all meters, one for each set of liars."""
-    costs = sorted(((problem.cost(each), each) for each in found), key=lambda pair: pair[0])
-    best: dict[bytes, tuple[float, State]] = {}
-    for cost, each in costs:
-        if cost - costs[0][0] <= 2.0 * np.log(lies.like):
-            best.setdefault(each.liars.tobytes(), (cost, each))
-    total = sum(float(np.exp(-0.5 * (cost - costs[0][0]))) for cost, _ in best.values())
-    return tuple(
-        _explained(each, cost, float(np.exp(-0.5 * (cost - costs[0][0]))) / total, live)
-        for cost, each in best.values()
-    )
+    if worth(problem, found):
+        sets = alike(problem, found)
+    else:
+        sets = [
+            Set(each.liars, each.powers, problem.cost(each), each.g, problem.a2 * each.liars * each.g)
+            for each in found
+        ]
+    sets.sort(key=lambda each: each.cost)
+    best: dict[bytes, Set] = {}
+    for each in sets:
+        if each.cost - sets[0].cost <= 2.0 * np.log(lies.like):
+            best.setdefault(each.liars.tobytes(), each)
+    likely = {key: float(np.exp(-0.5 * (each.cost - sets[0].cost))) for key, each in best.items()}
+    total = sum(likely.values())
+    return tuple(_explained(each, likely[key] / total, live) for key, each in best.items())
 
 
-def _explained(each: State, cost: float, probability: float, live: Bools) -> Explained:
+def _explained(each: Set, probability: float, live: Bools) -> Explained:
     """An explanation of the live meters as one of all."""
-    weights = np.zeros(live.size)
-    weights[live] = each.g
-    return Explained(_spread(each.liars, live), _spread(each.powers, live), probability, cost, weights)
+    weights, lies = np.zeros(live.size), np.zeros(live.size)
+    weights[live], lies[live] = each.weights, each.lies
+    liars, powers = _spread(each.liars, live), _spread(each.powers, live)
+    return Explained(liars, powers, probability, each.cost, weights, lies)
 
 
 def _spread(some: Bools, live: Bools) -> Bools:
