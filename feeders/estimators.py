@@ -245,7 +245,7 @@ def _direct_bank(site: Site, _: Job) -> monitor.MonitorDesign:
 
 def _lmi_bank(site: Site, job: Job) -> monitor.MonitorDesign:
     settings = site.tables.meta.monitor
-    lure = close_loop(site.balanced, site.droop, site.meters)
+    lure = close_loop(plant(site).balanced, site.droop, site.meters)
     found = bank_gains(
         lure,
         settings.max_attacked,

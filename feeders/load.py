@@ -208,7 +208,7 @@ def one_phase_each(tables: FeederTables) -> FeederTables:
     tables
         The feeder's tables.
     """
-    rows = [part for row in tables.customers for part in ([row] if len(row.phases) == 1 else _parts(row))]
+    rows = [part for row in tables.customers for part in (_parts(row) if row.phases == "abc" else [row])]
     return replace(tables, customers=tuple(rows))
 
 

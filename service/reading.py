@@ -241,7 +241,7 @@ def _phases(value: Any, known: Known, findings: Findings) -> list[float | None] 
         return None
     named = {f"v_phases[{k}]": v for k, v in enumerate(value)}
     phases = [_number(named, name, findings, required=False) for name in named]
-    if not findings.of and not _phases_plausible(phases, known):
+    if not _phases_plausible(phases, known):
         findings.add(BadReason.VALUE, f"v_phases are absurd where {known.nominal_volt:g} V is nominal")
     return phases
 

@@ -13,13 +13,13 @@ from gridsec.online import Estimate, Verdict
 from service.align import Tick
 
 
-def snapshot(tick: Tick) -> Snapshot:
+def snapshot(site: Site, tick: Tick) -> Snapshot:
     """Return what a tick's readings say, as `feeders.load.to_frame` takes it.
 
     Parameters
     ----------
-    tick
-        The tick.
+    site, tick
+        The feeder, and the tick.
     """
     nan = math.nan
     rows = [(nan, nan, nan) if r is None else (r.v_volt, r.p_kw, r.q_kvar) for r in tick.readings]
@@ -29,15 +29,16 @@ def snapshot(tick: Tick) -> Snapshot:
         v_volt=columns[:, 0].copy(),
         p_kw=columns[:, 1].copy(),
         q_kvar=columns[:, 2].copy(),
-        v0_volt=_busbar(tick),
+        v0_volt=_busbar(site, tick),
     )
 
 
-def _busbar(tick: Tick) -> Floats | float:
+def _busbar(site: Site, tick: Tick) -> Floats | float:
     if tick.busbar is None:
         return math.nan
     phases = tick.busbar.v_phases
-    return tick.busbar.v_volt if phases is None else np.array(phases)
+    # A balanced feeder has one voltage, and a phase that is not measured does not take it away.
+    return tick.busbar.v_volt if phases is None or isinstance(site.feeder, Feeder) else np.array(phases)
 
 
 def bus_volts(site: Site, v2_bus: Floats) -> tuple[Floats, Floats]:

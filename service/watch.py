@@ -241,7 +241,7 @@ class Watch:
         if self._state is None or (self.report is not None and tick.t <= self.report.t):
             # The first tick, or the clock was set back: what was known belongs to another time.
             self._state = self._watcher.init(tick.t, self.commissioning.known)
-        frame = to_frame(self.site, snapshot(tick))
+        frame = to_frame(self.site, snapshot(self.site, tick))
         self._state, estimate, verdict = self._watcher.step(self._state, frame)
         self.commissioning.follow(self._state, tick.t)
         return build(self.site, tick, self.max_attacked, estimate, verdict)

@@ -13,7 +13,7 @@ from feeders.estimators import DIRECT, FAMILIES, LMI, SEQUENTIAL, choose, design
 from feeders.load import load, to_frame
 from feeders.powerflow import PowerFlow
 from feeders.scenario import START, Scenario, random_attacks, simulate, snapshots
-from gridsec.errors import FeederInvalid, NotObservable
+from gridsec.errors import DesignInfeasible, FeederInvalid, NotObservable
 from gridsec.lure import close_loop
 from gridsec.online import Decision
 
@@ -32,6 +32,17 @@ def test_the_file_is_the_default_and_can_be_overruled() -> None:
 def test_every_name_that_a_file_may_hold_has_a_family() -> None:
     assert tuple(FAMILIES) == ESTIMATORS
     assert all(family.summary for family in FAMILIES.values())
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_an_estimator_takes_three_phases_or_says_that_it_does_not(name: str) -> None:
+    site = choose(load("ieee-european-lv"), estimator=name, max_attacked=1)
+    try:
+        watcher = design(site)
+    except DesignInfeasible as error:
+        assert "cannot watch single phases" in str(error)  # noqa: PT017  # others take them
+    else:
+        assert watcher.design.customers == len(site.feeder.customers)
 
 
 def test_every_mistake_is_named() -> None:

@@ -163,6 +163,15 @@ def test_a_site_has_a_customer_and_a_meter_for_each_phase() -> None:
     assert from_tables(site.tables).digest == site.digest
 
 
+@pytest.mark.parametrize("phases", ["ab", "cba"])
+def test_phases_that_the_format_does_not_have_are_refused(phases: str) -> None:
+    tables = find("ieee-european-lv")
+    first, *others = tables.customers
+    with pytest.raises(FeederInvalid, match="column phases") as caught:
+        from_tables(replace(tables, customers=(replace(first, phases=phases), *others)))
+    assert len(caught.value.problems) == 1
+
+
 def test_uncertain_powers_are_parted_as_those_of_independent_phases() -> None:
     tables = single_phase()
     rows = tuple(replace(row, p_std_kw=0.6, q_std_kvar=0.3) for row in tables.customers)

@@ -10,14 +10,16 @@ import msgspec
 import numpy as np
 import pytest
 
-from feeders.load import Site, from_tables, load
+from feeders.load import Site, from_tables, load, to_frame
 from feeders.recording import read_recording, record
 from feeders.scenario import Scenario, random_attacks, simulate
+from service.align import Tick
 from service.describe import detail
 from service.models import FeederDetail, State
-from service.reading import BadReason
+from service.reading import BadReason, Reading
 from service.replay import Tally, replay
 from service.simulate import Pace, payload_of, play
+from service.voltages import snapshot
 from service.watch import known_of
 from service.wire import Decoded, Wire
 from tests.service.running import service, until
@@ -66,6 +68,21 @@ def test_what_is_no_voltage_of_phases(site: Site, phases: object, reason: BadRea
     assert not decoded.readings
     assert decoded.bad[0].reason is reason
     assert any(said in problem for problem in decoded.bad[0].problems)
+
+
+def test_every_problem_is_named_with_those_of_the_phases(site: Site) -> None:
+    (bad,) = decode(site, v_volt=1e9, v_phases=[240.0, 1e9, 240.0]).bad
+    assert len(bad.problems) == 2
+
+
+def test_phases_do_not_matter_to_a_balanced_feeder() -> None:
+    village = load("kerber-landnetz")
+    nobody = (None,) * len(village.meter_ids)
+    for phases in (None, (229.0, float("nan"), 233.0), (0.0, 0.0, 0.0)):
+        busbar = Reading(village.feeder.name, None, START, 231.0, v_phases=phases)
+        said = snapshot(village, Tick(START, nobody, busbar, ()))
+        assert said.v0_volt == 231.0
+        assert to_frame(village, said).v0_phases is None
 
 
 def test_the_layout_is_that_of_the_buses(site: Site) -> None:

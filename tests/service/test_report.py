@@ -114,7 +114,7 @@ def test_the_monitor_s_own_sentences_name_no_customer(site: Site) -> None:
         heard = {r.meter: r for r in sample.readings if not (r.meter == "m01" and 32 <= sample.t - T < 36)}
         readings = tuple(heard.get(meter) for meter in site.meter_ids)
         now = Tick(sample.t, readings, heard[""], ())  # type: ignore[arg-type]
-        state, estimate, verdict = finished.step(state, to_frame(site, snapshot(now)))
+        state, estimate, verdict = finished.step(state, to_frame(site, snapshot(site, now)))
         report = build(site, now, 2, estimate, verdict)
         said.add(report.cause)
         assert not names.search(report.reason), report.reason
@@ -161,7 +161,7 @@ def test_blind_reports_are_undecided_and_estimate_nothing(site: Site) -> None:
 
 
 def test_snapshots_keep_the_order_of_the_meters(site: Site) -> None:
-    found = snapshot(tick(site, {4: 3.0}, (0, 2)))
+    found = snapshot(site, tick(site, {4: 3.0}, (0, 2)))
     assert np.flatnonzero(np.isnan(found.v_volt)).tolist() == [0, 2]
     assert found.v_volt[4] == pytest.approx(site.feeder.base_volt + 3.0)
     assert np.isnan(found.q_kvar).all()
@@ -244,7 +244,7 @@ def test_a_wrong_inverter_and_a_lying_meter_of_a_real_feeder(site: Site) -> None
     for sample in simulate(site, scenario):
         heard = {r.meter: r for r in sample.readings}
         now = Tick(sample.t, tuple(heard[m] for m in site.meter_ids), heard[""], ())  # type: ignore[arg-type]
-        state, estimate, verdict = finished.step(state, to_frame(site, snapshot(now)))
+        state, estimate, verdict = finished.step(state, to_frame(site, snapshot(site, now)))
         report = build(site, now, 1, estimate, verdict)
     assert isinstance(report, FeederReport)
     found = {c.kind: c for c in conditions(report) if c.known}
