@@ -190,7 +190,7 @@ def calibrate(
         journal, _subject(site, given, risk, tolerance) | {"exclude": sorted(exclude), "kinds": sorted(kinds)}
     )
     state, found = State(site.tables, tuple(exclude)), list[dict[str, Any]]()
-    while True:
+    for step in range(MOST_ERRORS + 1):
         now = prepare(state, given, tolerance=tolerance, errors=True)
         said: list[Verdict] = []
 
@@ -198,11 +198,16 @@ def calibrate(
             said.append(compare(now, given, risk, progress or _quiet, kinds))
             return _best(now, said[0], risk)
 
-        row = kept.get(f"error {len(found)}", work)
-        if row is None or len(found) == MOST_ERRORS:
+        row = kept.get(f"error {step}", work)
+        if row is None or step == MOST_ERRORS:
             break
         wrong = _read(row["correction"])
-        state = state.after(wrong)
+        if wrong.kind is Kind.METER:
+            # What its readings may have been taken for until now is forgotten: all begins again without it.
+            state = State(site.tables, (*state.excluded, *wrong.names))
+            found = [each for each in found if each["correction"]["kind"] == Kind.METER]
+        else:
+            state = state.after(wrong)
         found.append(row)
     verdict = said[0] if said else compare(now, given, risk, progress or _quiet, kinds)
     lines, ids = calibrate_tables.lines(now, tolerance)

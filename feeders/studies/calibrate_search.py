@@ -53,6 +53,9 @@ CHANGE_SPREAD: Final = 0.005
 SHORTEST: Final = 0.05
 """No line is shorter than this part of what its files say."""
 
+LIE_SPREAD: Final = 0.05
+"""The same of an error that is there all the time and that no honest meter of its class has."""
+
 PIECES: Final = 8
 """Stretches of time in which a meter's error may differ."""
 
@@ -317,6 +320,11 @@ def _chunks(now: Round, kinds: Collection[Kind]) -> Iterator[Chunk]:
         columns, times = steps(series, j, PIECES)
         changes = [Guess(Kind.METER, j, since=since, until=until) for since, until in times]
         yield changes, partial(_seen, now, columns), CHANGE_SPREAD
+    if Kind.METER in kinds:
+        span = float(series.t[0]), float(series.t[-1])
+        always = [Guess(Kind.METER, j, since=span[0], until=span[1]) for j in trusted]
+        columns = now.given.columns[:, :, now.given.where["bias"][trusted]]
+        yield always, partial(_seen, now, columns), LIE_SPREAD
 
 
 def _buses(net: Network, trusted: list[int]) -> list[Guess]:

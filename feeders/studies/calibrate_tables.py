@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from scipy.stats import norm
 
-from feeders.studies.calibrate_search import LENGTH_SPREAD, Correction, Kind
+from feeders.studies.calibrate_search import LENGTH_SPREAD, SHORTEST, Correction, Kind
 from gridsec.studies.calibrate import explain
 from gridsec.studies.calibrate_model import lengthened
 
@@ -133,7 +133,7 @@ def final(
                 "low": estimate - WIDE * std,
                 "high": estimate + WIDE * std,
             }
-        decided = not row["alternatives"]
+        decided = not row["alternatives"] and wrong.factor >= SHORTEST
         verdict = EXCLUDED if wrong.kind is Kind.METER else PROPOSED if decided else UNTOLD
         if decided and wrong.kind is not Kind.METER:
             sure.append(wrong)

@@ -17,7 +17,7 @@ from feeders.schema import read, write
 from feeders.studies.calibrate import OtherFeeder, calibrate
 from feeders.studies.calibrate_search import Kind
 from feeders.studies.journal import OtherStudy
-from gridsec.attack import Bias, Drift
+from gridsec.attack import Attack, Bias, Drift, Replay, Stuck
 from tests.feeders.studies.calibrate_cases import (
     CIGRE,
     biases,
@@ -125,6 +125,36 @@ def test_a_meter_whose_error_changes_is_excluded_and_leads_to_no_correction(
     assert found.corrections == ()
     assert found.meters.set_index("meter").loc["m03", "verdict"] == "excluded"
     assert found.customers.set_index("meter").loc["m03", "verdict"] == "excluded"
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize(
+    ("meter", "lie"),
+    [
+        (4, Bias(np.array([4]), START, np.inf, np.array([-0.03]))),
+        (2, Bias(np.array([2]), START, np.inf, np.array([0.08]))),
+        (2, Stuck(np.array([2]), START + 5 * 900.0, np.inf)),
+        (2, Replay(np.array([2]), START + 86400.0, np.inf, 43200.0)),
+    ],
+    ids=["low", "high", "stuck", "replay"],
+)
+def test_no_lie_becomes_a_correction(meter: int, lie: Attack, seed: int, tmp_path: Path) -> None:
+    found = calibrate(CIGRE, recorded(tmp_path, scenario(seed, attacks=(lie,))))
+    assert found.proposals["kind"].tolist() == ["meter"]
+    assert found.proposals["what"].tolist() == [CIGRE.meter_ids[meter]]
+    assert found.corrections == ()
+
+
+def test_an_error_of_the_files_is_found_beside_a_lie(tmp_path: Path) -> None:
+    lie = Stuck(np.array([2]), START + 5 * 900.0, np.inf)
+    wrong = site(shortened(TABLES, "Line R6-R16", 1.4))
+    journal = tmp_path / "journal"
+    readings = recorded(tmp_path, scenario(1, attacks=(lie,)))
+    found = calibrate(wrong, readings, journal=journal)
+    assert sorted(found.proposals["kind"]) == ["length", "meter"]
+    assert [each.names for each in found.corrections] == [("Line R6-R16",)]
+    again = calibrate(wrong, readings, journal=journal)
+    pd.testing.assert_frame_equal(again.proposals, found.proposals)
 
 
 @pytest.mark.parametrize(("ticks", "dt_s"), [(3600, 2.0), (1080, 20.0)])
