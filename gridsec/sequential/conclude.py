@@ -13,7 +13,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats
 from gridsec.judge import Situation, decide
-from gridsec.network import busbar_places
+from gridsec.network import busbar_places, one_busbar
 from gridsec.online import Cause, Decision, Estimate, Explanation, Verdict
 from gridsec.sequential.conditional import judge
 from gridsec.sequential.design import SequentialDesign
@@ -85,6 +85,7 @@ def conclude(design: SequentialDesign, state: SequentialState, tick: Tick) -> tu
         )
     )
     said = _contradicted(design, beyond & ~trust.named, trust.named, said)
+    said = _unvouched(design, tick.busbar, live, said)
     decision, cause, reason = _beside_meters(design, state, tick, amounts, said)
     injected = np.zeros(plant.droop.tau.size)
     for k, amount in amounts.items():
@@ -139,6 +140,27 @@ def _contradicted(design: SequentialDesign, beyond: Bools, named: Bools, said: _
         return said
     sentence = f"{said[2][:-1]}; but so are {more} of the others, and at most {most} can be told apart."
     return Decision.UNDECIDED, Cause.TOO_MANY_SUSPECTS, sentence
+
+
+def _unvouched(design: SequentialDesign, busbar: Bools | bool, live: Bools, said: _Said) -> _Said:
+    """The answer, unless nobody would notice that a phase without a busbar voltage is lied about as a whole.
+
+    On a balanced feeder most meters are honest, and they say where the busbar is. In three phases those of
+    the same phase say it, and that most of these are honest takes more than twice as many as may lie.
+    """
+    if said[0] is not Decision.CLEAN or np.all(busbar):
+        return said
+    feeder, meters = design.plant.feeder, design.prior.meters[live]
+    heard = one_busbar(feeder, np.arange(np.size(busbar)), meters) * np.ones(meters.size)
+    count = np.where(busbar, meters.size, heard.sum(axis=-1)).min()
+    most = max(1, min(design.most, meters.size // 3))
+    if count > 2 * most:
+        return said
+    sentence = (
+        f"The busbar voltage of a phase is missing, and {count:.0f} meters report from there; at least "
+        f"{2 * most + 1} are needed to tell {most} manipulated from the others."
+    )
+    return Decision.UNDECIDED, Cause.TOO_FEW_METERS, sentence
 
 
 def _beside_meters(

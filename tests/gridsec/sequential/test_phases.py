@@ -257,6 +257,25 @@ class TestTheEuropeanFeeder:
             assert np.ptp(frame.v0_phases) > 1e-3
             state, _, verdict = watcher.step(state, replace(frame, v0_phases=None))
             assert not verdict.suspects.any()
+            # 15 meters of a phase could all lie without anybody to contradict them.
+            assert verdict.decision is Decision.UNDECIDED
+        assert verdict.cause is Cause.TOO_FEW_METERS
+        assert "15 meters report from there; at least 37" in verdict.reason
+
+    @pytest.mark.parametrize("said", [None, np.nan, 0.0])
+    def test_a_whole_phase_that_lies_is_never_clean_without_its_busbar_voltage(
+        self, said: float | None
+    ) -> None:
+        this = self.trial(None, 20.0)
+        watcher = design_site(this.stated)
+        phase = np.array(["abc".index(row.phases) for row in this.stated.tables.customers])
+        state = watcher.init(0.0)
+        for frame, _ in frames(this):
+            assert frame.v0_phases is not None
+            v0 = None if said is None else np.where(np.arange(3) == 2, said, frame.v0_phases)
+            told = np.where(phase == 2, 1.2 * frame.y, frame.y)
+            state, _, verdict = watcher.step(state, replace(frame, y=told, v0_phases=v0))
+            assert verdict.decision is not Decision.CLEAN
 
     def test_absurd_frames_get_an_answer(self) -> None:
         this = self.trial(None, 12.0)
