@@ -9,13 +9,20 @@ from typing import Final
 
 import numpy as np
 
-from feeders.convert_changes import Change
+from feeders.convert_changes import WHOLE, Change
 from feeders.convert_customers import HOUSEHOLD_KW, droop_preset, reactive, rounded, usual_profile
 from feeders.schema import CustomerRow
 from gridsec.arrays import Phasors
 
 NO_POWER: Final = 1e-9
 """Share of a load's power that is a solver's last digits."""
+
+SWITCHED_OFF: Final = (
+    "in service",
+    "changed",
+    "switched off in the source; a customer who is expected to draw nothing",
+)
+"""What becomes of a load that is switched off: property, what was done, effect."""
 
 EVEN: Final = 1e-6
 """Spread of the phases' powers, as a share of the largest, below which a connection is of three phases."""
@@ -75,13 +82,18 @@ def customers_of(
     rows: list[CustomerRow] = []
     power: dict[str, complex] = {}
     for draw in sorted(draws, key=lambda each: each.rating_kva is not None):
-        for phases, kva in _connections(draw):
+        connections = _connections(draw)
+        if not connections:
+            what = "load" if draw.rating_kva is None else "generator"
+            effect = "draws nothing in the source's power flow"
+            changes.append(Change(f"{what} {draw.name}", WHOLE, "left out", effect))
+        for phases, kva in connections:
             row = CustomerRow(_unique(draw, phases, {*taken, *power}), draw.bus, 0.0, phases=phases)
             power[row.customer] = kva
             if draw.rating_kva is None:
                 rows.append(_load(row, kva, len(rows), volt, changes))
                 continue
-            share = draw.rating_kva if phases == "abc" else draw.rating_kva / len(_connections(draw))
+            share = draw.rating_kva if phases == "abc" else draw.rating_kva / len(connections)
             row = replace(row, pv_kw=rounded(max(-kva.real, 0.0)), pv_profile=f"PV{len(rows) % 8 + 1}")
             if share > 0:
                 row = replace(row, inverter_kva=rounded(share), droop=droop or droop_preset(share))

@@ -35,6 +35,9 @@ CONSTANT_POWER: Final = (
 DEAD: Final = 1e-4
 """Voltage, pu, below which nothing energises a phase: only open lines end there."""
 
+SAME_POWER: Final = 1e-6
+"""Relative difference of two powers below which they are the same."""
+
 SERIES: Final = {"line", "reactor"}
 COUPLINGS: Final = {"transformer", "autotrans"}
 LOADS: Final = {"load"}
@@ -137,7 +140,9 @@ def _read(dss: Any, path: Path) -> Network:
     _run(dss, CONSTANT_POWER)
     volts = _solved(dss)
     if volts:
+        before = elements
         elements = [_element(dss, name, problems) for name in dss.Circuit.AllElementNames()]
+        changes += _beyond_limits(before, elements, {change.element for _, change in changes})
     nominal = _nominal(dss, problems)
     network = Network(
         tool=f"OpenDSS {version('dss_python_backend')}",
@@ -224,6 +229,21 @@ def _voltage_dependence(dss: Any) -> tuple[list[tuple[str, Change]], list[tuple[
             effect = "a household's or a trade's profile of the library instead"
             shapes.append((bus, Change(f"load {name}", f"load shape {shape}", "left out", effect)))
     return changes, shapes
+
+
+def _beyond_limits(
+    found: list[_Element], constant: list[_Element], known: set[str]
+) -> list[tuple[str, Change]]:
+    """Loads and generators that become impedances at their voltages, though said to be of constant power."""
+    out = []
+    for one, other in zip(found, constant, strict=True):
+        if one.kind not in {"load", "generator"} or not one.enabled:
+            continue
+        label, power = f"{one.kind} {one.name}", other.power_kva[0].sum()
+        if label not in known and abs(one.power_kva[0].sum() - power) > SAME_POWER * abs(power):
+            effect = "beyond them it depends on the voltage in the source; taken as constant power"
+            out.append((one.buses[0], Change(label, "vminpu, vmaxpu", "approximated", effect)))
+    return out
 
 
 def _element(dss: Any, full: str, problems: list[str]) -> _Element:

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from feeders.convert_changes import Change
+from feeders.convert_changes import WHOLE, Change
 from feeders.convert_customers import (
     HOUSEHOLD_KW,
     HOUSEHOLDS,
@@ -23,7 +23,7 @@ from feeders.convert_customers import (
     usual_profile,
     with_meters,
 )
-from feeders.convert_draws import customers_of
+from feeders.convert_draws import SWITCHED_OFF, customers_of
 from feeders.convert_network import Converted, Network, below, below_source, finished, one_busbar
 from feeders.convert_pandapower_net import ids, network_of
 from feeders.profiles import envelopes
@@ -186,6 +186,11 @@ def _phase_rows(source: _Source, number: int) -> Iterable[CustomerRow]:
         scale = float(row.scaling) * float(row.in_service) * 1000.0
         drawn = {phase: complex(row[f"p_{phase}_mw"], row[f"q_{phase}_mvar"]) for phase in "abc"}
         used = [phase for phase, s in drawn.items() if s != 0]
+        if not used:
+            effect = "draws nothing on any phase in the source"
+            source.changes.append(Change(f"load {names[i]}", WHOLE, "left out", effect))
+        elif not row.in_service:
+            source.changes.append(Change(f"load {names[i]}", *SWITCHED_OFF))
         if str(row.get("type", "wye")) == "delta":
             effect = "in star, each phase with its own power; the check shows what that does"
             source.changes.append(Change(f"load {names[i]}", "delta", "approximated", effect))
@@ -228,6 +233,8 @@ def _load_row(source: _Source, index: int, name: str, number: int) -> CustomerRo
         for column in row.index
         if str(column).startswith("const_") and float(row[column]) > 0
     )
+    if not row.in_service:
+        source.changes.append(Change(f"load {name}", *SWITCHED_OFF))
     low_voltage = float(source.net.bus.at[int(row.bus), "vn_kv"]) < 1.0
     profile = str(row["profile"]) if "profile" in row and isinstance(row["profile"], str) else ""
     if profile not in envelopes():
@@ -256,7 +263,10 @@ def _generators(
         if int(generator.bus) not in source.inside:
             continue
         bus, label = source.names[int(generator.bus)], f"generator {names[i]}"
-        s = complex(generator.p_mw, generator.q_mvar) * float(generator.scaling) * float(generator.in_service)
+        if not generator.in_service:
+            source.changes.append(Change(label, WHOLE, "left out", "switched off in the source"))
+            continue
+        s = complex(generator.p_mw, generator.q_mvar) * float(generator.scaling)
         kw = rounded(s.real * 1000.0)
         kva = float(generator.sn_mva) * 1000.0
         kva = rounded(kva) if math.isfinite(kva) and kva > 0 else kw

@@ -47,6 +47,9 @@ COLUMNS: Final = {
 """What is needed of a net's tables."""
 
 UNLIMITED_KA: Final = 1000.0
+SWITCH_RX: Final = 2.0
+"""R / X of the impedance of switches between buses, which pandapower's power flow takes by itself."""
+
 TURN: Final = np.exp(-2j * np.pi / 3.0 * np.arange(3))
 SIDES: Final = {"trafo": ("hv", "lv"), "trafo3w": ("hv", "mv", "lv")}
 
@@ -222,8 +225,8 @@ def _switch_rows(net: Any, buses: dict[int, str]) -> Iterator[LineRow]:
                 line=names[i],
                 from_bus=buses[int(row.bus)],
                 to_bus=buses[int(row.element)],
-                r_ohm=rounded(ohm),
-                x_ohm=0.0,
+                r_ohm=rounded(ohm * SWITCH_RX / math.hypot(1.0, SWITCH_RX)),
+                x_ohm=rounded(ohm / math.hypot(1.0, SWITCH_RX)),
                 closed=bool(row.closed),
             )
 

@@ -15,7 +15,7 @@ from power_grid_model.validation import validate_input_data
 
 from feeders.convert_changes import WHOLE, Change
 from feeders.convert_customers import rounded
-from feeders.convert_draws import Draw
+from feeders.convert_draws import SWITCHED_OFF, Draw
 from feeders.convert_lines import capacitor, line_row, open_end
 from feeders.convert_network import Coupling, Network
 from feeders.records import some
@@ -33,6 +33,12 @@ COUPLINGS: Final = {
     "three_winding_transformer": tuple((f"node_{k}", f"p_{k}", f"q_{k}") for k in (1, 2, 3)),
     "generic_branch": (("from_node", "p_from", "q_from"), ("to_node", "p_to", "q_to")),
 }
+CARRIED: Final = {
+    *("node", "source", "line", "asym_line", "link", "shunt"),
+    *(*LOADS, *GENERATORS, *COUPLINGS),
+}
+"""Tables that are told about row by row."""
+
 STATUS: Final = ("status", "from_status", "to_status", "status_1", "status_2", "status_3")
 TOLERANCES: Final = (1e-11, 1e-9, 1e-7)
 """Largest voltage corrections of the last Newton step, pu; links, almost short circuits, limit them."""
@@ -284,6 +290,9 @@ def _draws(tables: Tables, network: Network) -> None:
         for row in _rows(tables, kind):
             power = sign * float(row["status"]) * _by_phase(row["p_specified"], row["q_specified"])
             even = bool((power == power[0]).all())
+            if not row["status"]:
+                off = Change(f"{kind} {row['id']}", *SWITCHED_OFF)
+                network.of_bus.append((str(row["node"]), off))
             rating = float(np.abs(power.sum())) if kind in GENERATORS else None
             network.draws.append(Draw(f"{kind} {row['id']}", str(row["node"]), power, even, rating))
 
@@ -309,7 +318,7 @@ def _shunts(tables: Tables, solved: Tables, network: Network) -> None:
 def _rest(tables: Tables, network: Network) -> None:
     """Name the tables that say nothing about the network itself."""
     for kind, rows in tables.items():
-        if not len(rows):
+        if not len(rows) or kind in CARRIED:
             continue
         if kind.endswith("_sensor"):
             effect = "every customer has a meter of the feeder's own kind instead"
@@ -318,5 +327,5 @@ def _rest(tables: Tables, network: Network) -> None:
         elif kind == "fault":
             effect = "not part of a power flow"
         else:
-            continue
+            effect = "has no place in a feeder; the check shows what that does"
         network.changes.append(Change(f"{len(rows)} {kind}(s)", WHOLE, "left out", effect))

@@ -215,3 +215,27 @@ def test_sentences_of_a_check_and_of_changes() -> None:
         + " and 3 more; constant power",
     )
     assert len(changes_csv(same).splitlines()) == 12
+
+
+def test_switches_with_an_impedance_and_what_is_switched_off(tmp_path: Path) -> None:
+    net = networks.create_kerber_landnetz_freileitung_1()
+    far = int(net.load.bus.iloc[-1])
+    end = pp.create_bus(net, 0.4, name="end")
+    pp.create_switch(net, far, end, "b", z_ohm=0.05, name="fuse")
+    pp.create_load(net, end, 0.01, 0.003, name="shop")
+    pp.create_load(net, end, 0.02, 0.001, name="closed shop", in_service=False)
+    pp.create_sgen(net, end, 0.02, sn_mva=0.02, name="old roof", in_service=False)
+    pp.to_json(net, str(tmp_path / "net.json"))
+    done = convert(str(tmp_path / "net.json"), tmp_path / "x")
+    assert done.check is not None
+    assert done.check.largest_pu < UNBALANCED_PU
+    said = [(each.element, each.prop, each.done) for each in done.changes]
+    assert ("load closed shop", "in service", "changed") in said
+    assert ("generator old roof", "all of it", "left out") in said
+    customers = {row.customer: row for row in read(tmp_path / "x").customers}
+    assert customers["closed shop"].load_kw == 0.0
+    # A generator that is switched off does not become an inverter that works.
+    assert not any(row.inverter_kva for row in customers.values())
+    pp.create_asymmetric_load(net, end, name="nobody")
+    later = [(each.element, each.prop, each.done) for each in from_pandapower(net, "x").changes]
+    assert ("load nobody", "all of it", "left out") in later

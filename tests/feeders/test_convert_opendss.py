@@ -253,3 +253,28 @@ def test_another_engine_and_the_folder_are_left_alone(
     assert set(os.listdir(tmp_path)) == {"net", "x"}
     assert Path.cwd() == tmp_path
     assert capfd.readouterr() == ("", "")
+
+
+def test_loads_beyond_their_limits_of_voltage_and_without_power_are_named(tmp_path: Path) -> None:
+    source = master(
+        tmp_path,
+        """
+new line.long bus1=B1 bus2=Far linecode=lc length=900 units=m
+new load.mill bus1=Far phases=3 kv=0.4 kw=40 pf=0.95
+new load.steady bus1=Far phases=3 kv=0.4 kw=5 pf=0.95 vminpu=0.5
+new load.empty bus1=B1.2 phases=1 kv=0.231 kw=0 kvar=0
+new pvsystem.dark bus1=B1.3 phases=1 kv=0.231 kva=5 pmpp=5 irradiance=0
+""",
+    )
+    done = convert(source, tmp_path / "x")
+    assert done.check is not None
+    assert done.check.largest_pu < UNBALANCED_PU
+    # The mill is an impedance below 95 % of its voltage: OpenDSS has higher voltages than the feeder.
+    assert done.check.as_found_pu is not None
+    assert done.check.as_found_pu > 1e-3
+    said = [(each.element, each.prop, each.done) for each in done.changes]
+    assert ("load mill", "vminpu, vmaxpu", "approximated") in said
+    assert ("load empty", "all of it", "left out") in said
+    assert ("generator dark", "all of it", "left out") in said
+    assert not [each for each in said if "steady" in each[0] or "shop" in each[0]]
+    assert {row.customer for row in read(tmp_path / "x").customers} == {"shop", "mill", "steady"}

@@ -85,6 +85,7 @@ def test_everything_is_carried_over_or_named(tmp_path: Path) -> None:
     tables["sym_load"].append(load(52, 5, 1e4, 3e3, kind=2))
     tables["asym_load"] = [load(53, 5, [5e3, 0.0, 2e3], [1e3, 0.0, 0.0])]
     tables["sym_gen"] = [load(54, 3, 1.5e4, 0.0)]
+    tables["sym_load"].append(load(56, 5, 6e3, 1e3) | {"status": 0})
     tables["node"].append({"id": 8, "u_rated": 230.0})
     tables["transformer"].append(transformer(11, 7, 8, (400.0, 230.0)))
     tables["sym_load"].append(load(55, 8, 8e3, 2e3))
@@ -109,6 +110,7 @@ def test_everything_is_carried_over_or_named(tmp_path: Path) -> None:
     said = "\n".join(done.notes)
     for part in (
         "constant current of sym_load 52",
+        "in service of sym_load 56; switched off",
         "zero-sequence charging of line 25",
         "shunt conductance of line 25",
         "connection of shunt 60",
