@@ -60,10 +60,10 @@ class Lies:
     false: float = 3.0
     rate: float = 0.0095
     like: float = 20.0
-    amplitude: float = 0.1
+    amplitude: float = 0.06
     differ: float = 0.15
     apart: float = 4.0
-    pair: float = 3.5
+    pair: float = 4.0
     more: float = 2.0
 
 
