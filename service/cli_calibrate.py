@@ -9,7 +9,7 @@ import typer
 from rich.markup import escape
 
 from service import console
-from service.cli_plan import bar, said, show
+from service.cli_plan import Journal, Out, bar, said, show
 from service.console import Feeder
 from service.tables import write_tables
 
@@ -39,12 +39,8 @@ def calibrate(
     write: Annotated[
         Path | None, typer.Option(help="Write a corrected copy of the feeder into this new folder.")
     ] = None,
-    journal: Annotated[
-        Path | None, typer.Option(help="Keep finished work in this file, and go on from it.")
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option(help="Write the tables into this folder, as CSV and Parquet.")
-    ] = None,
+    journal: Journal = None,
+    out: Out = None,
 ) -> None:
     """What recorded readings say against a feeder's files: places, phases, lengths, meters, loads.
 
@@ -57,6 +53,8 @@ def calibrate(
     for name in look_for or ():
         if name not in tuple(Kind):
             raise typer.BadParameter(f"{name!r}: expected one of {', '.join(Kind)}", param_hint="--look-for")
+    if write is not None and write.exists() and (not write.is_dir() or any(write.iterdir())):
+        raise typer.BadParameter(f"{write}: already there; expected a new folder", param_hint="--write")
     site = site_of(feeder)
     with bar("errors that the readings may speak for") as tell, said():
         found = study(

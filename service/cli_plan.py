@@ -15,7 +15,7 @@ from rich.table import Table
 
 from service import console
 from service.console import Feeder
-from service.tables import write_tables
+from service.tables import A_FEEDER, is_feeder, write_tables
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -32,7 +32,19 @@ Silent = Annotated[list[str] | None, typer.Option(help="A meter that is missing;
 BusbarUnknown = Annotated[bool, typer.Option("--busbar-unknown", help="The busbar's voltage is not metered.")]
 CurvesAt = Annotated[str, typer.Option(help="Where inverters work: steepest or deadband.")]
 Journal = Annotated[Path | None, typer.Option(help="Keep finished work in this file, and go on from it.")]
-Out = Annotated[Path | None, typer.Option(help="Write the tables into this folder, as CSV and Parquet.")]
+
+
+def _apart(folder: Path | None) -> Path | None:
+    """Refuse a feeder's own folder before the work, and not after it."""
+    if folder is not None and is_feeder(folder):
+        raise typer.BadParameter(f"{folder}: {A_FEEDER}")
+    return folder
+
+
+Out = Annotated[
+    Path | None,
+    typer.Option(help="Write the tables into this folder, as CSV and Parquet.", callback=_apart),
+]
 
 
 def redundancy(

@@ -6,12 +6,27 @@ import os
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
+
+from feeders.raw import META_FILE
 
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["write_tables"]
+__all__ = ["A_FEEDER", "is_feeder", "write_tables"]
+
+A_FEEDER: Final = "a feeder's folder; tables would replace its own files, they go into another folder"
+
+
+def is_feeder(folder: Path) -> bool:
+    """Return whether a folder holds a feeder.
+
+    Parameters
+    ----------
+    folder
+        A folder, or what may become one.
+    """
+    return (folder / META_FILE).exists()
 
 
 def write_tables(folder: Path | None, tables: Mapping[str, pd.DataFrame]) -> None:
@@ -30,11 +45,15 @@ def write_tables(folder: Path | None, tables: Mapping[str, pd.DataFrame]) -> Non
     ------
     ValueError
         If a name is not that of a file in the folder.
+    FileExistsError
+        If the folder is a feeder's: tables have names like those of its own files.
     OSError
         If the folder cannot be written.
     """
     if folder is None:
         return
+    if is_feeder(folder):
+        raise FileExistsError(f"{folder}: {A_FEEDER}")
     folder.mkdir(parents=True, exist_ok=True)
     for name, frame in tables.items():
         if Path(name).name != name or name in ("", ".."):

@@ -8,6 +8,8 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from feeders.load import load
+from feeders.schema import write
 from service.tables import write_tables
 
 
@@ -44,3 +46,11 @@ def test_no_folder_and_no_rows(tmp_path: Path) -> None:
 def test_a_table_stays_in_its_folder(tmp_path: Path, name: str) -> None:
     with pytest.raises(ValueError, match="no name of a table"):
         write_tables(tmp_path / "in", {name: pd.DataFrame({"a": [1]})})
+
+
+def test_a_feeders_own_files_are_never_replaced(tmp_path: Path) -> None:
+    write(load("cigre-lv").tables, tmp_path)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    with pytest.raises(FileExistsError, match="a feeder's folder"):
+        write_tables(tmp_path, {"customers": pd.DataFrame({"customer": ["x"]})})
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
