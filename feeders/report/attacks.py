@@ -56,7 +56,8 @@ def campaign(_: Site, found: Campaign) -> Section:
             "named": "share of the liars that were named",
             "false": "share of scenarios in which somebody honest was named",
             "… low, … high": "limits that hold the true share in 95 of 100 cases",
-            "delay": "from the beginning of a lie until the liar was named, s; ∞: never",
+            "delay": "from the beginning of a lie until the liar was named, s; ∞: never; "
+            "medians are of those that were named",
             "error": "of the reconstructed voltage, % of nominal",
             "undecided": "share of the time in which the monitor said that it cannot tell",
             "clean lying s": "for how long it said CLEAN although somebody lied",

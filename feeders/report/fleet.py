@@ -40,11 +40,13 @@ def droop(site: Site, found: DroopStudy) -> Section:
         for asked, mine in ((given.v_min, own.v_min_pu), (given.v_max, own.v_max_pu))
     ]
     band = f"{number(limits[0], 1)} to {number(limits[1], 1)} V"
+    ends = given.v0_low, given.v0_high
+    busbar = f"at {ends[0]:g} pu" if ends[0] == ends[1] else f"from {ends[0]:g} to {ends[1]:g} pu"
     every = "continuously" if not given.interval_s else f"every {given.interval_s:g} s"
     delay = f", with a dead time of {given.dead} intervals" if given.dead else ""
     return Section(
         title="The inverters",
-        answers={Question.FLEET: _fleet(found, band)},
+        answers={Question.FLEET: _fleet(found, band, busbar)},
         figures=_figures(found, band),
         tables=found.tables,
         columns={
@@ -62,7 +64,7 @@ def droop(site: Site, found: DroopStudy) -> Section:
         assumptions=(
             f"Inverters: {given.preset or 'as in the files'}; they act {every}{delay}. Balanced power flow.",
             f"Any loads up to {100.0 * given.load_high:g} % and generation up to {100.0 * given.pv_high:g} % "
-            f"of their peaks; busbar from {given.v0_low:g} to {given.v0_high:g} pu; band {band}.",
+            f"of their peaks; busbar {busbar}; band {band}.",
         ),
     )
 
@@ -70,11 +72,11 @@ def droop(site: Site, found: DroopStudy) -> Section:
 # --- sentences ----------------------------------------------------------------------------------
 
 
-def _fleet(found: DroopStudy, band: str) -> Finding:
+def _fleet(found: DroopStudy, band: str, busbar: str) -> Finding:
     stability, kept = found.tables["stability"], found.tables["band"].to_dict("records")
     fleet = {str(name): value for name, value in kept[0].items()}
     verdict, rest, always = str(found.verdict), str(fleet["rest"]), str(fleet["always"])
-    sentences = [_stability(stability, verdict), _band(fleet, rest, always, band)]
+    sentences = [_stability(stability, verdict, busbar), _band(fleet, (rest, always), band, busbar)]
     without = [row for row in kept if row["case"] == "without"]
     if without and (rest, always) != (str(without[0]["rest"]), str(without[0]["always"])):
         told = str(without[0]["always"])
@@ -86,14 +88,15 @@ def _fleet(found: DroopStudy, band: str) -> Finding:
     return Finding(standing, tuple(sentences))
 
 
-def _stability(stability: pd.DataFrame, verdict: str) -> Sentence:
+def _stability(stability: pd.DataFrame, verdict: str, busbar: str) -> Sentence:
     name = "droop-stability"
     if verdict == STABLE:
         margin: Sentence = ()
         if math.isfinite(float(stability["margin"].min())):
             times = least(stability, name, "margin", digits=1, side=Side.BELOW)
             margin = (" All curves could be ", times, " times as steep and still be proved stable.")
-        return ("Stable: proved for constant loads anywhere within their limits.", *margin)
+        lead = f"Stable: proved for constant loads anywhere within their limits, the busbar {busbar}."
+        return (lead, *margin)
     which = [str(p) for p, v in zip(stability["point"], stability["verdict"], strict=True) if v == verdict]
     count = Value(len(which), str(len(which)), f"{name}:verdict:count {verdict}")
     where: Sentence = (" (", count, f" of {len(stability)} cases: {listed(which)})")
@@ -104,14 +107,15 @@ def _stability(stability: pd.DataFrame, verdict: str) -> Sentence:
     return ("Whether the fleet is stable is not proved", *where, f"{reason}. It may oscillate.")
 
 
-def _band(fleet: dict[str, object], rest: str, always: str, band: str) -> Sentence:
-    proved = _limits(fleet, "")
+def _band(fleet: dict[str, object], kept: tuple[str, str], band: str, busbar: str) -> Sentence:
+    rest, always = kept
     if always == KEPT:
-        return (f"The band from {band} is kept, however loads move within their limits", *proved, ".")
+        lead = f"The band from {band} is kept, however loads move within their limits, the busbar {busbar}"
+        return (lead, *_limits(fleet, ""), ".")
     if rest == KEPT:
         broken = always == VIOLATED
         sudden = "sudden changes can break it" if broken else "during sudden changes that is not proved"
-        lead = f"The band from {band} is kept while loads move slowly; {sudden}"
+        lead = f"The band from {band} is kept while loads move slowly, the busbar {busbar}; {sudden}"
         return (lead, *_limits(fleet, "_rest"), ".")
     if VIOLATED in (rest, always):
         when = "at rest" if rest == VIOLATED else "while loads change"
@@ -141,7 +145,9 @@ def _hosting(found: DroopStudy) -> list[Sentence]:
         name = "without reactive power" if row["preset"] == "none" else f"with {row['preset']}"
         size = Value(kw, f"{number(kw, 0, Side.BELOW)} kW", f"droop-hosting:capacity_kw:row {k}")
         words += ["; " if k else "", size]
-        words.append(f" {name} ({row['limit'] or 'no limit found'})")
+        unsure = {UNDECIDED: "; that the fleet is stable there is not proved", UNSTABLE: "; unstable there"}
+        limit = row["limit"] or "no limit found"
+        words.append(f" {name} ({limit}{unsure.get(str(row.get('verdict')), '')})")
     return [(*words, ".")]
 
 

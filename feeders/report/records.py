@@ -24,7 +24,7 @@ __all__ = ["calibrate"]
 ROWS = 40
 """So many meters a chart has at most: those that are off most."""
 
-UNTOLD, PROPOSED = "cannot be told", "proposed"
+UNTOLD, PROPOSED, EXCLUDED = "cannot be told", "proposed", "excluded"
 # Words of `feeders.studies.calibrate_tables`; `tests/feeders/report` holds them together.
 
 
@@ -92,6 +92,18 @@ def _said(found: Calibrate) -> Finding:
         count = Value(len(vague), str(len(vague)), f"calibrate-proposals:verdict:count {UNTOLD}")
         noun = plural(len(vague), "error")
         sentences.append((count, f" {noun} shown by the readings could be one of several."))
+    changing = found.proposals[found.proposals["verdict"] == EXCLUDED]
+    if len(changing):
+        count = Value(len(changing), str(len(changing)), f"calibrate-proposals:verdict:count {EXCLUDED}")
+        what = [f"{row['what']}: {row['proposed']}" for row in changing.to_dict("records")]
+        verb = plural(len(changing), "meter is", "meters are")
+        sentences.append(
+            (
+                count,
+                f" {verb} off in a way that errors of the files explain less well: {listed(what)}. "
+                "A lie looks like that. The voltages were left out of account.",
+            )
+        )
     outside = found.meters[found.meters["verdict"] == "outside its class"]["meter"].tolist()
     if outside:
         count = Value(len(outside), str(len(outside)), "calibrate-meters:verdict:count outside its class")
@@ -114,7 +126,7 @@ def _said(found: Calibrate) -> Finding:
 
 def _doubt_map(site: Site, customers: pd.DataFrame, width: float) -> Drawing:
     verdicts = dict(zip(customers["customer"].astype(str), customers["verdict"].astype(str), strict=True))
-    shapes = {PROPOSED: Shape.ALARM, UNTOLD: Shape.OPEN}
+    shapes = {PROPOSED: Shape.ALARM, UNTOLD: Shape.OPEN, EXCLUDED: Shape.OPEN}
     spots = []
     for name in site.feeder.customers:
         verdict = verdicts.get(name, UNTOLD)

@@ -59,7 +59,7 @@ class DroopOptions:
     interval_s, dead
         Sampling interval of the inverters, s (0: continuous), and dead time in whole intervals.
     v0_low, v0_high
-        Limits of the busbar's voltage, pu; points of operation have the middle.
+        Limits of the busbar's voltage, pu; points of operation have the middle, hosting the upper one.
     v_min, v_max
         The band, pu; None: the limits of the feeder's files.
     load_high, pv_high
@@ -350,7 +350,7 @@ def _most(rows: list[dict[str, Any]], column: str) -> float:
 def _hosting_tasks(study: _Study) -> Iterator[Task]:
     given, site = study.options, study.subject.site
     low, high = study.limits
-    at = Conditions(given.hosting_load, study.v0, low, high, study.update)
+    at = Conditions(given.hosting_load, given.v0_high, low, high, study.update)
     share = shares_of(site, given.hosting_customers)
     for preset in given.hosting_presets:
         plan = Plan(share, preset)

@@ -21,7 +21,7 @@ from feeders.report.section import Question, Section
 from feeders.report.sections import Outcome
 from feeders.report.words import Standing, said
 from feeders.studies.calibrate import Calibrate
-from feeders.studies.calibrate_tables import PROPOSED, UNTOLD
+from feeders.studies.calibrate_tables import EXCLUDED, PROPOSED, UNTOLD
 from feeders.studies.campaign import Campaign
 from feeders.studies.detectable import Detectable
 from feeders.studies.droop import DroopStudy
@@ -107,7 +107,7 @@ def test_what_cannot_be_told_is_neither_right_nor_wrong(site: Site, *, sure: boo
 
 
 def test_words_of_the_calibration_are_its_own() -> None:
-    assert (records.UNTOLD, records.PROPOSED) == (UNTOLD, PROPOSED)
+    assert (records.UNTOLD, records.PROPOSED, records.EXCLUDED) == (UNTOLD, PROPOSED, EXCLUDED)
 
 
 def test_sizes_that_are_not_proved_are_said_to_be_none(site: Site, outcomes: list[Outcome]) -> None:
@@ -163,3 +163,28 @@ def test_a_campaign_without_liars_tells_nothing_about_attacks(site: Site, played
     section = attacks(site, replace(played, liars=played.liars.head(0)))
     assert section.answers[Question.MONITOR].standing is Standing.OPEN
     assert "nothing was learned about attacks" in told(section, Question.MONITOR)
+
+
+@pytest.mark.parametrize(("verdict", "words"), [("undecided", "not proved"), ("unstable", "unstable there")])
+def test_hosted_generation_is_not_called_stable_where_that_is_not_proved(
+    site: Site, studied: DroopStudy, verdict: str, words: str
+) -> None:
+    row = {"preset": "ieee1547-b", "capacity_kw": 100.0, "limit": "voltage high"}
+    for known, there in ((verdict, True), ("stable", False)):
+        hosting = pd.DataFrame([row | {"verdict": known}])
+        tables = {**studied.tables, "hosting": hosting}
+        text = told(fleet(site, replace(studied, tables=tables)), Question.FLEET)
+        hosted = text[text.index("Generation that the feeder hosts") :]
+        assert (words in hosted) == there
+
+
+def test_a_meter_that_seems_to_lie_is_said(site: Site) -> None:
+    found = calibration(site, sure=False)
+    meter = str(site.meter_ids[0])
+    row = {"what": [meter], "proposed": ["its error is another"], "verdict": [EXCLUDED]}
+    customers = found.customers.assign(verdict=[EXCLUDED, *["as in the files"] * (len(found.customers) - 1)])
+    section = records.calibrate(site, replace(found, proposals=pd.DataFrame(row), customers=customers))
+    text = told(section, Question.RECORDS)
+    assert f"1 meter is off in a way that errors of the files explain less well: {meter}" in text
+    drawing = section.figures[0].draw(WIDE)
+    assert any(getattr(mark, "text", "") == "cannot be told" for mark in drawing.marks)

@@ -293,6 +293,17 @@ def test_hosting_capacity_is_where_the_simulator_breaks_the_band() -> None:
     assert len({row["units"] for row in rows}) > 1
 
 
+def test_hosting_is_for_the_highest_busbar() -> None:
+    site = village()
+    options = DroopOptions(
+        v0_low=0.98, v0_high=1.02, presets=(), tau_factors=(), hosting=True, hosting_presets=("",), draws=0
+    )
+    limits = site.tables.meta.limits
+    at = Conditions(0.1, 1.02, limits.v_min_pu, limits.v_max_pu, Update(1.0))
+    expected = capacity(Subject.of(site), Plan(shares_of(site, None), ""), at)
+    assert droop(site, options).tables["hosting"]["capacity_kw"].tolist() == [expected["capacity_kw"]]
+
+
 def test_line_ratings_limit_what_is_hosted() -> None:
     site = village()
     lines = tuple(replace(row, rating_a=20.0 if row.line == "l1" else None) for row in site.tables.lines)
