@@ -99,6 +99,8 @@ class SequentialState:
         What was prepared for inverters without a trusted meter; None while there were none.
     v0_squared
         Last squared busbar voltage, pu; in three phases (3,).
+    unmetered
+        For how many frames there has been none; in three phases (3,).
     window
         The last residuals.
     trust
@@ -125,6 +127,7 @@ class SequentialState:
     x: Floats | None
     free: Free | None
     v0_squared: Floats | float
+    unmetered: Ints | int
     window: Window
     trust: Trust
     fits: tuple[Fit | None, ...]
@@ -169,6 +172,7 @@ def init(
         x=None,
         free=None,
         v0_squared=design.plant.droop.vbar**2,
+        unmetered=0,
         window=empty(design.lengths, p),
         trust=Trust(
             ~no,

@@ -21,7 +21,7 @@ from gridsec.sequential.kinds import Kinds, describe, listen, suspicious
 from gridsec.sequential.loads import prior
 from gridsec.sequential.naming import name
 from gridsec.sequential.state import Doubts, SequentialState, Trust
-from gridsec.sequential.windows import Window, forget, push, shift
+from gridsec.sequential.windows import Window, forget, forget_last, push, shift
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,7 +72,7 @@ def step(
     x, free = _inverters(design, state, frame, heard)
     q, v2_bus = _voltages(design, frame, heard, x)
     residual = heard.y - v2_bus[at] - state.learned.bias
-    window = push(state.window, design.lengths, residual, heard.live)
+    window = push(_remembered(design, state, heard.busbar), design.lengths, residual, heard.live)
     if state.ticks % _STALE == 0:
         state = replace(state, model_error=_model_error(design, frame.p, q, heard.v0_squared))
     since = frame.t if state.x is None else state.since
@@ -93,6 +93,7 @@ def step(
         x=x,
         free=free,
         v0_squared=heard.v0_squared,
+        unmetered=np.where(heard.busbar, 0, state.unmetered + 1),
         window=window,
         trust=trust,
         fits=seen.fits,
@@ -103,6 +104,18 @@ def step(
     tick = Tick(heard.y, heard.live, heard.v0_squared, heard.busbar, v2_bus, transient, seen, rivals)
     estimate, verdict = conclude(design, after, tick)
     return replace(after, last=(estimate, verdict)), estimate, verdict
+
+
+def _remembered(design: SequentialDesign, state: SequentialState, busbar: Bools | bool) -> Window:
+    """The residuals so far; where the busbar voltage is back, not those of the time without it.
+
+    They are as far off as it had moved meanwhile, and all meters alike.
+    """
+    since = np.where(busbar, state.unmetered, 0)
+    if not since.any():
+        return state.window
+    feeder, at = design.plant.feeder, design.prior.meters
+    return forget_last(state.window, design.lengths, by_place(feeder, since)[at].astype(np.intp))
 
 
 def _transient(design: SequentialDesign, age: float) -> Floats:

@@ -106,6 +106,28 @@ def forget(window: Window, meters: Bools) -> Window:
     return Window(ring, marks, window.head, sums, counts)
 
 
+def forget_last(window: Window, lengths: tuple[int, ...], ticks: Ints) -> Window:
+    """Forget the last ticks of some meters.
+
+    Parameters
+    ----------
+    window
+        So far; not changed.
+    lengths : (s,)
+        Ticks of each scale.
+    ticks : (p,)
+        How many of each meter.
+    """
+    if not ticks.any():
+        return window
+    age = (window.head - 1 - np.arange(len(window.residual))) % len(window.residual)
+    kept = window.heard & (age[:, None] >= ticks)
+    ring = np.where(kept, window.residual, 0.0)
+    sums = np.stack([ring[age < length].sum(axis=0) for length in lengths])
+    counts = np.stack([kept[age < length].sum(axis=0, dtype=np.intp) for length in lengths])
+    return Window(ring, kept, window.head, sums, counts)
+
+
 def shift(window: Window, change: Floats) -> Window:
     """Express all residuals relative to something else.
 

@@ -296,3 +296,31 @@ class TestTheEuropeanFeeder:
         # The same frame again is not used.
         _, _, verdict = watcher.step(state, frame)
         assert verdict.decision is Decision.UNDECIDED
+
+
+@pytest.mark.parametrize("name", ["ieee-european-lv", "kerber-landnetz"])
+def test_a_busbar_that_moved_while_it_was_silent_accuses_nobody(name: str) -> None:
+    """A tap changer moves all voltages by 1.25 %, and the busbar's meter tells of it only later."""
+    this = Trial(
+        load(name),
+        seed=4,
+        duration_s=70.0,
+        meters=Meters.WHITE,
+        load_error=LoadError(0.6, 0.2),
+        profile_s=300_000.0,
+    )
+    watcher = design_site(this.stated)
+    state = watcher.init(0.0)
+    for tick, (frame, _) in enumerate(frames(this)):
+        moved = 0.025 * (tick >= 30)
+        v0 = np.array([frame.v0_squared]) if frame.v0_phases is None else frame.v0_phases
+        v0 = np.where(20 <= tick < 50, np.nan, v0 + moved)
+        heard = replace(
+            frame,
+            y=frame.y + moved,
+            v0_squared=float(v0.mean()),
+            v0_phases=None if frame.v0_phases is None else v0,
+        )
+        state, _, verdict = watcher.step(state, heard)
+        assert not verdict.suspects.any()
+    assert verdict.decision is Decision.CLEAN
