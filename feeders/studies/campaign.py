@@ -64,8 +64,8 @@ class Campaign:
         `delay_s`.
     by_kind, by_size, by_place, by_liars
         The same together: shares `exact` and `false` (somebody honest was named) of the scenarios, `named`
-        of the liars; median and 95th percentile of delays; median `_95` and `_worst` of the errors; the share
-        of the time that was `undecided`.
+        of the liars; median and 95th percentile of the delays of those that were named; median `_95` and
+        `_worst` of the errors; the share of the time that was `undecided`.
     delays
         Operating curve: share of liars `named` within `within_s`, by kind and size.
     false_names

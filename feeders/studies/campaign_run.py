@@ -7,6 +7,7 @@ order. A worker that dies takes no result with it: what it had in hand is done a
 from __future__ import annotations
 
 import multiprocessing
+import os
 import platform
 import signal
 from collections import Counter, deque
@@ -16,6 +17,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import version
+from threading import Thread
 from typing import Any, Final, Protocol
 
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]  # has no stubs
@@ -124,8 +126,17 @@ class Processes:
 
 
 def _begin() -> None:
-    """Prepare a process: whoever interrupts the first process does not interrupt this one."""
+    """Prepare a process: an interruption of the first one is not its own, but the end of that one is."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    Thread(target=_follow, daemon=True).start()
+
+
+def _follow() -> None:
+    """End with the process that began this one, even if that was killed and could not say so."""
+    first = multiprocessing.parent_process()
+    if first is not None:
+        first.join()
+        os._exit(1)
 
 
 def _single(work: Work, piece: int) -> Any:
