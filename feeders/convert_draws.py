@@ -24,6 +24,13 @@ SWITCHED_OFF: Final = (
 )
 """What becomes of a load that is switched off: property, what was done, effect."""
 
+ONLY_REACTIVE: Final = (
+    "reactive power",
+    "left out",
+    "draws no active power, to which what is expected of the reactive power is tied",
+)
+"""The same of a load that draws reactive power only."""
+
 EVEN: Final = 1e-6
 """Spread of the phases' powers, as a share of the largest, below which a connection is of three phases."""
 
@@ -133,6 +140,8 @@ def _load(row: CustomerRow, kva: complex, number: int, volt: float, changes: lis
         changes.append(
             Change(f"load {row.customer}", "power factor", "approximated", "leading; expected to be 1")
         )
+    if p <= 0.0 and q > NO_POWER:
+        changes.append(Change(f"load {row.customer}", *ONLY_REACTIVE))
     household = volt < 1000.0 and p <= HOUSEHOLD_KW
     row = replace(row, load_kw=rounded(max(p, 0.0)), load_profile=usual_profile(number, household=household))
     return reactive(row, p / math.hypot(p, q) if p > 0 and q > 0 else None)

@@ -23,7 +23,7 @@ from feeders.convert_customers import (
     usual_profile,
     with_meters,
 )
-from feeders.convert_draws import SWITCHED_OFF, customers_of
+from feeders.convert_draws import ONLY_REACTIVE, SWITCHED_OFF, customers_of
 from feeders.convert_network import Converted, Network, below, below_source, finished, one_busbar
 from feeders.convert_pandapower_net import ids, network_of
 from feeders.profiles import envelopes
@@ -214,6 +214,8 @@ def _known(source: _Source, customer: CustomerRow, s: complex) -> CustomerRow:
     if s.real < 0:
         effect = "feeds in; its expected load is taken as 0"
         source.changes.append(Change(label, "p_mw", "changed", effect))
+    if s.real <= 0.0 and s.imag > 0.0:
+        source.changes.append(Change(label, *ONLY_REACTIVE))
     if s.imag < 0:
         source.changes.append(Change(label, "power factor", "approximated", "leading; expected to be 1"))
     return reactive(customer, s.real / abs(s) if s.real > 0 and s.imag > 0 else None)

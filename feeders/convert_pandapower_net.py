@@ -9,6 +9,7 @@ import warnings
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from importlib.metadata import version
+from numbers import Real
 from typing import Any, Final
 
 import numpy as np
@@ -45,6 +46,16 @@ COLUMNS: Final = {
     "shunt": "name bus p_mw q_mvar vn_kv step in_service",
 }
 """What is needed of a net's tables."""
+
+NUMBERS: Final = {
+    "line": {
+        **dict.fromkeys(("length_km", "r_ohm_per_km", "x_ohm_per_km", "c_nf_per_km"), 0.0),
+        "parallel": 1.0,
+    },
+    "load": dict.fromkeys(("p_mw", "q_mvar", "scaling"), -math.inf),
+    "sgen": dict.fromkeys(("p_mw", "q_mvar", "scaling"), -math.inf),
+}
+"""Numbers without which a row says nothing, and the least that they can be."""
 
 UNLIMITED_KA: Final = 1000.0
 SWITCH_RX: Final = 2.0
@@ -109,11 +120,31 @@ def problems_of(net: Any) -> list[str]:
         for column in ends:
             strange = net[table].index[~net[table][column].isin(net.bus.index)]
             problems += [f"{table} {i}: {column} {net[table].at[i, column]} is no bus" for i in strange]
-    for column in ("length_km", "r_ohm_per_km", "x_ohm_per_km", "c_nf_per_km"):
-        values = net.line[column].astype(float)
-        bad = net.line.index[~(values >= 0) | np.isinf(values)]
-        problems += [f"line {i}: {column} is {net.line.at[i, column]}; expected at least 0" for i in bad]
+    for kind, table in (("b", "bus"), ("l", "line")):
+        given = net.switch[net.switch.et == kind]
+        strange = given.index[~given.element.isin(net[table].index)]
+        problems += [f"switch {i}: element {net.switch.at[i, 'element']} is no {table}" for i in strange]
+    return problems + _numbers(net)
+
+
+def _numbers(net: Any) -> list[str]:
+    """Whatever is not a number, or not one that it can be."""
+    problems = []
+    if not isinstance(net.get("f_hz"), Real) or not 0.0 < net.f_hz < math.inf:
+        problems.append(f"f_hz is {net.get('f_hz')}; expected a frequency")
+    for table, columns in NUMBERS.items():
+        for column, least in columns.items():
+            values = np.asarray([_number(cell) for cell in net[table][column]], dtype=np.float64)
+            bad = net[table].index[~((values >= least) & np.isfinite(values))]
+            wanted = f"at least {least:g}" if math.isfinite(least) else "a number"
+            problems += [
+                f"{table} {i}: {column} is {net[table].at[i, column]}; expected {wanted}" for i in bad
+            ]
     return problems
+
+
+def _number(cell: object) -> float:
+    return float(cell) if isinstance(cell, Real) else math.nan
 
 
 def network_of(net: Any) -> Network:
@@ -154,8 +185,11 @@ def _place(net: Any, bus: int) -> tuple[float, float] | None:
     geo = net.bus.at[bus, "geo"] if "geo" in net.bus.columns else None
     if not isinstance(geo, str):
         return None
-    x, y = json.loads(geo)["coordinates"][:2]
-    return round(float(x), 6), round(float(y), 6)
+    try:
+        x, y = json.loads(geo)["coordinates"][:2]
+        return round(float(x), 6), round(float(y), 6)
+    except (ValueError, TypeError, KeyError):  # a bus may have a place or none; the network is the same
+        return None
 
 
 # --- lines and switches -------------------------------------------------------------------------

@@ -176,6 +176,28 @@ def test_all_problems_of_a_net_at_once(tmp_path: Path) -> None:
     assert len(caught.value.problems) == 2
 
 
+def test_what_is_no_number_is_told_and_not_a_traceback() -> None:
+    net = village()
+    net.line["r_ohm_per_km"] = net.line["r_ohm_per_km"].astype(object)
+    net.line.loc[0, "r_ohm_per_km"] = "a lot"
+    net.line.loc[1, "parallel"] = 0
+    net.load.loc[0, "p_mw"] = np.nan
+    net.switch.loc[0, "element"] = 99
+    net.f_hz = None
+    net.bus["geo"] = '{"x": 1}'
+    with pytest.raises(FeederInvalid) as caught:
+        from_pandapower(net, "x")
+    assert len(caught.value.problems) == 5
+    for part in (
+        "r_ohm_per_km is a lot",
+        "line 1: parallel is 0",
+        "load 0: p_mw is nan",
+        "switch 0: element 99 is no line",
+        "f_hz is None",
+    ):
+        assert part in str(caught.value), part
+
+
 def test_a_source_without_solution_is_converted_and_not_checked(tmp_path: Path) -> None:
     net = village()
     net.load.loc[0, "p_mw"] = 5e3
@@ -225,6 +247,7 @@ def test_switches_with_an_impedance_and_what_is_switched_off(tmp_path: Path) -> 
     pp.create_load(net, end, 0.01, 0.003, name="shop")
     pp.create_load(net, end, 0.02, 0.001, name="closed shop", in_service=False)
     pp.create_sgen(net, end, 0.02, sn_mva=0.02, name="old roof", in_service=False)
+    pp.create_load(net, end, 0.0, 0.002, name="coil")
     pp.to_json(net, str(tmp_path / "net.json"))
     done = convert(str(tmp_path / "net.json"), tmp_path / "x")
     assert done.check is not None
@@ -232,6 +255,7 @@ def test_switches_with_an_impedance_and_what_is_switched_off(tmp_path: Path) -> 
     said = [(each.element, each.prop, each.done) for each in done.changes]
     assert ("load closed shop", "in service", "changed") in said
     assert ("generator old roof", "all of it", "left out") in said
+    assert ("load coil", "reactive power", "left out") in said
     customers = {row.customer: row for row in read(tmp_path / "x").customers}
     assert customers["closed shop"].load_kw == 0.0
     # A generator that is switched off does not become an inverter that works.
