@@ -13,8 +13,8 @@ freedom that it gives: what one meter costs follows from A and from how well the
 What *all* single accusations change follows from ``Q = K^-1`` and ``g = Q m``: `gridsec.sequential.rises`.
 
 The price is that of sets whose members each lie with a probability that is Beta(a, b) distributed: the k-th
-liar costs ``2 ln((p - k + b) / (k - 1 + a)) + each``, less the more there are already. Up to eight liars whose
-lies are alike have fewer freedoms, and independent ones cost more: `gridsec.sequential.alike`.
+liar costs ``2 ln((p - k + b) / (k - 1 + a)) + each``, less the more there are already. Up to eight liars
+whose lies are alike have fewer freedoms, and independent ones cost more: `gridsec.sequential.alike`.
 
 `anybody` is what makes a false alarm as rare as asked for. Nobody is named unless accusing one meter lowers
 J, and with it that takes a leave-one-out residual beyond the ``1 - r / (2 p)`` quantile of the normal
