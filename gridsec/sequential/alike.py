@@ -143,13 +143,22 @@ class _Base:
 
 
 def worth(problem: Problem, found: list[State]) -> bool:
-    """Whether anything could change: several liars, or one and somebody else whose reading is odd."""
-    best = min(found, key=problem.cost)
-    count, within = best.counts[0], problem.cost(best) + 2.0 * np.log(problem.lies.like)
-    if count != 1:
-        return 1 < count <= MOST
-    odd = (best.g**2 > least(problem, 2) * best.Q.diagonal()) & ~best.liars
-    return bool(odd.any()) or any(each.counts[0] > 1 and problem.cost(each) <= within for each in found)
+    """Whether anything could change.
+
+    It could not where nobody else's reading is odd, every accusation is beyond doubt, and no other
+    explanation comes near.
+    """
+    costs = [problem.cost(each) for each in found]
+    at = int(np.argmin(costs))
+    best, count = found[at], found[at].counts[0]
+    if not 0 < count <= MOST:
+        return False
+    if ((best.g**2 > least(problem, count + 1) * best.Q.diagonal()) & ~best.liars).any():
+        return True
+    if count > 1 and (problem.meters(best)[best.liars] <= _WORSE).any():
+        return True
+    near = (each for each, cost in zip(found, costs, strict=True) if cost - costs[at] <= _WORSE)
+    return any(each is not best and each.counts[0] > 1 for each in near)
 
 
 def least(problem: Problem, k: int) -> float:
