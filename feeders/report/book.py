@@ -12,7 +12,7 @@ import numpy as np
 from feeders.report import raster
 from feeders.report.drawing import Drawing, svg
 from feeders.report.figure import WIDE, Figure
-from feeders.report.maps import Shape, Spot, draw_map
+from feeders.report.maps import Shape, Spot, draw_map, legend_of
 from feeders.report.page import About, Chapter, page
 from feeders.report.sections import Outcome, section
 
@@ -119,6 +119,4 @@ def _feeder_map(site: Site, width: float) -> Drawing:
         "meter, with an inverter": Shape.SUN,
         "customer without a meter": Shape.NONE,
     }
-    there = {spot.shape for spot in spots}
-    legend = {name: Spot(shape) for name, shape in meanings.items() if shape in there}
-    return draw_map(site, spots, width, legend=legend)
+    return draw_map(site, spots, width, legend=legend_of(meanings, spots))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from feeders.report.drawing import Drawing
 from feeders.report.figure import Figure
-from feeders.report.maps import Shape, Spot, draw_map
+from feeders.report.maps import Shape, Spot, draw_map, legend_of
 from feeders.report.section import Question, Section
 from feeders.report.spots import names_of
 from feeders.report.words import Finding, Sentence, Standing, Value, listed, number
@@ -114,6 +114,4 @@ def _index_map(site: Site, meters: pd.DataFrame, width: float) -> Drawing:
         "not known": Shape.OPEN,
         "no meter": Shape.NONE,
     }
-    there = {spot.shape for spot in spots}
-    legend = {name: Spot(shape) for name, shape in meanings.items() if shape in there}
-    return draw_map(site, spots, width, legend=legend)
+    return draw_map(site, spots, width, legend=legend_of(meanings, spots))

@@ -18,7 +18,7 @@ from feeders.report.layout import Placed, place
 if TYPE_CHECKING:
     from feeders.load import Site
 
-__all__ = ["Scale", "Shape", "Spot", "draw_map", "steps_of"]
+__all__ = ["Scale", "Shape", "Spot", "draw_map", "legend_of", "steps_of"]
 
 
 class Shape(Enum):
@@ -106,6 +106,20 @@ def steps_of(values: Sequence[float], unit: str) -> Scale:
 def _digits(step: float) -> int:
     digits = max(0, -math.floor(math.log10(step)))
     return digits + int(abs(step * 10.0**digits - round(step * 10.0**digits)) > 1e-6)
+
+
+def legend_of(meanings: Mapping[str, Shape], spots: Sequence[Spot]) -> dict[str, Spot]:
+    """What the shapes mean that are on a map.
+
+    Parameters
+    ----------
+    meanings
+        Shapes by what they mean.
+    spots
+        What the map shows.
+    """
+    there = {spot.shape for spot in spots}
+    return {name: Spot(shape) for name, shape in meanings.items() if shape in there}
 
 
 def draw_map(

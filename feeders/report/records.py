@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from feeders.report.charts import Bar, Row, rows
 from feeders.report.drawing import Drawing
 from feeders.report.figure import Figure
-from feeders.report.maps import Shape, Spot, draw_map
+from feeders.report.maps import Shape, Spot, draw_map, legend_of
 from feeders.report.section import Question, Section
 from feeders.report.words import Finding, Sentence, Standing, Value, listed, number, plural
 
@@ -132,11 +132,8 @@ def _doubt_map(site: Site, customers: pd.DataFrame, width: float) -> Drawing:
         verdict = verdicts.get(name, UNTOLD)
         shape = shapes.get(verdict, Shape.METER)
         spots.append(Spot(shape, name if shape is Shape.ALARM else "", f"{name}: {verdict}"))
-    legend = {"to be corrected": Shape.ALARM, "cannot be told": Shape.OPEN, "as in the files": Shape.METER}
-    there = {spot.shape for spot in spots}
-    return draw_map(
-        site, spots, width, legend={name: Spot(shape) for name, shape in legend.items() if shape in there}
-    )
+    meanings = {"to be corrected": Shape.ALARM, "cannot be told": Shape.OPEN, "as in the files": Shape.METER}
+    return draw_map(site, spots, width, legend=legend_of(meanings, spots))
 
 
 def _bias_chart(meters: pd.DataFrame, width: float) -> Drawing:

@@ -40,6 +40,9 @@ _WORSE = 30.0
 _PAIRED = 8
 
 
+Ranked = list[tuple[float, State]]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Set:
     """One explanation, its lies alike or not. p meters.
@@ -142,23 +145,26 @@ class _Base:
         return np.linalg.slogdet(M)[1] - np.einsum("...k,...k", z, by), by
 
 
-def worth(problem: Problem, found: list[State]) -> bool:
+def worth(problem: Problem, ranked: Ranked) -> bool:
     """Whether anything could change.
 
     It could not where nobody else's reading is odd, every accusation is beyond doubt, and no other
     explanation comes near.
+
+    Parameters
+    ----------
+    problem, ranked
+        As in `alike`.
     """
-    costs = [problem.cost(each) for each in found]
-    at = int(np.argmin(costs))
-    best, count = found[at], found[at].counts[0]
+    lowest, best = ranked[0]
+    count = best.counts[0]
     if not 0 < count <= MOST:
         return False
     if ((best.g**2 > least(problem, count + 1) * best.Q.diagonal()) & ~best.liars).any():
         return True
     if count > 1 and (problem.meters(best)[best.liars] <= _WORSE).any():
         return True
-    near = (each for each, cost in zip(found, costs, strict=True) if cost - costs[at] <= _WORSE)
-    return any(each is not best and each.counts[0] > 1 for each in near)
+    return any(each.counts[0] > 1 and cost - lowest <= _WORSE for cost, each in ranked[1:])
 
 
 def least(problem: Problem, k: int) -> float:
@@ -167,29 +173,28 @@ def least(problem: Problem, k: int) -> float:
     return max(float(prices[k] - prices[k - 1]) + (lies.pair if k == 2 else lies.more), 0.0)
 
 
-def alike(problem: Problem, found: list[State]) -> list[Set]:
+def alike(problem: Problem, ranked: Ranked) -> list[Set]:
     """The explanations that were found, and what is likelier still because lies are alike.
 
     Parameters
     ----------
     problem
         The readings, and what may be wrong with them.
-    found
-        Explanations; those of more than `MOST` liars stay out.
+    ranked
+        Explanations with J, the best first; those of more than `MOST` liars stay out.
 
     Returns
     -------
     list of Set
         In no order, none twice.
     """
-    costs = sorted(((problem.cost(each), each) for each in found), key=lambda pair: pair[0])
     bases: dict[bytes, _Base] = {}
     likely: dict[bytes, list[State]] = {}
-    for cost, at in costs:
-        if cost - costs[0][0] <= _WORSE and at.counts[0] <= MOST:
+    for cost, at in ranked:
+        if cost - ranked[0][0] <= _WORSE and at.counts[0] <= MOST:
             likely.setdefault(at.powers.tobytes(), []).append(at)
     for key, some in likely.items():
-        same = [at for at in found if at.powers.tobytes() == key]
+        same = [at for _, at in ranked if at.powers.tobytes() == key]
         bases[key] = _Base(problem, min(same, key=lambda at: at.counts[0]), some[0].m)
         bases[key].costs(_members(at.liars) for at in some)
     best = min(bases.values(), key=lambda base: min(base.known.values())[0])

@@ -92,9 +92,7 @@ def inverters_of(design: SequentialDesign, accused: Sequence[int]) -> Bools:
     accused
         Indices of its book.
     """
-    out = np.zeros(design.plant.droop.tau.size, dtype=np.bool_)
-    out[[k - design.customers for k in accused if k >= design.customers]] = True
-    return out
+    return _suspicions(design, accused)[design.customers :]
 
 
 def powers_of(design: SequentialDesign, accused: Sequence[int]) -> Bools:
@@ -107,8 +105,13 @@ def powers_of(design: SequentialDesign, accused: Sequence[int]) -> Bools:
     accused
         Indices of its book.
     """
-    out = np.zeros(design.customers, dtype=np.bool_)
-    out[[k for k in accused if k < design.customers]] = True
+    return _suspicions(design, accused)[: design.customers]
+
+
+def _suspicions(design: SequentialDesign, accused: Sequence[int]) -> Bools:
+    """The book's powers and inverters, (N + m,): which are accused."""
+    out = np.zeros(design.customers + design.plant.droop.tau.size, dtype=np.bool_)
+    out[list(accused)] = True
     return out
 
 

@@ -285,12 +285,13 @@ def _more(problem: Problem, at: State, known: dict[bytes, State], false: bool) -
 
 def _reported(problem: Problem, found: list[State], live: Bools, lies: Lies) -> tuple[Explained, ...]:
     """The likeliest of them as explanations of all meters, one for each set of liars."""
-    if worth(problem, found):
-        sets = alike(problem, found)
+    ranked = sorted(((problem.cost(each), each) for each in found), key=lambda pair: pair[0])
+    if worth(problem, ranked):
+        sets = alike(problem, ranked)
     else:
         sets = [
-            Set(each.liars, each.powers, problem.cost(each), each.g, problem.a2 * each.liars * each.g)
-            for each in found
+            Set(each.liars, each.powers, cost, each.g, problem.a2 * each.liars * each.g)
+            for cost, each in ranked
         ]
     sets.sort(key=lambda each: each.cost)
     best: dict[bytes, Set] = {}

@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 import uvicorn
+from playwright.sync_api import Browser, sync_playwright
 
 from gridsec.errors import FeederInvalid
 from gridsec.online import Cause, Decision
@@ -26,6 +27,11 @@ from service.errors import FeederFixed, TooManyFeeders
 from service.report import FeederReport, MeterReport
 from service.store import Store
 from tests.service.databases import Cluster, find_postgresql
+
+CHROMIUM = [
+    *("--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"),
+    *("--disable-component-update", "--disable-sync"),
+]
 
 T0 = 1_795_212_000.0
 NOMINAL = 230.94
@@ -343,3 +349,14 @@ def serve() -> Iterator[Callable[[SmallService], Server]]:
     for server in made:
         if server.thread.is_alive():
             server.stop()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    found = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if found is None:
+        pytest.skip("no Chromium on this machine")
+    with sync_playwright() as playwright:
+        made = playwright.chromium.launch(executable_path=found, args=CHROMIUM)
+        yield made
+        made.close()

@@ -22,10 +22,10 @@ from feeders.load import load
 from feeders.recording import read_recording
 from feeders.scenario import Scenario, random_attacks
 from service.bus import BusConfig
-from service.cli import main
 from service.demo import Outcome, verdict
 from service.ingest import Meters
 from service.simulate import Pace, play
+from tests.service.commands import command
 from tests.service.running import FEEDER, free_port, until
 
 ENVIRONMENT = {k: v for k, v in os.environ.items() if not k.startswith("GRIDSEC_")}
@@ -50,12 +50,7 @@ def gridsec(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch)
         monkeypatch.delenv(name)
 
     def run(*arguments: str) -> Done:
-        monkeypatch.setattr(sys, "argv", ["gridsec", *arguments])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as end:
-            main()
-        told = capsys.readouterr()
-        return Done(int(end.value.code or 0), told.out, told.err)
+        return Done(*command()(monkeypatch, capsys, *arguments))
 
     return run
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,20 +14,12 @@ from feeders.recording import record
 from feeders.scenario import Scenario
 from feeders.schema import read, write
 from feeders.variation import Variation
-from service.cli import main
+from tests.service.commands import command
 
 CIGRE = load("cigre-lv")
 
 
-def run(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: str
-) -> tuple[int, str, str]:
-    monkeypatch.setattr(sys, "argv", ["gridsec", "study", "calibrate", *arguments])
-    capsys.readouterr()
-    with pytest.raises(SystemExit) as end:
-        main()
-    told = capsys.readouterr()
-    return int(end.value.code or 0), told.out, told.err
+run = command("study", "calibrate")
 
 
 @pytest.fixture

@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
-from service.cli import main
+from tests.service.commands import command, plain
 
 FEW = ("campaign", "cigre-lv", "--scenarios", "3", "--duration", "30", "--workers", "1")
+
+
+gridsec = command("study")
 
 
 def run(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: str
 ) -> tuple[int, str, str]:
-    monkeypatch.setattr(sys, "argv", ["gridsec", "study", *arguments])
-    capsys.readouterr()
-    with pytest.raises(SystemExit) as end:
-        main()
-    told = capsys.readouterr()
-    return int(end.value.code or 0), told.out, " ".join(told.err.replace("│", " ").split())
+    code, told, error = gridsec(monkeypatch, capsys, *arguments)
+    return code, told, plain(error)
 
 
 def test_tables_are_printed_and_written(

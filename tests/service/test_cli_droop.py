@@ -2,28 +2,19 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
 from feeders.schema import write
-from service.cli import main
 from tests.feeders.villages import tables, village_without_inverters
+from tests.service.commands import command
 
 FEW = ("--compare", "vde4105", "--tau-factor", "0.1")
 
 
-def run(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: str
-) -> tuple[int, str, str]:
-    monkeypatch.setattr(sys, "argv", ["gridsec", "study", "droop", *arguments])
-    capsys.readouterr()
-    with pytest.raises(SystemExit) as end:
-        main()
-    told = capsys.readouterr()
-    return int(end.value.code or 0), told.out, told.err
+run = command("study", "droop")
 
 
 def test_the_answer_is_told_and_its_tables_are_written(

@@ -12,21 +12,13 @@ import pytest
 
 from gridsec.papers import kim2018
 from gridsec.papers.claims import Claim, Reproduction, number, statement
-from service.cli import main
 from service.cli_reproduce import PAPERS
+from tests.service.commands import command
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def run(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: str
-) -> tuple[int, str, str]:
-    monkeypatch.setattr(sys, "argv", ["gridsec", "reproduce", *arguments])
-    capsys.readouterr()
-    with pytest.raises(SystemExit) as end:
-        main()
-    told = capsys.readouterr()
-    return int(end.value.code or 0), told.out, told.err
+run = command("reproduce")
 
 
 def row(text: str, what: str) -> list[str]:

@@ -3,27 +3,18 @@
 from __future__ import annotations
 
 import csv
-import sys
 from pathlib import Path
 
 import pytest
 
 from feeders.comparison import BEGIN, END
 from feeders.estimators import FAMILIES
-from service.cli import main
+from tests.service.commands import command
 
 QUICK = ("--seeds", "1", "--duration", "80", "--max-attacked", "1", "--case", "bias")
 
 
-def run(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: str
-) -> tuple[int, str, str]:
-    monkeypatch.setattr(sys, "argv", ["gridsec", "study", *arguments])
-    capsys.readouterr()
-    with pytest.raises(SystemExit) as end:
-        main()
-    told = capsys.readouterr()
-    return int(end.value.code or 0), told.out, told.err
+run = command("study")
 
 
 def row(text: str, family: str) -> list[str]:
