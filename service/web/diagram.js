@@ -31,6 +31,8 @@ function sharedPrefix(names) {
   return k;
 }
 
+const named = ({ customer, phase }) => `${customer}${phase ? `, phase ${phase}` : ""}`;
+
 export class Diagram {
   constructor({ onSelect }) {
     this.box = byId("diagram");
@@ -101,6 +103,7 @@ export class Diagram {
       const note = svg("text", { class: "note", ...spot.note });
       const group = svg("g", {
         class: "customer", transform: `translate(${spot.x} ${spot.y}) scale(${spot.size})`, role: "button",
+        "aria-label": `${named(customer)}: no data`,
         tabindex: k === 0 ? 0 : -1,
         on: {
           click: () => this.onSelect(customer.customer),
@@ -252,7 +255,7 @@ export class Diagram {
       part.note.textContent = loud
         ? signed(meter.attack_volt_estimated)
         : part.labels ? (name.length > 8 ? `${name.slice(0, 7)}…` : name) : "";
-      part.group.setAttribute("aria-label", `${id}${part.customer.phase ? `, phase ${part.customer.phase}` : ""}: ${now.text}, reconstructed ${volt(v)}`);
+      part.group.setAttribute("aria-label", `${named(part.customer)}: ${now.text}, reconstructed ${volt(v)}`);
       part.group.classList.toggle("selected", id === this.selected);
     }
     if (this.busbarName) {

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
@@ -94,7 +95,6 @@ def customer(page: Page, name: str) -> Any:
 
 
 def fill_of(page: Page, name: str) -> tuple[int, int, int]:
-    page.wait_for_timeout(400)  # the colour fades over
     text = customer(page, name).locator(".shape").evaluate("e => getComputedStyle(e).fill")
     red, green, blue = map(int, re.findall(r"\d+", text)[:3])
     return red, green, blue
@@ -167,7 +167,7 @@ def test_limits_have_shapes(site: Site) -> None:
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_low_is_blue_and_high_is_orange(site: Site, scheme: str) -> None:
     site.tick(T0, 1, volts={"H1": 222.0, "H2": 230.94, "H3": 240.0})
-    page = site.open(color_scheme=scheme)
+    page = site.open(color_scheme=scheme, reduced_motion="reduce")  # no colour fades over
     expect(page.locator("#decision")).to_have_text("CLEAN")
     low, middle, high = (fill_of(page, name) for name in ("H1", "H2", "H3"))
     assert low[2] > low[0] + 60
@@ -504,7 +504,24 @@ def test_the_map_shows_real_places(site_of: Callable[..., Site], village: type) 
     page.locator('#view button[data-view="map"]').click()
     expect(page.locator("#diagram .customer")).to_have_count(13)
     expect(page.locator('#view button[data-view="map"]')).to_have_attribute("aria-pressed", "true")
-    assert page.locator("#diagram .customer").first.get_attribute("aria-label") is not None
+    expect(page.locator('#diagram .customer[aria-label*="reconstructed"]')).to_have_count(13)
+    seen = page.locator("#diagram .customer").evaluate_all(
+        "all => all.map(e => [e.ariaLabel.split(':')[0], e.transform.baseVal[0].matrix])"
+        ".map(([name, m]) => [name, m.e, m.f])"
+    )
+    layout = detail(load("simbench-lv-rural1"))["layout"]
+    xy = dict(zip(layout["buses"], layout["xy"], strict=True))
+    bus = {known["customer"]: known["bus"] for known in layout["customers"]}
+    x, y = np.array([[x, y] for _, x, y in seen]).T
+    east, north = np.array([xy[bus[name]] for name, _, _ in seen]).T
+    # The same plan but for scale and origin, north up: the screen counts downwards.
+    scales = []
+    for spot, place in ((x, east), (-y, north)):
+        scale, origin = np.polyfit(place, spot, 1)
+        np.testing.assert_allclose(spot, scale * place + origin, atol=0.01)
+        scales.append(scale)
+    assert scales[0] == pytest.approx(scales[1])
+    assert scales[0] > 0
 
 
 def test_a_link_leads_to_its_feeder(site_of: Callable[..., Site], village: type) -> None:
