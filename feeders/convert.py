@@ -25,7 +25,7 @@ from feeders.convert_network import Converted, feeder_of
 from feeders.convert_opendss import read_opendss
 from feeders.convert_pandapower import Fleet, from_pandapower
 from feeders.convert_pgm import read_pgm
-from feeders.convert_source import feeder_source, profiles_source
+from feeders.convert_source import SOURCE_FILE, feeder_source, profiles_source
 from feeders.profiles import ENVELOPES, Season
 from feeders.schema import read, validate, write
 from gridsec.errors import FeederInvalid, GridsecError
@@ -206,7 +206,7 @@ def convert(
         notes=done.notes,
         check=done.check.sentence if done.check else f"Not checked: {done.unchecked}",
     )
-    (folder / "SOURCE.md").write_text(text, encoding="utf-8", newline="\n")
+    (folder / SOURCE_FILE).write_text(text, encoding="utf-8", newline="\n")
     return done
 
 
@@ -330,7 +330,7 @@ def _convert_profiles(folder: Path) -> None:
     for season in Season:
         (folder / season.file).write_bytes(convert_simbench.library_csv(columns, season))
     (folder / ENVELOPES).write_text(convert_simbench.envelopes_csv(columns), encoding="ascii", newline="\n")
-    (folder / "SOURCE.md").write_text(text, encoding="utf-8", newline="\n")
+    (folder / SOURCE_FILE).write_text(text, encoding="utf-8", newline="\n")
 
 
 def _open(origin: str) -> tuple[Any, str]:

@@ -8,6 +8,8 @@ from collections.abc import Iterable
 from dataclasses import astuple, dataclass
 from typing import Final, Literal
 
+from gridsec.errors import GridsecError
+
 CHANGES_FILE: Final = "conversion.csv"
 WHOLE: Final = "all of it"
 """The property of an element that is meant as a whole."""
@@ -16,6 +18,10 @@ NAMED: Final = 8
 """Elements that a sentence names; the file names all of them."""
 
 Done = Literal["left out", "approximated", "changed", "added", "accepted"]
+
+
+class BusbarUnclear(GridsecError):
+    """There are several buses, or none, that could be the metered busbar."""
 
 
 @dataclass(frozen=True, slots=True)

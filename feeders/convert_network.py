@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from feeders.columns import SUSPICIONS
-from feeders.convert_changes import WHOLE, Change
+from feeders.convert_changes import WHOLE, BusbarUnclear, Change
 from feeders.convert_check import SourceState
 from feeders.convert_customers import USUAL_POWER_FACTOR, base_kva, with_meters
 from feeders.convert_draws import Draw, customers_of, is_even
@@ -312,11 +312,11 @@ def _busbar(network: Network, rows: list[LineRow], root: str | None) -> str:
         return hits[0]
     if len(network.sources) != 1:
         names = ", ".join(network.sources) or "none"
-        raise GridsecError(f"the busbar is not clear, voltage sources at: {names}; name it with root")
+        raise BusbarUnclear(f"the busbar is not clear, voltage sources at: {names}; name it with root")
     way = _way_down(network, rows)
     if not _has_lines(way[-1], rows):
         beyond = ", ".join(sorted(_beyond(network, way))) or "none"
-        raise GridsecError(f"the busbar is not clear, candidates: {beyond}; name it with root")
+        raise BusbarUnclear(f"the busbar is not clear, candidates: {beyond}; name it with root")
     return way[-1]
 
 

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from feeders.convert_changes import WHOLE, Change
+from feeders.convert_changes import WHOLE, BusbarUnclear, Change
 from feeders.convert_customers import (
     HOUSEHOLD_KW,
     HOUSEHOLDS,
@@ -155,7 +155,7 @@ def _root(net: Any, network: Network, names: dict[int, str], wanted: str | None)
     found = below_source(network)
     if found is None:
         candidates = ", ".join(str(net.bus.at[bus, "name"]) for bus in sides) or "none"
-        raise GridsecError(f"the busbar is not clear, candidates: {candidates}; name it with root")
+        raise BusbarUnclear(f"the busbar is not clear, candidates: {candidates}; name it with root")
     return found
 
 

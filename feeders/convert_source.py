@@ -9,6 +9,8 @@ from importlib.metadata import PackageNotFoundError, version
 
 from feeders.schema import FeederTables
 
+SOURCE_FILE = "SOURCE.md"
+
 ODBL = """\
 The database called SimBench is made available under the Open Database License,
 http://opendatacommons.org/licenses/odbl/1.0/. Any rights in individual contents of the database are

@@ -83,14 +83,22 @@ def _names_phases(folder: Traversable) -> bool:
     )
 
 
-def find(path_or_name: Path | str) -> FeederTables:
-    """Read the tables of a feeder's folder, or of a feeder that comes with the project; raises as `load`."""
+def folder_of(path_or_name: Path | str) -> Path | None:
+    """Return a feeder's folder, or that of a feeder that comes with the project; None if there is neither."""
     path = Path(path_or_name)
     if path.is_dir():
-        return read(path)
+        return path
     bundled = data_root() / "feeders" / str(path_or_name)
     if len(path.parts) == 1 and path.name not in (".", "..") and bundled.is_dir():
-        return read(Path(str(bundled)))
+        return Path(str(bundled))
+    return None
+
+
+def find(path_or_name: Path | str) -> FeederTables:
+    """Read the tables of a feeder's folder, or of a feeder that comes with the project; raises as `load`."""
+    folder = folder_of(path_or_name)
+    if folder is not None:
+        return read(folder)
     there, advised = ", ".join(names(balanced=False)), advice(path_or_name)
     raise FeederInvalid(
         [f"{path_or_name}: there is neither such a folder nor such a feeder; there are {there}{advised}"]
