@@ -11,6 +11,7 @@ from typing import Final, Literal
 from gridsec.errors import GridsecError
 
 CHANGES_FILE: Final = "conversion.csv"
+COLUMNS: Final = ("element", "property", "done", "effect")
 WHOLE: Final = "all of it"
 """The property of an element that is meant as a whole."""
 
@@ -72,6 +73,6 @@ def changes_csv(changes: Iterable[Change]) -> str:
     """Return the table of all changes, one row for each element and property."""
     out = io.StringIO(newline="")
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(["element", "property", "done", "effect"])
+    writer.writerow(COLUMNS)
     writer.writerows(astuple(change) for change in changes)
     return out.getvalue()

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from feeders.convert_changes import CHANGES_FILE
+from feeders.convert_changes import CHANGES_FILE, COLUMNS
 from feeders.convert_source import SOURCE_FILE
 from feeders.equipment import folder_of
 from gridsec.errors import GridsecError
@@ -46,7 +46,7 @@ def origin(path_or_name: Path | str) -> Origin | None:
     Raises
     ------
     GridsecError
-        If its conversion.csv is no table.
+        If its conversion.csv is not what `feeders.convert` writes.
     """
     folder = folder_of(path_or_name)
     if folder is None or not (folder / CHANGES_FILE).is_file():
@@ -55,6 +55,8 @@ def origin(path_or_name: Path | str) -> Origin | None:
         changes = pd.read_csv(folder / CHANGES_FILE, dtype=str, keep_default_na=False)
     except ValueError as error:
         raise GridsecError(f"{folder / CHANGES_FILE}: {error}") from error
+    if tuple(changes.columns) != COLUMNS:
+        raise GridsecError(f"{folder / CHANGES_FILE}: expected the columns {', '.join(COLUMNS)}")
     told = folder / SOURCE_FILE
     text = told.read_text(encoding="utf-8", errors="replace") if told.is_file() else ""
     source = re.search(r"^- Source: `(.*)`(.*)$", text, re.MULTILINE)

@@ -10,7 +10,8 @@ from rich.markup import escape
 
 from service import console
 from service.cli_plan import Journal, Out, bar, said, show
-from service.console import Feeder
+from service.console import Studied
+from service.foreign import converted
 from service.tables import write_tables
 
 if TYPE_CHECKING:
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def calibrate(
-    feeder: Feeder = "simbench-lv-rural1",
+    feeder: Studied = "simbench-lv-rural1",
     *,
     readings: Annotated[
         Path, typer.Option(help="A recording (Parquet), or a CSV table with columns meter, t, v_volt, p_kw.")
@@ -55,6 +56,7 @@ def calibrate(
             raise typer.BadParameter(f"{name!r}: expected one of {', '.join(Kind)}", param_hint="--look-for")
     if write is not None and write.exists() and (not write.is_dir() or any(write.iterdir())):
         raise typer.BadParameter(f"{write}: already there; expected a new folder", param_hint="--write")
+    feeder = converted(feeder, out)
     site = site_of(feeder)
     with bar("errors that the readings may speak for") as tell, said():
         found = study(

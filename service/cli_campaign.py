@@ -12,7 +12,8 @@ from rich.markup import escape
 
 from service import console
 from service.cli_plan import Journal, Out, bar, said, show
-from service.console import Feeder
+from service.console import Studied
+from service.foreign import converted
 from service.tables import write_tables
 
 if TYPE_CHECKING:
@@ -73,7 +74,7 @@ DaskAt = Annotated[str | None, typer.Option(help="Address of a Dask scheduler, i
 
 
 def campaign(
-    feeder: Feeder = "simbench-lv-rural1",
+    feeder: Studied = "simbench-lv-rural1",
     *,
     scenarios: Scenarios = 160,
     seed: Seed = 0,
@@ -103,7 +104,7 @@ def campaign(
     from feeders.studies.campaign_plan import KINDS, Design, Place, Plan
     from feeders.trials import LoadError, Meters
 
-    site, together = load(feeder), min(scenarios, TOGETHER)
+    site, together = load(converted(feeder, out)), min(scenarios, TOGETHER)
     with said():
         plan = Plan(
             scenes=-(-scenarios // together),

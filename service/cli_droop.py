@@ -9,7 +9,8 @@ from rich.markup import escape
 
 from service import console
 from service.cli_plan import Journal, Out, bar, said, show
-from service.console import Feeder
+from service.console import Studied
+from service.foreign import converted
 from service.tables import write_tables
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ TITLES = {
 
 
 def droop(
-    feeder: Feeder = "simbench-lv-rural1",
+    feeder: Studied = "simbench-lv-rural1",
     *,
     preset: Annotated[
         str | None, typer.Option(help="Equip customers with this preset. [default: the feeder's inverters]")
@@ -112,7 +113,7 @@ def droop(
         unit_kw=unit_kw,
         draws=draws,
     )
-    site, others = load(feeder), [load(name) for name in also or ()]
+    site, others = load(converted(feeder, out)), [load(converted(name, None)) for name in also or ()]
     with bar("fleets, steps and loads") as tell, said():
         found = study(site, options, seed=seed, journal=journal, progress=tell)
         if others:

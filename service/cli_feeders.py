@@ -14,6 +14,7 @@ from rich.table import Table
 
 from gridsec.errors import FeederInvalid
 from service.console import FEEDER, Feeder, complain, err, out
+from service.foreign import show_check
 
 if TYPE_CHECKING:
     from feeders.convert import Conversion
@@ -171,12 +172,9 @@ def convert(
     done = run(source, folder, root=root, name=name, droop=droop, opened=opened or ())
     _show_changes(done)
     out.print(f"[green]{escape(str(folder))} written[/]")
-    if done.check is None:
-        err.print(f"[yellow]not checked: {escape(done.unchecked)}[/]")
-        return
-    colour = "green" if done.check.exact else "yellow"
-    out.print(f"[{colour}]{escape(done.check.sentence)}[/]")
-    out.print(f"largest difference {done.check.largest_pu:.2e} pu, at bus {escape(done.check.at)}")
+    show_check(done)
+    if done.check is not None:
+        out.print(f"largest difference {done.check.largest_pu:.2e} pu, at bus {escape(done.check.at)}")
 
 
 def _show_changes(done: Conversion) -> None:

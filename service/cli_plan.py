@@ -14,7 +14,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from service import console
-from service.console import Feeder
+from service.console import Studied
+from service.foreign import converted
 from service.tables import A_FEEDER, is_feeder, write_tables
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ Out = Annotated[
 
 
 def redundancy(
-    feeder: Feeder = "simbench-lv-rural1",
+    feeder: Studied = "simbench-lv-rural1",
     *,
     unknown: Unknown = None,
     silent: Silent = None,
@@ -61,7 +62,7 @@ def redundancy(
     from feeders.load import load
     from feeders.studies.redundancy import redundancy as study
 
-    site = load(feeder)
+    site = load(converted(feeder, out))
     with bar("searching for liars that stay invisible") as tell, said():
         found = study(
             site,
@@ -82,7 +83,7 @@ def redundancy(
 
 
 def protect(
-    feeder: Feeder = "simbench-lv-rural1",
+    feeder: Studied = "simbench-lv-rural1",
     *,
     max_attacked: Annotated[int, typer.Option(help="How many of the other meters lie at most.", min=1)] = 2,
     goal: Annotated[
@@ -113,7 +114,7 @@ def protect(
     for option, (name, known) in kinds.items():
         if name not in known:
             raise typer.BadParameter(f"{name!r}: expected one of {', '.join(known)}", param_hint=option)
-    site = load(feeder)
+    site = load(converted(feeder, out))
     with bar("meters protected, against attacks") as tell, said():
         found = study(
             site,
@@ -140,7 +141,7 @@ def protect(
 
 
 def detectable(
-    feeder: Feeder = "simbench-lv-rural1",
+    feeder: Studied = "simbench-lv-rural1",
     *,
     max_attacked: Annotated[int, typer.Option(help="How many meters lie together at most.", min=1)] = 2,
     share: Annotated[float, typer.Option(help="Share of its peak that every load draws.", min=0.0)] = 0.5,
@@ -155,7 +156,7 @@ def detectable(
     from feeders.studies.detectable import detectable as study
     from feeders.studies.rehearsal import rehearse
 
-    site = load(feeder)
+    site = load(converted(feeder, out))
     with bar("lies of meters, errors of customers") as tell, said():
         found = study(site, max_attacked=max_attacked, share=share, risk=risk, journal=journal, progress=tell)
     more = found.max_attacked - 1

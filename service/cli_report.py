@@ -15,14 +15,15 @@ from rich.markup import escape
 
 from service import console
 from service.cli_plan import bar
-from service.console import FAILED, Feeder, complain
+from service.console import FAILED, Studied, complain
+from service.foreign import converted
 
 if TYPE_CHECKING:
     from service.study_report import Asked
 
 
 def report(
-    feeder: Feeder = "simbench-lv-rural1",
+    feeder: Studied = "simbench-lv-rural1",
     *,
     out: Annotated[
         Path, typer.Option(help="The page; figures, tables and journals go into a folder beside it.")
@@ -69,6 +70,7 @@ def report(
     Interrupted, the same command goes on where it was. What a study cannot answer, the report says.
     """
     from feeders.load import load
+    from feeders.origin import origin
     from feeders.report.book import report as make
     from feeders.report.page import About
     from feeders.studies.protect import Goal
@@ -94,12 +96,13 @@ def report(
         hosting=hosting,
         readings=readings,
     )
-    site = load(feeder)
     folder = out.with_name(f"{out.stem}-files")
+    studied = converted(feeder, folder)
+    site = load(studied)
     out.parent.mkdir(parents=True, exist_ok=True)
     outcomes = [outcome(name, site, asked, journals=folder / "journals", bar=bar) for name in chosen]
     about = About(made, _command(asked, out, studies), versions(), seeds(chosen, asked), folder.name)
-    write(make(site, outcomes, about), out, folder)
+    write(make(site, outcomes, about, origin(studied)), out, folder)
     console.out.print(escape(f"{out}: {len(outcomes)} studies; figures and tables in {folder}"))
     failed = [each for each in outcomes if each.result is None]
     for each in failed:

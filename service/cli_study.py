@@ -12,7 +12,8 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from service import cli_calibrate, cli_campaign, cli_droop, cli_plan, cli_report, console
-from service.console import Feeder
+from service.console import Studied
+from service.foreign import converted
 
 if TYPE_CHECKING:
     from feeders.comparison import Plan, Row
@@ -35,7 +36,7 @@ def study() -> None:
 
 @app.command("compare")
 def study_compare(
-    feeder: Feeder = "simbench-lv-rural1",
+    feeder: Studied = "simbench-lv-rural1",
     *,
     family: Annotated[
         list[str] | None, typer.Option(help="An estimator; may be repeated. [default: all]")
@@ -86,7 +87,7 @@ def study_compare(
     before = None if write is None else write.read_text(encoding="utf-8")
     if before is not None:
         splice(before, "")  # a document without markers is refused before the work, not after it
-    site = load(feeder)
+    site = load(converted(feeder, None))
     with Progress(
         SpinnerColumn(),
         TextColumn("{task.description}"),

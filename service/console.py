@@ -17,6 +17,15 @@ ADDRESS: Final = 5
 FILE: Final = 6
 
 Feeder = Annotated[str, typer.Argument(help="A feeder's folder, or the name of one that comes with gridsec.")]
+Studied = Annotated[
+    str,
+    typer.Argument(
+        help="A feeder's folder, the name of one that comes with gridsec, or another tool's network: a "
+        "pandapower or power-grid-model JSON file, an OpenDSS master file (.dss), simbench:CODE, "
+        "pandapower:NETWORK.",
+        metavar="FEEDER",
+    ),
+]
 
 out = Console(highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() else 160)
 err = Console(stderr=True, highlight=False, soft_wrap=True)

@@ -13,13 +13,14 @@ from feeders.report import raster
 from feeders.report.drawing import Drawing, svg
 from feeders.report.figure import WIDE, Figure
 from feeders.report.maps import Shape, Spot, draw_map, legend_of
-from feeders.report.page import About, Chapter, page
+from feeders.report.page import CONVERSION, FEEDER, About, Chapter, page
 from feeders.report.sections import Outcome, section
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from feeders.load import Site
+    from feeders.origin import Origin
 
 __all__ = ["Report", "report"]
 
@@ -43,7 +44,7 @@ class Report:
     tables: dict[str, pd.DataFrame]
 
 
-def report(site: Site, outcomes: Sequence[Outcome], about: About) -> Report:
+def report(site: Site, outcomes: Sequence[Outcome], about: About, origin: Origin | None = None) -> Report:
     """Make the report; the same arguments give the same bytes.
 
     Parameters
@@ -54,6 +55,8 @@ def report(site: Site, outcomes: Sequence[Outcome], about: About) -> Report:
         What became of its studies, in the order of the sections.
     about
         What the report says of itself.
+    origin
+        Where the feeder is from, if it was converted.
     """
     chapters = [Chapter(outcome, section(site, outcome)) for outcome in outcomes]
     chart = _chart(site)
@@ -64,7 +67,9 @@ def report(site: Site, outcomes: Sequence[Outcome], about: About) -> Report:
         for chapter in chapters
         for name, table in chapter.section.tables.items()
     }
-    html = page(title, _facts(site), chart, chapters, about)
+    if origin is not None:
+        tables[f"{FEEDER}-{CONVERSION}"] = origin.changes
+    html = page(title, _facts(site), chart, chapters, about, origin=origin)
     return Report(html, {name: data for figure in figures for name, data in _files(figure)}, tables)
 
 

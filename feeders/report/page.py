@@ -22,7 +22,13 @@ from feeders.report.words import Finding, Standing, Value, number
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["About", "Chapter", "page"]
+    from feeders.origin import Origin
+
+__all__ = ["CONVERSION", "FEEDER", "About", "Chapter", "page"]
+
+FEEDER: Final = "feeder"
+CONVERSION: Final = "conversion"
+"""Where the table of what a conversion did not carry over belongs, and its name."""
 
 MOST_COLUMNS: Final = 13
 """It shows so many columns at most, and more than FEW_COLUMNS in small print."""
@@ -78,7 +84,13 @@ class Chapter:
 
 
 def page(
-    title: str, facts: Mapping[str, str], chart: Figure, chapters: Sequence[Chapter], about: About
+    title: str,
+    facts: Mapping[str, str],
+    chart: Figure,
+    chapters: Sequence[Chapter],
+    about: About,
+    *,
+    origin: Origin | None,
 ) -> str:
     """Write the page.
 
@@ -94,6 +106,8 @@ def page(
         What its studies found.
     about
         What the report says of itself.
+    origin
+        Where the feeder is from, if it was converted.
     """
     script = _file("sort.js")
     seal = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
@@ -114,7 +128,7 @@ def page(
         "main",
         _front(title, facts, chapters, about),
         _contents(chapters),
-        _feeder(facts, chart),
+        _feeder(facts, chart, [] if origin is None else _origin(origin, about.folder)),
         [_chapter(each, about.folder) for each in chapters],
         _made(about, chapters),
     )
@@ -184,7 +198,7 @@ def _part(part: str | Value) -> str:
 
 
 def _contents(chapters: Sequence[Chapter]) -> Markup:
-    links = [("feeder", "The feeder"), *((_id(c.outcome.study), c.section.title) for c in chapters)]
+    links = [(FEEDER, "The feeder"), *((_id(c.outcome.study), c.section.title) for c in chapters)]
     links.append(("made", "How this was made"))
     items = [el("li", el("a", name, href=f"#{key}")) for key, name in links]
     return el("nav", el("ul", items), class_="card", aria_label="Contents")
@@ -197,16 +211,34 @@ def _id(study: str) -> str:
 # --- sections -----------------------------------------------------------------------------------
 
 
-def _feeder(facts: Mapping[str, str], chart: Figure) -> Markup:
+def _feeder(facts: Mapping[str, str], chart: Figure, source: Sequence[Markup]) -> Markup:
     told = [el("div", el("dt", name), el("dd", value)) for name, value in facts.items()]
     return el(
         "section",
         el("div", el("h2", "The feeder"), class_="head"),
         el("dl", told, class_="facts"),
         _figure(chart),
+        source,
         class_="card",
-        id="feeder",
+        id=FEEDER,
     )
+
+
+def _origin(origin: Origin, folder: str) -> list[Markup]:
+    """What a conversion did not carry over, and what that does to the voltages."""
+    fates = [f"{count} {fate}" for fate, count in origin.changes["done"].value_counts(sort=False).items()]
+    table = _table(FEEDER, CONVERSION, origin.changes, folder, ())
+    return [
+        el("h3", "What was not carried over from its source"),
+        el(
+            "p",
+            f"Converted from {origin.source or 'a network of another tool'}: "
+            f"{', '.join(fates) or 'nothing was changed'}.",
+        ),
+        table,
+        el("h3", "Checked against the source's power flow"),
+        el("p", origin.check or "Nothing is told of a check."),
+    ]
 
 
 def _chapter(chapter: Chapter, folder: str) -> Markup:

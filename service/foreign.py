@@ -1,0 +1,98 @@
+"""Studies of another tool's network: it becomes a feeder's folder first."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import tempfile
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from rich.markup import escape
+
+from gridsec.errors import FeederInvalid
+from service import console
+
+if TYPE_CHECKING:
+    from feeders.convert import Conversion
+
+__all__ = ["FOLDER", "converted", "show_check"]
+
+FOLDER: Final = "feeder"
+"""Name of a converted feeder's folder within that of the results."""
+
+
+def converted(feeder: str, out: Path | None) -> str:
+    """Return a feeder as `feeders.load.load` takes it; another tool's network is converted, and that is told.
+
+    It is converted again each time: an OpenDSS file may lead to others that have changed while it has not.
+
+    Parameters
+    ----------
+    feeder
+        A folder, the name of a feeder that comes with the project, or any source of `feeders.convert`.
+    out
+        Folder of the results, in which the feeder's becomes `feeder`; None: a folder for temporary files,
+        which stays, so that what was not carried over can be read.
+
+    Raises
+    ------
+    FeederInvalid, BusbarUnclear
+        If there is no feeder in it, or more than one; with how to choose.
+    GridsecError
+        If it cannot be read.
+    FileExistsError
+        If there is something else where the feeder is to be written.
+    """
+    from feeders.convert import convert
+    from feeders.convert_changes import CHANGES_FILE, BusbarUnclear
+    from feeders.raw import FOREIGN
+
+    if Path(feeder).is_dir() or not FOREIGN.fullmatch(feeder):
+        return feeder
+    temporary = None if out is not None else Path(tempfile.mkdtemp(prefix="gridsec-"))
+    folder = (out or temporary or Path()) / FOLDER
+    if folder.exists() and not (folder / CHANGES_FILE).is_file():
+        raise FileExistsError(f"{folder}: already there, and no converted feeder; {feeder} would become it")
+    advice = (
+        f"to choose: gridsec feeders convert {feeder} FOLDER, with --root BUS (the metered busbar) and "
+        "--open LINE (to cut a loop); then study FOLDER"
+    )
+    done: Conversion | None = None
+    try:
+        done = convert(feeder, folder, name=_name(feeder))
+    except FeederInvalid as error:
+        raise FeederInvalid([*error.problems, advice]) from error
+    except BusbarUnclear as error:
+        raise BusbarUnclear(f"{error}\n{advice}") from error
+    finally:
+        if done is None and temporary is not None:
+            shutil.rmtree(temporary)
+    fates = Counter(change.done for change in done.changes)
+    counts = ", ".join(f"{count} {fate}" for fate, count in fates.items()) or "nothing changed"
+    console.out.print(escape(f"{feeder} becomes {folder}: {counts}; the list: {folder / CHANGES_FILE}"))
+    show_check(done)
+    return str(folder)
+
+
+def _name(feeder: str) -> str:
+    """A feeder's name: that of the file, or of the network within its collection."""
+    path = Path(feeder)
+    name = path.stem if path.is_file() else feeder.partition(":")[2] or feeder
+    return re.sub(r"[^A-Za-z0-9_-]+", "-", name)[:64]
+
+
+def show_check(done: Conversion) -> None:
+    """Print how a conversion compares with its source's power flow.
+
+    Parameters
+    ----------
+    done
+        The conversion.
+    """
+    if done.check is None:
+        console.err.print(f"[yellow]not checked: {escape(done.unchecked)}[/]")
+        return
+    colour = "green" if done.check.exact else "yellow"
+    console.out.print(f"[{colour}]{escape(done.check.sentence)}[/]")

@@ -1,0 +1,177 @@
+"""`gridsec study` given another tool's network: it becomes a feeder's folder, and the study goes on."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from feeders.load import load
+from feeders.studies.redundancy import redundancy
+from tests.feeders.foreign import opendss, pgm
+from tests.service.commands import Run, command, plain
+
+run = command("study")
+
+
+def written(source: str, folder: Path) -> Path:
+    """A real file of each tool."""
+    if source == "my-net.json":
+        import pandapower
+        from pandapower.networks import create_kerber_landnetz_freileitung_2
+
+        net = create_kerber_landnetz_freileitung_2()
+        pandapower.create_shunt(net, bus=net.bus.index[-1], q_mvar=0.0, p_mw=0.001)
+        pandapower.to_json(net, str(folder / source))
+        return folder / source
+    return (
+        opendss(folder / source, 9, balanced=True)
+        if source[-3:] == "dss"
+        else pgm(folder / source, 9, balanced=True)
+    )
+
+
+@pytest.mark.parametrize("source", ["my-net.json", "town.dss", "grid.json"])
+def test_a_study_of_another_tools_file(
+    source: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip({"my-net.json": "pandapower", "town.dss": "opendssdirect"}.get(source, "numpy"))
+    file, out = written(source, tmp_path), tmp_path / "out"
+    code, told, complaint = run(monkeypatch, capsys, "redundancy", str(file), "--out", str(out))
+    assert code == 0, complaint
+    changes = pd.read_csv(out / "feeder" / "conversion.csv")
+    left_out = int((changes["done"] == "left out").sum())
+    assert left_out >= 1
+    assert f"{left_out} left out" in told
+    assert f"the list: {out / 'feeder' / 'conversion.csv'}" in told
+    assert "|v| differs by less than" in told
+    site = load(out / "feeder")
+    assert site.feeder.name == file.stem
+    expected = redundancy(site).tables
+    pd.testing.assert_frame_equal(pd.read_csv(out / "meters.csv")[["meter"]], expected["meters"][["meter"]])
+
+    # Again, into the same folder: the results are the same, and nobody asks.
+    before = {path.name: path.read_bytes() for path in out.rglob("*.csv")}
+    assert run(monkeypatch, capsys, "redundancy", str(file), "--out", str(out))[0] == 0
+    assert {path.name: path.read_bytes() for path in out.rglob("*.csv")} == before
+
+
+def test_without_a_folder_the_list_stays_where_it_is_said_to_be(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    (tmp_path / "temporary").mkdir()
+    file = pgm(tmp_path / "grid.json", 9, balanced=True)
+    code, told, complaint = run(monkeypatch, capsys, "redundancy", str(file))
+    assert code == 0, complaint
+    said = re.search(r"the list: (\S+)", told)
+    assert said is not None
+    assert Path(said[1]).is_relative_to(tmp_path / "temporary")
+    assert Path(said[1]).read_text(encoding="utf-8").startswith("element,property,done,effect\n")
+
+
+def test_a_folder_of_somebody_else_is_not_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = pgm(tmp_path / "grid.json", 9, balanced=True)
+    own = tmp_path / "out" / "feeder"
+    own.mkdir(parents=True)
+    (own / "feeder.toml").write_text("mine", encoding="utf-8")
+    code, _, told = run(monkeypatch, capsys, "redundancy", str(file), "--out", str(tmp_path / "out"))
+    assert code == 6
+    assert "already there, and no converted feeder" in plain(told)
+    assert (own / "feeder.toml").read_text(encoding="utf-8") == "mine"
+    assert [path.name for path in own.iterdir()] == ["feeder.toml"]
+
+
+def looped(folder: Path) -> Path:
+    """An OpenDSS file with two loops."""
+    source = opendss(folder / "town.dss", 9, balanced=True)
+    ring = "new line.ring1 bus1=n8 bus2=n1 length=1\nnew line.ring2 bus1=n7 bus2=n2 length=1\n"
+    source.write_text(source.read_text().replace("set voltagebases", ring + "set voltagebases"))
+    return source
+
+
+def test_what_keeps_it_from_being_a_feeder_is_told_with_the_way_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("opendssdirect", reason="the extra `convert` is not installed")
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    (tmp_path / "temporary").mkdir()
+    source = looped(tmp_path)
+    code, _, told = run(monkeypatch, capsys, "redundancy", str(source))
+    assert code == 3
+    assert plain(told).count("form a loop") == 2
+    assert f"gridsec feeders convert {source} FOLDER, with --root BUS" in plain(told)
+    assert "--open LINE" in told
+    assert not list((tmp_path / "temporary").iterdir())
+
+
+def test_a_busbar_that_is_not_clear(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pandapower = pytest.importorskip("pandapower", reason="the extra `convert` is not installed")
+    net = pandapower.networks.create_cigre_network_lv()
+    pandapower.to_json(net, str(tmp_path / "net.json"))
+    words = ("detectable", str(tmp_path / "net.json"), "--out", str(tmp_path / "out"))
+    code, _, told = run(monkeypatch, capsys, *words)
+    assert code == 1
+    assert "the busbar is not clear, candidates:" in plain(told)
+    assert "--root BUS" in told
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", ["nowhere.json", "simbench:7-LV--0-sw", "nowhere"])
+def test_what_is_not_there(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, _, told = run(monkeypatch, capsys, "redundancy", name)
+    assert code != 0
+    assert name.removeprefix("simbench:") in plain(told)
+
+
+def test_a_report_tells_what_was_not_carried_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, page = pgm(tmp_path / "grid.json", 9, balanced=True), tmp_path / "report.html"
+    words = ("report", str(file), "--studies", "redundancy", "--out", str(page))
+    assert run(monkeypatch, capsys, *words)[0] == 0
+    folder = tmp_path / "report-files"
+    changes = pd.read_csv(folder / "feeder" / "conversion.csv")
+    pd.testing.assert_frame_equal(pd.read_csv(folder / "tables" / "feeder-conversion.csv"), changes)
+    html = page.read_text(encoding="utf-8")
+    assert "What was not carried over from its source" in html
+    for cell in changes["element"]:
+        assert f"<td>{cell}</td>" in html
+    source = (folder / "feeder" / "SOURCE.md").read_text(encoding="utf-8")
+    check = " ".join(source.partition("## Checked\n\n")[2].partition("\n\n")[0].split())
+    assert check.startswith("AC power flow of power-grid-model")
+    assert check.replace("'", "&#x27;") in html
+    assert f"gridsec study report {file}" in html
+
+
+@pytest.mark.parametrize(
+    ("more", "study"),
+    [
+        (("--max-attacked", "1"), command("study", "protect")),
+        (("--scenarios", "2", "--duration", "30", "--workers", "1"), command("study", "campaign")),
+        (("--draws", "0", "--compare", "vde4105", "--preset", "vde4105", "--who", "all"),
+         command("study", "droop")),
+        (("--case", "clean", "--family", "sequential", "--seeds", "1", "--duration", "70"),
+         command("study", "compare")),
+    ],
+    ids=["protect", "campaign", "droop", "compare"],
+)  # fmt: skip
+def test_every_study_takes_it(
+    more: tuple[str, ...],
+    study: Run,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    code, told, complaint = study(monkeypatch, capsys, str(pgm(tmp_path / "g.json", 6, balanced=True)), *more)
+    assert code == 0, complaint
+    assert "left out" in told
