@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import defaultdict
 from typing import Any
 
-from feeders import profiles, units
+from feeders import matrices, profiles, units
 from feeders.records import Parsed, Report, rows, some
 from feeders.topology import Edge, Tree, tree
 from gridsec.droop import PRESETS
@@ -23,6 +23,7 @@ def feeder(parsed: Parsed) -> tuple[list[str], list[str]]:
     report = Report()
     for check in (_duplicates, _reserved, _limits, _power_factors, _presets, _profiles, _positions):
         check(parsed, report)
+    matrices.check(parsed, report)
     edges, found = _graph(parsed, report)
     units.check(parsed, edges, found, report)
     return report.problems, report.notes

@@ -97,17 +97,50 @@ class Column:
 
 
 PHASES = ("abc", "a", "b", "c")
+LINE_PHASES = (*PHASES, "ab", "bc", "ca")
+PAIRS = ("aa", "ab", "ac", "bb", "bc", "cc")
+"""Upper triangle of a symmetric matrix in phases, row by row."""
+
+
+def _matrix(symbol: str, unit: str, what: tuple[str, str], high: float) -> tuple[Column, ...]:
+    """Columns of a symmetric matrix in phases; what is on its diagonal is never negative."""
+    return tuple(
+        Column(
+            f"{symbol}_{pair}_{unit}",
+            Kind.NUMBER,
+            what[0 if own else 1].format(*pair),
+            None,
+            low=0.0 if own else -high,
+            high=high,
+        )
+        for pair, own in ((pair, pair[0] == pair[1]) for pair in PAIRS)
+    )
+
+
+SERIES_COLUMNS = (
+    *_matrix("r", "ohm", ("self-resistance of phase {}, ohm", "mutual resistance of {} and {}, ohm"), 1e6),
+    *_matrix("x", "ohm", ("self-reactance of phase {}, ohm", "mutual reactance of {} and {}, ohm"), 1e6),
+)
+SHUNT_COLUMNS = _matrix(
+    "b",
+    "us",
+    ("shunt susceptance of phase {}, microsiemens", "its entry of {} and {}, not above 0, microsiemens"),
+    1e9,
+)
+MATRIX_NAMES = frozenset(column.name for column in (*SERIES_COLUMNS, *SHUNT_COLUMNS))
 
 LINE_COLUMNS: tuple[Column, ...] = (
     Column("line", Kind.ID, "id of the line or switch"),
     Column("from_bus", Kind.ID, "bus at one end"),
     Column("to_bus", Kind.ID, "bus at the other end"),
-    Column("phases", Kind.TEXT, "conductors", "abc", choices=PHASES),
+    Column("phases", Kind.TEXT, "conductors", "abc", choices=LINE_PHASES),
     Column("r_ohm", Kind.NUMBER, "series resistance of the whole line, per phase, ohm", low=0.0, high=1e6),
     Column("x_ohm", Kind.NUMBER, "series reactance of the whole line, per phase, ohm", low=0.0, high=1e6),
     Column("r0_ohm", Kind.NUMBER, "zero-sequence resistance, ohm", None, low=0.0, high=1e6),
     Column("x0_ohm", Kind.NUMBER, "zero-sequence reactance, ohm", None, low=0.0, high=1e6),
+    *SERIES_COLUMNS,
     Column("b_us", Kind.NUMBER, "total shunt susceptance, microsiemens per phase", 0.0, low=0.0, high=1e9),
+    *SHUNT_COLUMNS,
     Column("tap", Kind.NUMBER, "ratio of an ideal transformer at from_bus", 1.0, low=0.001, high=1e3),
     Column("closed", Kind.TRUTH, "whether the line carries current", True),
     Column("rating_a", Kind.NUMBER, "thermal limit, ampere", None, above=0.0, high=1e9),

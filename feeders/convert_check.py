@@ -124,8 +124,7 @@ def compare(state: SourceState, tables: FeederTables) -> SourceCheck:
     """
     power = np.array([state.power_kva.get(row.customer, 0.0) for row in tables.customers])
     size = np.abs(state.busbar_volt)
-    single = {row.phases for row in tables.lines} | {row.phases for row in tables.customers} != {"abc"}
-    phases = single or bool(np.ptp(size) > UNIFORM * size[0]) or not _uniform(state)
+    phases = tables.in_phases or bool(np.ptp(size) > UNIFORM * size[0]) or not _uniform(state)
     if phases:
         unbalanced = three_phase(tables)
         v0 = np.asarray(state.busbar_volt, dtype=np.complex128)

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from feeders.columns import MATRIX_NAMES
 from feeders.profiles import data_root
 from feeders.raw import CUSTOMERS_FILE, LINES_FILE, META_FILE, advice
 from feeders.schema import CustomerRow, FeederTables, read, to_json
@@ -68,7 +69,7 @@ def names(*, balanced: bool = True) -> list[str]:
     Parameters
     ----------
     balanced
-        Only those without single-phase lines and customers, which every study and estimator takes.
+        Only those that are not in three phases, which every study and estimator takes.
     """
     folder = data_root() / "feeders"
     found = (entry for entry in folder.iterdir() if (entry / META_FILE).is_file())
@@ -76,11 +77,10 @@ def names(*, balanced: bool = True) -> list[str]:
 
 
 def _names_phases(folder: Traversable) -> bool:
-    """Whether a folder of ours has single-phase lines or customers: the writer leaves out default columns."""
-    tables = (folder / name for name in (LINES_FILE, CUSTOMERS_FILE))
-    return any(
-        "phases" in table.read_text(encoding="utf-8").partition("\n")[0].split(",") for table in tables
-    )
+    """Whether a folder of ours is in three phases: the writer leaves out default columns."""
+    tables = ((folder / name).read_text(encoding="utf-8") for name in (LINES_FILE, CUSTOMERS_FILE))
+    columns = {column for table in tables for column in table.partition("\n")[0].split(",")}
+    return not columns.isdisjoint({"phases", *MATRIX_NAMES})
 
 
 def folder_of(path_or_name: Path | str) -> Path | None:

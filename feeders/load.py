@@ -59,8 +59,8 @@ ABSURD_PU = 100.0
 class Site:
     """A feeder ready to be watched or simulated. N customers, p meters, b + 1 buses.
 
-    With single-phase lines or customers anywhere, it is one in three phases, all of whose customers have one
-    phase: a customer of three is three, see `one_phase_each`.
+    With single-phase lines or customers or lines that are not transposed, it is one in three phases, all of
+    whose customers have one phase: a customer of three is three, see `one_phase_each`.
 
     Attributes
     ----------
@@ -114,7 +114,7 @@ class Site:
         """
         if isinstance(self.feeder, Feeder):
             return self.feeder
-        raise FeederInvalid(["lines, customers: single phases, and this takes balanced feeders only"])
+        raise FeederInvalid(["lines, customers: in three phases, and this takes balanced feeders only"])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,7 +169,7 @@ def from_tables(tables: FeederTables) -> Site:
     FeederInvalid
         If the tables are not valid, or need what the model cannot do yet.
     """
-    if any(row.phases != "abc" for rows in (tables.lines, tables.customers) for row in rows):
+    if tables.in_phases:
         return _in_phases(one_phase_each(tables))
     problems = validate(tables) or _unsupported(tables)
     if problems:

@@ -23,6 +23,7 @@ from feeders.equipment import (
     names,
     positions,
 )
+from feeders.matrices import cells_of, series_ohm, shunt_us
 from feeders.schema import FeederTables, LineRow, validate
 from feeders.topology import Edge, Tree, tree
 from gridsec.arrays import Floats, Ints, Phasors
@@ -85,10 +86,10 @@ def three_phase_names() -> list[str]:
 def three_phase(tables: FeederTables) -> ThreePhaseSite:
     """Turn a feeder's tables into the three-phase model.
 
-    A line of all phases is cyclically symmetric: `sequence_matrix` of its positive and zero sequence. That of
-    a single phase has the self-impedance ``(2 z1 + z0) / 3``, or without zero-sequence values
-    ``r_ohm + j x_ohm`` of the conductor and its return together. Charging is that of cores screened from each
-    other, ``b_us`` in each phase.
+    A line has the matrix of its columns, or without one is cyclically symmetric: `sequence_matrix` of its
+    positive and zero sequence. That of a single phase has the self-impedance ``(2 z1 + z0) / 3``, or without
+    zero-sequence values ``r_ohm + j x_ohm`` of the conductor and its return together. Charging without a
+    matrix is that of cores screened from each other, ``b_us`` in each phase.
 
     With ``z_base = 3 V^2 / (1000 S)`` ohm for V volts phase to neutral and S kVA of all three phases, as on
     a balanced feeder; a single-phase customer's kW divide by ``S / 3``.
@@ -130,7 +131,7 @@ def _feeder(tables: FeederTables, lines: list[LineRow], found: Tree) -> ThreePha
     z_base = 3.0 * meta.voltage_volt**2 / (1000.0 * meta.base_kva)
     phases = np.array([(True,) * 3, *(_present(line.phases) for line in lines)])
     both = phases[1:, :, None] & phases[1:, None, :]
-    charging = np.array([line.b_us for line in lines]) * (1e-6 * z_base)
+    charging = np.array([_shunt(line) for line in lines]) * (1e-6 * z_base)
     return ThreePhaseFeeder(
         name=meta.name,
         parent=np.array(found.parent, dtype=np.intp),
@@ -142,16 +143,25 @@ def _feeder(tables: FeederTables, lines: list[LineRow], found: Tree) -> ThreePha
         buses=found.buses,
         base_volt=meta.voltage_volt,
         base_kva=meta.base_kva,
-        charging=np.where(both, charging[:, None, None] * np.eye(3), 0.0),
+        charging=np.where(both, charging, 0.0),
     )
 
 
 def _series(line: LineRow) -> Phasors:
     """Impedance of a line in phases, ohm."""
+    matrix = series_ohm(cells_of(line))
+    if matrix is not None:
+        return matrix
     positive = np.array(complex(line.r_ohm, line.x_ohm))
     if line.r0_ohm is None or line.x0_ohm is None:
         return np.asarray(positive * np.eye(3))
     return sequence_matrix(positive, np.array(complex(line.r0_ohm, line.x0_ohm)))
+
+
+def _shunt(line: LineRow) -> Floats:
+    """Total shunt susceptance of a line in phases, microsiemens."""
+    matrix = shunt_us(cells_of(line))
+    return line.b_us * np.eye(3) if matrix is None else matrix
 
 
 def _present(phases: str) -> Bools:
@@ -180,9 +190,11 @@ def _unsupported(tables: FeederTables) -> tuple[str, ...]:
                 )
             if line.r0_ohm or line.x0_ohm:
                 problems.append(f"{where}: has an impedance only in the zero sequence; expected both or none")
-        elif given == 1 or (given == 0 and line.phases == "abc"):
+        elif given == 1 or (given == 0 and len(line.phases) > 1 and series_ohm(cells_of(line)) is None):
             missing = "r0_ohm" if line.r0_ohm is None else "x0_ohm"
-            problems.append(f"{where}, column {missing}: is missing; three phases need the zero sequence")
+            problems.append(
+                f"{where}, column {missing}: is missing; several phases need the zero sequence or a matrix"
+            )
     if all(map(_fuses, closed)):
         problems.append("lines: no closed line has an impedance; there is nothing to watch below the busbar")
     return tuple(problems)

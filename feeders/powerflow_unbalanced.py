@@ -321,7 +321,7 @@ def _grid(tables: FeederTables, source_ohm: Phasors | None) -> tuple[UnbalancedG
         ends=np.array([(node[line.from_bus], node[line.to_bus]) for line in lines], dtype=np.intp),
         present=np.array([_present(line.phases) for line in lines]),
         z_ohm=np.array([_series(line) for line in lines]).reshape(count, 3, 3),
-        b_siemens=np.array([line.b_us * 1e-6 * np.eye(3) for line in lines]).reshape(count, 3, 3),
+        b_siemens=np.array([_shunt(line) for line in lines]).reshape(count, 3, 3),
         busbar=node[tables.meta.busbar],
         customer_bus=np.array([node[row.bus] for row in tables.customers], dtype=np.intp),
         connected=np.array([_present(row.phases) for row in tables.customers]).reshape(-1, 3),
@@ -338,7 +338,26 @@ def _present(phases: str) -> list[bool]:
 
 def _series(line: LineRow) -> Phasors:
     """Impedances of a line in phases; without zero-sequence values those of a conductor and its return."""
+    matrix = _entries(line, "r", "ohm") + 1j * _entries(line, "x", "ohm")
+    if matrix.any():
+        return np.asarray(matrix)
     positive = complex(line.r_ohm, line.x_ohm)
     if line.r0_ohm is None or line.x0_ohm is None:
         return np.asarray(positive * np.eye(3), dtype=np.complex128)
     return sequence_ohm(positive, complex(line.r0_ohm, line.x0_ohm))
+
+
+def _shunt(line: LineRow) -> Floats:
+    """Total shunt susceptances of a line in phases, S."""
+    b = _entries(line, "b", "us")
+    return 1e-6 * (b if b.any() else line.b_us * np.eye(3))
+
+
+def _entries(line: LineRow, symbol: str, unit: str) -> Floats:
+    """A symmetric matrix of a line, entry by entry; 0 where its columns are empty."""
+    return np.array(
+        [
+            [getattr(line, f"{symbol}_{''.join(sorted(one + other))}_{unit}") or 0.0 for other in PHASES]
+            for one in PHASES
+        ]
+    )

@@ -16,7 +16,16 @@ from pathlib import Path
 from typing import Any
 
 from feeders import check, raw
-from feeders.columns import CUSTOMER_COLUMNS, LINE_COLUMNS, META_COLUMNS, REQUIRED, Column, parse, shown
+from feeders.columns import (
+    CUSTOMER_COLUMNS,
+    LINE_COLUMNS,
+    MATRIX_NAMES,
+    META_COLUMNS,
+    REQUIRED,
+    Column,
+    parse,
+    shown,
+)
 from feeders.raw import CUSTOMERS_FILE, LINES_FILE, META_FILE, Rows
 from feeders.records import Parsed, Record
 from gridsec.errors import FeederInvalid
@@ -36,7 +45,25 @@ class LineRow:
     phases: str = "abc"
     r0_ohm: float | None = None
     x0_ohm: float | None = None
+    r_aa_ohm: float | None = None
+    r_ab_ohm: float | None = None
+    r_ac_ohm: float | None = None
+    r_bb_ohm: float | None = None
+    r_bc_ohm: float | None = None
+    r_cc_ohm: float | None = None
+    x_aa_ohm: float | None = None
+    x_ab_ohm: float | None = None
+    x_ac_ohm: float | None = None
+    x_bb_ohm: float | None = None
+    x_bc_ohm: float | None = None
+    x_cc_ohm: float | None = None
     b_us: float = 0.0
+    b_aa_us: float | None = None
+    b_ab_us: float | None = None
+    b_ac_us: float | None = None
+    b_bb_us: float | None = None
+    b_bc_us: float | None = None
+    b_cc_us: float | None = None
     tap: float = 1.0
     closed: bool = True
     rating_a: float | None = None
@@ -146,6 +173,13 @@ class FeederTables:
     lines: tuple[LineRow, ...]
     customers: tuple[CustomerRow, ...]
 
+    @property
+    def in_phases(self) -> bool:
+        """Whether it is one in three phases: not all of every row, or a line that is not transposed."""
+        return any(row.phases != "abc" for row in self.customers) or any(
+            row.phases != "abc" or row.r_aa_ohm is not None or row.b_aa_us is not None for row in self.lines
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class Examination:
@@ -209,7 +243,10 @@ def from_json(obj: object) -> FeederTables:
 
 
 def to_json(tables: FeederTables) -> dict[str, Any]:
-    """Return the JSON form: the same names as in the files, a list of rows per table."""
+    """Return the JSON form: the same names as in the files, a list of rows per table.
+
+    Matrices are left out where there are none.
+    """
     meta = asdict(tables.meta)
     meta["accept"] = list(tables.meta.accept)
     meta["busbar_xy"] = None if tables.meta.busbar_xy is None else list(tables.meta.busbar_xy)
@@ -241,7 +278,8 @@ def _tables(examination: Examination) -> FeederTables:
 
 
 def _ordered(row: dict[str, Any], columns: tuple[Column, ...]) -> dict[str, Any]:
-    return {column.name: row[column.name] for column in columns}
+    given = (column.name for column in columns)
+    return {name: row[name] for name in given if row[name] is not None or name not in MATRIX_NAMES}
 
 
 # --- from cells to typed rows -------------------------------------------------------------------
@@ -350,11 +388,11 @@ def _listed(noun: str, names: list[str]) -> str:
 
 
 def _csv(columns: tuple[Column, ...], rows: list[dict[str, Any]]) -> str:
-    kept = [c for c in columns if any(row[c.name] != c.default for row in rows)]
+    kept = [c for c in columns if any(row.get(c.name) != c.default for row in rows)]
     out = io.StringIO(newline="")
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow([column.name for column in kept])
-    writer.writerows([_csv_cell(row[column.name]) for column in kept] for row in rows)
+    writer.writerows([_csv_cell(row.get(column.name)) for column in kept] for row in rows)
     return out.getvalue()
 
 

@@ -100,9 +100,7 @@ def site_of(path_or_name: Path | str) -> Site | ThreePhaseSite:
 
 
 def _site(tables: FeederTables) -> Site | ThreePhaseSite:
-    unbalanced = any(line.phases != "abc" for line in tables.lines)
-    unbalanced |= any(row.phases != "abc" for row in tables.customers)
-    return three_phase(tables) if unbalanced else from_tables(tables)
+    return three_phase(tables) if tables.in_phases else from_tables(tables)
 
 
 def network(tables: FeederTables) -> Network:

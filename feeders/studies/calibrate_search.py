@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from feeders.columns import MATRIX_NAMES
 from feeders.schema import LineRow
 from feeders.studies import calibrate_feeder as model
 from gridsec.arrays import Floats, Ints
@@ -453,6 +454,6 @@ def longer(line: LineRow, factor: float) -> LineRow:
     """
     scaled: dict[str, Any] = {
         name: None if (value := getattr(line, name)) is None else value * factor
-        for name in ("r_ohm", "x_ohm", "r0_ohm", "x0_ohm", "b_us")
+        for name in ("r_ohm", "x_ohm", "r0_ohm", "x0_ohm", "b_us", *MATRIX_NAMES)
     }
     return replace(line, **scaled)
