@@ -1,9 +1,9 @@
-"""What estimators ask of a feeder, in the same words whether it is balanced or in three phases.
+"""What estimators ask of a feeder, in the same words whether it is radial, meshed or in three phases.
 
 A *place* has one squared voltage: a bus of a balanced feeder, a phase of a bus of another. The linear power
-flow is ``v^2 = v0^2 + 2 R p + 2 X q`` with rows for places and columns for customers. On a balanced feeder
-its entries are those of common paths, so that it is symmetric between customers, and everything is a sum
-over the tree; in three phases it is neither symmetric nor nonnegative, and rows are not columns.
+flow is ``v^2 = v0^2 + 2 R p + 2 X q`` with rows for places and columns for customers. On a balanced radial
+feeder its entries are those of common paths, and everything is a sum over the tree. On a meshed one it is
+still symmetric between customers, but may have negative entries; in three phases it is not symmetric either.
 """
 
 from __future__ import annotations
@@ -13,11 +13,13 @@ from enum import StrEnum
 import numpy as np
 
 from gridsec import feeder as balanced
+from gridsec import mesh
 from gridsec.arrays import Floats, Ints
 from gridsec.feeder import Feeder, common_paths, path_sums
+from gridsec.mesh import MeshedFeeder
 from gridsec.phases import PhasedFeeder, places
 
-Network = Feeder | PhasedFeeder
+Network = Feeder | MeshedFeeder | PhasedFeeder
 """A feeder that an estimator can watch."""
 
 
@@ -36,7 +38,7 @@ def busbar_places(feeder: Network) -> slice:
     feeder
         The feeder.
     """
-    return slice(0, 1 if isinstance(feeder, Feeder) else 3)
+    return slice(0, 3 if isinstance(feeder, PhasedFeeder) else 1)
 
 
 def one_busbar(feeder: Network, some: Ints, others: Ints) -> Floats | float:
@@ -49,7 +51,7 @@ def one_busbar(feeder: Network, some: Ints, others: Ints) -> Floats | float:
     some, others : (j,), (k,)
         The places.
     """
-    if isinstance(feeder, Feeder):
+    if not isinstance(feeder, PhasedFeeder):
         return 1.0
     return np.equal.outer(some % 3, others % 3).astype(np.float64)
 
@@ -64,7 +66,7 @@ def by_place(feeder: Network, of_busbar: Floats | float) -> Floats:
     of_busbar
         One number, or in three phases one for each.
     """
-    if isinstance(feeder, Feeder):
+    if not isinstance(feeder, PhasedFeeder):
         return np.full(len(feeder.buses), of_busbar)
     return np.tile(np.broadcast_to(np.asarray(of_busbar, dtype=np.float64), 3), len(feeder.tree.buses))
 
@@ -72,7 +74,7 @@ def by_place(feeder: Network, of_busbar: Floats | float) -> Floats:
 def bus_voltages(
     feeder: Network, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1
 ) -> Floats:
-    """Squared voltage of every place, losses corrected; O(n).
+    """Squared voltage of every place, losses corrected; O(n), on a meshed feeder O(n N).
 
     Parameters
     ----------
@@ -92,6 +94,8 @@ def bus_voltages(
     """
     if isinstance(feeder, Feeder):
         return balanced.bus_voltages(feeder, p, q, v0_squared, steps=steps)
+    if isinstance(feeder, MeshedFeeder):
+        return mesh.bus_voltages(feeder, p, q, v0_squared, steps=steps)
     return places.bus_voltages(feeder, p, q, v0_squared, steps=steps)
 
 
@@ -105,6 +109,8 @@ def model_error_bound(feeder: Network, p: Floats, q: Floats, v0_squared: Floats 
     """
     if isinstance(feeder, Feeder):
         return balanced.model_error_bound(feeder, p, q, v0_squared)
+    if isinstance(feeder, MeshedFeeder):
+        return mesh.model_error_bound(feeder, p, q, v0_squared)
     return places.model_error_bound(feeder, p, q, v0_squared)
 
 
@@ -186,9 +192,9 @@ def own(feeder: Network, power: Power) -> Floats:
 def covariance(feeder: Network, power: Power, at: Ints, variance: Floats) -> Floats:
     """Columns `at` of ``4 R V R^T``, or of ``4 X V X^T``, for diagonal V, (n, p).
 
-    On a balanced feeder O(n p): a voltage is that of the bus above less what the branch between takes off,
-    and this depends on the flow, the sum of the powers below. So covariances with flows are summed up the
-    tree, those with voltages down.
+    On a balanced radial feeder O(n p): a voltage is that of the bus above less what the branch between takes
+    off, and this depends on the flow, the sum of the powers below. So covariances with flows are summed up
+    the tree, those with voltages down.
 
     Parameters
     ----------
@@ -218,7 +224,7 @@ def covariance(feeder: Network, power: Power, at: Ints, variance: Floats) -> Flo
 def variances(feeder: Network, power: Power, variance: Floats) -> Floats:
     """Diagonal of ``4 R V R^T``, or of ``4 X V X^T``, for diagonal V, (n,).
 
-    On a balanced feeder O(n): whoever is below a bus shares all of its path.
+    On a balanced radial feeder O(n): whoever is below a bus shares all of its path.
 
     Parameters
     ----------
@@ -241,5 +247,5 @@ def _branch(feeder: Feeder, power: Power) -> Floats:
     return feeder.r if power is Power.ACTIVE else feeder.x
 
 
-def _matrix(feeder: PhasedFeeder, power: Power) -> Floats:
+def _matrix(feeder: MeshedFeeder | PhasedFeeder, power: Power) -> Floats:
     return feeder.R if power is Power.ACTIVE else feeder.X

@@ -13,6 +13,7 @@ from gridsec.errors import DesignInfeasible
 from gridsec.feeder import Feeder, LinDistFlow, lindistflow
 from gridsec.judge import Tally
 from gridsec.lure import Lure
+from gridsec.mesh import MeshedFeeder
 from gridsec.network import Network
 from gridsec.online import Estimate, Verdict
 
@@ -24,7 +25,7 @@ class Plant:
     Attributes
     ----------
     feeder
-        The feeder with its customers, balanced or in three phases.
+        The feeder with its customers: radial, meshed or in three phases.
     droop
         The customers' inverters and their curves.
     meters : (p,)
@@ -43,10 +44,14 @@ class Plant:
 
     @property
     def balanced(self) -> Feeder:
-        """The feeder, for estimators that take only balanced ones; raises DesignInfeasible for others."""
+        """The feeder, for estimators of balanced radial ones alone; raises DesignInfeasible for others."""
         if isinstance(self.feeder, Feeder):
             return self.feeder
-        raise DesignInfeasible(f"estimator for {self.feeder.name}", "it cannot watch single phases")
+        meshed = isinstance(self.feeder, MeshedFeeder)
+        reason = "it takes radial feeders only, and closed lines form loops here"
+        raise DesignInfeasible(
+            f"estimator for {self.feeder.name}", reason if meshed else "it cannot watch single phases"
+        )
 
 
 @dataclass(frozen=True, slots=True)

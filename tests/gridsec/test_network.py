@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible, FeederInvalid
 from gridsec.feeder import Feeder, lindistflow
+from gridsec.mesh import MeshedFeeder, impedances
 from gridsec.network import (
     Network,
     Power,
@@ -27,6 +28,7 @@ from gridsec.network import (
 )
 from gridsec.phases import PHASES, PhasedFeeder
 from gridsec.plant import setting
+from tests.gridsec.meshes import ac, random_mesh
 from tests.gridsec.radial import random_feeder
 from tests.gridsec.street import make_plant
 from tests.gridsec.unbalanced import power_flow, random_three_phase
@@ -40,10 +42,13 @@ def phased(seed: int) -> PhasedFeeder:
 
 
 def dense(feeder: Network, power: Power) -> Floats:
-    """R or X from customers to places: of the tree by `lindistflow`, or by differences of AC power flows."""
+    """R or X from customers to places: by `lindistflow`, `impedances`, or differences of AC power flows."""
     if isinstance(feeder, Feeder):
         model = lindistflow(feeder)
         return model.R_bus if power is Power.ACTIVE else model.X_bus
+    if isinstance(feeder, MeshedFeeder):
+        Z = impedances(feeder, feeder.bus)
+        return Z.real if power is Power.ACTIVE else Z.imag
     step, none, out = 1e-5, np.zeros(feeder.bus.size), []
     for c in range(feeder.bus.size):
         # 1 pu of the power of a phase is a third of S.
@@ -57,7 +62,7 @@ def dense(feeder: Network, power: Power) -> Floats:
     return np.array(out).T
 
 
-@pytest.mark.parametrize("kind", [random_feeder, phased])
+@pytest.mark.parametrize("kind", [random_feeder, random_mesh, phased])
 @given(seed=seeds)
 @settings(max_examples=15, deadline=None)
 def test_every_word_is_that_of_the_dense_matrix(kind: object, seed: int) -> None:
@@ -66,7 +71,7 @@ def test_every_word_is_that_of_the_dense_matrix(kind: object, seed: int) -> None
     rng, count = np.random.default_rng(seed), feeder.bus.size
     metered = np.sort(rng.choice(count, max(1, count // 2), replace=False))
     weights, variance = rng.normal(size=metered.size), rng.uniform(0.0, 2.0, count)
-    tol = 1e-9 if isinstance(feeder, Feeder) else 1e-7
+    tol = 1e-7 if isinstance(feeder, PhasedFeeder) else 1e-9
     for power in Power:
         M = dense(feeder, power)
         there = ~np.isnan(M).any(axis=1)
@@ -103,6 +108,18 @@ def test_voltages_of_the_places_within_their_bound_of_the_power_flow(seed: int) 
     np.testing.assert_allclose(bus_voltages(feeder, p, q, v0, steps=0), linear, rtol=0, atol=1e-12)
 
 
+def test_voltages_of_a_meshed_feeder_within_their_bound_of_the_power_flow() -> None:
+    feeder = random_mesh(4, charging=0.01)
+    p, q = 0.01 * np.random.default_rng(4).normal(-0.5, 1.0, (2, feeder.bus.size))
+    exact = ac(feeder, p, q, 1.04)
+    found, bound = bus_voltages(feeder, p, q, 1.04), model_error_bound(feeder, p, q, 1.04)
+    assert found[busbar_places(feeder)] == pytest.approx(1.04, abs=1e-14)
+    assert (np.abs(found - exact)[feeder.bus] <= bound + 2e-9).all()
+    linear = by_place(feeder, 1.04) + 2.0 * (feeder.R @ p + feeder.X @ q)
+    np.testing.assert_allclose(bus_voltages(feeder, p, q, 1.04, steps=0), linear, rtol=0, atol=1e-12)
+    assert one_busbar(feeder, feeder.bus, feeder.bus) == 1.0
+
+
 def test_places_know_their_bus_and_their_phase() -> None:
     feeder = phased(3)
     for name, place, phase, bus in zip(
@@ -126,4 +143,7 @@ def test_what_is_refused() -> None:
     plant = make_plant(np.random.default_rng(0))
     other = type(plant)(phased(0), plant.droop, plant.meters, plant.accuracy)
     with pytest.raises(DesignInfeasible, match="cannot watch single phases"):
+        setting(other, max_attacked=1)
+    other = type(plant)(random_mesh(0), plant.droop, plant.meters, plant.accuracy)
+    with pytest.raises(DesignInfeasible, match="takes radial feeders only, and closed lines form loops here"):
         setting(other, max_attacked=1)

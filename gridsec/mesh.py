@@ -1,0 +1,308 @@
+"""A feeder with closed ties: a radial feeder and the lines that close loops in it, in the same per unit.
+
+With W the busbar's voltage as it arrives without load, and ``Z = R + j X`` the inverse of the admittance
+matrix without the busbar, powers s and voltages V of the other buses obey
+
+    V = W + Z conj(s / V).
+
+To first order in s, and without charging, ``|V|^2 = v0^2 + 2 Re(Z conj(s)) = v0^2 + 2 R p + 2 X q``. On a
+tree Z holds the sums of common paths, so that this is LinDistFlow; with ties its entries may be negative, but
+it stays symmetric, and both parts positive semidefinite. Derivations: docs/theory-mesh.md.
+
+References
+----------
+.. [1] S. Bolognani, S. Zampieri, "On the existence and linear approximation of the power flow solution in
+   power distribution networks", IEEE Trans. Power Systems 31(1), 2016: the model, for networks of any form.
+.. [2] C. Wang, A. Bernstein, J.-Y. Le Boudec, M. Paolone, "Explicit conditions on existence and uniqueness
+   of load-flow solutions in distribution networks", IEEE Trans. Smart Grid 9(2), 2018: the fixed point.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.sparse import csc_array, diags_array
+from scipy.sparse.linalg import splu
+
+from gridsec.arrays import Floats, Ints, Phasors, frozen, frozen_ints
+from gridsec.errors import FeederInvalid
+from gridsec.feeder import Feeder, common_paths
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeshedFeeder:
+    """A feeder whose closed lines form loops. N customers, b + 1 buses, t ties.
+
+    Attributes
+    ----------
+    tree
+        Everything but the ties: a radial feeder that reaches every bus.
+    ends : (t, 2)
+        Buses at both ends of each tie.
+    r, x : (t,)
+        Series resistance and reactance of each tie, pu.
+    charging : (t,)
+        Total shunt susceptance of each tie, pu; half of it sits at each end.
+    half : (b + 1,)
+        Derived. Shunt susceptance at the buses, pu.
+    R, X : (b + 1, N)
+        Derived. The linear power flow ``v^2 = v0^2 + 2 R p + 2 X q``, from a customer's power to every bus.
+    idle : (b + 1,)
+        Derived. Voltage of every bus without load, by that of the busbar: 1 without charging.
+    transfer : (b + 1, N)
+        Derived. From a current that a customer injects to the voltage of every bus, charging included, pu.
+    between : (N, N)
+        Derived. The same to the customers' voltages.
+    size : (N, N)
+        Derived. Its absolute values.
+
+    Raises
+    ------
+    FeederInvalid
+        With every problem found.
+    """
+
+    tree: Feeder
+    ends: Ints
+    r: Floats
+    x: Floats
+    charging: Floats
+    half: Floats = field(init=False, repr=False)
+    R: Floats = field(init=False, repr=False)
+    X: Floats = field(init=False, repr=False)
+    idle: Phasors = field(init=False, repr=False)
+    transfer: Phasors = field(init=False, repr=False)
+    between: Phasors = field(init=False, repr=False)
+    size: Floats = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        def put(name: str, value: object) -> None:
+            object.__setattr__(self, name, value)
+
+        for name in ("r", "x", "charging"):
+            put(name, frozen(getattr(self, name)))
+        put("ends", frozen_ints(self.ends))
+        problems = _problems(self)
+        if problems:
+            raise FeederInvalid(problems)
+        half = self.tree.half.copy()
+        np.add.at(half, self.ends, 0.5 * self.charging[:, None])
+        put("half", frozen(half))
+        Z = impedances(self, self.bus)
+        put("R", frozen(Z.real))
+        put("X", frozen(Z.imag))
+        idle, transfer = _charged(self) if half.any() else (np.ones(half.size, np.complex128), Z)
+        for name, values in (("idle", idle), ("transfer", transfer), ("between", transfer[self.bus])):
+            values.flags.writeable = False
+            put(name, values)
+        put("size", frozen(np.abs(self.between)))
+
+    @property
+    def name(self) -> str:
+        """Name of the feeder."""
+        return self.tree.name
+
+    @property
+    def bus(self) -> Ints:
+        """Bus of each customer, (N,)."""
+        return self.tree.bus
+
+    @property
+    def customers(self) -> tuple[str, ...]:
+        """Identifiers of the customers, (N,)."""
+        return self.tree.customers
+
+    @property
+    def buses(self) -> tuple[str, ...]:
+        """Identifiers of the buses, the busbar first, (b + 1,)."""
+        return self.tree.buses
+
+    @property
+    def base_volt(self) -> float:
+        """Nominal phase-to-neutral voltage (1 pu), V."""
+        return self.tree.base_volt
+
+    @property
+    def base_kva(self) -> float:
+        """Three-phase base power (1 pu), kVA."""
+        return self.tree.base_kva
+
+
+def _problems(feeder: MeshedFeeder) -> list[str]:
+    """Every reason why the ties do not fit the tree."""
+    count, buses = feeder.r.size, len(feeder.tree.buses)
+    expected = (
+        ("ends", feeder.ends.shape, (count, 2)),
+        ("r", feeder.r.shape, (count,)),
+        ("x", feeder.x.shape, (count,)),
+        ("charging", feeder.charging.shape, (count,)),
+    )
+    out = [f"{what} has shape {has}; expected {wants}" for what, has, wants in expected if has != wants]
+    if out:
+        return out
+    for k, (one, other) in enumerate(feeder.ends.tolist()):
+        missing = [end for end in (one, other) if not 0 <= end < buses]
+        out.extend(f"tie {k}: bus {end} does not exist; expected 0 to {buses - 1}" for end in missing)
+        if one == other:
+            out.append(f"tie {k}: both ends are bus {one}; a line needs two")
+        for what in ("r", "x", "charging"):
+            value = getattr(feeder, what)[k]
+            if not (np.isfinite(value) and value >= 0):
+                out.append(f"tie {k}: {what} is {value}; it must be finite and not negative")
+        if feeder.r[k] == 0 and feeder.x[k] == 0:
+            out.append(f"tie {k}: r and x are both 0; fuse the two buses")
+    return out
+
+
+def impedances(feeder: MeshedFeeder, buses: Ints) -> Phasors:
+    """Columns of the inverse of the reduced admittance matrix, without charging; O(b k t).
+
+    The ties, with ends C (+1 at one, -1 at the other) and impedances z, add ``C z^-1 C^T`` to the admittances
+    of the tree, whose inverse T are the common paths. The inverse of the sum is (Woodbury)
+
+        Z = T - T C (z + C^T T C)^-1 C^T T,
+
+    with the impedances of the t loops in the middle: no linear system of the size of the feeder is solved.
+
+    Parameters
+    ----------
+    feeder
+        The feeder.
+    buses : (k,)
+        Where a current is injected.
+
+    Returns
+    -------
+    (b + 1, k)
+        Rise of the voltage of every bus for each of them, pu; 0 at the busbar.
+    """
+    tree = feeder.tree
+
+    def paths(some: Ints) -> Phasors:
+        return common_paths(tree, tree.r, some) + 1j * common_paths(tree, tree.x, some)
+
+    Z = paths(buses)
+    if feeder.r.size:
+        one, other = feeder.ends.T
+        across = paths(one) - paths(other)  # T C
+        loops = np.diag(feeder.r + 1j * feeder.x) + across[one] - across[other]
+        Z = Z - across @ np.linalg.solve(loops, across[buses].T)
+    return Z
+
+
+def admittance(feeder: MeshedFeeder) -> csc_array:
+    """Admittance matrix of all buses, charging included, (b + 1, b + 1), pu.
+
+    Parameters
+    ----------
+    feeder
+        The feeder.
+    """
+    tree = feeder.tree
+    lines = np.vstack([np.column_stack([tree.parent, np.arange(1, len(tree.buses))]), feeder.ends])
+    z = np.concatenate([tree.r, feeder.r]) + 1j * np.concatenate([tree.x, feeder.x])
+    signs = np.repeat([1.0, -1.0], len(lines))
+    rows = np.tile(np.arange(len(lines)), 2)
+    incidence = csc_array((signs, (rows, lines.T.ravel())), shape=(len(lines), len(tree.buses)))
+    return csc_array(incidence.T @ diags_array(1.0 / z) @ incidence + diags_array(1j * feeder.half))
+
+
+def _charged(feeder: MeshedFeeder) -> tuple[Phasors, Phasors]:
+    """Voltages without load, and what currents of the customers do, charging included."""
+    Y = admittance(feeder)
+    below = splu(csc_array(Y[1:, 1:]))
+    idle = np.ones(len(feeder.buses), dtype=np.complex128)
+    idle[1:] = below.solve(-Y[1:, [0]].toarray().ravel())
+    transfer, injected = np.zeros((2, idle.size, feeder.bus.size), dtype=np.complex128)
+    injected[feeder.bus, np.arange(feeder.bus.size)] = 1.0
+    transfer[1:] = below.solve(injected[1:])
+    return idle, transfer
+
+
+def bus_voltages(
+    feeder: MeshedFeeder, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1
+) -> Floats:
+    """Squared voltage of every bus, losses and charging corrected.
+
+    The fixed-point iteration ``V <- W + Z conj(s / V)`` from ``V = W``: its first iterate has the voltages of
+    the linear power flow and the square of its drops, and every step after it gains one order in the load, as
+    a step of `gridsec.feeder.loss_correction` does.
+
+    Parameters
+    ----------
+    feeder
+        The feeder.
+    p, q : (…, N)
+        Net active and reactive injection of each customer (generation positive), pu.
+    v0_squared : (…) or scalar
+        Squared busbar voltage, pu.
+    steps
+        Steps after the first iterate; with none the linear power flow alone.
+
+    Returns
+    -------
+    (…, b + 1)
+        Squared voltages, pu.
+    """
+    if not steps:
+        base = np.asarray(v0_squared, dtype=np.float64)[..., None]
+        return np.asarray(base + 2.0 * (p @ feeder.R.T + q @ feeder.X.T))
+    s, idle, here = _start(feeder, p, q, v0_squared)
+    V = here
+    for _ in range(steps):
+        V = here + np.conj(s / V) @ feeder.between.T
+    V = idle + np.conj(s / V) @ feeder.transfer.T
+    return np.asarray(V.real**2 + V.imag**2)
+
+
+def model_error_bound(feeder: MeshedFeeder, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:
+    """How far `v^2` after one correction can be from the AC power flow, for every customer.
+
+    V1 and V2 are the iterates of `bus_voltages`, ``d = |V2 - V1|``, and
+    ``M_ij = |Z_ij| |s_j| / (c_j min(|V1_j|, c_j))`` with ``c = 0.9 |V2|``. A step sends whatever is within
+    ``rho <= 0.1 |V2|`` of V2 no further than ``M (rho + d)`` from V2. So if ``M M d <= theta M d`` for a
+    theta below 1, and ``rho = M d / (1 - theta)``, the disks of radius rho around V2 are sent into
+    themselves: they hold a solution of the AC power flow (Brouwer), and only one, because theta also bounds
+    the contraction there. Where theta is 1 or more, or rho above 0.1 |V2|, the bound is infinite.
+
+    Parameters
+    ----------
+    feeder, p, q, v0_squared
+        As in `bus_voltages`.
+
+    Returns
+    -------
+    (…, N)
+        Bound on the error of `v^2`, pu.
+
+    References
+    ----------
+    Wang et al. 2018, for the existence of the solution; the componentwise bound: docs/theory-mesh.md.
+    """
+    with np.errstate(all="ignore"):
+        s, _, idle = _start(feeder, p, q, v0_squared)
+        first = idle + np.conj(s / idle) @ feeder.between.T
+        second = idle + np.conj(s / first) @ feeder.between.T
+        low = (1.0 - _NEAR) * np.abs(second)
+        weight = np.abs(s) / (low * np.minimum(low, np.abs(first)))
+        once = (weight * np.abs(second - first)) @ feeder.size.T
+        twice = (weight * once) @ feeder.size.T
+        theta = np.max(np.where(twice > 0.0, twice / once, 0.0), axis=-1, keepdims=True, initial=0.0)
+        rho = once / (1.0 - theta)
+        holds = (theta < 1.0) & np.all(rho <= _NEAR * np.abs(second), axis=-1, keepdims=True)
+        bound = np.where(holds, rho * (2.0 * np.abs(second) + rho), np.inf)
+    return np.asarray(bound)
+
+
+# How near to the second iterate, as a part of it, a solution is looked for.
+_NEAR = 0.1
+
+
+def _start(
+    feeder: MeshedFeeder, p: Floats, q: Floats, v0_squared: Floats | float
+) -> tuple[Phasors, Phasors, Phasors]:
+    """Powers of the customers (…, N), and voltages without load of all buses (…, b + 1) and of theirs."""
+    v0 = np.sqrt(np.asarray(v0_squared, dtype=np.float64))[..., None]
+    idle = v0 * feeder.idle
+    return np.asarray(p + 1j * q), np.asarray(idle), np.asarray(idle[..., feeder.bus])
