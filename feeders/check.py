@@ -137,7 +137,7 @@ def _graph(parsed: Parsed, report: Report) -> tuple[list[Edge], Tree | None]:
             zero = cells.get("r_ohm") == 0 and cells.get("x_ohm") == 0
             edges.append(Edge(cells.get("line", "?"), one, other, zero))
     found = tree(busbar if busbar is not None else next(iter(known), ""), edges, known)
-    _loops(found, edges, report)
+    _loops(found, edges, parsed.top("meshed") is True, report)
     whole = all({"from_bus", "to_bus", "closed"} <= row.cells.keys() for row in parsed.lines or ())
     if parsed.lines is None or busbar is None or not whole:
         return edges, None
@@ -155,7 +155,7 @@ def _graph(parsed: Parsed, report: Report) -> tuple[list[Edge], Tree | None]:
     return edges, found
 
 
-def _loops(found: Tree, edges: list[Edge], report: Report) -> None:
+def _loops(found: Tree, edges: list[Edge], meshed: bool, report: Report) -> None:
     for loop in found.loops:
         names = some([edges[k].line for k in loop])
         if len(loop) == 1:
@@ -163,10 +163,13 @@ def _loops(found: Tree, edges: list[Edge], report: Report) -> None:
                 f"lines: {names} is short-circuited, lines without impedance join its two buses; "
                 "set closed to false on one of them"
             )
+        elif meshed:
+            report.notes.append(f"lines: {names} form a loop; {edges[loop[0]].line!r} is drawn as a tie")
         else:
             report.problems.append(
                 f"lines: {names} form a loop; the feeder must be radial: set closed to false on one of them "
-                "(or merge parallel lines into one row)"
+                "(or merge parallel lines into one row), or meshed to true in feeder.toml if the loop is "
+                "really closed"
             )
 
 

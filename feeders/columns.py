@@ -124,7 +124,7 @@ SERIES_COLUMNS = (
 SHUNT_COLUMNS = _matrix(
     "b",
     "us",
-    ("shunt susceptance of phase {}, microsiemens", "its entry of {} and {}, not above 0, microsiemens"),
+    ("shunt susceptance of phase {}, microsiemens", "its entry of {} and {}, seldom above 0, microsiemens"),
     1e9,
 )
 MATRIX_NAMES = frozenset(column.name for column in (*SERIES_COLUMNS, *SHUNT_COLUMNS))
@@ -232,6 +232,7 @@ META_COLUMNS: dict[str, tuple[Column, ...]] = {
         ),
         Column("busbar", Kind.ID, "bus whose voltage the busbar meter reads; root of the feeder"),
         Column("busbar_xy", Kind.PAIR, "position of the busbar", None),
+        Column("meshed", Kind.TRUTH, "whether closed lines may form loops", False),
         Column(
             "busbar_class_percent",
             Kind.NUMBER,

@@ -32,6 +32,7 @@ from gridsec.detect import MeterAccuracy
 from gridsec.droop import Droop
 from gridsec.errors import FeederInvalid
 from gridsec.feeder import Feeder
+from gridsec.mesh import MeshedFeeder
 from gridsec.monitor import Plant
 from gridsec.network import Network
 from gridsec.online import Frame
@@ -67,7 +68,7 @@ class Site:
     tables
         The feeder in SI, as its files say it; in three phases with customers of one phase.
     feeder
-        The radial tree, pu; or in three phases.
+        The radial tree, pu; or with closed ties, or in three phases.
     droop
         The inverters with a droop curve, in the order of the customers.
     meters : (p,)
@@ -99,9 +100,22 @@ class Site:
     digest: str
 
     @property
-    def tree(self) -> Feeder | ThreePhaseFeeder:
-        """The tree of its buses, whatever the number of their phases."""
+    def spanning(self) -> Feeder | ThreePhaseFeeder:
+        """A tree that reaches all its buses, whatever the number of their phases: all lines but the ties."""
         return self.feeder if isinstance(self.feeder, Feeder) else self.feeder.tree
+
+    @property
+    def tree(self) -> Feeder | ThreePhaseFeeder:
+        """The tree of its buses, for what takes radial feeders only.
+
+        Raises
+        ------
+        FeederInvalid
+            If closed lines form loops.
+        """
+        if isinstance(self.feeder, MeshedFeeder):
+            raise FeederInvalid(["lines: closed lines form loops, and this takes radial feeders only"])
+        return self.spanning
 
     @property
     def balanced(self) -> Feeder:
@@ -110,10 +124,10 @@ class Site:
         Raises
         ------
         FeederInvalid
-            In three phases.
+            In three phases, or if closed lines form loops.
         """
-        if isinstance(self.feeder, Feeder):
-            return self.feeder
+        if isinstance(self.tree, Feeder):
+            return self.tree
         raise FeederInvalid(["lines, customers: in three phases, and this takes balanced feeders only"])
 
 
@@ -180,11 +194,12 @@ def from_tables(tables: FeederTables) -> Site:
         meta.busbar,
         [Edge(row.line, row.from_bus, row.to_bus, row.r_ohm == row.x_ohm == 0.0) for row in closed],
     )
-    feeder = _feeder(tables, closed, found)
+    feeder = _feeder(tables, [closed[k] for k in found.branch], found)
+    ties = [closed[k] for k in found.ties]
     metered = metered_customers(tables)
     return Site(
         tables=tables,
-        feeder=feeder,
+        feeder=_meshed(tables, feeder, ties, found) if ties else feeder,
         droop=inverters(tables),
         meters=metered,
         meter_ids=tuple(tables.customers[k].meter for k in metered),
@@ -346,10 +361,9 @@ def _unsupported(tables: FeederTables) -> tuple[str, ...]:
     return tuple(problems)
 
 
-def _feeder(tables: FeederTables, closed: list[LineRow], found: Tree) -> Feeder:
+def _feeder(tables: FeederTables, lines: list[LineRow], found: Tree) -> Feeder:
     meta = tables.meta
     z_base = 3.0 * meta.voltage_volt**2 / (1000.0 * meta.base_kva)
-    lines = [closed[k] for k in found.branch]
     return Feeder(
         name=meta.name,
         parent=indices(found.parent),
@@ -361,4 +375,16 @@ def _feeder(tables: FeederTables, closed: list[LineRow], found: Tree) -> Feeder:
         base_volt=meta.voltage_volt,
         base_kva=meta.base_kva,
         charging=np.array([line.b_us for line in lines]) * (1e-6 * z_base),
+    )
+
+
+def _meshed(tables: FeederTables, feeder: Feeder, ties: list[LineRow], found: Tree) -> MeshedFeeder:
+    meta = tables.meta
+    z_base = 3.0 * meta.voltage_volt**2 / (1000.0 * meta.base_kva)
+    return MeshedFeeder(
+        tree=feeder,
+        ends=np.array([(found.group[tie.from_bus], found.group[tie.to_bus]) for tie in ties], dtype=np.intp),
+        r=np.array([tie.r_ohm for tie in ties]) / z_base,
+        x=np.array([tie.x_ohm for tie in ties]) / z_base,
+        charging=np.array([tie.b_us for tie in ties]) * (1e-6 * z_base),
     )

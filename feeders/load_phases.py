@@ -25,7 +25,7 @@ from feeders.equipment import (
 )
 from feeders.matrices import cells_of, series_ohm, shunt_us
 from feeders.schema import FeederTables, LineRow, validate
-from feeders.topology import Edge, Tree, tree
+from feeders.topology import LOOPS_SHOWN, Edge, Tree, tree
 from gridsec.arrays import Floats, Ints, Phasors
 from gridsec.detect import MeterAccuracy
 from gridsec.droop import Droop
@@ -111,6 +111,9 @@ def three_phase(tables: FeederTables) -> ThreePhaseSite:
     closed = [line for line in tables.lines if line.closed]
     edges = [Edge(row.line, row.from_bus, row.to_bus, _fuses(row)) for row in closed]
     found = tree(meta.busbar, edges)
+    if found.ties:
+        named = ", ".join(repr(closed[k].line) for k in found.ties[:LOOPS_SHOWN])
+        raise FeederInvalid([f"lines: {named} close loops; only balanced feeders can be meshed"])
     metered = metered_customers(tables)
     return ThreePhaseSite(
         tables=tables,
@@ -131,11 +134,11 @@ def _feeder(tables: FeederTables, lines: list[LineRow], found: Tree) -> ThreePha
     z_base = 3.0 * meta.voltage_volt**2 / (1000.0 * meta.base_kva)
     phases = np.array([(True,) * 3, *(_present(line.phases) for line in lines)])
     both = phases[1:, :, None] & phases[1:, None, :]
-    charging = np.array([_shunt(line) for line in lines]) * (1e-6 * z_base)
+    charging = np.array([shunt_of(line) for line in lines]) * (1e-6 * z_base)
     return ThreePhaseFeeder(
         name=meta.name,
         parent=np.array(found.parent, dtype=np.intp),
-        z=np.where(both, np.array([_series(line) for line in lines]) / z_base, 0.0),
+        z=np.where(both, np.array([series_of(line) for line in lines]) / z_base, 0.0),
         phases=phases,
         bus=np.array([found.group[row.bus] for row in tables.customers], dtype=np.intp),
         connected=np.array([_present(row.phases) for row in tables.customers]).reshape(-1, 3),
@@ -147,8 +150,14 @@ def _feeder(tables: FeederTables, lines: list[LineRow], found: Tree) -> ThreePha
     )
 
 
-def _series(line: LineRow) -> Phasors:
-    """Impedance of a line in phases, ohm."""
+def series_of(line: LineRow) -> Phasors:
+    """Return the impedances of a line in phases, ohm.
+
+    Parameters
+    ----------
+    line
+        Its row; only what is of its phases counts.
+    """
     matrix = series_ohm(cells_of(line))
     if matrix is not None:
         return matrix
@@ -158,8 +167,8 @@ def _series(line: LineRow) -> Phasors:
     return sequence_matrix(positive, np.array(complex(line.r0_ohm, line.x0_ohm)))
 
 
-def _shunt(line: LineRow) -> Floats:
-    """Total shunt susceptance of a line in phases, microsiemens."""
+def shunt_of(line: LineRow) -> Floats:
+    """Return the total shunt susceptances of a line in phases, microsiemens; as `series_of`."""
     matrix = shunt_us(cells_of(line))
     return line.b_us * np.eye(3) if matrix is None else matrix
 

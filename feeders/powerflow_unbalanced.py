@@ -26,7 +26,7 @@ from scipy.sparse.linalg import splu
 
 from feeders.powerflow import PowerFlow, PowerFlowDiverged
 from gridsec.arrays import Bools, Floats, Ints, Phasors
-from gridsec.feeder import Feeder
+from gridsec.phases import PhasedFeeder
 
 if TYPE_CHECKING:
     from feeders.load import Site
@@ -262,7 +262,7 @@ def power_flow(site: Site) -> PowerFlow | PlacesFlow:
     site
         The feeder.
     """
-    return PowerFlow(site) if isinstance(site.feeder, Feeder) else PlacesFlow(site)
+    return PlacesFlow(site) if isinstance(site.feeder, PhasedFeeder) else PowerFlow(site)
 
 
 def sequence_ohm(positive: complex, zero: complex) -> Phasors:

@@ -155,6 +155,7 @@ class FeederMeta:
     title: str = ""
     base_kva: float = 100.0
     busbar_xy: tuple[float, float] | None = None
+    meshed: bool = False
     busbar_class_percent: float = 0.1
     busbar_resolution_volt: float = 0.1
     busbar_jitter_percent: float = 0.02
@@ -416,7 +417,8 @@ def _toml(meta: dict[str, Any]) -> str:
 
 
 def _worth_writing(column: Column, meta: dict[str, Any]) -> bool:
-    return meta[column.name] is not None and meta[column.name] not in ([], "")
+    value = meta[column.name]
+    return value is not None and value is not False and value not in ([], "")
 
 
 def _toml_value(value: object) -> str:

@@ -1,4 +1,4 @@
-"""The feeder as a graph: fused buses, the tree below the busbar, loops and islands.
+"""The feeder as a graph: fused buses, a tree below the busbar, what closes loops in it, and islands.
 
 Works on ids alone, so that the checks and the loader see the same graph.
 """
@@ -35,8 +35,11 @@ class Tree:
         Fused bus that feeds bus k + 1; always at most k.
     branch
         Index (into the edges given) of the line that feeds bus k + 1.
+    ties
+        Indices of the edges that close loops: each would join two buses that the edges before it connect.
     loops
-        Indices of the edges of each loop (at most LOOPS_SHOWN loops). A feeder must have none.
+        Indices of the edges of each loop: of every tie that joins a bus to itself, and of at most LOOPS_SHOWN
+        others. A radial feeder has none.
     islands
         Buses that cannot be reached, one tuple for each connected piece.
     """
@@ -45,6 +48,7 @@ class Tree:
     buses: tuple[str, ...]
     parent: tuple[int, ...]
     branch: tuple[int, ...]
+    ties: tuple[int, ...]
     loops: tuple[tuple[int, ...], ...]
     islands: tuple[tuple[str, ...], ...]
 
@@ -104,7 +108,9 @@ def tree(busbar: str, edges: Sequence[Edge], others: Iterable[str] = ()) -> Tree
         else:
             closing.append(k)
     index, parent, branch = _walk(fused.find(busbar), neighbours)
-    loops = tuple(_loop(k, edges[k], fused, neighbours) for k in closing[:LOOPS_SHOWN])
+    short = [k for k in closing if fused.find(edges[k].from_bus) == fused.find(edges[k].to_bus)]
+    shown = sorted([*short, *[k for k in closing if k not in short][:LOOPS_SHOWN]])
+    loops = tuple(_loop(k, edges[k], fused, neighbours) for k in shown)
     pieces: dict[str, list[str]] = {}
     for bus in fused.rank:
         if fused.find(bus) not in index:
@@ -114,6 +120,7 @@ def tree(busbar: str, edges: Sequence[Edge], others: Iterable[str] = ()) -> Tree
         tuple(index),
         parent,
         branch,
+        tuple(closing),
         loops,
         tuple(map(tuple, pieces.values())),
     )

@@ -29,14 +29,14 @@ SHOWN = 40
 def feeders_list() -> None:
     """List the feeders that come with gridsec."""
     from feeders.load import load, names
-    from gridsec.feeder import Feeder as Balanced
+    from gridsec.phases import PhasedFeeder
 
     table = Table("name", "title", "phases", "customers", "meters", "inverters", "M")
     for name in names(balanced=False):
         site = load(name)
         counts = (len(site.feeder.customers), len(site.meter_ids), site.droop.customer.size)
         cells = (*map(str, counts), str(site.tables.meta.monitor.max_attacked))
-        phases = "balanced" if isinstance(site.feeder, Balanced) else "single-phase"
+        phases = "single-phase" if isinstance(site.feeder, PhasedFeeder) else "balanced"
         table.add_row(name, escape(site.tables.meta.title), phases, *cells)
     out.print(table)
 
@@ -50,7 +50,7 @@ def feeders_show(feeder: Feeder) -> None:
     meta = site.tables.meta
     out.print(f"[bold]{escape(meta.name)}[/] {escape(meta.title)}")
     out.print(
-        f"{meta.voltage_volt:g} V phase to neutral, {len(site.tree.buses)} buses, "
+        f"{meta.voltage_volt:g} V phase to neutral, {len(site.spanning.buses)} buses, "
         f"{len(site.feeder.customers)} customers, {len(site.meter_ids)} meters, "
         f"watched every {meta.monitor.tick_s:g} s for up to {meta.monitor.max_attacked} manipulated meters"
     )

@@ -38,7 +38,7 @@ def detail(site: Site) -> dict[str, Any]:
         The feeder.
     """
     meta = site.tables.meta
-    tree = site.tree
+    tree = site.spanning
     xy = site.xy
     return {
         **summary(site),

@@ -239,7 +239,7 @@ def build(site: Site, tick: Tick, max_attacked: int, estimate: Estimate, verdict
             )
         )
     one, phases = bus_volts(site, estimate.v2_bus)
-    buses = zip(site.tree.buses, one, strict=True)
+    buses = zip(site.spanning.buses, one, strict=True)
     return _whole(
         site,
         tick,
@@ -287,7 +287,7 @@ def blind(site: Site, tick: Tick, max_attacked: int, cause: Cause, reason: str) 
         max_attacked,
         verdict=(Decision.UNDECIDED, cause, reason),
         meters=meters,
-        buses=tuple((bus, None) for bus in site.tree.buses),
+        buses=tuple((bus, None) for bus in site.spanning.buses),
         customers=tuple(CustomerReport(customer, None, None) for customer in site.feeder.customers),
         inverters=_inverters(site, None, None),
         explanations=(),

@@ -8,8 +8,8 @@ import numpy as np
 
 from feeders.load import Site, Snapshot, volts
 from gridsec.arrays import Floats
-from gridsec.feeder import Feeder
 from gridsec.online import Estimate, Verdict
+from gridsec.phases import PhasedFeeder
 from service.align import Tick
 
 
@@ -38,7 +38,8 @@ def _busbar(site: Site, tick: Tick) -> Floats | float:
         return math.nan
     phases = tick.busbar.v_phases
     # A balanced feeder has one voltage, and a phase that is not measured does not take it away.
-    return tick.busbar.v_volt if phases is None or isinstance(site.feeder, Feeder) else np.array(phases)
+    one = phases is None or not isinstance(site.feeder, PhasedFeeder)
+    return tick.busbar.v_volt if one else np.array(phases)
 
 
 def bus_volts(site: Site, v2_bus: Floats) -> tuple[Floats, Floats]:
@@ -59,7 +60,7 @@ def bus_volts(site: Site, v2_bus: Floats) -> tuple[Floats, Floats]:
         Voltage of each of its phases, V, NaN for one that it does not have; nothing on a balanced feeder.
     """
     v = volts(site, v2_bus)
-    if isinstance(site.feeder, Feeder):
+    if not isinstance(site.feeder, PhasedFeeder):
         return v, np.zeros((v.size, 0))
     phases = np.where(site.feeder.tree.phases, v.reshape(-1, 3), np.nan)
     off = np.where(np.isnan(phases), -1.0, np.abs(phases - site.feeder.base_volt))

@@ -95,7 +95,7 @@ def _facts(site: Site) -> dict[str, str]:
         "peak of all loads": f"{sum(row.load_kw for row in rows):.4g} kW",
         "nominal voltage": f"{meta.voltage_volt:.1f} V",
         "voltage band": f"{meta.limits.v_min_pu:g} to {meta.limits.v_max_pu:g} pu",
-        "busbar": str(site.tree.buses[0]),
+        "busbar": str(site.spanning.buses[0]),
         "content (SHA-256)": site.digest[:16],
     }
 

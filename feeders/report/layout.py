@@ -90,8 +90,8 @@ def _real(site: Site, width: float) -> Placed:
     x = 0.5 * (width - factor * span[0]) + factor * (xy[:, 0] - low[0])
     y = height - 0.5 * (height - factor * span[1]) - factor * (xy[:, 1] - low[1])
     at: list[Point] = [(float(a), float(b)) for a, b in zip(x, y, strict=True)]
-    wires = tuple((at[int(p)], at[k + 1]) for k, p in enumerate(site.tree.parent))
-    spots, drops = _fans(at, site.tree.bus.tolist())
+    wires = tuple((at[int(p)], at[k + 1]) for k, p in enumerate(site.spanning.parent))
+    spots, drops = _fans(at, site.spanning.bus.tolist())
     bx, by = at[0]
     return Placed(
         width, height, wires, drops, ((bx - 9.0, by), (bx + 9.0, by)), spots, _room(spots), real=True
@@ -143,11 +143,11 @@ class _Grid:
     """Places the tree of a feeder on a grid."""
 
     def __init__(self, site: Site) -> None:
-        parent = site.tree.parent.tolist()
+        parent = site.spanning.parent.tolist()
         count = len(parent) + 1
         self.children: list[list[int]] = [[] for _ in range(count)]
         self.at: list[list[int]] = [[] for _ in range(count)]
-        for k, bus in enumerate(site.tree.bus.tolist()):
+        for k, bus in enumerate(site.spanning.bus.tolist()):
             self.at[bus].append(k)
         self.weight = [len(here) for here in self.at]
         self.depth = [1] * count

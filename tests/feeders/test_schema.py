@@ -69,6 +69,7 @@ def metas(draw: st.DrawFn, busbar: str) -> FeederMeta:
         base_kva=draw(st.floats(1.0, 1e4)),
         busbar=busbar,
         busbar_xy=draw(maybe(st.tuples(st.floats(-1e3, 1e3), st.floats(-1e3, 1e3)))),
+        meshed=draw(st.booleans()),
         busbar_class_percent=draw(st.floats(0.02, 2.0)),
         accept=tuple(draw(st.lists(st.sampled_from(SUSPICIONS), unique=True))),
         limits=Limits(low, draw(st.floats(0.95, 1.5))),
