@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
 from feeders.convert_changes import WHOLE, Change
 from feeders.convert_customers import rounded
+from feeders.load_phases import series_of, shunt_of
+from feeders.matrices import SHUNT_NAMES, cells_of, columns_of, passive, shunt_us
 from feeders.schema import LineRow
 from gridsec.arrays import Floats, Ints, Phasors
 
@@ -29,15 +31,15 @@ def line_row(
 ) -> LineRow:
     """Return the row of a line given by matrices.
 
-    A matrix of three phases becomes cyclically symmetric: the mean of its diagonal and of the rest. One of
-    two phases is that of three whose third carries nothing. Of the charging the positive sequence remains.
+    Matrices of the series impedances that are cyclically symmetric become sequence values, and of charging
+    that is the same in every phase and goes to earth only, one number.
 
     Parameters
     ----------
     name, ends
         Of the line.
     phases : (k,)
-        Its phases, 0 for a.
+        Its phases, ascending, 0 for a.
     series : (k, k)
         Series impedances, ohm.
     shunt : (k, k)
@@ -46,75 +48,127 @@ def line_row(
         Takes what is not carried over exactly.
     """
     own, mutual = _means(series)
-    b_own, b_mutual = (part.real for part in _means(shunt.astype(np.complex128)))
-    label, count = f"line {name}", len(phases)
-    if count == 1:
-        return LineRow(
-            name, *ends, rounded(own.real), rounded(own.imag), "abc"[phases[0]], b_us=_charging(b_own)
-        )
-    cyclic = np.full((count, count), mutual)
-    np.fill_diagonal(cyclic, own)
-    off = float(np.abs(series - cyclic).max() / np.abs(series).max())
-    if off > CYCLIC:
-        changes.append(
-            Change(
-                label,
-                "impedance matrix",
-                "approximated",
-                f"taken as transposed; entries are up to {100 * off:.1g} % of the largest off their mean",
-            )
-        )
-    if count == 2:
-        changes.append(Change(label, "phases", "changed", "of two phases; its third carries nothing"))
-    if abs(b_mutual) > CYCLIC * abs(b_own):
-        changes.append(
-            Change(
-                label,
-                "charging between phases",
-                "approximated",
-                "the positive-sequence charging in every phase; exact where the voltages are balanced",
-            )
-        )
-    positive, zero = own - mutual, own + 2.0 * mutual
-    return LineRow(
+    row = LineRow(
         name,
         *ends,
-        rounded(positive.real),
-        rounded(positive.imag),
-        r0_ohm=rounded(zero.real),
-        x0_ohm=rounded(zero.imag),
-        b_us=_charging(b_own - b_mutual),
+        rounded((own - mutual).real),
+        rounded((own - mutual).imag),
+        _NAMES[tuple(phases.tolist())],
+        **charging_cells(name, phases, shunt, changes),
     )
+    if len(phases) == 1:
+        return row
+    like_each_other = cyclic(series)
+    if not like_each_other and not passive(series.real):
+        effect = "its resistances generate power; taken as transposed"
+        changes.append(Change(f"line {name}", "impedance matrix", "approximated", effect))
+        like_each_other = True
+    if like_each_other:
+        zero = own + 2.0 * mutual
+        return replace(row, r0_ohm=rounded(zero.real), x0_ohm=rounded(zero.imag))
+    return replace(row, **_cells("r", "ohm", series.real, phases), **_cells("x", "ohm", series.imag, phases))
 
 
-def _means(matrix: Phasors) -> tuple[complex, complex]:
+ALL: Final = np.arange(3)
+"""All phases."""
+
+_NAMES: Final = {(0,): "a", (1,): "b", (2,): "c", (0, 1): "ab", (1, 2): "bc", (0, 2): "ca", (0, 1, 2): "abc"}
+
+
+def cyclic(matrix: Phasors | Floats) -> bool:
+    """Whether phases are interchangeable: one value on the diagonal, one beside it."""
+    own, mutual = _means(matrix)
+    alike = np.full(matrix.shape, mutual)
+    np.fill_diagonal(alike, own)
+    return bool(np.abs(matrix - alike).max() <= CYCLIC * np.abs(matrix).max())
+
+
+def _means(matrix: Phasors | Floats) -> tuple[complex, complex]:
     """Mean of the diagonal and of the rest."""
     count = len(matrix)
     own = complex(np.trace(matrix)) / count
     return own, (complex(matrix.sum()) - count * own) / max(count * (count - 1), 1)
 
 
-def _charging(siemens: float) -> float:
-    return rounded(max(siemens, 0.0) * 1e6)
+def _cells(symbol: str, unit: str, matrix: Floats, phases: Ints) -> dict[str, Any]:
+    whole = np.zeros((3, 3))
+    whole[np.ix_(phases, phases)] = 0.5 * (matrix + matrix.T)
+    found = columns_of(symbol, unit, whole, np.isin(np.arange(3), phases))
+    return {name: rounded(value) for name, value in found.items()}
 
 
-def capacitor(name: str, bus: str, siemens: float, phases: str = "abc") -> LineRow:
+def charging_cells(name: str, phases: Ints, shunt: Floats, changes: list[Change]) -> dict[str, Any]:
+    """Return the cells of a line's charging: one number, or a matrix beside its positive sequence.
+
+    Parameters
+    ----------
+    name, phases, shunt, changes
+        As `line_row` takes them.
+    """
+    own, mutual = (part.real for part in _means(shunt))
+    one = {"b_us": rounded(max(own - mutual, 0.0) * 1e6)}
+    if len(phases) == 1 or (cyclic(shunt) and abs(mutual) <= CYCLIC * abs(own)):
+        return one
+    if not passive(shunt):
+        changes.append(Change(f"line {name}", CHARGING, "approximated", "no capacitances; " + IN_EVERY_PHASE))
+        return one
+    return one | _cells("b", "us", 1e6 * shunt, phases)
+
+
+def by_sequence(one: float, zero: float) -> Floats:
+    """Return the susceptances of three phases that are alike; without a zero sequence none knows of another.
+
+    Parameters
+    ----------
+    one, zero
+        Of the positive and the zero sequence, S; NaN where the latter is not known.
+    """
+    apart = zero if np.isfinite(zero) else one
+    return np.asarray(one * np.eye(3) + (apart - one) / 3.0)
+
+
+CHARGING: Final = "charging between phases"
+IN_EVERY_PHASE: Final = "the positive-sequence charging in every phase; exact where the voltages are balanced"
+
+
+def balanced_charging(lines: Sequence[LineRow], changes: list[Change]) -> list[LineRow]:
+    """Return the lines with charging of their positive sequence only, if nothing else needs three phases.
+
+    Parameters
+    ----------
+    lines
+        Rows of a feeder whose customers all have three phases.
+    changes
+        Takes what that leaves out.
+    """
+    matrices = [shunt_us(cells_of(row)) for row in lines]
+    if any(row.phases != "abc" or row.r_aa_ohm is not None for row in lines) or not all(
+        matrix is None or cyclic(matrix) for matrix in matrices
+    ):
+        return list(lines)
+    given = [row.line for row, matrix in zip(lines, matrices, strict=True) if matrix is not None]
+    changes.extend(Change(f"line {name}", CHARGING, "approximated", IN_EVERY_PHASE) for name in given)
+    nothing: dict[str, Any] = dict.fromkeys(SHUNT_NAMES)
+    return [replace(row, **nothing) if row.line in given else row for row in lines]
+
+
+def capacitor(name: str, bus: str, siemens: float | Floats, phases: str = "abc") -> LineRow:
     """Return a capacitor as the charging of a line to nowhere, so short that its voltage is that of its bus.
 
     Parameters
     ----------
     name, bus
         Of the capacitor.
-    siemens
-        Its susceptance per phase, S.
+    siemens : scalar or (k, k)
+        Its susceptance per phase, S, or those of and between its phases.
     phases
         Phases it is connected to.
     """
-    ohm = rounded(1e-7 / siemens)
-    zero = ohm if phases == "abc" else None
-    return LineRow(
-        name, bus, f"{bus} {name}", ohm, ohm, phases, r0_ohm=zero, x0_ohm=zero, b_us=rounded(siemens * 1e6)
-    )
+    here = np.array(["abc".index(phase) for phase in sorted(phases)])
+    shunt = siemens * np.eye(here.size) if isinstance(siemens, float) else siemens
+    ohm = (1.0 + 1j) * 1e-7 / float(shunt.diagonal().max())
+    series = np.diag(np.full(here.size, ohm, dtype=np.complex128))
+    return line_row(name, (bus, f"{bus} {name}"), here, series=series, shunt=shunt, changes=[])
 
 
 def open_end(row: LineRow, bus: str, volt: float) -> LineRow | None:
@@ -188,7 +242,8 @@ def _parallel(rows: list[LineRow], changes: list[Change]) -> LineRow:
     """Join lines between the same buses."""
     names = " + ".join(row.line for row in rows)
     first = rows[0]
-    if len({row.phases for row in rows}) > 1:
+    alike = len({row.phases for row in rows}) == 1
+    if not alike or any(row.r_aa_ohm is not None or row.b_aa_us is not None for row in rows):
         return _side_by_side(rows, names, changes)
     changes.append(Change(f"lines {names}", WHOLE, "changed", f"in parallel; one line {first.line}"))
     positive = [complex(row.r_ohm, row.x_ohm) for row in rows]
@@ -213,33 +268,24 @@ def _parallel(rows: list[LineRow], changes: list[Change]) -> LineRow:
 
 
 def _side_by_side(rows: list[LineRow], names: str, changes: list[Change]) -> LineRow:
-    """Join lines of single phases between the same buses: one of all phases without coupling."""
-    own: dict[str, complex] = {}
-    charge: dict[str, float] = defaultdict(float)
+    """Join lines of any phases and matrices between the same buses: their admittances add up."""
+    first = rows[0]
+    admittance: Phasors = np.zeros((3, 3), dtype=np.complex128)
+    charge = np.zeros((3, 3))
     for row in rows:
-        for phase in row.phases:
-            z = complex(row.r_ohm, row.x_ohm)
-            own[phase] = z if phase not in own else 1.0 / (1.0 / own[phase] + 1.0 / z)
-            charge[phase] += row.b_us
-    mean = sum(own.values()) / len(own)
-    apart = max(abs(z - mean) for z in own.values()) / abs(mean)
-    alike = apart <= CYCLIC and all(len(row.phases) == 1 for row in rows)
-    changes.append(
-        Change(
-            f"lines {names}",
-            WHOLE,
-            "changed" if alike else "approximated",
-            f"side by side; one line {rows[0].line} of all phases"
-            + ("" if alike else f" with their mean impedance, from which they differ by {100 * apart:.1g} %"),
-        )
+        here = np.ix_(*[["abc".index(phase) for phase in sorted(row.phases)]] * 2)
+        admittance[here] += np.linalg.inv(series_of(row)[here])
+        charge[here] += shunt_of(row)[here]
+    phases = np.flatnonzero(admittance.diagonal())
+    there = np.ix_(phases, phases)
+    changes.append(Change(f"lines {names}", WHOLE, "changed", f"side by side; one line {first.line}"))
+    joined = line_row(
+        first.line,
+        (first.from_bus, first.to_bus),
+        phases,
+        series=np.asarray(np.linalg.inv(admittance[there])),
+        shunt=1e-6 * charge[there],
+        changes=changes,
     )
-    return replace(
-        rows[0],
-        phases="abc",
-        r_ohm=rounded(mean.real),
-        x_ohm=rounded(mean.imag),
-        r0_ohm=rounded(mean.real),
-        x0_ohm=rounded(mean.imag),
-        b_us=rounded(sum(charge.values()) / len(own)),
-        rating_a=min((row.rating_a for row in rows if row.rating_a is not None), default=None),
-    )
+    limit = min((row.rating_a for row in rows if row.rating_a is not None), default=None)
+    return replace(joined, rating_a=limit, to_x=first.to_x, to_y=first.to_y)

@@ -18,7 +18,7 @@ from feeders.convert_changes import WHOLE, BusbarUnclear, Change
 from feeders.convert_check import SourceState
 from feeders.convert_customers import USUAL_POWER_FACTOR, base_kva, with_meters
 from feeders.convert_draws import Draw, customers_of, is_even
-from feeders.convert_lines import merged
+from feeders.convert_lines import balanced_charging, merged
 from feeders.schema import FeederMeta, FeederTables, LineRow, LoadDefaults, validate
 from gridsec.arrays import Phasors
 from gridsec.errors import FeederInvalid, GridsecError
@@ -164,6 +164,9 @@ def feeder_of(
     volt = network.nominal[part.busbar]
     rows, power = customers_of(part.draws, volt, droop, part.changes)
     rows = with_meters(rows)
+    lines = part.lines
+    if all(row.phases == "abc" for row in rows):
+        lines = balanced_charging(lines, part.changes)
     meta = FeederMeta(
         format=1,
         name=name,
@@ -174,7 +177,7 @@ def feeder_of(
         busbar_xy=network.xy.get(part.busbar),
         load=LoadDefaults(power_factor=USUAL_POWER_FACTOR, power_factor_min=0.85),
     )
-    tables = FeederTables(meta, tuple(part.lines), tuple(rows))
+    tables = FeederTables(meta, tuple(lines), tuple(rows))
     return finished(network, part, tables, power)
 
 

@@ -378,28 +378,14 @@ def _shunt(dss: Any, each: _Element, network: Network) -> None:
         effect = f"{-kvar:.4g} kvar" if each.closed else "switched off in the source"
         network.of_bus.append((bus, Change(label, WHOLE, "left out", effect)))
         return
-    here = [k for k, node in enumerate(each.nodes[0]) if 1 <= node <= PHASES]
-    block = _yprim(dss, each)[np.ix_(here, here)].imag
-    own = block.sum(axis=1) if len(here) < PHASES else np.full(PHASES, block.diagonal().mean())
-    mutual = float(block[0, 1]) if len(here) > 1 else 0.0
-    delta = abs(mutual) > 1e-6 * float(block.diagonal().max())
-    if delta and len(here) == PHASES:
-        own = np.full(PHASES, block.diagonal().mean() - mutual)
-    change = Change(
-        label,
-        "connection",
-        "approximated" if delta else "changed",
-        f"{kvar:.4g} kvar as the charging of a line to nowhere"
-        + (", in star instead of delta; exact where the voltages are balanced" if delta else ""),
+    here = sorted(
+        (k for k, node in enumerate(each.nodes[0]) if 1 <= node <= PHASES), key=lambda k: each.nodes[0][k]
     )
-    network.of_bus.append((bus, change))
-    for k, siemens in zip(here, own, strict=True):
-        phase = "abc" if len(here) == PHASES else "abc"[each.nodes[0][k] - 1]
-        name = each.name if len(here) != 2 else f"{each.name}-{phase}"
-        if siemens > 0:
-            network.lines.append(capacitor(f"capacitor.{name}", bus, float(siemens), phase))
-        if phase == "abc":
-            return
+    block = _yprim(dss, each)[np.ix_(here, here)].imag
+    phases = "".join("abc"[each.nodes[0][k] - 1] for k in here)
+    effect = f"{kvar:.4g} kvar as the charging of a line to nowhere"
+    network.of_bus.append((bus, Change(label, "connection", "changed", effect)))
+    network.lines.append(capacitor(f"capacitor.{each.name}", bus, block, phases))
 
 
 def _draw(dss: Any, each: _Element, network: Network) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 from feeders.convert_changes import WHOLE, Change
 from feeders.convert_customers import rounded
 from feeders.convert_draws import Draw
-from feeders.convert_lines import capacitor, open_end
+from feeders.convert_lines import ALL, by_sequence, capacitor, charging_cells, open_end
 from feeders.convert_network import Coupling, Network
 from feeders.schema import LineRow
 from gridsec.arrays import Phasors
@@ -204,7 +204,9 @@ def _line_rows(net: Any, buses: dict[int, str], network: Network) -> Iterator[Li
         length, parallel = float(row["length_km"]), float(row["parallel"])
         limit = float(row["max_i_ka"]) * float(row["df"]) * parallel
         ends = int(row["from_bus"]), int(row["to_bus"])
-        charging = rounded(omega * float(row["c_nf_per_km"]) * length * parallel * 1e-3)
+        siemens = [
+            1e-9 * omega * length * parallel * float(row.get(f"c{k}_nf_per_km", math.nan)) for k in ("", "0")
+        ]
         on = [bus for bus in ends if (i, bus) not in opened and bus not in dead and row["in_service"]]
         closed = len(on) == 2
         _side_effects(row, f"line {names[i]}", buses[ends[0]], closed, network)
@@ -216,7 +218,7 @@ def _line_rows(net: Any, buses: dict[int, str], network: Network) -> Iterator[Li
             x_ohm=rounded(float(row["x_ohm_per_km"]) * length / parallel),
             r0_ohm=_zero_sequence(row, "r0_ohm_per_km", length / parallel),
             x0_ohm=_zero_sequence(row, "x0_ohm_per_km", length / parallel),
-            b_us=charging,
+            **charging_cells(names[i], ALL, by_sequence(*siemens), network.changes),
             closed=closed,
             rating_a=rounded(limit * 1000.0) if 0.0 < limit < UNLIMITED_KA else None,
         )
@@ -238,10 +240,6 @@ def _side_effects(row: dict[str, Any], label: str, bus: str, closed: bool, netwo
     if row["g_us_per_km"] > 0 and closed:
         effect = f"{row['g_us_per_km'] * length * parallel:.3g} microsiemens"
         network.of_bus.append((bus, Change(label, "shunt conductance", "left out", effect)))
-    zero = row.get("c0_nf_per_km", math.nan)
-    if closed and math.isfinite(zero) and abs(zero - row["c_nf_per_km"]) > 1e-7 * row["c_nf_per_km"]:
-        effect = "that of the positive sequence; exact where the voltages are balanced"
-        network.of_bus.append((bus, Change(label, "zero-sequence charging", "approximated", effect)))
 
 
 def _zero_sequence(row: dict[str, Any], column: str, factor: float) -> float | None:

@@ -16,7 +16,7 @@ from power_grid_model.validation import validate_input_data
 from feeders.convert_changes import WHOLE, Change
 from feeders.convert_customers import rounded
 from feeders.convert_draws import SWITCHED_OFF, Draw
-from feeders.convert_lines import capacitor, line_row, open_end
+from feeders.convert_lines import ALL, by_sequence, capacitor, charging_cells, line_row, open_end
 from feeders.convert_network import Coupling, Network
 from feeders.records import some
 from feeders.schema import LineRow
@@ -180,7 +180,6 @@ def _lines(tables: Tables, network: Network) -> None:
             if row["tan1"] > 0 and b1 > 0:
                 effect = f"{1e6 * b1 * float(row['tan1']):.3g} microsiemens"
                 network.of_bus.append((ends[0], Change(name, "shunt conductance", "left out", effect)))
-            _zero_charging(network, name, ends[0], b1, b0)
             limit = _finite(row["i_n"])
             made = LineRow(
                 name,
@@ -189,7 +188,7 @@ def _lines(tables: Tables, network: Network) -> None:
                 rounded(float(row["x1"])),
                 r0_ohm=_finite(row["r0"]),
                 x0_ohm=_finite(row["x0"]),
-                b_us=rounded(1e6 * b1),
+                **charging_cells(name, ALL, by_sequence(b1, b0), network.changes),
                 closed=_closed(row),
                 rating_a=limit if limit else None,
             )
@@ -202,12 +201,6 @@ def _add_line(row: Any, made: LineRow, network: Network) -> None:
         bus = made.from_bus if row["from_status"] else made.to_bus
         stub = open_end(made, bus, network.nominal[bus])
         network.lines += [stub] if stub else []
-
-
-def _zero_charging(network: Network, name: str, bus: str, b1: float, b0: float) -> None:
-    if np.isfinite(b0) and abs(b0 - b1) > 1e-7 * max(b0, b1):
-        effect = "that of the positive sequence; exact where the voltages are balanced"
-        network.of_bus.append((bus, Change(name, "zero-sequence charging", "approximated", effect)))
 
 
 def _asymmetric_lines(tables: Tables, network: Network) -> None:
@@ -230,8 +223,7 @@ def _asymmetric_lines(tables: Tables, network: Network) -> None:
 
 def _capacitances(row: Any) -> Floats:
     if np.isnan(row["c_aa"]):
-        own, mutual = (2.0 * row["c1"] + row["c0"]) / 3.0, (row["c0"] - row["c1"]) / 3.0
-        return np.asarray(OMEGA * (mutual * np.ones((3, 3)) + (own - mutual) * np.eye(3)))
+        return OMEGA * by_sequence(float(row["c1"]), float(row["c0"]))
     c = np.zeros((3, 3))
     for i, one in enumerate("abc"):
         for j, other in enumerate("abc"[: i + 1]):
@@ -307,10 +299,10 @@ def _shunts(tables: Tables, solved: Tables, network: Network) -> None:
         if row["g1"] != 0:
             network.of_bus.append((bus, Change(label, "conductance", "left out", f"{p:.4g} kW")))
         if row["b1"] > 0:
-            network.lines.append(capacitor(f"{label}", bus, float(row["b1"])))
+            block = by_sequence(float(row["b1"]), float(row["b0"]))
+            network.lines.append(capacitor(f"{label}", bus, block))
             effect = f"{-q:.4g} kvar as the charging of a line to nowhere"
             network.of_bus.append((bus, Change(label, "connection", "changed", effect)))
-            _zero_charging(network, label, bus, float(row["b1"]), float(row["b0"]))
         elif row["b1"] < 0:
             network.of_bus.append((bus, Change(label, "inductance", "left out", f"{q:.4g} kvar")))
 

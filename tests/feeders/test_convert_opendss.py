@@ -11,7 +11,7 @@ import pytest
 
 from feeders.convert import check_against_source, convert
 from feeders.convert_check import BALANCED_PU, UNBALANCED_PU
-from feeders.schema import read, write
+from feeders.schema import examine, read, write
 from gridsec.errors import FeederInvalid, GridsecError
 from tests.feeders.foreign import opendss
 
@@ -99,6 +99,7 @@ new energymeter.m element=line.main
     assert main.b_us == pytest.approx(2e-3 * np.pi * 60.0 * 250 * 0.5)
     assert (lines["spur"].phases, lines["spur"].r_ohm) == ("b", pytest.approx(0.05))
     assert (lines["pair"].r_ohm, lines["pair"].x0_ohm) == (pytest.approx(0.02), pytest.approx(0.08))
+    assert lines["pair"].phases == "ca"
     assert lines["tie"].closed is False
     assert lines["tie"].r_ohm == pytest.approx(0.1)
     assert "gone" not in lines
@@ -115,7 +116,6 @@ new energymeter.m element=line.main
         "model 2 of load lamp; depends on the voltage",
         "delta of load welder",
         "load shape evening of load home",
-        "phases of line pair; of two phases",
         "capacitor bank",
         "capacitor small",
         "left out: reactor coil",
@@ -134,19 +134,64 @@ new energymeter.m element=line.main
     assert done.check.sentence in source_md
 
 
-def test_untransposed_lines_are_approximated_and_the_check_says_by_how_much(tmp_path: Path) -> None:
+def test_lines_that_are_not_transposed(tmp_path: Path) -> None:
+    """Poles, matrices, two phases, charging from phase to phase: nothing of it is approximated."""
     source = master(
         tmp_path,
         """
-new line.bare bus1=B1 bus2=B2 phases=3 rmatrix=(.4|.1 .5|.1 .2 .4) xmatrix=(.6|.2 .7|.3 .2 .6)
-~ cmatrix=(0|0 0|0 0 0) length=1
-new load.home bus1=B2 phases=3 kv=0.4 kw=8 pf=0.95
+new wiredata.al rac=0.3 runits=km gmrac=6 gmrunits=mm radius=8 radunits=mm
+new linegeometry.pole nconds=4 nphases=3 reduce=yes
+~ cond=1 wire=al x=-0.6 h=8.5 units=m
+~ cond=2 wire=al x=-0.1 h=8.5 units=m
+~ cond=3 wire=al x=0.6 h=8.5 units=m
+~ cond=4 wire=al x=0.0 h=7.3 units=m
+new line.poles bus1=B1 bus2=B2 geometry=pole length=400 units=m
+new line.turned bus1=B2.2.3.1 bus2=B3.2.3.1 geometry=pole length=200 units=m
+new line.bare bus1=B2 bus2=B4 phases=3 rmatrix=(.4|.1 .5|.1 .2 .4) xmatrix=(.6|.2 .7|.3 .2 .6)
+~ cmatrix=(300|-20 300|-60 -20 250) length=0.2
+new line.two bus1=B4.3.2 bus2=B5.3.2 phases=2 rmatrix=(.4|.1 .5) xmatrix=(.6|.2 .7) cmatrix=(9|-1 8) length=.2
+new line.one bus1=B4.1 bus2=B5.1 phases=1 r1=0.5 x1=0.1 r0=0.5 x0=0.1 c1=0 c0=0 length=0.1
+new line.lower bus1=B3 bus2=B6 phases=3 r1=0.5 x1=0.2 r0=1 x0=0.5 c1=40 c0=15 length=0.3
+new capacitor.star bus1=B3.2.1 phases=2 kv=0.231 kvar=4
+new capacitor.delta bus1=B4 phases=3 kv=0.4 kvar=10 conn=delta
+new capacitor.across bus1=B5.3.2 phases=1 kv=0.4 kvar=3 conn=delta
+new load.mill bus1=B6 phases=3 kv=0.4 kw=8 pf=0.95 vminpu=0.5
+new load.home bus1=B5.3 phases=1 kv=0.231 kw=6 pf=0.95 vminpu=0.5
+new load.hut bus1=B5.1 phases=1 kv=0.231 kw=3 pf=0.9
+new load.shed bus1=B3.2 phases=1 kv=0.231 kw=5 pf=1
+""",
+    )
+    done = convert(source, tmp_path / "x")
+    assert done.check is not None
+    assert done.check.largest_pu < 1e-8
+    assert [each for each in done.changes if each.done == "approximated"] == []
+    rows = {row.line: row for row in read(tmp_path / "x").lines}
+    assert (rows["bare"].r_bb_ohm, rows["bare"].x_ac_ohm) == (pytest.approx(0.1), pytest.approx(0.06))
+    assert rows["bare"].r_ohm == pytest.approx(0.2 * (1.3 - 0.4) / 3)
+    assert rows["bare"].b_ac_us == pytest.approx(-2e-3 * np.pi * 60 * 60 * 0.2)
+    # One row for the two sides of the street, of all phases.
+    assert (rows["two"].phases, rows["two"].r_ab_ohm) == ("abc", 0.0)
+    assert (rows["two"].r_bc_ohm, rows["two"].r_cc_ohm) == (pytest.approx(0.02), pytest.approx(0.08))
+    assert rows["lower"].r0_ohm == pytest.approx(0.3)
+    assert rows["lower"].b_ab_us == pytest.approx(-2e-3 * np.pi * 60 * 25 * 0.3 / 3)
+    assert (rows["capacitor.star"].phases, rows["capacitor.star"].b_ab_us) == ("ab", None)
+    across = rows["capacitor.across"]
+    assert (across.phases, across.b_bc_us) == ("bc", pytest.approx(-3e9 / 400.0**2))
+    assert examine(tmp_path / "x").problems == ()
+
+
+def test_a_matrix_that_no_line_has_is_taken_as_transposed(tmp_path: Path) -> None:
+    source = master(
+        tmp_path,
+        """
+new line.odd bus1=B1 bus2=B2 phases=3 rmatrix=(.1|.2 .1|.2 .2 .5) xmatrix=(.6|.2 .7|.3 .2 .6)
+~ cmatrix=(0|0 0|0 0 0) length=0.1
+new load.home bus1=B2.1 phases=1 kv=0.231 kw=8 pf=0.95
 """,
     )
     done = convert(source, tmp_path / "x")
     assert any(each.prop == "impedance matrix" and each.done == "approximated" for each in done.changes)
     assert done.check is not None
-    assert done.check.largest_pu > UNBALANCED_PU
     assert not done.check.exact
     assert done.check.at == "b2"
     assert "(bus b2)" in done.check.sentence

@@ -104,6 +104,7 @@ def test_everything_is_carried_over_or_named(tmp_path: Path) -> None:
     assert both.b_us == pytest.approx(2 * 2 * np.pi * 50 * 0.3)
     assert (lines["link 30"].r_ohm, lines["link 30"].closed) == (0.0, True)
     assert lines["line 24"].closed is False
+    assert lines["line 25"].b_ab_us == pytest.approx(2e6 * np.pi * 50 * (3e-7 - 5e-7) / 3)
     customers = {row.customer: row for row in feeder.customers}
     assert customers["asym_load 53-a"].load_kw == pytest.approx(5.0)
     assert customers["sym_gen 54"].pv_kw == pytest.approx(15.0)
@@ -111,7 +112,6 @@ def test_everything_is_carried_over_or_named(tmp_path: Path) -> None:
     for part in (
         "constant current of sym_load 52",
         "in service of sym_load 56; switched off",
-        "zero-sequence charging of line 25",
         "shunt conductance of line 25",
         "connection of shunt 60",
         "inductance of shunt 61",
@@ -145,6 +145,37 @@ def test_lines_given_by_matrices(tmp_path: Path) -> None:
     reduced = own + 2 * mutual - 3 * mutual**2 / neutral
     assert complex(row.r_ohm, row.x_ohm) == pytest.approx(own - mutual)
     assert complex(row.r0_ohm, row.x0_ohm) == pytest.approx(reduced)
+
+
+def test_lines_that_are_not_transposed(tmp_path: Path) -> None:
+    tables = street()
+    tables["line"].pop()
+    entries = {"aa": 0.3, "ba": 0.1, "bb": 0.35, "ca": 0.12, "cb": 0.09, "cc": 0.28}
+    matrix = {f"r_{pair}": value for pair, value in entries.items()}
+    matrix |= {f"x_{pair}": 0.7 * value for pair, value in entries.items()}
+    matrix |= {f"c_{pair}": (1e-6 if pair[0] == pair[1] else 4e-7) * value for pair, value in entries.items()}
+    ends = {"id": 26, "from_node": 4, "to_node": 6, "from_status": 1, "to_status": 1}
+    tables["asym_line"] = [ends | matrix, ends | matrix | {"id": 27}]
+    done = convert(written(tmp_path, tables), tmp_path / "x")
+    assert done.check is not None
+    assert done.check.three_phase
+    assert done.check.largest_pu < UNBALANCED_PU
+    assert {each.done for each in done.changes} == {"left out", "changed"}  # above, and two as one
+    row = {row.line: row for row in read(tmp_path / "x").lines}["asym_line 26"]
+    assert (row.r_ab_ohm, row.x_cc_ohm) == (pytest.approx(0.05), pytest.approx(0.098))
+    assert row.b_bc_us == pytest.approx(2 * 2e6 * np.pi * 50 * 4e-7 * 0.09)
+    assert row.r_ohm == pytest.approx(0.5 * (0.31 - 0.31 / 3))
+
+
+def test_zero_sequence_charging_of_a_balanced_network_is_left_out(tmp_path: Path) -> None:
+    tables = street()
+    tables["line"][1]["c0"] = 1e-7
+    done = convert(written(tmp_path, tables), tmp_path / "x")
+    assert done.check is not None
+    assert not done.check.three_phase
+    assert done.check.largest_pu < BALANCED_PU
+    assert any("charging between phases of line line 21" in note for note in done.notes)
+    assert not read(tmp_path / "x").in_phases
 
 
 def test_half_open_line_at_medium_voltage_keeps_its_charging(tmp_path: Path) -> None:
