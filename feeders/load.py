@@ -105,6 +105,11 @@ class Site:
         return self.feeder if isinstance(self.feeder, Feeder) else self.feeder.tree
 
     @property
+    def ties(self) -> Ints:
+        """Buses at both ends of the lines that close loops in `spanning`, (t, 2)."""
+        return self.feeder.ends if isinstance(self.feeder, MeshedFeeder) else np.zeros((0, 2), dtype=np.intp)
+
+    @property
     def tree(self) -> Feeder | ThreePhaseFeeder:
         """The tree of its buses, for what takes radial feeders only.
 

@@ -48,6 +48,7 @@ def detail(site: Site) -> dict[str, Any]:
         "layout": {
             "buses": list(tree.buses),
             "parent": [None, *(int(bus) for bus in tree.parent)],
+            "ties": [(int(one), int(other)) for one, other in site.ties],
             "xy": None if xy is None else [[float(x), float(y)] for x, y in xy],
             "customers": [
                 {

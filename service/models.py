@@ -223,10 +223,13 @@ class LayoutCustomer(BaseModel):
 
 
 class Layout(BaseModel):
-    """The tree of the feeder, the busbar first."""
+    """A tree of the feeder, the busbar first, and the lines that close loops in it."""
 
     buses: list[str]
     parent: list[int | None] = Field(description="Index of the bus that feeds each one; null for the busbar.")
+    ties: list[tuple[int, int]] = Field(
+        default=[], description="Indices of the buses at both ends of each line that closes a loop."
+    )
     xy: list[tuple[float, float] | None] | None = Field(default=None, description="Coordinates, if known.")
     customers: list[LayoutCustomer]
 

@@ -89,6 +89,10 @@ export class Diagram {
     const { root, spots, wires } = this.view === "map" ? this.mapParts() : this.lineParts();
     const [casing, layer] = [svg("g", {}), svg("g", {})];
     for (const wire of wires) {
+      if (wire.kind === "tie") {
+        casing.append(svg("path", { class: "tie", d: wire.d }));
+        continue;
+      }
       const path = svg("path", { class: `wire ${wire.kind ?? ""}`, d: wire.d });
       this.lines.push({ path, bus: wire.bus });
       casing.append(svg("path", { class: `casing ${wire.kind ?? ""}`, d: wire.d }));
@@ -156,6 +160,21 @@ export class Diagram {
       const note = upright ? { x: 17, y: 4, "text-anchor": "start" } : { x: 0, y: 26, "text-anchor": "middle" };
       return { customer: c.customer, x: x + hang[0], y: y + hang[1], size, note, labels, order: c.row * 1e4 + c.x };
     });
+    const places = new Map();
+    for (const b of this.placed.buses) places.set(b.bus, [b.x, b.row, 0]);
+    for (const c of this.placed.customers) if (c.bus !== c.from) places.set(c.bus, [c.x, c.row, 1]);
+    for (const [one, other] of this.feeder.layout.ties ?? []) {
+      // The busbar is met where the other end is.
+      const ends = [one, other].map((bus, k) => places.get(bus) ?? [0, places.get(k ? one : other)?.[1] ?? 0, 0]);
+      const [[ax, ay], [bx, by]] = ends.map(([x, row, low]) => {
+        const [px, py] = at(x, row);
+        return [px + low * hang[0], py + low * hang[1]];
+      });
+      // Bent, so that it does not hide behind the row that it closes.
+      const bend = Math.min(36, 12 + 0.2 * Math.hypot(bx - ax, by - ay));
+      const [mx, my] = [(ax + bx) / 2 - (upright ? bend : 0), (ay + by) / 2 - (upright ? 0 : bend)];
+      wires.push({ d: `M${ax} ${ay}Q${mx} ${my} ${bx} ${by}`, kind: "tie" });
+    }
     const [x0, y0] = at(0, 0);
     const [x1, y1] = at(0, rows - 1);
     wires.push({
@@ -190,6 +209,9 @@ export class Diagram {
       const [bx, by] = at(i + 1);
       return { d: `M${ax} ${ay}L${bx} ${by}`, bus: i + 1 };
     });
+    for (const [one, other] of this.feeder.layout.ties ?? []) {
+      wires.push({ d: `M${at(one).join(" ")}L${at(other).join(" ")}`, kind: "tie" });
+    }
     const [bx, by] = at(0);
     wires.push({ d: `M${bx - 9} ${by}h18M${bx} ${by - 9}v18`, bus: 0, kind: "busbar" });
     const index = new Map(buses.map((id, k) => [id, k]));

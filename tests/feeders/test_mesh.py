@@ -19,7 +19,6 @@ from feeders.powerflow_unbalanced import power_flow
 from feeders.schema import LineRow, examine, read, validate, write
 from feeders.studies.calibrate_feeder import network
 from feeders.studies.droop import droop
-from feeders.studies.protect import protect
 from feeders.studies.redundancy import redundancy
 from feeders.trials import LoadError, Meters, Outcome, Trial, judge
 from gridsec.errors import DesignInfeasible, FeederInvalid
@@ -188,13 +187,12 @@ def test_estimators_for_radial_feeders_say_so(name: str) -> None:
     "study",
     [
         redundancy,
-        lambda site: protect(site, max_attacked=1),
         droop,
         lambda site: network(site.tables),
         lambda site: site.tree,
         lambda site: site.balanced,
     ],
-    ids=["redundancy", "protect", "droop", "calibrate", "tree", "balanced"],
+    ids=["redundancy", "droop", "calibrate", "tree", "balanced"],
 )
 def test_studies_of_radial_feeders_say_so(study: Callable[[Site], object]) -> None:
     with pytest.raises(FeederInvalid, match="closed lines form loops, and this takes radial feeders only"):

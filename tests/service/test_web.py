@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
+from feeders.load import Site as FeederSite
 from feeders.load import load, names
 from gridsec.online import Cause
 from service.describe import detail
 from service.report import CustomerReport, InverterReport
+from tests.feeders.meshes import baran_wu
 
 pytestmark = pytest.mark.browser
 
@@ -79,11 +81,11 @@ def site(site_of: Callable[..., Site], village: type) -> Site:
     return site_of(village())
 
 
-def real(village: type, name: str) -> Any:
+def real(village: type, of: FeederSite) -> Any:
     """A village with the tree of a real feeder."""
-    made = village(name, 0)
+    made = village(of.feeder.name, 0)
     made.detail = lambda: known
-    known = detail(load(name))
+    known = detail(of)
     layout = known["layout"]
     made.buses, made.parent, made.customers = layout["buses"], layout["parent"], layout["customers"]
     made.meters = [c["meter"] for c in made.customers]
@@ -441,7 +443,7 @@ def test_ids_are_text_and_nothing_else(site_of: Callable[..., Site], village: ty
 def test_146_customers_can_be_told_apart(
     site_of: Callable[..., Site], village: type, size: dict[str, int]
 ) -> None:
-    site = site_of(real(village, "kerber-vorstadtnetz"))
+    site = site_of(real(village, load("kerber-vorstadtnetz")))
     suspects = {site.village.meters[k]: 8.0 for k in range(0, 144, 3)}
     site.tick(T0, 1, lies=suspects, sag=0.3)
     page = site.open(size)
@@ -498,7 +500,7 @@ def test_real_feeders_are_drawn_without_crossings(site: Site) -> None:
 
 
 def test_the_map_shows_real_places(site_of: Callable[..., Site], village: type) -> None:
-    site = site_of(real(village, "simbench-lv-rural1"))
+    site = site_of(real(village, load("simbench-lv-rural1")))
     site.tick(T0, sag=0.3)
     page = site.open()
     page.locator('#view button[data-view="map"]').click()
@@ -522,6 +524,27 @@ def test_the_map_shows_real_places(site_of: Callable[..., Site], village: type) 
         scales.append(scale)
     assert scales[0] == pytest.approx(scales[1])
     assert scales[0] > 0
+
+
+def test_closed_ties_are_drawn_in_both_views(site_of: Callable[..., Site], village: type) -> None:
+    mesh = baran_wu()
+    page = site_of(real(village, mesh)).open()
+    drawn = page.locator("#diagram path.tie")
+    expect(drawn).to_have_count(5)
+    boxes = [drawn.nth(k).bounding_box() for k in range(5)]
+    frame = page.locator("#diagram svg").bounding_box()
+    for box in boxes:
+        assert frame["x"] <= box["x"]
+        assert frame["y"] <= box["y"]
+        assert box["x"] + box["width"] <= frame["x"] + frame["width"]
+        assert box["y"] + box["height"] <= frame["y"] + frame["height"]
+    page.locator('#view button[data-view="map"]').click()
+    expect(drawn).to_have_count(5)
+    # On the map a tie joins the places of its two buses: its size is their distance, in one scale.
+    xy = np.array(mesh.xy)[mesh.ties]
+    apart = np.abs(xy[:, 0] - xy[:, 1])
+    size = np.array(drawn.evaluate_all("all => all.map(e => e.getBBox()).map(b => [b.width, b.height])"))
+    np.testing.assert_allclose(size / size.max(), apart / apart.max(), atol=1e-3)
 
 
 def test_a_link_leads_to_its_feeder(site_of: Callable[..., Site], village: type) -> None:
