@@ -23,7 +23,7 @@ from feeders.studies.journal import Journal, Progress, worked
 from feeders.studies.operating import SHARE, box, volts_of_lie
 from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible
-from gridsec.feeder import model_error_bound
+from gridsec.network import model_error_bound
 from gridsec.sequential import SequentialOptions
 from gridsec.sequential import design as design_sequential
 from gridsec.studies.lies import Box, largest_lie, worst_error
@@ -170,7 +170,7 @@ def monitor_rule(site: Site, *, risk: float = RISK, share: float = SHARE) -> Rul
     )
     p = -share * site.loads.load_peak
     q = 0.5 * (site.loads.tan_min + site.loads.tan_max) * p
-    model = model_error_bound(site.balanced, p, q, 1.0)[site.meters]
+    model = model_error_bound(site.feeder, p, q, 1.0)[site.meters]
     if not np.isfinite(model).all():
         raise DesignInfeasible(
             f"rule of {site.feeder.name}'s monitor", f"no power flow at {share:g} of the peak"

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints
-from gridsec.feeder import lindistflow
 from gridsec.lure import close_loop
 from gridsec.studies.patterns import Patterns, patterns, unknown_pair, unknown_voltages
 
@@ -85,7 +84,7 @@ def knowledge(
     silent
         Meters that are missing. Nobody knows the powers of their customers either.
     busbar_known
-        Whether the busbar's voltage is metered and honest.
+        Whether the busbar's voltage is metered and honest; in three phases all of them, or none.
     curves
         Where the inverters work.
 
@@ -104,7 +103,7 @@ def knowledge(
     open_[site.meters[gone]] = True
     which = np.flatnonzero(open_)
     lure = close_loop(site.feeder, site.droop, site.meters)
-    W = unknown_voltages(lindistflow(site.balanced), which, busbar=not busbar_known, tol=TOLERANCE)
+    W = unknown_voltages(site.feeder, which, busbar=not busbar_known, tol=TOLERANCE)
     slope = lure.slope if curves is Curves.STEEPEST else np.zeros_like(lure.slope)
     A, C = unknown_pair(lure, slope, W)
     everybody = close_loop(site.feeder, site.droop, np.arange(metered.size))

@@ -10,8 +10,9 @@ from feeders.load import Snapshot, to_frame
 from feeders.studies.hidden import Curves
 from gridsec.arrays import Floats
 from gridsec.detect import busbar_error, reading_error
-from gridsec.feeder import lindistflow
+from gridsec.network import Power, between
 from gridsec.studies.lies import Box
+from gridsec.studies.patterns import from_busbar
 
 if TYPE_CHECKING:
     from feeders.load import Site
@@ -29,7 +30,8 @@ def box(site: Site, *, share: float = SHARE, curves: Curves = Curves.DEADBAND) -
     """The worst cases of the exact bank's thresholds, at nominal voltage.
 
     Intervals of powers are those of a frame in which every metered load draws `share` of its peak and reports
-    active power only. Inverters answer along their droop curves, linearised.
+    active power only. Inverters answer along their droop curves, linearised. In three phases each voltage of
+    the busbar errs on its own.
 
     Parameters
     ----------
@@ -46,19 +48,20 @@ def box(site: Site, *, share: float = SHARE, curves: Curves = Curves.DEADBAND) -
     frame = to_frame(
         site, Snapshot(0.0, nominal, drawn, np.full(drawn.size, np.nan), float(site.feeder.base_volt))
     )
-    model, own = lindistflow(site.balanced), site.droop.customer
+    R, X = (between(site.feeder, power) for power in Power)
+    own = site.droop.customer
     slope = site.droop.slope if curves is Curves.STEEPEST else np.zeros(own.size)
-    loop = np.eye(model.X.shape[0])
-    loop[:, own] += 2.0 * model.X[:, own] * slope
+    loop = np.eye(len(X))
+    loop[:, own] += 2.0 * X[:, own] * slope
     open_loop = np.hstack(
         [
-            2.0 * model.R * frame.p_error,
-            2.0 * model.X * frame.q_error,
-            np.full((model.R.shape[0], 1), busbar_error(site.accuracy, 1.0, SIGMAS)),
+            2.0 * R * frame.p_error,
+            2.0 * X * frame.q_error,
+            busbar_error(site.accuracy, 1.0, SIGMAS) * from_busbar(site.feeder),
         ]
     )
     reading = reading_error(site.accuracy, np.ones(site.meters.size), SIGMAS)
-    return Box(np.linalg.solve(loop, open_loop), site.meters, reading)
+    return Box(np.asarray(np.linalg.solve(loop, open_loop)), site.meters, reading)
 
 
 def volts_of_lie(site: Site, size: Floats | float) -> Floats:

@@ -22,7 +22,7 @@ from feeders.studies.journal import Journal, Progress, worked
 from gridsec.errors import DesignInfeasible
 from gridsec.index import Index
 from gridsec.studies.patterns import fewest_meters
-from gridsec.studies.redundancy import Part, meter_redundancy, part_redundancy, parts
+from gridsec.studies.redundancy import Part, meter_redundancy, part_redundancy, parts, tree_bus
 
 if TYPE_CHECKING:
     from feeders.load import Site
@@ -132,7 +132,7 @@ def redundancy(
     cases = {ALL: known(silent=())}
     if silent:
         cases[SILENT] = known(silent=silent)
-    pieces = parts(site.balanced, site.feeder.bus[site.meters])
+    pieces = parts(site.tree, tree_bus(site.feeder)[site.meters])
     tasks = [task for case, what in cases.items() for task in _tasks(site, case, what, pieces)]
     done = worked(Journal(journal, subject), tasks, progress)
     return Redundancy(
@@ -205,7 +205,7 @@ def _meter(site: Site, case: str, what: Knowledge, j: int) -> dict[str, Any]:
 def _part(site: Site, case: str, what: Knowledge, piece: Part) -> dict[str, Any]:
     row: dict[str, Any] = {
         "case": case,
-        "bus": site.feeder.buses[piece.bus],
+        "bus": site.tree.buses[piece.bus],
         "branch": piece.branch,
         "meters": int(np.count_nonzero(~what.silent[piece.meters])),
     }

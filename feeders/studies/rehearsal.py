@@ -18,7 +18,7 @@ from feeders.studies.journal import Progress
 from feeders.studies.operating import SHARE, squared
 from gridsec import sequential
 from gridsec.arrays import Bools, Floats
-from gridsec.feeder import bus_voltages
+from gridsec.network import bus_voltages, busbar_places
 from gridsec.online import Frame
 from gridsec.studies.quiet import Rule, largest_shift
 
@@ -143,10 +143,10 @@ def _world(given: Rule, site: Site, share: float, rng: np.random.Generator) -> C
     x = np.zeros(own.size)
     for _ in range(_SETTLING):
         injected = q + off_q + np.bincount(own, weights=x, minlength=q.size)
-        v2 = bus_voltages(site.balanced, p + off_p, injected, 1.0, steps=3)[site.feeder.bus]
+        v2 = bus_voltages(site.feeder, p + off_p, injected, 1.0, steps=3)[site.feeder.bus]
         x = 0.5 * x + 0.5 * site.droop(site.droop.vbar**2 - v2[own])
     v = np.sqrt(v2[site.meters]) * (1.0 + accuracy.class_fraction * rng.uniform(-1.0, 1.0, site.meters.size))
-    busbar = 1.0 + design.busbar / 2.0 * float(draw(rng, 1)[0])
+    busbar = (1.0 + design.busbar / 2.0 * draw(rng, busbar_places(site.feeder).stop)) ** 2
     root3 = np.sqrt(3.0)
 
     def frame(tick: int, lies: Floats) -> Frame:
@@ -157,13 +157,14 @@ def _world(given: Rule, site: Site, share: float, rng: np.random.Generator) -> C
             t=(tick + 1) * design.step_s,
             y=reading**2 + lies,
             seen=np.ones(v.size, dtype=np.bool_),
-            v0_squared=busbar**2,
+            v0_squared=float(busbar.mean()),
             p=p,
             p_error=root3 * doubt.p,
             q=q,
             q_error=root3 * doubt.q,
             q_net=np.full(q.size, np.nan),
             q_net_error=np.zeros(q.size),
+            v0_phases=busbar if busbar.size > 1 else None,
         )
 
     return frame

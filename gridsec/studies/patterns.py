@@ -22,12 +22,12 @@ from scipy.linalg import qr
 from scipy.sparse.csgraph import connected_components
 
 from gridsec.arrays import Bools, Floats, Ints
-from gridsec.feeder import LinDistFlow
 from gridsec.index import Index, Sparsest, eigenspaces, fewest, kernel, linearise
 from gridsec.index.blocks import MOST_NODES, Matrix
 from gridsec.lure import Lure
+from gridsec.network import Network, Power, between, busbar_places, one_busbar
 
-__all__ = ["Patterns", "fewest_meters", "patterns", "unknown_pair", "unknown_voltages"]
+__all__ = ["Patterns", "fewest_meters", "from_busbar", "patterns", "unknown_pair", "unknown_voltages"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,16 +62,17 @@ class Patterns:
         return np.hstack([whole.real, whole.imag]) if np.iscomplexobj(whole) else np.asarray(whole)
 
 
-def unknown_voltages(model: LinDistFlow, unknown: Ints, *, busbar: bool, tol: float) -> Floats:
+def unknown_voltages(feeder: Network, unknown: Ints, *, busbar: bool, tol: float) -> Floats:
     """Orthonormal basis W of what unknown powers can do to the customers' squared voltages, (N, d).
 
-    The range of ``[2 R_U, 2 X_U]``, and of a column of ones where the busbar's voltage is unknown too. Powers
-    that move no customer's voltage are no unknowns: they harm nobody.
+    The range of ``[2 R_U, 2 X_U]``, and where the busbar's voltage is unknown too, of a column of ones; in
+    three phases of a column for each, ones where its customers are. Powers that move no customer's voltage
+    are no unknowns: they harm nobody.
 
     Parameters
     ----------
-    model
-        The linear power flow.
+    feeder
+        The feeder.
     unknown : (k,)
         Customers whose active and reactive powers nobody knows.
     busbar
@@ -79,15 +80,28 @@ def unknown_voltages(model: LinDistFlow, unknown: Ints, *, busbar: bool, tol: fl
     tol
         Singular values up to this part of the largest, of columns of unit length, are zero.
     """
-    columns = [model.R[:, unknown], model.X[:, unknown]]
+    columns = [between(feeder, power)[:, unknown] for power in Power]
     if busbar:
-        columns.append(np.ones((model.R.shape[0], 1)))
+        columns.append(from_busbar(feeder))
     whole = np.hstack(columns)
     length = np.linalg.norm(whole, axis=0)
     if not length.any():
-        return np.zeros((model.R.shape[0], 0))
+        return np.zeros((feeder.bus.size, 0))
     u, s, _ = np.linalg.svd(whole[:, length > 0.0] / length[length > 0.0], full_matrices=False)
     return np.asarray(u[:, s > tol * s[0]])
+
+
+def from_busbar(feeder: Network) -> Floats:
+    """What each voltage of the busbar does to the customers' squared voltages, (N, 1), or (N, 3) in phases.
+
+    Parameters
+    ----------
+    feeder
+        The feeder.
+    """
+    first = busbar_places(feeder)
+    of_each = one_busbar(feeder, feeder.bus, np.arange(first.stop))
+    return np.array(np.broadcast_to(of_each, (feeder.bus.size, first.stop)))
 
 
 def unknown_pair(lure: Lure, slope: Floats, W: Floats) -> tuple[Floats, Floats]:

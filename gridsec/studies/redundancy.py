@@ -15,9 +15,11 @@ import numpy as np
 from gridsec.arrays import Bools, Ints
 from gridsec.feeder import Feeder
 from gridsec.index import Index
+from gridsec.network import Network
+from gridsec.phases import PhasedFeeder, ThreePhaseFeeder
 from gridsec.studies.patterns import Patterns, fewest_meters
 
-__all__ = ["Meter", "Part", "meter_redundancy", "part_redundancy", "parts"]
+__all__ = ["Meter", "Part", "meter_redundancy", "part_redundancy", "parts", "tree_bus"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,13 +97,26 @@ def part_redundancy(given: Patterns, part: Part, silent: Bools) -> Index:
     return fewest_meters(given, honest=honest, silent=silent)
 
 
-def parts(feeder: Feeder, buses: Ints) -> Sequence[Part]:
-    """All parts of a feeder that differ in their meters, those nearest the busbar first.
+def tree_bus(feeder: Network) -> Ints:
+    """Bus of each customer in the feeder's tree, whatever its phase, (N,).
 
     Parameters
     ----------
     feeder
         The feeder.
+    """
+    return feeder.tree.at if isinstance(feeder, PhasedFeeder) else feeder.bus
+
+
+def parts(feeder: Feeder | ThreePhaseFeeder, buses: Ints) -> Sequence[Part]:
+    """All parts of a feeder that differ in their meters, those nearest the busbar first.
+
+    A part has all phases of its buses.
+
+    Parameters
+    ----------
+    feeder
+        The feeder's tree.
     buses : (p,)
         Bus of each meter.
     """

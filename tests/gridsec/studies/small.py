@@ -8,20 +8,25 @@ import numpy as np
 
 from gridsec.arrays import Floats, Ints
 from gridsec.droop import fleet
-from gridsec.feeder import Feeder, lindistflow
+from gridsec.feeder import Feeder
 from gridsec.index import observable_rows, unstable_subspace
 from gridsec.lure import Lure, close_loop
+from gridsec.network import Network
+from gridsec.phases import PhasedFeeder, ThreePhaseFeeder
 from gridsec.studies.lies import Box
 from gridsec.studies.patterns import unknown_pair, unknown_voltages
 
 TOL = 1e-9
 
 
-def tree(seed: int) -> tuple[Feeder, Lure, Ints, Ints]:
-    """A small feeder: 7 customers, 5 of them with meters, 2 inverters, 1 or 2 loads that nobody knows."""
+def tree(seed: int, *, phased: bool = False) -> tuple[Network, Lure, Ints, Ints]:
+    """A small feeder: 7 customers, 5 of them with meters, 2 inverters, 1 or 2 loads that nobody knows.
+
+    In three phases each customer has one of them, and mutual impedances are a good part of the others.
+    """
     rng = np.random.default_rng(seed)
     branches = 7
-    feeder = Feeder(
+    feeder: Network = Feeder(
         name="small",
         parent=np.array([rng.integers(max(0, k - 2), k + 1) for k in range(branches)]),
         r=rng.uniform(0.01, 0.05, branches),
@@ -33,6 +38,10 @@ def tree(seed: int) -> tuple[Feeder, Lure, Ints, Ints]:
         base_kva=100.0,
         charging=np.zeros(branches),
     )
+    if phased:
+        assert isinstance(feeder, Feeder)
+        phase = np.random.default_rng([seed, 3]).integers(0, 3, 7)
+        feeder = in_phases(feeder, phase, mutual=0.4)
     meters = np.sort(rng.choice(7, 5, replace=False))
     own = np.sort(rng.choice(7, 2, replace=False))
     droop = fleet(own, "ieee1547-b", np.array([5.0, 9.0]), 100.0, tau=np.array([2.0, 3.1]))
@@ -40,9 +49,29 @@ def tree(seed: int) -> tuple[Feeder, Lure, Ints, Ints]:
     return feeder, close_loop(feeder, droop, meters), meters, unknown
 
 
-def system(seed: int, *, busbar: bool = False) -> tuple[Floats, Floats]:
-    feeder, lure, _, unknown = tree(seed)
-    W = unknown_voltages(lindistflow(feeder), unknown, busbar=busbar, tol=TOL)
+def in_phases(feeder: Feeder, phase: Ints, *, mutual: float) -> PhasedFeeder:
+    """The same tree with its customers on single phases; mutual impedances are a part of a phase's own."""
+    z = (feeder.r + 1j * feeder.x)[:, None, None]
+    return PhasedFeeder(
+        ThreePhaseFeeder(
+            name=feeder.name,
+            parent=feeder.parent,
+            z=z * (mutual + (1.0 - mutual) * np.eye(3)),
+            phases=np.ones((len(feeder.buses), 3), dtype=np.bool_),
+            bus=feeder.bus,
+            connected=np.equal.outer(phase, np.arange(3)),
+            customers=feeder.customers,
+            buses=feeder.buses,
+            base_volt=feeder.base_volt,
+            base_kva=feeder.base_kva,
+            charging=feeder.charging[:, None, None] * np.eye(3),
+        )
+    )
+
+
+def system(seed: int, *, busbar: bool = False, phased: bool = False) -> tuple[Floats, Floats]:
+    feeder, lure, _, unknown = tree(seed, phased=phased)
+    W = unknown_voltages(feeder, unknown, busbar=busbar, tol=TOL)
     return unknown_pair(lure, lure.slope, W)
 
 

@@ -34,9 +34,12 @@ def check(attacker: Attacker, p: int, fewest: int) -> None:
     assert greedy.gap == greedy.meters.size - greedy.least
 
 
-@pytest.mark.parametrize("seed", range(50))
-def test_protection_against_imitators_equals_brute_force(seed: int) -> None:
-    A, C = system(100 + seed, busbar=seed % 2 == 0)
+@pytest.mark.parametrize(
+    ("seed", "phased"),
+    [*((seed, False) for seed in range(50)), *((seed, True) for seed in range(15))],
+)
+def test_protection_against_imitators_equals_brute_force(seed: int, phased: bool) -> None:
+    A, C = system(100 + seed, busbar=seed % 2 == 0, phased=phased)
     p, liars = len(C), 2 * (1 + seed % 2)
     found = patterns(A, C, persistent=True, tol=TOL)
     safe = {}

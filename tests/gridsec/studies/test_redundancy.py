@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from gridsec.arrays import Floats
-from gridsec.feeder import lindistflow
+from gridsec.feeder import Feeder
 from gridsec.index import redundant_detectable, redundant_observable
 from gridsec.studies.patterns import Patterns, fewest_meters, patterns, unknown_pair, unknown_voltages
-from gridsec.studies.redundancy import meter_redundancy, part_redundancy, parts
+from gridsec.studies.redundancy import meter_redundancy, part_redundancy, parts, tree_bus
 from tests.gridsec.studies.small import TOL, brute, system, tree
 
 
@@ -17,10 +17,19 @@ def given(A: Floats, C: Floats, *, persistent: bool) -> Patterns:
     return patterns(A, C, persistent=persistent, tol=TOL)
 
 
+FEEDERS = pytest.mark.parametrize(
+    ("seed", "phased"),
+    [*((seed, False) for seed in range(25)), *((seed, True) for seed in range(10))],
+)
+"""Balanced feeders, and some in three phases."""
+
+
 @pytest.mark.parametrize("persistent", [True, False])
-@pytest.mark.parametrize("seed", range(25))
-def test_indices_of_all_and_of_each_meter_equal_brute_force(seed: int, persistent: bool) -> None:
-    A, C = system(seed, busbar=seed % 3 == 0)
+@FEEDERS
+def test_indices_of_all_and_of_each_meter_equal_brute_force(
+    seed: int, persistent: bool, phased: bool
+) -> None:
+    A, C = system(seed, busbar=seed % 3 == 0, phased=phased)
     found = given(A, C, persistent=persistent)
     everybody = list(range(len(C)))
     nobody = np.zeros(len(C), dtype=np.bool_)
@@ -37,22 +46,23 @@ def test_indices_of_all_and_of_each_meter_equal_brute_force(seed: int, persisten
 
 
 @pytest.mark.parametrize("persistent", [True, False])
-@pytest.mark.parametrize("seed", range(25))
-def test_parts_and_silent_meters_equal_brute_force(seed: int, persistent: bool) -> None:
-    feeder, _, meters, _ = tree(seed)
-    A, C = system(seed)
+@FEEDERS
+def test_parts_and_silent_meters_equal_brute_force(seed: int, persistent: bool, phased: bool) -> None:
+    feeder, _, meters, _ = tree(seed, phased=phased)
+    whole = feeder if isinstance(feeder, Feeder) else feeder.tree
+    A, C = system(seed, phased=phased)
     found = given(A, C, persistent=persistent)
     silent = np.arange(len(C)) == seed % len(C)
     live = np.flatnonzero(~silent).tolist()
-    for part in parts(feeder, feeder.bus[meters]):
+    for part in parts(whole, tree_bus(feeder)[meters]):
         inside = [j for j in part.meters.tolist() if not silent[j]]
         counted = part_redundancy(found, part, silent).count
         assert counted == brute(A, C, inside, live, persistent=persistent)
 
 
-@pytest.mark.parametrize("seed", range(25))
-def test_index_is_redundant_observability_where_nobody_is_blind(seed: int) -> None:
-    A, C = system(seed)
+@FEEDERS
+def test_index_is_redundant_observability_where_nobody_is_blind(seed: int, phased: bool) -> None:
+    A, C = system(seed, phased=phased)
     live = np.ones(len(C), dtype=np.bool_)
     for persistent in (True, False):
         found = given(A, C, persistent=persistent)
@@ -80,7 +90,7 @@ def test_the_liars_of_an_index_do_imitate_a_pattern() -> None:
 
 def test_known_loads_leave_nothing_that_stays() -> None:
     feeder, lure, _, _ = tree(1)
-    W = unknown_voltages(lindistflow(feeder), np.zeros(0, dtype=np.intp), busbar=False, tol=TOL)
+    W = unknown_voltages(feeder, np.zeros(0, dtype=np.intp), busbar=False, tol=TOL)
     A, C = unknown_pair(lure, lure.slope, W)
     assert fewest_meters(given(A, C, persistent=True)).count == np.inf
 
@@ -88,10 +98,20 @@ def test_known_loads_leave_nothing_that_stays() -> None:
 def test_an_unknown_busbar_moves_every_meter() -> None:
     feeder, lure, _, _ = tree(1)
     none = np.zeros(0, dtype=np.intp)
-    W = unknown_voltages(lindistflow(feeder), none, busbar=True, tol=TOL)
+    W = unknown_voltages(feeder, none, busbar=True, tol=TOL)
     A, C = unknown_pair(lure, 0.0 * lure.slope, W)
     found = fewest_meters(given(A, C, persistent=True))
     assert found.count == len(C)
+
+
+def test_an_unknown_busbar_in_three_phases_moves_the_meters_of_a_phase() -> None:
+    feeder, lure, meters, _ = tree(1, phased=True)
+    none = np.zeros(0, dtype=np.intp)
+    W = unknown_voltages(feeder, none, busbar=True, tol=TOL)
+    A, C = unknown_pair(lure, 0.0 * lure.slope, W)
+    each = np.bincount(feeder.bus[meters] % 3, minlength=3)
+    found = fewest_meters(given(A, C, persistent=True))
+    assert found.count == each[each > 0].min() < meters.size
 
 
 def test_a_liar_must_be_there() -> None:
