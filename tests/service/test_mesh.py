@@ -1,0 +1,67 @@
+"""A feeder with closed ties through the whole service: its layout, a recording, and who lies."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from feeders.recording import read_recording, record
+from feeders.scenario import Scenario, random_attacks, simulate
+from feeders.schema import to_json, write
+from gridsec.feeder import Feeder
+from service.describe import detail
+from service.models import FeederDetail, State
+from service.replay import Tally, replay
+from service.simulate import Pace, play
+from tests.feeders.meshes import baran_wu
+from tests.service.running import service, until
+
+START = 1_795_212_000.0
+NAME = "case33bw"
+
+
+@pytest.fixture(scope="module")
+def scenario() -> Scenario:
+    attacks = random_attacks(baran_wu(), 3, "bias", 10, 0.03, t_on=START + 15, t_off=START + 60)
+    return Scenario(seed=6, start=START, duration_s=30.0, attacks=attacks)
+
+
+def test_the_layout_is_a_tree_and_its_ties() -> None:
+    site = baran_wu()
+    found = FeederDetail.model_validate(detail(site)).layout
+    assert len(found.ties) == 5
+    lines = {frozenset((row.from_bus, row.to_bus)) for row in site.tables.lines}
+    drawn = [(k, above) for k, above in enumerate(found.parent) if above is not None] + found.ties
+    assert {frozenset((found.buses[a], found.buses[b])) for a, b in drawn} == lines
+    assert len(drawn) == len(lines) == 37
+
+
+def test_the_service_names_the_liars(scenario: Scenario, tmp_path: Path) -> None:
+    site = baran_wu()
+    write(site.tables, tmp_path / NAME)
+    with service(tmp_path, (str(tmp_path / NAME),), clock="events") as live:
+        samples = list(play(site, scenario, live.meters, Pace(float("inf"), ahead=3)))
+        until(lambda: live.state(NAME).get("t", 0.0) >= samples[-1].t - 2.0, "the end")
+        state = live.state(NAME)
+    lying = {site.meter_ids[k] for k in np.flatnonzero(samples[-1].manipulated)}
+    assert len(lying) == 10
+    assert state["verdict"] == "attacked"
+    assert {meter["meter"] for meter in state["meters"] if meter["suspect"]} == lying
+    State.model_validate(state)
+    found = np.array([bus["v_volt"] for bus in state["buses"]])
+    np.testing.assert_allclose(found, samples[-1].v_bus_volt, rtol=2e-3)
+
+
+def test_a_recording_is_replayed(scenario: Scenario, tmp_path: Path) -> None:
+    site, short = baran_wu(), replace(scenario, duration_s=20.0)
+    recording = record(site, short, tmp_path / "day.parquet")
+    samples = list(simulate(site, short))
+    reports = [one.report for one in replay(site, read_recording(recording.path).readings(), Tally())]
+    lying = {site.meter_ids[k] for k in np.flatnonzero(samples[-1].manipulated)}
+    assert {meter.meter for meter in reports[-1].meters if meter.suspect} == lying
+    assert reports[-1].verdict == "attacked"
+    assert not isinstance(site.feeder, Feeder)
+    assert to_json(site.tables)["feeder"]["meshed"] is True
