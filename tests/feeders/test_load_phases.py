@@ -8,15 +8,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from feeders.columns import PAIRS
 from feeders.load import find, from_tables, load
 from feeders.load_phases import ThreePhaseSite, load_three_phase, three_phase, three_phase_names
 from feeders.powerflow_unbalanced import UnbalancedPowerFlow
-from feeders.schema import FeederTables, read
+from feeders.schema import FeederTables, LineRow, examine, from_json, read, to_json
 from gridsec import feeder as balanced
-from gridsec.arrays import Floats
+from gridsec.arrays import Floats, Phasors
 from gridsec.errors import FeederInvalid
 from gridsec.feeder import lindistflow
-from gridsec.phases import PhasedFeeder, bus_voltages, lindist3flow, per_customer, sensitivities
+from gridsec.phases import (
+    PhasedFeeder,
+    bus_voltages,
+    lindist3flow,
+    per_customer,
+    sensitivities,
+    sequence_matrix,
+)
 
 CASE = Path(__file__).parent.parent / "cases" / "good" / "single-phase"
 EUROPEAN = "ieee-european-lv"
@@ -50,6 +58,112 @@ def test_a_lateral_with_zero_sequence_has_its_self_impedance() -> None:
     feeder = three_phase(replace(tables, lines=lines)).feeder
     base = 3 * 230.0**2 / (1000.0 * 100.0)
     assert feeder.z[2, 1, 1] * base == pytest.approx((0.2 + 0.07j + 2 * (0.05 + 0.01j)) / 3)
+
+
+def bare(matrix: Phasors, line: LineRow, **changes: object) -> LineRow:
+    """A line with this matrix of impedances instead of its sequences."""
+    pairs = {f"{'abc'[i]}{'abc'[j]}": (i, j) for i in range(3) for j in range(i, 3)}
+    cells = {f"{symbol}_{pair}_ohm": part[at] for symbol, part in (("r", matrix.real), ("x", matrix.imag))
+             for pair, at in pairs.items()}  # fmt: skip
+    one = matrix.diagonal().mean() - matrix[np.triu_indices(3, 1)].mean()
+    given = {"r_ohm": one.real, "x_ohm": one.imag, "r0_ohm": None, "x0_ohm": None}
+    return replace(line, **(cells | given | changes))
+
+
+Z = np.array([[0.3 + 0.2j, 0.1 + 0.09j, 0.08 + 0.06j], [0, 0.34 + 0.21j, 0.11 + 0.1j], [0, 0, 0.28 + 0.22j]])
+Z = Z + np.triu(Z, 1).T
+
+
+def test_a_line_that_is_not_transposed_has_its_own_matrices() -> None:
+    tables = single_phase()
+    charging = {
+        "b_aa_us": 5.0,
+        "b_ab_us": -1.0,
+        "b_ac_us": -1.5,
+        "b_bb_us": 4.0,
+        "b_bc_us": -0.5,
+        "b_cc_us": 6.0,
+    }
+    one = bare(Z, tables.lines[0], b_us=6.0, **charging)
+    tables = replace(tables, lines=(one, *tables.lines[1:]))
+    site = three_phase(tables)
+    base = 3 * 230.0**2 / (1000.0 * 100.0)
+    np.testing.assert_allclose(site.feeder.z[0] * base, Z, rtol=1e-14)
+    B = np.array([[5.0, -1.0, -1.5], [-1.0, 4.0, -0.5], [-1.5, -0.5, 6.0]])
+    np.testing.assert_allclose(site.feeder.charging[0] / base, 1e-6 * B, rtol=1e-14)
+    grid = UnbalancedPowerFlow(site).grid
+    np.testing.assert_array_equal(grid.z_ohm[0], Z)
+    np.testing.assert_allclose(grid.b_siemens[0], 1e-6 * B, rtol=1e-15)
+    p, q, v0 = np.array([2.0, 9.0, 1.5]), np.array([0.3, 2.0, 0.2]), np.full(3, 1.02**2)
+    truth = UnbalancedPowerFlow(site).solve(p, q, 1.02 * 230.0)[1] / 230.0
+    drawn = [site.feeder.connections(-3 * power / 100) for power in (p, q)]
+    model = np.sqrt(bus_voltages(site.feeder, *drawn, v0, steps=20)).T
+    model[~site.feeder.phases] = np.nan
+    np.testing.assert_allclose(model, truth, rtol=0, atol=1e-9)
+    # In files and in JSON, nothing of it is lost.
+    assert from_json(to_json(tables)) == tables
+
+
+@pytest.mark.parametrize("phases", ["ab", "bc", "ca"])
+def test_a_line_of_two_phases(phases: str) -> None:
+    tables = single_phase()
+    here = [k for k, phase in enumerate("abc") if phase in phases]
+    block = Z[np.ix_(here, here)]
+    one = block.diagonal().mean() - block[0, 1]
+    cells = {f"r_{pair}_ohm": None for pair in PAIRS} | {f"x_{pair}_ohm": None for pair in PAIRS}
+    for i in here:
+        for j in (j for j in here if j >= i):
+            pair = "abc"[i] + "abc"[j]
+            cells |= {f"r_{pair}_ohm": Z[i, j].real, f"x_{pair}_ohm": Z[i, j].imag}
+    lateral = replace(tables.lines[2], phases=phases, r_ohm=one.real, x_ohm=one.imag, **cells)
+    customer = replace(tables.customers[2], phases=phases[1])
+    tables = replace(tables, lines=(*tables.lines[:2], lateral), customers=(*tables.customers[:2], customer))
+    site = three_phase(tables)
+    base = 3 * 230.0**2 / (1000.0 * 100.0)
+    np.testing.assert_allclose(site.feeder.z[2][np.ix_(here, here)] * base, block, rtol=1e-14)
+    np.testing.assert_array_equal(site.feeder.phases[3], [phase in phases for phase in "abc"])
+    # With its sequences instead, of those that transposed it would have.
+    twin = replace(lateral, r0_ohm=0.2, x0_ohm=0.4, **dict.fromkeys(cells))
+    expected = sequence_matrix(one, np.array(0.2 + 0.4j))
+    found = three_phase(replace(tables, lines=(*tables.lines[:2], twin))).feeder.z[2]
+    np.testing.assert_allclose(found[np.ix_(here, here)] * base, expected[np.ix_(here, here)], rtol=1e-14)
+    assert np.isfinite(from_tables(tables).feeder.R).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"x_bc_ohm": None}, "columns x_bc_ohm: missing; expected the whole matrix"),
+        ({"phases": "a"}, "column r_aa_ohm: a matrix, but phases is 'a'"),
+        (
+            {"phases": "ab"},
+            "columns r_ac_ohm, r_bc_ohm, r_cc_ohm, x_ac_ohm, x_bc_ohm, x_cc_ohm: of a conductor",
+        ),
+        (
+            {"r_ohm": 0.5},
+            "column r_ohm: 0.5 is not the positive sequence of the line's matrix; expected 0.21",
+        ),
+        ({"r0_ohm": 0.5, "x0_ohm": 0.5}, "columns r0_ohm and x0_ohm: beside a matrix"),
+        ({"r_ab_ohm": 0.4, "r_ohm": 0.11}, "columns r_aa_ohm to r_cc_ohm: generate power"),
+        ({"b_aa_us": 1.0}, "columns b_ab_us, b_ac_us, b_bb_us, b_bc_us, b_cc_us: missing"),
+        (
+            {"b_us": 4.0 / 3} | {f"b_{pair}_us": float(pair[0] != pair[1]) * -2.0 for pair in PAIRS},
+            "columns b_aa_us to b_cc_us: no capacitances",
+        ),
+        (
+            {f"r_{pair}_ohm": 0.3 for pair in PAIRS}
+            | {f"x_{pair}_ohm": 0.2 for pair in PAIRS}
+            | {"r_ohm": 0.0, "x_ohm": 0.0},
+            "columns r_aa_ohm to x_cc_ohm: are singular",
+        ),
+    ],
+)
+def test_what_is_no_matrix_of_a_line(changes: dict[str, object], said: str) -> None:
+    tables = single_phase()
+    lines = (bare(Z, tables.lines[0], **changes), *tables.lines[1:])
+    problems = examine(to_json(replace(tables, lines=lines))).problems
+    assert any(problem.startswith("lines, row 1 (1)") and said in problem for problem in problems), problems
+    assert all("expected" in problem for problem in problems)
 
 
 def test_a_balanced_feeder_has_the_matrices_of_the_balanced_loader() -> None:
