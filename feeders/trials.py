@@ -192,7 +192,9 @@ class Truth:
     inverters: Bools
 
 
-def frames(trial: Trial, scenario: Scenario | None = None) -> Iterator[tuple[Frame, Truth]]:
+def frames(
+    trial: Trial, scenario: Scenario | None = None, *, stated: Site | None = None
+) -> Iterator[tuple[Frame, Truth]]:
     """Play a trial.
 
     Parameters
@@ -201,6 +203,8 @@ def frames(trial: Trial, scenario: Scenario | None = None) -> Iterator[tuple[Fra
         The trial.
     scenario
         What is played in place of `trial.scenario`: another season, other attacks.
+    stated
+        `trial.stated`, where it is known already.
 
     Yields
     ------
@@ -213,7 +217,8 @@ def frames(trial: Trial, scenario: Scenario | None = None) -> Iterator[tuple[Fra
     NoSuchAttack, PowerFlowDiverged, NoEquilibrium
         When the lie cannot be told on this feeder, or the feeder not be solved.
     """
-    site, scenario = trial.stated, trial.scenario if scenario is None else scenario
+    site = trial.stated if stated is None else stated
+    scenario = trial.scenario if scenario is None else scenario
     known = Customers(
         site, scenario.variation, scenario.seed, scenario.start, scenario.profile_s, season=scenario.season
     )

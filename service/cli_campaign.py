@@ -24,10 +24,14 @@ if TYPE_CHECKING:
     from feeders.studies.campaign_plan import Kind, Plan
     from feeders.studies.campaign_run import Runner
 
-TOGETHER = 16
-"""Scenarios of a scene, where more than as many are asked for."""
-
-Scenarios = Annotated[int, typer.Option(help="How many, about a sixteenth of them without a lie.", min=1)]
+Scenarios = Annotated[int, typer.Option(help="How many, the first of each scene without a lie.", min=1)]
+Together = Annotated[
+    int,
+    typer.Option(
+        help="Scenarios of a scene, the first without a lie; 2: every lie has a scene of its own.",
+        min=1,
+    ),
+]
 Seed = Annotated[int, typer.Option(help="Chooses everything random.", min=0)]
 Kinds = Annotated[
     list[str] | None,
@@ -37,7 +41,8 @@ Promised = Annotated[
     bool,
     typer.Option(
         "--promised",
-        help="Lies of the sizes that `study detectable` finds, for M = 2, in place of the six kinds.",
+        help="Lies of the sizes that `study detectable` finds, for M = 2, in place of the six kinds, and "
+        "how many of its promises are kept.",
     ),
 ]
 Liars = Annotated[
@@ -77,6 +82,7 @@ def campaign(
     feeder: Studied = "simbench-lv-rural1",
     *,
     scenarios: Scenarios = 160,
+    together: Together = 16,
     seed: Seed = 0,
     kind: Kinds = None,
     promised: Promised = False,
@@ -104,11 +110,11 @@ def campaign(
     from feeders.studies.campaign_plan import KINDS, Design, Place, Plan
     from feeders.trials import LoadError, Meters
 
-    site, together = load(converted(feeder, out)), min(scenarios, TOGETHER)
+    site, count = load(converted(feeder, out)), min(scenarios, together)
     with said():
         plan = Plan(
-            scenes=-(-scenarios // together),
-            together=together,
+            scenes=-(-scenarios // count),
+            together=count,
             seed=seed,
             kinds=tuple(_kind(each) for each in kind or ()) or KINDS,
             liars=tuple(liars or (1, 3)),
@@ -138,6 +144,8 @@ def _print(found: Campaign) -> None:
     told = f"{plan.scenarios} scenarios of {plan.duration_s:g} s watched by {plan.estimator}"
     note = f"; {impossible} cannot be played, see `reason`" if impossible else ""
     console.out.print(escape(f"{found.feeder}: {told}{note}"))
+    if not found.promises.empty:
+        show("Promises of `study detectable`", found.promises)
     show("By kind and size", _short(found.by_size))
     show("By place", _short(found.by_place))
     show("By number of liars", _short(found.by_liars))
@@ -145,13 +153,13 @@ def _print(found: Campaign) -> None:
 
 
 def _with_promised(site: Site, plan: Plan, others: tuple[Kind, ...]) -> Plan:
-    from feeders.studies.campaign_plan import promised
+    from feeders.studies.campaign_promises import promised
     from feeders.studies.detectable import detectable
 
     stated = plan.trial(site, plan.moment(0)).stated
     with bar("lies of meters, errors of customers") as tell:
         found = detectable(stated, max_attacked=2, progress=tell)
-    return replace(plan, kinds=(*others, *promised(found)))
+    return replace(plan, kinds=(*others, *promised(stated, found)))
 
 
 def _short(table: pd.DataFrame) -> pd.DataFrame:

@@ -13,7 +13,7 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import pandas as pd
 
@@ -30,6 +30,10 @@ if TYPE_CHECKING:
     from feeders.load import Site
 
 __all__ = ["Campaign", "NothingPlayed", "campaign"]
+
+
+ROWS: Final = 2
+"""Edition of the rows that journals hold."""
 
 
 class NothingPlayed(GridsecError):
@@ -53,7 +57,8 @@ class Campaign:
         Monday), `hour` of its beginning; `alarms_per_year`; `kind`, `size`, `liars`, `place`, `onset_s`;
         `reason` why it could not be played, or empty;
         `exact`: all liars and nobody else were named; `named`, how many liars, `missed` and `falsely_named`,
-        who; `false_events`, how often an honest meter or inverter became named; `delay_s` from the onset
+        who; `because`, who was named from the onset on, and not in the same scene without the lie;
+        `false_events`, how often an honest meter or inverter became named; `delay_s` from the onset
         until the last liar had been named; `clear_s` from the end of the lies until nobody was named;
         `most_named` at once; `watched_s`, `undecided_s`, and `clean_lying_s`, CLEAN during a lie;
         `error_liars` and `error_others` of the reconstructed voltage, the largest and (`_95`) the 95th
@@ -61,7 +66,7 @@ class Campaign:
         there was nothing of is NaN.
     liars
         One row for each liar: `who`, whether an `inverter`, `lie_volt`, the largest displacement, and
-        `delay_s`.
+        `delay_s`; `anyway`, whether it is named without the lie too.
     by_kind, by_size, by_place, by_liars
         The same together: shares `exact` and `false` (somebody honest was named) of the scenarios, `named`
         of the liars; median and 95th percentile of the delays of those that were named; median `_95` and
@@ -71,6 +76,12 @@ class Campaign:
     false_names
         Operating curve: false names `per_year` while nobody lies, with Poisson limits at 95 %, and the
         share of liars named, by `alarms_per_year`.
+    promises
+        Lies of which something is promised, one row for each `promise`: how many `lies`, how many that were
+        to stay hidden somebody was named because of, or that were to be named left a liar unnamed (`broken`);
+        `by_chance`, a liar was named without the lie too, which proves nothing: not among the lies that were
+        to be named; `honest_named`, scenarios with a false name; of how many independent `scenes` how many
+        have a broken promise, and the upper limit of its probability, Clopper and Pearson's at 95 %.
     """
 
     feeder: str
@@ -85,6 +96,7 @@ class Campaign:
     by_liars: pd.DataFrame
     delays: pd.DataFrame
     false_names: pd.DataFrame
+    promises: pd.DataFrame
 
     @property
     def seed(self) -> int:
@@ -95,7 +107,8 @@ class Campaign:
     def tables(self) -> dict[str, pd.DataFrame]:
         """All tables by name."""
         names = ("by_kind", "by_size", "by_place", "by_liars", "delays", "false_names", "scenarios", "liars")
-        return {name: getattr(self, name) for name in names}
+        tables: dict[str, pd.DataFrame] = {name: getattr(self, name) for name in names}
+        return tables if self.promises.empty else {"promises": self.promises, **tables}
 
 
 def campaign(
@@ -139,7 +152,13 @@ def campaign(
     plan = plan if seed is None else replace(plan, seed=seed)
     prepare(site, plan)  # whatever is wrong with it is told here, and not by a worker
     used = versions()
-    subject = {"study": "campaign", "digest": site.digest, "plan": plan.subject, "versions": used}
+    subject = {
+        "study": "campaign",
+        "rows": ROWS,
+        "digest": site.digest,
+        "plan": plan.subject,
+        "versions": used,
+    }
     kept = Journal(journal, subject)
     todo = [scene for scene in range(plan.scenes) if _key(scene) not in kept]
     done = plan.scenes - len(todo)
@@ -196,4 +215,7 @@ def _campaign(site: Site, plan: Plan, used: dict[str, str], rows: list[dict[str,
         **by,
         delays=campaign_tables.delays(liars),
         false_names=campaign_tables.false_names(found, liars),
+        promises=campaign_tables.promises(
+            found, liars, {kind.name: kind.promise for kind in plan.kinds if kind.promise is not None}
+        ),
     )

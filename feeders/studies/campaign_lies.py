@@ -53,12 +53,17 @@ def attacks(
         rating = np.array([row.inverter_kva for row in site.tables.customers])[site.droop.customer[some]]
         q = case.size / 100.0 * random.choice([-1.0, 1.0], some.size) * rating / site.feeder.base_kva
         return (), (InverterAttack(some.astype(np.intp), q, t_on, t_off),)
-    some, signs = liars(site, case, random)
-    if kind.volts:
-        volts = np.array(kind.volts)
-        if volts.size != there:
-            raise NoSuchAttack(f"kind {kind.name!r} has sizes for {volts.size} meters of {there}")
-        return (Bias(some, t_on, t_off, case.size * signs * volts[some] / site.feeder.base_volt),), ()
+    for sizes in (kind.volts, *kind.together):
+        if sizes and len(sizes) != there:
+            raise NoSuchAttack(f"kind {kind.name!r} has sizes for {len(sizes)} meters of {there}")
+    if kind.together:
+        told = np.array(kind.together[int(random.integers(len(kind.together)))])
+        some, signs = np.flatnonzero(told), random.choice([-1.0, 1.0], 1)
+    else:
+        told = np.array(kind.volts)
+        some, signs = liars(site, case, random)
+    if told.size:
+        return (Bias(some, t_on, t_off, case.size * signs * told[some] / site.feeder.base_volt),), ()
     lie = Lie(kind.trick, case.liars, case.size)
     return (each_alone(lie, some, signs, t_on, t_off),), ()
 

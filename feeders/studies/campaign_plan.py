@@ -25,9 +25,8 @@ from gridsec.arrays import Ints
 
 if TYPE_CHECKING:
     from feeders.load import Site
-    from feeders.studies.detectable import Detectable
 
-__all__ = ["CLEAN", "KINDS", "LEARN_STEP_S", "Case", "Design", "Kind", "Moment", "Place", "Plan", "promised"]
+__all__ = ["CLEAN", "KINDS", "LEARN_STEP_S", "Case", "Design", "Kind", "Moment", "Place", "Plan", "Promise"]
 
 CLEAN: Final = "clean"
 """Name of the kind of case in which nobody lies."""
@@ -59,6 +58,15 @@ class Design(StrEnum):
     """Any, independently."""
 
 
+class Promise(StrEnum):
+    """What `detectable` says of lies of a size."""
+
+    HIDDEN = "hidden"
+    """Nobody is named because of it."""
+    NAMED = "named"
+    """Each liar is named."""
+
+
 @dataclass(frozen=True, slots=True)
 class Kind:
     """One way to lie.
@@ -73,20 +81,26 @@ class Kind:
         As `feeders.lies.Lie.size`; with `volts`, as factors on these.
     volts
         A bias of each meter, V; empty: sizes are the same for all meters.
+    together
+        Biases of all meters, V, of which one tuple is drawn, and a sign; who lies, it says itself.
     liars
         How many lie; empty: as the plan says.
+    promise
+        What is to become of such lies, if anything is promised.
     """
 
     name: str
     trick: Trick
     sizes: tuple[float, ...]
     volts: tuple[float, ...] = ()
+    together: tuple[tuple[float, ...], ...] = ()
     liars: tuple[int, ...] = ()
+    promise: Promise | None = None
 
     def __post_init__(self) -> None:
         if not self.sizes or self.name == CLEAN:
             raise ValueError(f"kind {self.name!r} needs a size, and a name other than {CLEAN!r}")
-        if self.volts and self.trick is not Trick.BIAS:
+        if (self.volts or self.together) and self.trick is not Trick.BIAS:
             raise ValueError(f"kind {self.name!r}: sizes in volts of each meter are for {Trick.BIAS}")
 
 
@@ -353,28 +367,6 @@ _PLACED = (Trick.COORDINATED, Trick.COORDINATED_POWER, Trick.INVERTER)
 
 
 def _places(kind: Kind, places: Iterable[Place]) -> tuple[Place, ...]:
-    if kind.trick is Trick.INVERTER:
+    if kind.trick is Trick.INVERTER or kind.together:
         return (Place.RANDOM,)
     return (Place.COLLUDING,) if kind.trick in _PLACED else tuple(places)
-
-
-def promised(found: Detectable) -> tuple[Kind, Kind]:
-    """Lies of the sizes that `detectable` found, in a campaign.
-
-    Parameters
-    ----------
-    found
-        What it found for this feeder, as stated: with the plan's errors of loads and meters.
-
-    Returns
-    -------
-    hidden
-        One meter, by half of and by its whole hidden size.
-    named
-        As many as it was asked for, each by its named size and by 1.2 of it.
-    """
-    columns = {name: tuple(float(v) for v in found.meters[name]) for name in ("hidden_alone", "named")}
-    return (
-        Kind("hidden", Trick.BIAS, (0.5, 1.0), columns["hidden_alone"], (1,)),
-        Kind("named", Trick.BIAS, (1.0, 1.2), columns["named"], (found.max_attacked,)),
-    )

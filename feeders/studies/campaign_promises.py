@@ -1,4 +1,4 @@
-"""Rehearsals of the sizes that `detectable` promises, on all cores or on a cluster."""
+"""The sizes that `detectable` promises: as lies of a campaign, and rehearsed on all cores or on a cluster."""
 
 from __future__ import annotations
 
@@ -7,21 +7,82 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from feeders.lies import Trick
 from feeders.load import from_tables
 from feeders.schema import FeederTables
+from feeders.studies.campaign_plan import Kind, Promise
 from feeders.studies.campaign_run import Here, Runner, versions
-from feeders.studies.detectable import Detectable
+from feeders.studies.detectable import Detectable, monitor_rule
 from feeders.studies.journal import Journal, Progress
-from feeders.studies.operating import SHARE
+from feeders.studies.operating import SHARE, volts_of_lie
 from feeders.studies.rehearsal import Rehearsal, rehearse
+from gridsec.studies.quiet import largest_shift
 
 if TYPE_CHECKING:
     from feeders.load import Site
 
-__all__ = ["rehearse_everywhere"]
+__all__ = ["promised", "rehearse_everywhere"]
 
 PIECE = 1_000
 """Trials of a piece."""
+
+HIDDEN, NAMED = (0.5, 1.0), (1.0, 1.2)
+"""Factors on the sizes up to which lies stay hidden, and beyond which liars are named."""
+
+NOTHING = 1e-6
+"""What a solver leaves where nobody lies, V."""
+
+
+def promised(site: Site, found: Detectable, *, share: float = SHARE) -> tuple[Kind, ...]:
+    """Lies of the sizes that `detectable` found, in a campaign.
+
+    Parameters
+    ----------
+    site
+        The feeder, as stated: with the campaign's errors of loads and meters.
+    found
+        What was found for it.
+    share
+        As `found` was made with.
+
+    Returns
+    -------
+    hidden_alone, hidden
+        One meter, and M of them in the worst collusion of this size; nobody is to be named.
+    named_alone, named
+        One meter, and any M of them, each by its size; all are to be named.
+
+    Notes
+    -----
+    For M = 1 there are only those alone, and where no lie stays hidden for sure there are none of these.
+    """
+    most, alone = found.max_attacked, (1,)
+    kinds = [
+        Kind("hidden_alone", Trick.BIAS, HIDDEN, _volts(found, "hidden_alone"), (), alone, Promise.HIDDEN),
+        Kind("named_alone", Trick.BIAS, NAMED, _volts(found, "named_alone"), (), alone, Promise.NAMED),
+    ]
+    if most > 1:
+        worst = _collusions(site, found, share)
+        kinds += [
+            Kind("hidden", Trick.BIAS, HIDDEN, (), worst, (most,), Promise.HIDDEN),
+            Kind("named", Trick.BIAS, NAMED, _volts(found, "named"), (), (most,), Promise.NAMED),
+        ]
+    return tuple(kind for kind in kinds if any(kind.volts) or kind.together)
+
+
+def _volts(found: Detectable, column: str) -> tuple[float, ...]:
+    return tuple(float(volt) for volt in found.meters[column])
+
+
+def _collusions(site: Site, found: Detectable, share: float) -> tuple[tuple[float, ...], ...]:
+    """Lies of all meters, V: for each of them the worst that stay hidden although it takes part."""
+    rule, p = monitor_rule(site, risk=found.risk, share=share), site.meters.size
+    worst = [largest_shift(rule, np.eye(p)[j], found.max_attacked, seen=False, must=j).lies for j in range(p)]
+    volts = [np.sign(lies) * volts_of_lie(site, np.abs(lies)) for lies in worst]
+    volts = [np.where(np.abs(row) > NOTHING, row, 0.0) for row in volts]
+    return tuple(tuple(row.tolist()) for row in volts if row.any())
 
 
 def rehearse_everywhere(

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
 import pandas as pd
 from scipy.stats import binomtest, chi2
 
-from feeders.studies.campaign_plan import CLEAN
+from feeders.studies.campaign_plan import CLEAN, Promise
 
-__all__ = ["CONFIDENCE", "WITHIN_S", "delays", "false_names", "grouped", "scenarios"]
+__all__ = ["CONFIDENCE", "WITHIN_S", "delays", "false_names", "grouped", "promises", "scenarios"]
 
 CONFIDENCE: Final = 0.95
 """Of every interval."""
@@ -33,7 +33,7 @@ def scenarios(rows: Sequence[dict[str, Any]]) -> tuple[pd.DataFrame, pd.DataFram
     kept = ("scenario", "alarms_per_year", "kind", "size", "liars", "place")
     each = [{name: row[name] for name in kept} | one for row in rows for one in row.get("each", ())]
     frame = pd.DataFrame([{name: cell for name, cell in row.items() if name != "each"} for row in rows])
-    liars = pd.DataFrame(each, columns=[*kept, "who", "inverter", "lie_volt", "delay_s"])
+    liars = pd.DataFrame(each, columns=[*kept, "who", "inverter", "lie_volt", "delay_s", "anyway"])
     return frame, liars.astype({"alarms_per_year": float, "delay_s": float})
 
 
@@ -132,6 +132,52 @@ def false_names(found: pd.DataFrame, liars: pd.DataFrame) -> pd.DataFrame:
                 "liars_told": len(lied),
             }
             | _share("named", int(np.isfinite(lied["delay_s"]).sum()), len(lied))
+        )
+    return pd.DataFrame(rows)
+
+
+def promises(found: pd.DataFrame, liars: pd.DataFrame, promised: Mapping[str, Promise]) -> pd.DataFrame:
+    """What became of lies of which something is promised; columns as in `campaign.Campaign`.
+
+    Parameters
+    ----------
+    found, liars
+        From `scenarios`.
+    promised
+        By kind.
+
+    Notes
+    -----
+    Lies of a scene have their loads and the errors of their meters in common; scenes have nothing in common.
+    So the limit is that of the scenes with a broken promise, each of which counts once: it holds for the
+    probability that a lie breaks it, however alike the lies of a scene fare.
+    """
+    rows = []
+    tried = found[(found["reason"] == "") & found["kind"].isin(list(promised))]
+    columns = ["alarms_per_year", "scenario"]
+    anyway = liars.loc[liars["anyway"].astype(bool), columns].drop_duplicates()
+    by_chance = pd.MultiIndex.from_frame(tried[columns]).isin(pd.MultiIndex.from_frame(anyway))
+    tried = tried.assign(promise=tried["kind"].map(promised), by_chance=by_chance)
+    for (rate, promise), group in tried.groupby(["alarms_per_year", "promise"], sort=True):
+        if promise is Promise.HIDDEN:
+            lies, broken = group, group["because"] != ""
+        else:
+            lies = group[~group["by_chance"]]
+            broken = lies["missed"] != ""
+        scenes = broken.groupby(lies["scene"]).any()
+        limits = _share("broken", int(scenes.sum()), len(scenes))
+        rows.append(
+            {
+                "alarms_per_year": rate,
+                "promise": str(promise),
+                "lies": len(lies),
+                "broken": int(broken.sum()),
+                "by_chance": int(group["by_chance"].sum()),
+                "honest_named": int((group["falsely_named"] != "").sum()),
+                "scenes": len(scenes),
+                "scenes_broken": int(scenes.sum()),
+                "probability_high": limits["broken_high"],
+            }
         )
     return pd.DataFrame(rows)
 

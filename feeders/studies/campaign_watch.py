@@ -111,7 +111,7 @@ def watch(given: Prepared, scene: int) -> list[dict[str, Any]]:
         "weekday": int(moment.profile_s // 86_400.0) % 7,
     }
     try:
-        played = _Played.of(list(frames(trial, honest)))
+        played = _Played.of(list(frames(trial, honest, stated=given.stated)))
         known = _learned(given, trial, honest) if plan.learn_s else {}
     except IMPOSSIBLE as error:
         return [_row(head, case, rate) | _nothing(error) for case in cases for rate in given.watchers]
@@ -121,7 +121,7 @@ def watch(given: Prepared, scene: int) -> list[dict[str, Any]]:
         clean[rate], states[rate] = _clean(
             watcher, watcher.init(honest.start, known.get(rate)), played, onsets
         )
-    rows = [_told(given, head, cases[0], rate, seen, played, 0) for rate, seen in clean.items()]
+    rows = [_told(given, head, cases[0], rate, seen, played, 0, seen) for rate, seen in clean.items()]
     for case in cases[1:]:
         onset = round(case.onset_s / plan.step_s)
         try:
@@ -131,7 +131,7 @@ def watch(given: Prepared, scene: int) -> list[dict[str, Any]]:
             continue
         for rate, watcher in given.watchers.items():
             seen, _ = _step(watcher, states[rate][onset], lied.frames[onset:])
-            rows.append(_told(given, head, case, rate, seen, lied, onset))
+            rows.append(_told(given, head, case, rate, seen, lied, onset, clean[rate]))
     return rows
 
 
@@ -225,7 +225,7 @@ def _lied(given: Prepared, played: _Played, honest: Scenario, case: Case) -> _Pl
     if wrong or not all(_simple(attack, honest.start) for attack in some):
         trial = given.plan.trial(given.site, given.plan.moment(case.number // given.plan.together))
         lying = replace(honest, attacks=some, inverter_attacks=wrong)
-        return _Played.of(list(frames(trial, lying)))
+        return _Played.of(list(frames(trial, lying, stated=given.stated)))
     t = np.array([frame.t for frame in played.frames])
     # The root of a rounded square is the number itself.
     v = np.sqrt(np.array([frame.y for frame in played.frames]))
@@ -283,7 +283,7 @@ def _nothing(error: Exception) -> dict[str, Any]:
     nothing = dict.fromkeys(("delay_s", "clear_s", *_ERRORS), float("nan"))
     times = dict.fromkeys(("watched_s", "undecided_s", "clean_lying_s"), 0.0)
     counts = dict.fromkeys(("named", "false_events", "most_named"), 0)
-    none = {"exact": False, "missed": "", "falsely_named": "", "each": []}
+    none = {"exact": False, "missed": "", "falsely_named": "", "because": "", "each": []}
     return {"reason": str(error)} | none | counts | times | nothing
 
 
@@ -291,15 +291,23 @@ _ERRORS = ("error_liars", "error_liars_95", "error_others", "error_others_95")
 
 
 def _told(  # noqa: PLR0917  # one row needs all that is known of the case
-    given: Prepared, head: dict[str, Any], case: Case, rate: float, seen: _Seen, played: _Played, begin: int
+    given: Prepared,
+    head: dict[str, Any],
+    case: Case,
+    rate: float,
+    seen: _Seen,
+    played: _Played,
+    begin: int,
+    control: _Seen,
 ) -> dict[str, Any]:
-    """One row: what an estimator made of a case from frame `begin` on."""
+    """One row: what an estimator made of a case from frame `begin` on, and of the scene without lies."""
     plan, site, step_s = given.plan, given.site, given.plan.step_s
-    wrong = played.inverters[begin:]
-    inverters = seen.inverters if seen.inverters.shape[1] else np.zeros_like(wrong)
     names = (*site.meter_ids, *(site.feeder.customers[k] for k in site.droop.customer))
-    lies, named = np.hstack([played.liars[begin:], wrong]), np.hstack([seen.named, inverters])
-    told = _each(played, begin, site, lies, named, names, step_s)
+    lies = np.hstack([played.liars[begin:], played.inverters[begin:]])
+    named = _everybody(seen, lies)
+    anyway: Bools = np.any(_everybody(control, lies), axis=0)
+    because = named.any(axis=0) & ~anyway
+    told = _each(played, begin, site, lies, named, anyway, names, step_s)
     # A name that stays a while after the lie is not false.
     wrong_names = named & ~np.logical_or.accumulate(lies, axis=0)
     false = wrong_names.any(axis=0)
@@ -314,6 +322,7 @@ def _told(  # noqa: PLR0917  # one row needs all that is known of the case
         "named": len(told) - len(missed),
         "missed": " ".join(missed),
         "falsely_named": " ".join(np.array(names)[false]),
+        "because": " ".join(np.array(names)[because]),
         "false_events": risings(wrong_names),
         "delay_s": float(delays.max()) if delays.size else float("nan"),
         "clear_s": (float(quiet[0] * step_s) if quiet.size else float("inf")) if ended else float("nan"),
@@ -323,6 +332,14 @@ def _told(  # noqa: PLR0917  # one row needs all that is known of the case
         "clean_lying_s": float((seen.clean & lying & ~named.any(axis=1)).sum() * step_s),
     }
     return row | _errors(plan, site, seen, played, begin, lies) | {"each": told}
+
+
+def _everybody(seen: _Seen, lies: Bools) -> Bools:
+    """Which meters and inverters (T, p + m) were named in the last frames."""
+    # Families that do not judge inverters name none.
+    inverters = np.zeros((len(seen.named), lies.shape[1] - seen.named.shape[1]), dtype=np.bool_)
+    some = np.hstack([seen.named, seen.inverters if seen.inverters.shape[1] else inverters])
+    return np.asarray(some[len(some) - len(lies) :], dtype=np.bool_)
 
 
 def risings(flags: Bools) -> int:
@@ -338,7 +355,14 @@ def risings(flags: Bools) -> int:
 
 
 def _each(  # noqa: PLR0917  # meters and inverters alike
-    played: _Played, begin: int, site: Site, lies: Bools, named: Bools, names: tuple[str, ...], step_s: float
+    played: _Played,
+    begin: int,
+    site: Site,
+    lies: Bools,
+    named: Bools,
+    anyway: Bools,
+    names: tuple[str, ...],
+    step_s: float,
 ) -> list[dict[str, Any]]:
     """One row for every liar."""
     rows = []
@@ -348,7 +372,15 @@ def _each(  # noqa: PLR0917  # meters and inverters alike
         delay = (caught[0] - np.argmax(lying)) * step_s if caught.size else np.inf
         inverter = bool(j >= site.meters.size)
         volt = np.nan if inverter else np.abs(played.shift[begin:, j]).max() * site.feeder.base_volt
-        rows.append({"who": names[j], "inverter": inverter, "lie_volt": float(volt), "delay_s": float(delay)})
+        rows.append(
+            {
+                "who": names[j],
+                "inverter": inverter,
+                "lie_volt": float(volt),
+                "delay_s": float(delay),
+                "anyway": bool(anyway[j]),
+            }
+        )
     return rows
 
 
