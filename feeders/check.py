@@ -168,8 +168,8 @@ def _loops(found: Tree, edges: list[Edge], meshed: bool, report: Report) -> None
         else:
             report.problems.append(
                 f"lines: {names} form a loop; the feeder must be radial: set closed to false on one of them "
-                "(or merge parallel lines into one row), or meshed to true in feeder.toml if the loop is "
-                "really closed"
+                "(or merge parallel lines into one row), or meshed to true in feeder.toml "
+                "(converters: --meshed) if the loop is really closed"
             )
 
 

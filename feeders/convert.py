@@ -26,6 +26,7 @@ from feeders.convert_opendss import read_opendss
 from feeders.convert_pandapower import Fleet, from_pandapower
 from feeders.convert_pgm import read_pgm
 from feeders.convert_source import SOURCE_FILE, feeder_source, profiles_source
+from feeders.load import from_tables
 from feeders.profiles import ENVELOPES, Season
 from feeders.schema import read, validate, write
 from gridsec.errors import FeederInvalid, GridsecError
@@ -154,6 +155,7 @@ def convert(
     name: str | None = None,
     droop: str | None = None,
     opened: Sequence[str] = (),
+    meshed: bool = False,
 ) -> Conversion:
     """Convert a source into a feeder's folder (or the profile library) with its SOURCE.md.
 
@@ -171,6 +173,8 @@ def convert(
         Preset of the source's generators.
     opened
         Lines to take as open, so that a mesh becomes radial.
+    meshed
+        Whether loops stay closed, as `meshed = true` in feeder.toml.
 
     Raises
     ------
@@ -187,22 +191,25 @@ def convert(
     chosen = name or (
         source if recipe is not None else re.sub(r"[^A-Za-z0-9_-]+", "-", folder.resolve().name)
     )
-    converted, package = _converted(source, chosen[:64], root=root, droop=droop, opened=opened)
+    converted, package = _converted(source, chosen[:64], root=root, droop=droop, opened=opened, meshed=meshed)
     problems = validate(converted.tables)
     if problems:
         raise FeederInvalid(
             [*problems, *(f"while converting: {note}" for note in sentences(converted.changes))]
         )
+    if meshed:
+        from_tables(converted.tables)  # Not every feeder can be: a folder that nothing loads is none.
     write(converted.tables, folder)
     done = _checked(converted, folder)
     (folder / CHANGES_FILE).write_text(changes_csv(done.changes), encoding="utf-8", newline="\n")
     target = f"data/feeders/{chosen}" if recipe else str(out)
+    options = [*_options(root, name, droop, opened), *(["--meshed"] if meshed else [])]
     text = feeder_source(
         converted.tables,
         about=recipe.about if recipe else "A converted network.",
         origin=recipe.source if recipe else source,
         package=package,
-        command=" ".join(["gridsec feeders convert", source, target, *_options(root, name, droop, opened)]),
+        command=" ".join(["gridsec feeders convert", source, target, *options]),
         notes=done.notes,
         check=done.check.sentence if done.check else f"Not checked: {done.unchecked}",
     )
@@ -248,9 +255,25 @@ def _checked(converted: Converted, folder: Path) -> Conversion:
 
 
 def _converted(
-    source: str, name: str, *, root: str | None, opened: Sequence[str] = (), droop: str | None = None
+    source: str,
+    name: str,
+    *,
+    root: str | None,
+    opened: Sequence[str] = (),
+    droop: str | None = None,
+    meshed: bool = False,
 ) -> tuple[Converted, str]:
     """Return a source as a feeder, and the package that holds its data or reads its file."""
+    found, package = _read(source, name, root=root, opened=opened, droop=droop)
+    if not meshed:
+        return found, package
+    tables = replace(found.tables, meta=replace(found.tables.meta, meshed=True))
+    return replace(found, tables=tables), package
+
+
+def _read(
+    source: str, name: str, *, root: str | None, opened: Sequence[str], droop: str | None
+) -> tuple[Converted, str]:
     recipe = RECIPES.get(source)
     origin = recipe.source if recipe else source
     path = Path(origin)

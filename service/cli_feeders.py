@@ -162,6 +162,7 @@ def convert(
     opened: Annotated[
         list[str] | None, typer.Option("--open", help="A line to take as open; may be repeated.")
     ] = None,
+    meshed: Annotated[bool, typer.Option("--meshed", help="Keep loops closed.")] = False,
 ) -> None:
     """Convert another tool's network into a feeder's folder, and check it by AC power flow against that tool.
 
@@ -169,7 +170,7 @@ def convert(
     """
     from feeders.convert import convert as run
 
-    done = run(source, folder, root=root, name=name, droop=droop, opened=opened or ())
+    done = run(source, folder, root=root, name=name, droop=droop, opened=opened or (), meshed=meshed)
     _show_changes(done)
     out.print(f"[green]{escape(str(folder))} written[/]")
     show_check(done)

@@ -57,7 +57,7 @@ def converted(feeder: str, out: Path | None) -> str:
         raise FileExistsError(f"{folder}: already there, and no converted feeder; {feeder} would become it")
     advice = (
         f"to choose: gridsec feeders convert {feeder} FOLDER, with --root BUS (the metered busbar) and "
-        "--open LINE (to cut a loop); then study FOLDER"
+        "--open LINE (to cut a loop) or --meshed (to keep loops closed); then study FOLDER"
     )
     done: Conversion | None = None
     try:

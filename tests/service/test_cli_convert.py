@@ -34,6 +34,10 @@ def test_an_opendss_file_with_a_loop(tmp_path: Path) -> None:
     done = run(app, ["feeders", "convert", str(source), str(tmp_path / "out")])
     assert done.exit_code != 0
     assert "form a loop" in str(done.exception)
+    done = run(app, ["feeders", "convert", str(source), str(tmp_path / "ring"), "--meshed"])
+    assert done.exit_code == 0, done.output
+    assert "less than 1e-08 pu" in " ".join(done.output.split())
+    assert "meshed = true" in (tmp_path / "ring" / "feeder.toml").read_text()
     done = run(
         app, ["feeders", "convert", str(source), str(tmp_path / "out"), "--open", "ring", "--name", "town"]
     )
