@@ -11,6 +11,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -20,7 +21,7 @@ from scipy.stats import beta
 
 from feeders.estimators import Watcher, design
 from feeders.lies import Trick
-from feeders.load import load
+from feeders.load import Site, load
 from feeders.profiles import Season
 from feeders.scenario import Scenario
 from feeders.studies.campaign import Campaign, NothingPlayed, campaign
@@ -44,6 +45,7 @@ from feeders.studies.rehearsal import rehearse
 from feeders.trials import LoadError, Trial, frames, judge
 from feeders.variation import Variation
 from gridsec.feeder import lindistflow
+from gridsec.online import Estimate, Frame, Verdict
 
 SITE = load("cigre-lv")
 PLAN = Plan(
@@ -272,20 +274,36 @@ def test_for_one_liar_or_where_nothing_hides_there_are_fewer_kinds() -> None:
     assert [kind.name for kind in promised(SITE, nothing)] == ["named_alone"]
 
 
-def test_broken_promises_are_counted_against_the_same_scene_without_the_lie() -> None:
-    """Promises of which nothing is true, an estimator that often cries wolf; the oracle plays all in full."""
+def crying_wolf(site: Site) -> Watcher:
+    """What the site's file asks for, which also names the first meter every seven seconds."""
+    watcher = design(site)
+
+    def step(given: Any, state: Any, frame: Frame) -> tuple[Any, Estimate, Verdict]:
+        state, estimate, verdict = watcher.family.step(given, state, frame)
+        wolf = np.zeros_like(verdict.suspects)
+        wolf[0] = round(frame.t) % 7 == 0
+        return state, estimate, replace(verdict, suspects=verdict.suspects | wolf)
+
+    return replace(watcher, family=replace(watcher.family, step=step))
+
+
+def test_broken_promises_are_counted_against_the_same_scene_without_the_lie(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Promises of which nothing is true, and an estimator that cries wolf; the oracle plays all in full."""
+    monkeypatch.setattr("feeders.studies.campaign_watch.design", crying_wolf)
     kinds = (
         Kind("loud", Trick.BIAS, (1.0, 3.0), promise=Promise.HIDDEN),
         Kind("small", Trick.BIAS, (0.2, 3.0), promise=Promise.NAMED),
     )
-    plan = replace(PLAN, scenes=6, together=5, kinds=kinds, alarms_per_year=(1e6,), places=(Place.RANDOM,))
+    plan = replace(PLAN, scenes=6, together=5, kinds=kinds, alarms_per_year=(1.0,), places=(Place.RANDOM,))
     told = campaign(SITE, plan)
     count = {promise: dict.fromkeys(("lies", "broken", "by_chance"), 0) for promise in Promise}
     broken: dict[Promise, set[int]] = {promise: set() for promise in Promise}
     for scene in range(plan.scenes):
         trial = plan.trial(SITE, plan.moment(scene))
         honest = replace(trial.scenario, season=plan.moment(scene).season)
-        watcher = design(plan.watched(trial.stated, 1e6))
+        watcher = crying_wolf(plan.watched(trial.stated, 1.0))
         control = _named(watcher, trial, honest)
         for case in plan.cases(scene)[1:]:
             lies, _ = attacks(trial.stated, plan, case, honest)
@@ -309,7 +327,7 @@ def test_broken_promises_are_counted_against_the_same_scene_without_the_lie() ->
         assert table.loc[promise, ["lies", "broken", "by_chance"]].to_dict() == count[promise]
         assert table.loc[promise, "scenes_broken"] == len(broken[promise])
         assert 0 < count[promise]["broken"] < count[promise]["lies"]
-    assert count[Promise.NAMED]["by_chance"]
+        assert count[promise]["by_chance"]
 
 
 def _named(watcher: Watcher, trial: Trial, scenario: Scenario) -> np.ndarray:
