@@ -158,7 +158,7 @@ def checked(subject: Subject, plan: Plan, kw: float, at: Conditions, ratings: Fl
             "broken": "no power flow",
         }
     net, own, v = injected(droop, s, x), droop.customer, np.abs(V)
-    full = currents(site.balanced, subject.net, net, V, at.v0) / ratings
+    full = currents(subject.feeder, subject.net, net, V, at.v0) / ratings
     near = 1e-7
     steep = slopes(droop, v[own] - near, v[own] + near)
     J = sensitivity(subject.net, net, V).dv_dq[np.ix_(own, own)]
@@ -167,7 +167,7 @@ def checked(subject: Subject, plan: Plan, kw: float, at: Conditions, ratings: Fl
     broken = (
         "voltage high" * bool(v.max() > at.v_max)
         or "voltage low" * bool(v.min() < at.v_min)
-        or f"line to {site.feeder.buses[worst + 1]}" * bool(full[worst] > 1.0)
+        or f"line to {site.tree.buses[worst + 1]}" * bool(full[worst] > 1.0)
         or "unstable" * bool(grows > 1.0 + CLEARLY)
     )
     return {

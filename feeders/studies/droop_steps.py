@@ -17,6 +17,7 @@ import numpy as np
 import pandas as pd
 
 from feeders.powerflow import PowerFlow, PowerFlowDiverged
+from feeders.powerflow_unbalanced import PlacesFlow
 from feeders.studies.droop_fleets import point
 from gridsec.arrays import Floats
 from gridsec.droop import Droop, voltage_curve
@@ -113,7 +114,7 @@ def steps(site: Site, v0: float = 1.0, *, tap: float = 0.025) -> dict[str, Step]
 
 
 def simulate(
-    plant: tuple[Site, PowerFlow],
+    plant: tuple[Site, PowerFlow | PlacesFlow],
     droop: Droop,
     update: Update,
     loads: Box,

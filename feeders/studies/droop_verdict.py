@@ -16,13 +16,16 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from feeders.powerflow import PowerFlow
+from feeders.powerflow_unbalanced import PlacesFlow, power_flow
 from feeders.studies.droop_fleets import inverter_names
 from feeders.studies.droop_steps import Outcome, simulate
 from gridsec.arrays import Floats
 from gridsec.droop import Droop
 from gridsec.errors import DesignInfeasible, FeederInvalid
+from gridsec.feeder import Feeder
+from gridsec.phases import PhasedFeeder
 from gridsec.studies.droop_network import Box, Network, network, sensitivity
-from gridsec.studies.droop_rest import injected, rest, shares
+from gridsec.studies.droop_rest import Share, injected, rest, shares, shares_of_gain
 from gridsec.studies.droop_stability import Loop, Update, growth, loop, proof, reach, slopes, steepened
 
 if TYPE_CHECKING:
@@ -74,18 +77,22 @@ class Subject:
         The feeder.
     flow
         AC power flow for simulation.
+    feeder
+        The site's own, radial.
     net
         AC power flow for proofs.
     """
 
     site: Site
-    flow: PowerFlow
+    flow: PowerFlow | PlacesFlow
+    feeder: Feeder | PhasedFeeder
     net: Network
 
     @classmethod
     def of(cls, site: Site) -> Subject:
-        """Both power flows of a feeder."""
-        return cls(site, PowerFlow(site), network(site.balanced))
+        """Both power flows of a feeder; `FeederInvalid` if it has closed ties."""
+        feeder = site.feeder if isinstance(site.feeder, PhasedFeeder) else site.balanced
+        return cls(site, power_flow(site), feeder, network(feeder))
 
 
 @dataclass(frozen=True, slots=True)
@@ -270,7 +277,9 @@ def longest_interval(subject: Subject, droop: Droop, update: Update, loads: Box)
     def proven(interval: float) -> bool:
         return bool(proof(loop(droop, within, replace(update, interval_s=interval))).kind)
 
-    if proven(50.0 * longest):  # e^-50 is nothing: as if inverters jumped to their set-points
+    jumping = loop(droop, within, replace(update, interval_s=50.0 * longest))
+    # e^-50 is nothing: as if inverters jumped to their set-points.
+    if proof(jumping).kind and jumping.covers_shorter:
         return math.inf
     start = update.interval_s or 1e-3 * float(np.min(droop.tau))
     return start * _last(lambda times: proven(start * times), 5)
@@ -291,7 +300,7 @@ def inverter_rows(
     given, _ = _loop(subject.net, droop, update, loads)
     if given is None:
         return []
-    own = shares(given, proof(given).factor * float(np.linalg.norm(0.5 * (given.S + given.S.T), 2)))
+    own = _shares(subject.site, given)
     names = inverter_names(subject.site, droop, given.rows)
     order = np.argsort(-own.part)
     return [
@@ -304,6 +313,16 @@ def inverter_rows(
         }
         for k in order
     ]
+
+
+def _shares(site: Site, given: Loop) -> Share:
+    """By the modes of a loop of reactances in common; in three phases by its gain without regard to sign."""
+    limit = proof(given).factor
+    if isinstance(site.feeder, Feeder):
+        return shares(given, limit * float(np.linalg.norm(0.5 * (given.S + given.S.T), 2)))
+    own = shares_of_gain(given)
+    # What all may do together, one may do alone.
+    return replace(own, factor=np.fmax(own.factor, limit if limit >= 1.0 else math.nan))
 
 
 def margin(subject: Subject, droop: Droop, update: Update, loads: Box) -> float:

@@ -1,9 +1,14 @@
-"""The AC power flow of a balanced feeder, and a proven range of its sensitivities over a box of powers.
+"""The AC power flow of a feeder, and a proven range of its sensitivities over a box of powers.
 
 With the complex impedances Z between customers and the no-load profile E (charging included), the AC
 equations are `V = E v0 + Z conj(s / V)`. From a solution V*, s* in the middle of a box follow, in closed
 form, how far any other solution in the box can be away, and how far its sensitivities `d|V|/dp`, `d|V|/dq`:
 no linear model and no sampling stands between the bound and the AC power flow.
+
+In three phases V is turned back by the angles of the busbar, `V_i / a_i` with a = (1, e^{-j 2 pi / 3},
+e^{j 2 pi / 3}) by phase, and `Z_ij a_j / a_i` takes the place of Z_ij: the equation is the same, magnitudes
+are those of the phases, and without charging Z is `R + j X` of `gridsec.phases`. Nothing here asks Z to be
+symmetric, or its parts not to be negative.
 
 References
 ----------
@@ -23,6 +28,8 @@ from numpy.typing import NDArray
 from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible
 from gridsec.feeder import Feeder, common_paths
+from gridsec.phases import ROTATION, PhasedFeeder
+from gridsec.trees import below, from_root
 
 __all__ = [
     "Box",
@@ -53,37 +60,76 @@ _SLACK = 1e-9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Network:
-    """`V = E v0 + Z conj(s / V)` at the customers, and at all buses. N customers, b + 1 buses.
+    """`V = E v0 + Z conj(s / V)` at the customers, and at all places. N customers, n places.
+
+    A place is a bus, or in three phases a phase of one. The busbar has k voltages, 1 or 3.
 
     Attributes
     ----------
     Z, E : (N, N), (N,)
         Impedances between customers, and their voltages without load for 1 pu at the busbar.
-    Z_bus, E_bus : (b + 1, N), (b + 1,)
-        The same for every bus.
+    of_busbar : (N, k)
+        The same for 1 pu at each of its voltages alone.
+    Z_bus, E_bus : (n, N), (n,)
+        Z and E for every place.
     """
 
     Z: Complex
     E: Complex
+    of_busbar: Complex
     Z_bus: Complex
     E_bus: Complex
 
 
-def network(feeder: Feeder) -> Network:
+def network(feeder: Feeder | PhasedFeeder) -> Network:
     """The impedances of a feeder, `(I + j Z0 B)^-1 Z0` with Z0 from the series impedances and B the charging.
 
     Parameters
     ----------
     feeder
         The feeder.
+
+    Raises
+    ------
+    DesignInfeasible
+        If three phases are charged so much that their voltage without load is not found.
     """
+    if isinstance(feeder, PhasedFeeder):
+        return _phased(feeder)
     everywhere = np.arange(len(feeder.buses))
     Z0 = common_paths(feeder, feeder.r, everywhere) + 1j * common_paths(feeder, feeder.x, everywhere)
     loaded = np.eye(everywhere.size) + 1j * Z0 * feeder.half
     unloaded = np.column_stack([Z0[:, feeder.bus], np.ones(everywhere.size)])
     both = np.asarray(np.linalg.solve(loaded, unloaded), dtype=np.complex128)
     Z_bus, E_bus = both[:, :-1], both[:, -1]
-    return Network(Z_bus[feeder.bus], E_bus[feeder.bus], Z_bus, E_bus)
+    E = E_bus[feeder.bus]
+    return Network(Z_bus[feeder.bus], E, E[:, None], Z_bus, E_bus)
+
+
+def _phased(feeder: PhasedFeeder) -> Network:
+    """By sweeps: of each customer's current, and of each voltage of the busbar, the charging repeated."""
+    tree, count = feeder.tree, feeder.bus.size
+    idle: Complex = np.zeros((count + 3, 3, len(tree.buses)), dtype=np.complex128)
+    idle[count:] = np.eye(3)[:, :, None]
+    drawn: Complex = np.zeros_like(idle)
+    # 1 pu of the power of a phase is a third of S.
+    drawn[np.arange(count), tree.phase, tree.at] = -3.0
+    V, change = idle, np.inf
+    for _ in range(_ROUNDS if tree.half.any() else 1):
+        charged = 1j * np.einsum("kij,cjk->cik", tree.half, V)
+        flow = np.einsum("bij,cjb->cib", tree.z, below(tree, drawn + charged)[..., 1:])
+        new: Complex = idle - from_root(tree, flow)
+        V, change = new, float(np.abs(new - V).max())
+        if not change > _TOL:
+            break
+    if tree.half.any() and not change <= _TOL:
+        raise DesignInfeasible("voltages of the feeder without load", "its charging is too much")
+    source = np.concatenate([ROTATION[tree.phase], ROTATION])
+    turned = source[:, None, None] * V / ROTATION[:, None]
+    every = turned.transpose(2, 1, 0).reshape(len(feeder.buses), count + 3)
+    Z_bus, each = every[:, :count], every[:, count:]
+    E_bus, own = np.asarray(each.sum(axis=1)), feeder.bus
+    return Network(Z_bus[own], E_bus[own], each[own], Z_bus, E_bus)
 
 
 def solve(net: Network, s: Complex, v0: Floats | float) -> Complex:
@@ -118,8 +164,10 @@ def solve(net: Network, s: Complex, v0: Floats | float) -> Complex:
     return V
 
 
-def currents(feeder: Feeder, net: Network, s: Complex, V: Complex, v0: Floats | float) -> Floats:
-    """Largest current at either end of every branch, pu.
+def currents(
+    feeder: Feeder | PhasedFeeder, net: Network, s: Complex, V: Complex, v0: Floats | float
+) -> Floats:
+    """Largest current at either end of every branch, in three phases that of its fullest conductor, pu.
 
     Parameters
     ----------
@@ -132,10 +180,28 @@ def currents(feeder: Feeder, net: Network, s: Complex, V: Complex, v0: Floats | 
         Magnitudes, in units of `base_kva / (3 base_volt)`.
     """
     at = np.asarray(v0, dtype=np.float64)[..., None] * net.E_bus + np.conj(s / V) @ net.Z_bus.T
+    if isinstance(feeder, PhasedFeeder):
+        return _phase_currents(feeder, np.conj(s / V), at)
     above, here = at[..., feeder.parent], at[..., 1:]
     series = (above - here) / (feeder.r + 1j * feeder.x)
     shunt = 0.5j * feeder.charging
     return np.maximum(np.abs(series + shunt * above), np.abs(series - shunt * here))
+
+
+def _phase_currents(feeder: PhasedFeeder, injected: Complex, at: Complex) -> Floats:
+    """`currents` of the phases, from what customers inject (…, N) and the voltages of the places (…, n)."""
+    tree = feeder.tree
+    V = ROTATION[:, None] * np.moveaxis(at.reshape(*at.shape[:-1], len(tree.buses), 3), -1, -2)
+    drawn = 1j * np.einsum("kij,...jk->...ik", tree.half, V)
+    flat = drawn.reshape(-1, 3, len(tree.buses))
+    for row, each in zip(flat, injected.reshape(-1, tree.at.size), strict=True):
+        np.add.at(row, (tree.phase, tree.at), -3.0 * ROTATION[tree.phase] * each)
+    series = below(tree, flat.reshape(V.shape))[..., 1:]
+    shunt = 0.5j * tree.charging
+    above, here = (
+        np.einsum("bij,...jb->...ib", shunt, V[..., ends]) for ends in (tree.parent, slice(1, None))
+    )
+    return np.asarray(np.maximum(np.abs(series + above), np.abs(series - here)).max(axis=-2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -146,8 +212,8 @@ class Sensitivity:
     ----------
     a, b : (N, N)
         `xi = a c + b conj(c)` for a change c of the conjugate injections.
-    busbar : (N,)
-        xi for 1 pu more at the busbar.
+    busbar : (N, k)
+        xi for 1 pu more at each voltage of the busbar.
     v : (N,)
         Voltage magnitudes, pu.
     """
@@ -193,12 +259,12 @@ def sensitivity(net: Network, s: Complex, V: Complex) -> Sensitivity:
         raise DesignInfeasible("sensitivities of the feeder", "the AC power flow has no solution there")
     relative = net.Z / V[:, None] / np.conj(V)
     M = relative * np.conj(s)
-    source = net.E / V
+    sources = [each / V for each in net.of_busbar.T]
     inverse = np.linalg.inv(np.eye(V.size) - M @ np.conj(M))
     return Sensitivity(
         a=inverse @ relative,
         b=-inverse @ M @ np.conj(relative),
-        busbar=inverse @ (source - M @ np.conj(source)),
+        busbar=np.column_stack([inverse @ (source - M @ np.conj(source)) for source in sources]),
         v=np.abs(V),
     )
 
@@ -212,7 +278,7 @@ class Box:
     p_low, p_high, q_low, q_high : (N,)
         Limits of the net injections (generation positive), inverters included.
     v0_low, v0_high
-        Limits of the busbar's voltage.
+        Limits of the busbar's voltage; in three phases of each of the three, which move as they like.
     """
 
     p_low: Floats
@@ -236,8 +302,8 @@ class Region:
         Sensitivities of the voltage magnitudes in the middle of the box.
     p_error, q_error : (N, N)
         How far those anywhere in the box are off, entry by entry.
-    dv_dv0, v0_error : (N,)
-        The same for the voltage of the busbar.
+    dv_dv0, v0_error : (N, k)
+        The same for the voltages of the busbar.
     low, high : (N,)
         Proven limits of the voltage magnitudes in the box, pu.
     """
@@ -272,7 +338,7 @@ def region(net: Network, box: Box) -> Region:
     at = sensitivity(net, s, solve(net, s, v0))
     swing = 0.5 * (box.v0_high - box.v0_low)
     gain, away = np.abs(at.a) + np.abs(at.b), np.hypot(*half)
-    r = _radius(gain, np.abs(s), away, np.abs(at.busbar) * swing)
+    r = _radius(gain, np.abs(s), away, np.abs(at.busbar).sum(axis=1) * swing)
     feedback = gain * ((away + np.abs(s) * (2.0 + r) * r) / (1.0 - r) ** 2)
     amplify = _neumann(feedback)
     tilt = gain * (r / (1.0 - r))
@@ -283,12 +349,12 @@ def region(net: Network, box: Box) -> Region:
         turned = (1.0 - np.sqrt(1.0 - r**2))[:, None] * np.abs(xi.real) + r[:, None] * np.abs(xi.imag)
         return np.asarray(at.v[:, None] * (change + turned))
 
-    columns = [(at.p, tilt), (at.q, tilt), (at.busbar[:, None], np.zeros((r.size, 1)))]
+    columns = [(at.p, tilt), (at.q, tilt), (at.busbar, np.zeros(at.busbar.shape))]
     J = np.hstack([at.v[:, None] * xi.real for xi, _ in columns])
     off = np.hstack([error(xi, own) for xi, own in columns])
     low, high = _limits(net, box, at.v, J, off)
     n = r.size
-    p, q, busbar = slice(n), slice(n, 2 * n), 2 * n
+    p, q, busbar = slice(n), slice(n, 2 * n), slice(2 * n, None)
     return Region(
         dv_dp=J[:, p],
         dv_dq=J[:, q],
@@ -341,7 +407,8 @@ def _neumann(feedback: Floats) -> Floats:
 
 def _limits(net: Network, box: Box, middle: Floats, J: Floats, off: Floats) -> tuple[Floats, Floats]:
     """The better of two bounds: from the middle, and from the corner that is extreme if no J is negative."""
-    width = np.concatenate([box.p_high - box.p_low, box.q_high - box.q_low, [box.v0_high - box.v0_low]])
+    swing = np.full(net.of_busbar.shape[1], box.v0_high - box.v0_low)
+    width = np.concatenate([box.p_high - box.p_low, box.q_high - box.q_low, swing])
     spread = (np.abs(J) + off) @ (0.5 * width)
     fall = np.minimum(J - off, 0.0) @ width
     bottom = np.abs(solve(net, box.p_low + 1j * box.q_low, box.v0_low))

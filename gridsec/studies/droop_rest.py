@@ -18,7 +18,7 @@ from gridsec.errors import DesignInfeasible
 from gridsec.studies.droop_network import Box, Complex, Network, sensitivity, solve
 from gridsec.studies.droop_stability import Loop, reach, slopes
 
-__all__ = ["Band", "Share", "always", "at_rest", "injected", "rest", "shares"]
+__all__ = ["Band", "Share", "always", "at_rest", "injected", "rest", "shares", "shares_of_gain"]
 
 _TOL: Final = 1e-11
 """How far set-points may be from injections at rest, pu of the largest limit."""
@@ -177,10 +177,10 @@ def at_rest(net: Network, droop: Droop, loads: Box) -> Band:
     if not (np.all(ones >= 0.5) and np.all(back @ ones < ones)):
         raise DesignInfeasible("voltages of the fleet at rest", "the loop gain may be 1 or more")
     # A busbar that rises lifts all voltages; how much of it the fleet takes back is counted like a load's.
-    busbar_high = given.dv_dv0 + given.v0_error
+    busbar_high = np.abs(given.dv_dv0) + given.v0_error
     U = np.maximum(inverse, 0.0) @ np.column_stack([np.abs(J) + off, busbar_high])
     L = np.column_stack([J - off, given.dv_dv0 - given.v0_error]) - back @ U
-    swing = [loads.v0_high - loads.v0_low]
+    swing = np.full(net.of_busbar.shape[1], loads.v0_high - loads.v0_low)
     width = np.concatenate([loads.p_high - loads.p_low, loads.q_high - loads.q_low, swing])
     wrong = np.minimum(L, 0.0) @ width
     ends = np.stack([loads.p_low + 1j * loads.q_low, loads.p_high + 1j * loads.q_high])
@@ -230,3 +230,40 @@ def shares(given: Loop, allowed: float) -> Share:
         own = allowed * np.sum(modes**2 / (allowed - values), axis=1)
         factor = np.where(own > 1.0, 1.0 / (1.0 - 1.0 / np.maximum(own, 1.0 + 1e-15)), np.inf)
     return Share(part, factor)
+
+
+def shares_of_gain(given: Loop) -> Share:
+    """The same for loops of any sign and symmetry, by the small-gain certificate.
+
+    With `M = |S| + error`, the gain `rho(M)` below 1 and `w_i = [(I - M)^-1]_ii`, a column i of M that is
+    multiplied by f leaves it below 1 up to `f = 1 / (1 - 1 / w_i)`. The part is the product of an inverter's
+    entries in the leading left and right vectors: what the gain grows by with its slope alone.
+
+    Parameters
+    ----------
+    given
+        The loop.
+
+    Returns
+    -------
+    Share
+        Factors are NaN where the gain may be 1 or more, so that the certificate says nothing.
+    """
+    M = np.abs(given.S) + given.error
+    if not M.size:
+        return Share(np.zeros(0), np.zeros(0))
+    left, right = (_leading(each) for each in (M.T, M))
+    part = left * right / float(left @ right)
+    inverse = np.linalg.inv(np.eye(len(M)) - M)
+    ones = inverse @ np.ones(len(M))
+    if not (np.all(ones >= 0.5) and np.all(M @ ones < ones)):
+        return Share(part, np.full(len(M), np.nan))
+    own = np.diagonal(inverse)
+    with np.errstate(divide="ignore"):
+        return Share(part, np.where(own > 1.0, 1.0 / (1.0 - 1.0 / np.maximum(own, 1.0 + 1e-15)), np.inf))
+
+
+def _leading(M: Floats) -> Floats:
+    """Vector of the largest eigenvalue of a matrix without negative entries."""
+    values, vectors = np.linalg.eig(M)
+    return np.asarray(np.abs(vectors[:, int(np.argmax(values.real))]))

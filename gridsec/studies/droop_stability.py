@@ -228,6 +228,18 @@ class Loop:
         """Largest gain of the loop at rest that its bounds allow."""
         return spectral_radius(np.abs(self.S) + self.error) if self.tau.size else 0.0
 
+    @property
+    def covers_shorter(self) -> bool:
+        """Whether a certificate of inverters that jump to their set-points is one for every interval.
+
+        All responses lie in the unit disk then, on whose rim those of inverters that jump are. The circle
+        criterion is linear in a response that all have in common, so that the rim decides; responses of their
+        own need `|S| < 1` besides, and the small-gain certificate knows of no interval at all.
+        """
+        alike = bool(np.all(self.tau == self.tau[:1]))
+        size = float(np.linalg.norm(self.S, 2) + np.linalg.norm(self.error, 2)) if self.tau.size else 0.0
+        return alike or size < 1.0 - _SURE or self.gain < 1.0 - _SURE
+
 
 def loop(droop: Droop, within: Reach, update: Update) -> Loop:
     """Build the loop of a fleet in a box.
@@ -251,6 +263,9 @@ def loop(droop: Droop, within: Reach, update: Update) -> Loop:
 
 _ANGLES: Final = 97
 """Frequencies at which the circle criterion is looked at before it is proven."""
+
+_LOPSIDED: Final = 0.2
+"""A loop that differs more from its transpose is looked at everywhere: its phase decides as well."""
 
 
 def factor(given: Loop) -> float:
@@ -283,7 +298,8 @@ def _responses(given: Loop) -> list[Complex]:
         return [1.0 / (1.0 + 1j * rate * given.tau) for rate in rates]
     alpha = given.update.share(given.tau)
     angles = np.pi * np.linspace(0.0, 1.0, _ANGLES * (1 + given.update.dead))
-    if np.all(alpha == alpha[:1]) and alpha.size:
+    lopsided = np.linalg.norm(given.S - given.S.T) > _LOPSIDED * np.linalg.norm(given.S)
+    if np.all(alpha == alpha[:1]) and alpha.size and not lopsided:
         # One response for all: where it reaches furthest to the left decides, or where errors weigh most.
         h = alpha[0] * np.exp(-1j * angles * given.update.dead) / (np.exp(1j * angles) - 1.0 + alpha[0])
         angles = angles[[0, *np.argsort(h.real)[:3], *np.argsort(h.real - np.abs(h) ** 2)[:3]]]

@@ -14,7 +14,7 @@ from gridsec.droop import Droop, voltage_curve
 from gridsec.errors import DesignInfeasible
 from gridsec.feeder import Feeder
 from gridsec.studies.droop_network import Box, currents, network, region, sensitivity, solve
-from gridsec.studies.droop_rest import always, at_rest, injected, rest, shares
+from gridsec.studies.droop_rest import always, at_rest, injected, rest, shares, shares_of_gain
 from gridsec.studies.droop_stability import (
     Loop,
     Update,
@@ -103,7 +103,7 @@ def test_sensitivities_against_differences_of_the_sweeps(seed: int) -> None:
     dp = (v(h, 0.0, 1.0) - v(-h, 0.0, 1.0)) / (2 * h)
     np.testing.assert_allclose(found.v * found.p[:, j].real, dp, atol=1e-7)
     d0 = (v(0.0, 0.0, 1.0 + h) - v(0.0, 0.0, 1.0 - h)) / (2 * h)
-    np.testing.assert_allclose(found.v * found.busbar.real, d0, atol=1e-7)
+    np.testing.assert_allclose(found.v * found.busbar[:, 0].real, d0, atol=1e-7)
 
 
 @FEW
@@ -144,11 +144,15 @@ def test_a_box_that_holds_collapse_is_refused() -> None:
 # --- certificates -----------------------------------------------------------------------------------------
 
 
-def random_given(seed: int, update: Update, *, spread: float = 1.0) -> Loop:
+def random_given(seed: int, update: Update, *, spread: float = 1.0, lopsided: bool = False) -> Loop:
+    """A loop of reactances in common; or of three phases, with any signs and no symmetry."""
     rng = np.random.default_rng(seed)
     m = int(rng.integers(1, 7))
     root = rng.normal(size=(m, m))
     S = root @ root.T
+    if lopsided:
+        turn = rng.normal(size=(m, m))
+        S = S + np.linalg.norm(S, 2) * (turn - turn.T)
     S *= rng.uniform(0.1, 3.0) / np.linalg.norm(S, 2)
     tau = 2.0 * spread ** rng.uniform(-0.5, 0.5, m)
     return Loop(S, np.zeros((m, m)), tau, update, np.arange(m))
@@ -169,11 +173,16 @@ def test_one_time_constant_and_no_dead_time_the_criterion_is_exact(seed: int, in
 
 
 @FEW
-@given(seed=st.integers(0, 200), dead=st.integers(0, 3), spread=st.sampled_from([1.0, 4.0]))
+@given(
+    seed=st.integers(0, 200),
+    dead=st.integers(0, 3),
+    spread=st.sampled_from([1.0, 4.0]),
+    lopsided=st.booleans(),
+)
 def test_what_is_verified_contracts_for_any_slopes_that_change_at_any_time(
-    seed: int, dead: int, spread: float
+    seed: int, dead: int, spread: float, lopsided: bool
 ) -> None:
-    made = random_given(seed, Update(1.0, dead), spread=spread)
+    made = random_given(seed, Update(1.0, dead), spread=spread, lopsided=lopsided)
     rng = np.random.default_rng(seed)
     m = made.tau.size
     made = replace(made, error=0.05 * rng.uniform(size=(m, m)))
@@ -190,6 +199,27 @@ def test_what_is_verified_contracts_for_any_slopes_that_change_at_any_time(
         way = [*way, -slope * (S @ e)]
         e = (1.0 - alpha) * e + alpha * way.pop(0)
     assert np.abs(e).max() < 1e-2
+
+
+@FEW
+@given(seed=st.integers(0, 100), dead=st.integers(0, 2), spread=st.sampled_from([1.0, 4.0]))
+def test_certificates_of_inverters_that_jump_cover_shorter_intervals(
+    seed: int, dead: int, spread: float
+) -> None:
+    made = random_given(seed, Update(1e3, dead), spread=spread, lopsided=True)
+    made = replace(made, S=0.95 * min(factor(made), 1e3) * made.S)
+    if not (verified(made) and made.covers_shorter):
+        return
+    for interval in (10.0, 2.0, 0.5, 0.05):
+        assert verified(replace(made, update=Update(interval, dead)))
+
+
+def test_shorter_intervals_are_covered_by_like_time_constants_or_a_small_loop() -> None:
+    S = np.array([[0.0, 1.8], [0.0, 0.0]])
+    apart = Loop(S, 0.0 * S, np.array([1.0, 30.0]), Update(), np.arange(2))
+    assert not replace(apart, S=0.75 * (S - S.T)).covers_shorter
+    assert replace(apart, tau=np.ones(2)).covers_shorter
+    assert replace(apart, S=0.5 * S).covers_shorter
 
 
 @FEW
@@ -335,6 +365,26 @@ def test_the_band_at_rest_is_reached_where_all_sensitivities_are_positive() -> N
     V = np.abs(rest(net, droop, np.stack([-full, full]) + 0j, 1.0)[1])
     np.testing.assert_allclose(band.low, V[0], atol=2e-4)
     np.testing.assert_allclose(band.high, V[1], atol=2e-4)
+
+
+@FEW
+@given(seed=st.integers(0, 100))
+def test_shares_of_a_gain_without_symmetry_against_eigenvalues(seed: int) -> None:
+    made = random_given(seed, Update(), lopsided=True)
+    m = made.tau.size
+    made = replace(made, error=0.05 * np.random.default_rng(seed).uniform(size=(m, m)))
+    M = np.abs(made.S) + made.error
+    size = 0.7 / float(np.max(np.abs(np.linalg.eigvals(M))))
+    made, M = replace(made, S=size * made.S, error=size * made.error), size * M
+    found = shares_of_gain(made)
+    assert found.part.sum() == pytest.approx(1.0)
+    for k in range(m):
+        times = np.where(np.arange(m) == k, min(found.factor[k], 1e9), 1.0)
+        assert np.max(np.abs(np.linalg.eigvals(M * times))) == pytest.approx(1.0, rel=1e-6)
+        grown = np.max(np.abs(np.linalg.eigvals(M * np.where(np.arange(m) == k, 1.0 + 1e-6, 1.0))))
+        assert (grown / 0.7 - 1.0) / 1e-6 == pytest.approx(found.part[k], abs=1e-4)
+    beyond = shares_of_gain(replace(made, S=2.0 * made.S, error=2.0 * made.error))
+    assert np.isnan(beyond.factor).all()
 
 
 @FEW
