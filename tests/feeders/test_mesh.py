@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
+from benchmarks.mesh import baran_wu, closed, landnetz, rural3
 from feeders.estimators import choose, design
 from feeders.lies import Lie, Trick
 from feeders.load import Site, from_tables, load
@@ -25,7 +26,6 @@ from gridsec.errors import DesignInfeasible, FeederInvalid
 from gridsec.mesh import MeshedFeeder
 from gridsec.network import bus_voltages, model_error_bound
 from tests.feeders import villages
-from tests.feeders.meshes import baran_wu, closed, landnetz, rural3
 
 SITES = [landnetz, rural3, baran_wu]
 

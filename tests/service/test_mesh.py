@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.mesh import baran_wu
 from feeders.recording import read_recording, record
 from feeders.scenario import Scenario, random_attacks, simulate
 from feeders.schema import to_json, write
@@ -16,7 +17,6 @@ from service.describe import detail
 from service.models import FeederDetail, State
 from service.replay import Tally, replay
 from service.simulate import Pace, play
-from tests.feeders.meshes import baran_wu
 from tests.service.running import service, until
 
 START = 1_795_212_000.0

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
+from benchmarks.mesh import baran_wu
 from feeders.load import Site as FeederSite
 from feeders.load import load, names
 from gridsec.online import Cause
 from service.describe import detail
 from service.report import CustomerReport, InverterReport
-from tests.feeders.meshes import baran_wu
 
 pytestmark = pytest.mark.browser
 

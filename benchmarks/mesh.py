@@ -1,0 +1,121 @@
+"""Feeders with closed ties: the model against the AC power flow, and a third of the meters lying.
+
+`python -m benchmarks.mesh`; the numbers of docs/theory-mesh.md. Half a minute.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from functools import cache
+
+# Before NumPy loads its libraries.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+
+from feeders.estimators import design
+from feeders.lies import Lie, Trick
+from feeders.load import Site, from_tables, load
+from feeders.powerflow_unbalanced import power_flow
+from feeders.schema import FeederTables, LineRow
+from feeders.trials import LoadError, Trial, judge
+from gridsec.arrays import Floats
+from gridsec.network import bus_voltages, model_error_bound
+
+LOADS = (0.25, 0.5, 1.0)
+SEEDS = range(5)
+LOAD_KW = {"kerber-landnetz": 0.3, "simbench-lv-rural3": 0.6, "case33bw": 2.0}
+
+
+def closed(tables: FeederTables, *ties: LineRow) -> FeederTables:
+    """The same feeder with every line closed, and some more lines."""
+    lines = tuple(replace(row, closed=True) for row in (*tables.lines, *ties))
+    return replace(tables, meta=replace(tables.meta, meshed=True), lines=lines)
+
+
+@cache
+def landnetz() -> Site:
+    """A line of thirteen houses, closed to a ring: its far end is connected to the busbar as well."""
+    return from_tables(
+        closed(load("kerber-landnetz").tables, LineRow("ring", "bus_1_13", "main_busbar", 0.05, 0.01))
+    )
+
+
+@cache
+def rural3() -> Site:
+    """The village of 118 customers, the ends of its two longest lines joined."""
+    site = load("simbench-lv-rural3")
+    x, y = site.xy[site.bus_of_file["LV3.101 Bus 125"]] if site.xy is not None else (0.0, 0.0)
+    tie = LineRow("ring", "LV3.101 Bus 36", "LV3.101 Bus 125", 0.01, 0.004, to_x=float(x), to_y=float(y))
+    return from_tables(closed(site.tables, tie))
+
+
+@cache
+def baran_wu() -> Site:
+    """The feeder of Baran and Wu with its five tie switches closed."""
+    return from_tables(closed(load("case33bw").tables))
+
+
+def opened(tables: FeederTables) -> FeederTables:
+    """The same feeder with the ties taken as open: the last line of each loop."""
+    site = from_tables(tables)
+    ends = {frozenset(pair) for pair in site.ties.tolist()}
+
+    def is_tie(row: LineRow) -> bool:
+        return frozenset((site.bus_of_file[row.from_bus], site.bus_of_file[row.to_bus])) in ends
+
+    lines = tuple(replace(row, closed=not is_tie(row)) for row in tables.lines)
+    return replace(tables, meta=replace(tables.meta, meshed=False), lines=lines)
+
+
+def errors(site: Site, part: float) -> str:
+    """One row: drop, errors of |v| without and with a correction, its bound, and with the ties left out."""
+    feeder, radial = site.feeder, from_tables(opened(site.tables)).feeder
+    p_kw = part * site.loads.load_peak * feeder.base_kva
+    q_kvar = 0.33 * p_kw
+    truth = power_flow(site).solve(p_kw, q_kvar, feeder.base_volt)[0] / feeder.base_volt
+    p, q = -p_kw / feeder.base_kva, -q_kvar / feeder.base_kva
+
+    def off(v2: Floats, bus: Floats) -> float:
+        return float(np.abs(np.sqrt(v2[bus]) - truth).max())
+
+    found = [off(bus_voltages(feeder, p, q, 1.0, steps=steps), feeder.bus) for steps in (0, 1)]
+    found.append(float((model_error_bound(feeder, p, q, 1.0) / (2.0 * truth)).max()))
+    found.append(off(bus_voltages(radial, p, q, 1.0), radial.bus))
+    return f"| {feeder.name} | {part:g} | {100 * (1 - truth.min()):.1f} % | " + " | ".join(
+        f"{value:.1e}" for value in found
+    )
+
+
+def named(site: Site, trick: Trick, percent: float) -> str:
+    """One row: liars, those missed, the slowest, the honest who were named, time of a step."""
+    kw, count = LOAD_KW[site.feeder.name], site.meters.size // 3
+    outcomes = []
+    for seed in SEEDS:
+        lie = Lie(trick, count, percent, onset_s=10.0)
+        trial = Trial(site, seed, 30.0, load_error=LoadError(kw, kw / 3.0), lie=lie)
+        outcomes.append(judge(design(trial.stated), trial, settling_s=3.0))
+    missed, accused = sum(o.missed for o in outcomes), sum(int(o.accused.sum()) for o in outcomes)
+    slowest = max(float(o.delay_s.max()) for o in outcomes)
+    step = np.median(np.concatenate([o.step_ms for o in outcomes]))
+    words = f"±{percent:g} %" if trick is Trick.BIAS else f"{percent:g} % all"
+    return (
+        f"| {site.feeder.name} | {count} of {site.meters.size} | {words} | "
+        f"{missed} | {slowest:g} s | {accused} | {step:.1f} ms |"
+    )
+
+
+def main() -> None:
+    """Print both tables."""
+    for make in (landnetz, rural3, baran_wu):
+        for part in LOADS:
+            print(errors(make(), part), "|")
+    for make in (landnetz, rural3, baran_wu):
+        for trick, percent in ((Trick.BIAS, 3.0), (Trick.TOGETHER, -2.0)):
+            print(named(make(), trick, percent))
+
+
+if __name__ == "__main__":
+    main()
