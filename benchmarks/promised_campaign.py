@@ -66,7 +66,7 @@ def main(lies: int, feeder: str, journal: Path | None) -> int:
         what = "with somebody named because of it" if row["promise"] == "hidden" else "with a liar missed"
         print(
             f"{feeder}: {row['lies']} lies to be {row['promise']}, {row['broken']} {what} "
-            f"({row['by_chance']} with a liar named without it too, {row['honest_named']} with an honest meter "
+            f"({row['by_chance']} with a liar named without it too, {row['honest_named']} with an honest one "
             f"named); probability below {row['probability_high']:.1e} (95 %, {row['scenes']} scenes)"
         )
     # Without the start of the processes: from the first scene that was done here to the last.

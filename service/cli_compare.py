@@ -1,0 +1,170 @@
+"""`gridsec study compare`: all estimators watch the same simulated attacks."""
+
+from __future__ import annotations
+
+import os
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.markup import escape
+from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from service import console
+from service.cli_campaign import LoadErrorKvar, LoadErrorKw, MetersAs
+from service.console import Studied
+from service.foreign import converted
+
+if TYPE_CHECKING:
+    from feeders.comparison import Plan, Row
+    from feeders.load import Site
+
+Families = Annotated[list[str] | None, typer.Option(help="An estimator; may be repeated. [default: all]")]
+Cases = Annotated[list[str] | None, typer.Option(help="A case; may be repeated. [default: all]")]
+MaxAttacked = Annotated[
+    int, typer.Option(help="How many meters lie, and estimators are to withstand.", min=1)
+]
+Seeds = Annotated[int, typer.Option(help="Runs of each case.", min=1)]
+Duration = Annotated[float, typer.Option(help="Length of a run, s.", min=70.0)]
+ReportQ = Annotated[bool, typer.Option(help="Meters report the net reactive power.")]
+Csv = Annotated[Path | None, typer.Option(help="Write all numbers into this file.")]
+Write = Annotated[
+    Path | None, typer.Option(help="Replace the tables between the markers of this Markdown file.")
+]
+Workers = Annotated[
+    int | None, typer.Option(help="Processes for matrix inequalities. [default: all cores]", min=1)
+]
+
+
+def compare(
+    feeder: Studied = "simbench-lv-rural1",
+    *,
+    family: Families = None,
+    case: Cases = None,
+    max_attacked: MaxAttacked = 2,
+    seeds: Seeds = 3,
+    duration: Duration = 480.0,
+    meters: MetersAs = "site",
+    load_error_kw: LoadErrorKw = 0.1,
+    load_error_kvar: LoadErrorKvar = 0.05,
+    report_q: ReportQ = False,
+    csv: Csv = None,
+    write: Write = None,
+    workers: Workers = None,
+) -> None:
+    """Let all estimators watch the same simulated attacks, and tell who did what.
+
+    The truth is full AC power flow; what the estimators know of loads and meters is as uncertain as it is
+    stated to be. Estimators that cannot watch the feeder are listed with the reason.
+    """
+    from feeders.comparison import CASES, Plan, markdown, splice, write_csv
+    from feeders.estimators import FAMILIES
+    from feeders.load import load
+    from feeders.trials import LoadError, Meters
+
+    plan = Plan(
+        max_attacked=max_attacked,
+        seeds=seeds,
+        duration_s=duration,
+        load_error=LoadError(load_error_kw, load_error_kvar),
+        meters=Meters(_known([meters], tuple(Meters), "--meters")[0]),
+        report_q=report_q,
+        families=_known(family, tuple(FAMILIES), "--family"),
+        cases=_known(case, tuple(each.name for each in CASES), "--case"),
+        workers=workers or os.cpu_count() or 1,
+    )
+    before = None if write is None else write.read_text(encoding="utf-8")
+    if before is not None:
+        splice(before, "")  # a document without markers is refused before the work, not after it
+    site = load(converted(feeder, None))
+    rows = _compared(site, plan)
+    _show(rows, plan)
+    if csv is not None:
+        write_csv(rows, csv)
+    if write is not None and before is not None:
+        write.write_text(
+            splice(before, f"{_told(feeder, site, plan)}\n\n{markdown(rows, plan)}"), encoding="utf-8"
+        )
+
+
+def _compared(site: Site, plan: Plan) -> list[Row]:
+    """Compare, and show what is being done."""
+    from feeders.comparison import compare as study
+
+    with Progress(
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        TimeElapsedColumn(),
+        console=console.err,
+        transient=True,
+        disable=not console.err.is_terminal,
+    ) as bar:
+        task = bar.add_task("", total=None)
+        return study(site, plan, progress=lambda what: bar.update(task, description=escape(what)))
+
+
+def _known(chosen: list[str] | None, known: tuple[str, ...], option: str) -> tuple[str, ...]:
+    """Check names given as an option; all of them, if none is given."""
+    for name in chosen or ():
+        if name not in known:
+            raise typer.BadParameter(f"{name!r}: expected one of {', '.join(known)}", param_hint=option)
+    return tuple(name for name in known if not chosen or name in chosen)
+
+
+def _told(feeder: str, site: Site, plan: Plan) -> str:
+    """What the tables hold for, in one sentence."""
+    error, runs = plan.load_error, "one run" if plan.seeds == 1 else f"{plan.seeds} runs"
+    return (
+        f"{site.tables.meta.title or site.feeder.name}: {len(site.meter_ids)} meters "
+        f"(errors: {plan.meters}{', with q' * plan.report_q}), {site.droop.tau.size} inverters, "
+        f"M = {plan.max_attacked}, "
+        f"{runs} of {plan.duration_s:g} s at {plan.step_s:g} s per case, powers known within "
+        f"{error.p_kw:g} kW and {error.q_kvar:g} kvar (1 sigma, correlated over {error.correlation_s:g} s).\n"
+        f"Measured by:\n\n    {_command(feeder, plan)}"
+    )
+
+
+def _command(feeder: str, plan: Plan) -> str:
+    """The command line that measures all this again."""
+    from feeders.comparison import Plan
+
+    usual = Plan()
+    options = {
+        "--max-attacked": (plan.max_attacked, usual.max_attacked),
+        "--seeds": (plan.seeds, usual.seeds),
+        "--duration": (plan.duration_s, usual.duration_s),
+        "--meters": (str(plan.meters), str(usual.meters)),
+        "--load-error-kw": (plan.load_error.p_kw, usual.load_error.p_kw),
+        "--load-error-kvar": (plan.load_error.q_kvar, usual.load_error.q_kvar),
+    }
+    words = ["gridsec study compare", shlex.quote(feeder)]
+    words += [f"{name} {value}" for name, (value, default) in options.items() if value != default]
+    words += ["--report-q"] * plan.report_q
+    for name, chosen, every in (
+        ("--family", plan.families, usual.families),
+        ("--case", plan.cases, usual.cases),
+    ):
+        words += [f"{name} {each}" for each in chosen if chosen != every]
+    return " ".join(words)
+
+
+def _show(rows: list[Row], plan: Plan) -> None:
+    """Print one table for each case; reasons stand below it."""
+    from feeders.comparison import CASES, HEADERS, cells
+
+    meanings = {case.name: case.told(plan.max_attacked) for case in CASES}
+    for name in dict.fromkeys(row.case for row in rows):
+        table = Table(*HEADERS, title_justify="left", title=f"[bold]{name}[/]: {meanings[name]}")
+        reasons: list[str] = []
+        for row in rows:
+            if row.case != name:
+                continue
+            if row.reason:
+                reasons.append(f"{row.family}: {row.reason}")
+            else:
+                table.add_row(*map(escape, cells(row)))
+        console.out.print(table, soft_wrap=False)
+        for reason in reasons:
+            console.out.print(escape(reason))
