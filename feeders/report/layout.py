@@ -31,6 +31,8 @@ class Placed:
         Of the sheet.
     wires, drops
         Polylines of lines, and of the last metres to customers.
+    ties
+        Polylines of the lines that close loops.
     busbar
         The busbar's two ends.
     customers
@@ -45,6 +47,7 @@ class Placed:
     height: float
     wires: tuple[tuple[Point, ...], ...]
     drops: tuple[tuple[Point, ...], ...]
+    ties: tuple[tuple[Point, ...], ...]
     busbar: tuple[Point, Point]
     customers: tuple[Point, ...]
     room: float
@@ -92,10 +95,10 @@ def _real(site: Site, width: float) -> Placed:
     at: list[Point] = [(float(a), float(b)) for a, b in zip(x, y, strict=True)]
     wires = tuple((at[int(p)], at[k + 1]) for k, p in enumerate(site.spanning.parent))
     spots, drops = _fans(at, site.spanning.bus.tolist())
+    ties = tuple((at[one], at[other]) for one, other in site.ties.tolist())
     bx, by = at[0]
-    return Placed(
-        width, height, wires, drops, ((bx - 9.0, by), (bx + 9.0, by)), spots, _room(spots), real=True
-    )
+    ends = ((bx - 9.0, by), (bx + 9.0, by))
+    return Placed(width, height, wires, drops, ties, ends, spots, _room(spots), real=True)
 
 
 def _room(spots: Sequence[Point]) -> float:
@@ -130,12 +133,14 @@ class _Items:
 
     customers: list[tuple[int, int, int]] = field(default_factory=list)  # customer, column, row
     streets: list[tuple[int, int, int]] = field(default_factory=list)  # first column, last column, row
+    poles: list[tuple[int, int, int]] = field(default_factory=list)  # bus, column, row
     ties: list[tuple[int, int, int, int]] = field(default_factory=list)  # column, row above, column, row
 
     def take(self, other: _Items, rows: int) -> None:
         """Add another block, so many rows lower."""
         self.customers += [(k, x, row + rows) for k, x, row in other.customers]
         self.streets += [(a, b, row + rows) for a, b, row in other.streets]
+        self.poles += [(bus, x, row + rows) for bus, x, row in other.poles]
         self.ties += [(x0, r0 + rows, x1, r1 + rows) for x0, r0, x1, r1 in other.ties]
 
 
@@ -187,6 +192,7 @@ class _Grid:
             slots = self.at[bus] + [who for k in others if not self.children[k] for who in self.at[k]]
             sides = [k for k in others if self.children[k]]
             branches += [(side, x) for side in sides]
+            items.poles += [(k, x, 0) for k in (bus, *others) if k not in sides]
             x += 1 if sides else 0
             items.customers += [(who, x + k, 0) for k, who in enumerate(slots)]
             x += max(len(slots), 0 if sides else 1) if (slots or len(self.children[bus]) != 1) else 0
@@ -254,6 +260,13 @@ def _tree(site: Site, width: float) -> Placed:
     for who, x, row in items.customers:
         spots[who] = below(at(x, row))
         drops.append((at(x, row), spots[who]))
+    poles = {bus: (x, row) for bus, x, row in items.poles}
+    closing = []
+    for one, other in site.ties.tolist():
+        # The busbar is met in the row of the other end.
+        a, b = (at(*poles.get(k, (0, poles.get(far, (0, 0))[1]))) for k, far in ((one, other), (other, one)))
+        x, y = 0.5 * (a[0] + b[0]), 0.5 * (a[1] + b[1])
+        closing.append((a, (x - 14.0, y) if upright else (x, y - 14.0), b))
     first, last = at(0, 0), at(0, rows - 1)
     ends = (
         ((first[0] - 10, first[1]), (last[0] + 10, last[1]))
@@ -262,5 +275,13 @@ def _tree(site: Site, width: float) -> Placed:
     )
     height = 2.0 * pad + (breadths - 1) * (along if upright else across) + (8.0 if upright else hang + 8.0)
     return Placed(
-        width, height, (*wires, *ties), tuple(drops), ends, tuple(spots), min(along, 60.0), real=False
+        width,
+        height,
+        (*wires, *ties),
+        tuple(drops),
+        tuple(closing),
+        ends,
+        tuple(spots),
+        min(along, 60.0),
+        real=False,
     )

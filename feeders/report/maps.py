@@ -1,6 +1,8 @@
 """Maps of a feeder: its streets, its customers, and something about each of them.
 
-A customer is told apart by shape and size, and by a word or a number beside it; colour comes on top.
+A customer is told apart by shape and size, and by a word or a number beside it; colour comes on top. In three
+phases everybody has one leg of a star, that of the phase: a to the upper right, b downwards, c to the upper
+left.
 """
 
 from __future__ import annotations
@@ -10,7 +12,7 @@ from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from feeders.report.drawing import STEPS, Area, Disc, Drawing, Line, Mark, Text, regular, width_of
 from feeders.report.layout import Placed, place
@@ -49,6 +51,8 @@ class Spot:
         For a size on a scale: which step.
     weight
         Labels of heavier customers get their place first.
+    phase
+        Its phase, a, b or c, where the feeder has several; empty: none is shown.
     """
 
     shape: Shape
@@ -56,6 +60,11 @@ class Spot:
     tip: str = ""
     step: int = 0
     weight: float = 0.0
+    phase: str = ""
+
+
+LEGS: Final = {"a": 60.0, "b": 180.0, "c": 300.0}
+"""Where the leg of a phase points, degrees clockwise from above."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,13 +154,16 @@ def draw_map(
         height=at.height + top,
         wires=tuple(_down(points, top) for points in at.wires),
         drops=tuple(_down(points, top) for points in at.drops),
+        ties=tuple(_down(points, top) for points in at.ties),
         busbar=(_moved(at.busbar[0], top), _moved(at.busbar[1], top)),
         customers=tuple(_moved(point, top) for point in at.customers),
     )
     marks: list[Mark] = [Text(8.0, 15.0, note, "quiet", size=12.0)] if note else []
     marks += [Line(points, "drop") for points in at.drops]
     marks += [Line(points, "wire") for points in at.wires]
+    marks += [Line(points, "line-wire") for points in at.ties]
     marks.append(Line(at.busbar, "busbar", tip=f"busbar: {site.feeder.buses[0]}"))
+    spots, legend = _with_phases(site, spots, legend)
     size = min(max(at.room / 3.4, 3.2), 7.5)
     order = sorted(range(len(spots)), key=lambda k: (spots[k].step, spots[k].weight))
     for k in order:
@@ -159,6 +171,23 @@ def draw_map(
     marks += _labels(spots, at, size, top)
     lines, height = _legend(legend, at.height, width)
     return Drawing(width, height, (*marks, *lines))
+
+
+def _with_phases(
+    site: Site, spots: Sequence[Spot], legend: Mapping[str, Spot]
+) -> tuple[Sequence[Spot], Mapping[str, Spot]]:
+    """Spots and legend with everybody's phase, where there are several."""
+    phases = [row.phases for row in site.tables.customers]
+    if not set(phases) <= LEGS.keys():
+        return spots, legend
+    own = [
+        replace(spot, phase=phase, tip=f"{spot.tip}, phase {phase}" if spot.tip else f"phase {phase}")
+        for spot, phase in zip(spots, phases, strict=True)
+    ]
+    return own, {
+        **legend,
+        **{f"phase {phase}": Spot(Shape.NONE, phase=phase) for phase in sorted(set(phases))},
+    }
 
 
 def _moved(point: tuple[float, float], down: float) -> tuple[float, float]:
@@ -189,7 +218,15 @@ def _glyph(spot: Spot, x: float, y: float, size: float) -> list[Mark]:
             marks = [Disc(x, y, size * (0.62 + 0.16 * spot.step), f"step{spot.step}", spot.tip)]
         case Shape.METER:
             marks = [Disc(x, y, size, "solid", spot.tip)]
-    return marks
+    return [*marks, *_leg(spot.phase, x, y, size)]
+
+
+def _leg(phase: str, x: float, y: float, size: float) -> list[Mark]:
+    if not phase:
+        return []
+    angle = math.radians(LEGS[phase])
+    ends = tuple((x + r * size * math.sin(angle), y - r * size * math.cos(angle)) for r in (1.4, 2.2))
+    return [Line(ends, "line-ink")]
 
 
 Box = tuple[float, float, float, float]
@@ -204,10 +241,11 @@ def _labels(spots: Sequence[Spot], at: Placed, size: float, top: float) -> list[
     for k in order:
         (x, y), long = at.customers[k], width_of(spots[k].label, letters)
         away = 1.5 * size + 3.0
+        leg = 0.8 * size if spots[k].phase else 0.0
         places = {
             "right": (x + away, y + 4.0, "start", x + away),
             "left": (x - away, y + 4.0, "end", x - away - long),
-            "below": (x, y + away + 8.0, "middle", x - 0.5 * long),
+            "below": (x, y + away + leg + 8.0, "middle", x - 0.5 * long),
             "above": (x, y - away, "middle", x - 0.5 * long),
         }
         wanted = ("right", "left", "below", "above") if at.real else ("below", "right")

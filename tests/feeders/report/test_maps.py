@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 
@@ -10,8 +11,9 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from benchmarks.mesh import baran_wu, landnetz, rural3
 from feeders.load import Site, load, names
-from feeders.report.drawing import STEPS, Disc, Text, width_of
+from feeders.report.drawing import STEPS, Disc, Line, Text, width_of
 from feeders.report.figure import NARROW, WIDE
 from feeders.report.layout import has_places, place
 from feeders.report.maps import Shape, Spot, draw_map, steps_of
@@ -38,6 +40,25 @@ def test_everybody_is_on_the_sheet_and_on_a_line(feeder: Site, width: float, *, 
     assert apart > 7.0
     ends = {end for drop in at.drops for end in drop[1:]}
     assert set(at.customers) == ends
+
+
+@pytest.mark.parametrize("width", [WIDE, NARROW])
+@pytest.mark.parametrize("make", [baran_wu, rural3, landnetz])
+def test_ties_end_on_the_lines_they_join(make: Callable[[], Site], width: float) -> None:
+    site = make()
+    for shown in (site, replace(site, xy=None)):
+        at = place(shown, width)
+        assert len(at.ties) == len(site.ties) > 0
+        assert all(0.0 <= x <= at.width and 0.0 <= y <= at.height for tie in at.ties for x, y in tie)
+        lit = [pair for wire in (at.busbar, *at.wires) for pair in pairwise(wire)]
+        for tie in at.ties:
+            assert _touches(tie[0], lit)
+            assert _touches(tie[-1], lit)
+            assert tie[0] != tie[-1]
+    drawn = draw_map(site, [Spot(Shape.METER)] * site.feeder.bus.size, width, legend={})
+    assert len([mark for mark in drawn.marks if isinstance(mark, Line) and mark.look == "line-wire"]) == len(
+        site.ties
+    )
 
 
 def test_streets_of_a_tree_do_not_share_a_place(feeder: Site) -> None:
