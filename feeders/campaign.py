@@ -175,13 +175,14 @@ def fake_load(
         When no load moves the meters that far, or only one that is absurd at first sight.
     """
     loads = _typical(site) if loads is None else loads
-    loop = ClosedLoop(power_flow(site), site.droop, site.feeder.base_kva, site.feeder.base_volt)
+    loop = ClosedLoop(power_flow(site), site.droop, site.feeder.base_kva, site.customer_volt)
     without = loop.equilibrium(loads)
     ratio = 0.5 * float(site.loads.tan_min[customer] + site.loads.tan_max[customer])
     one = np.array([customer])
     R, X = (0.5 * columns(site.feeder, power, one)[site.feeder.bus] for power in Power)
-    v = without.v_volt / site.feeder.base_volt
-    pattern = load_pattern(R, X, 0, ratio, v)[site.meters]
+    v = without.v_volt / site.customer_volt
+    nominal = site.tables.meta.voltage_volt
+    pattern = (load_pattern(R, X, 0, ratio, v) * (site.customer_volt / nominal))[site.meters]
     chosen = _affected(site, customer, pattern, meters) if isinstance(meters, int) else meters
     try:
         power = coordinate(pattern, chosen, size)  # pu, to first order; AC has the last word below
@@ -200,7 +201,7 @@ def fake_load(
                 f"{site.feeder.name} cannot carry a load of {power * site.feeder.base_kva:.0f} kW at "
                 f"{site.feeder.customers[customer]}, not even a fake one"
             ) from error
-        shift = ((with_it.v_volt - without.v_volt) / site.feeder.base_volt)[site.meters]
+        shift = ((with_it.v_volt - without.v_volt) / nominal)[site.meters]
         missing = coordinate(shift, chosen, size)
         if abs(missing - 1.0) < SIZING_TOLERANCE:
             shift = shift * missing

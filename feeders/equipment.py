@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.resources.abc import Traversable
 from pathlib import Path
 
@@ -127,27 +127,40 @@ def metered_customers(tables: FeederTables) -> Ints:
     return indices([k for k, row in enumerate(tables.customers) if row.meter])
 
 
-def inverters(tables: FeederTables) -> Droop:
-    """Return the inverters with a droop curve, in the order of the customers."""
+def inverters(tables: FeederTables, ratio: Floats) -> Droop:
+    """Return the inverters with a droop curve, in the order of the customers.
+
+    Parameters
+    ----------
+    tables
+        The feeder's tables.
+    ratio : (N,)
+        Of each customer's voltage base and the nominal voltage, in which curves are standardised.
+    """
     own = [k for k, row in enumerate(tables.customers) if row.inverter_kva > 0]
     rows = [tables.customers[k] for k in own]
-    return fleet(
+    made = fleet(
         indices(own),
         [row.droop for row in rows],
         np.array([row.inverter_kva for row in rows], dtype=np.float64),
         tables.meta.base_kva,
         tau=np.array([np.nan if row.tau_s is None else row.tau_s for row in rows], dtype=np.float64),
     )
+    base = ratio[own]
+    return made if (base == 1.0).all() else replace(made, v=made.v / base[:, None])
 
 
-def accuracy(tables: FeederTables) -> MeterAccuracy:
-    """Return what the meters promise, pu."""
+def accuracy(tables: FeederTables, ratio: Floats) -> MeterAccuracy:
+    """Return what the meters promise, in the voltage base of each; arguments as of `inverters`."""
     meta = tables.meta
-    rows = [tables.customers[k] for k in metered_customers(tables)]
+    metered = metered_customers(tables)
+    rows, base = [tables.customers[k] for k in metered], ratio[metered]
     return MeterAccuracy(
         class_fraction=frozen(_either(rows, "class_percent", meta.meters.class_percent) / 100.0),
-        resolution=frozen(_either(rows, "resolution_volt", meta.meters.resolution_volt) / meta.voltage_volt),
-        jitter=frozen(_either(rows, "jitter_percent", meta.meters.jitter_percent) / 100.0),
+        resolution=frozen(
+            _either(rows, "resolution_volt", meta.meters.resolution_volt) / (base * meta.voltage_volt)
+        ),
+        jitter=frozen(_either(rows, "jitter_percent", meta.meters.jitter_percent) / 100.0 / base),
         busbar_class=meta.busbar_class_percent / 100.0,
         busbar_resolution=meta.busbar_resolution_volt / meta.voltage_volt,
         busbar_jitter=meta.busbar_jitter_percent / 100.0,

@@ -106,15 +106,17 @@ class ClosedLoop:
     droop
         The inverters; their curves are evaluated here as piecewise linear functions of the voltage.
     base_kva, base_volt
-        What 1 pu means for `droop`.
+        What 1 pu means for `droop`; the voltage as one number, or for each customer, (N,).
     """
 
-    def __init__(self, flow: PowerFlow | PlacesFlow, droop: Droop, base_kva: float, base_volt: float) -> None:
+    def __init__(
+        self, flow: PowerFlow | PlacesFlow, droop: Droop, base_kva: float, base_volt: Floats | float
+    ) -> None:
         self.flow = flow
         self.tau = droop.tau
         self.count = droop.tau.size
         self._base_kva = base_kva
-        self._base_volt = base_volt
+        self._base_volt = np.broadcast_to(base_volt, flow.grid.customer_bus.shape)[droop.customer]
         self._customer = droop.customer
         self._owner = np.eye(flow.grid.customer_bus.size)[droop.customer]
         # One ramp between each pair of neighbouring breakpoints, (m, 3).

@@ -26,8 +26,9 @@ from feeders.equipment import (
 )
 from feeders.load_phases import three_phase
 from feeders.schema import CustomerRow, FeederTables, LineRow, validate
+from feeders.taps import Referred, refer
 from feeders.topology import Edge, Tree, tree
-from gridsec.arrays import Floats, Ints
+from gridsec.arrays import Floats, Ints, frozen
 from gridsec.detect import MeterAccuracy
 from gridsec.droop import Droop
 from gridsec.errors import FeederInvalid
@@ -83,6 +84,8 @@ class Site:
         Positions of the buses, or None unless the files place every one of them.
     loads
         What is known of the customers' powers.
+    base_volt : (n,)
+        1 pu of every place, V: the nominal voltage, but behind taps its part, see `feeders.taps`.
     digest
         SHA-256 of the content: key of design caches. It changes with every value and with the order of
         the rows (which is the order of all arrays), not with layout, comments or unknown columns.
@@ -97,7 +100,13 @@ class Site:
     bus_of_file: Mapping[str, int]
     xy: Floats | None
     loads: LoadModel
+    base_volt: Floats
     digest: str
+
+    @property
+    def customer_volt(self) -> Floats:
+        """1 pu at every customer, V, (N,)."""
+        return np.asarray(self.base_volt[self.feeder.bus])
 
     @property
     def spanning(self) -> Feeder | ThreePhaseFeeder:
@@ -181,7 +190,8 @@ def from_tables(tables: FeederTables) -> Site:
     """Turn a feeder's tables into the per-unit model.
 
     With ``z_base = 3 V^2 / (1000 S)`` ohm for V volts phase to neutral and S kVA of all three phases:
-    ``r = r_ohm / z_base``, ``b = 1e-6 b_us z_base``, and powers in kW divide by S.
+    ``r = r_ohm / z_base``, ``b = 1e-6 b_us z_base``, and powers in kW divide by S. Behind taps V is that of
+    `feeders.taps`.
 
     Raises
     ------
@@ -199,19 +209,21 @@ def from_tables(tables: FeederTables) -> Site:
         meta.busbar,
         [Edge(row.line, row.from_bus, row.to_bus, row.r_ohm == row.x_ohm == 0.0) for row in closed],
     )
-    feeder = _feeder(tables, [closed[k] for k in found.branch], found)
+    base = refer(tables, closed, found)
+    feeder = _feeder(tables, base, found)
     ties = [closed[k] for k in found.ties]
     metered = metered_customers(tables)
     return Site(
         tables=tables,
         feeder=_meshed(tables, feeder, ties, found) if ties else feeder,
-        droop=inverters(tables),
+        droop=inverters(tables, base.customer),
         meters=metered,
         meter_ids=tuple(tables.customers[k].meter for k in metered),
-        accuracy=accuracy(tables),
+        accuracy=accuracy(tables, base.customer),
         bus_of_file=found.group,
         xy=positions(tables, found),
         loads=load_model(tables),
+        base_volt=frozen(base.bus * meta.voltage_volt),
         digest=digest(tables),
     )
 
@@ -257,7 +269,8 @@ def _in_phases(tables: FeederTables) -> Site:
     """The site of a feeder whose customers have one phase each."""
     found = three_phase(tables)
     parts = {f.name: getattr(found, f.name) for f in fields(found)}
-    return Site(**parts | {"feeder": PhasedFeeder(found.feeder)})
+    places = {"feeder": PhasedFeeder(found.feeder), "base_volt": frozen(np.repeat(found.base_volt, 3))}
+    return Site(**parts | places)
 
 
 def plant(site: Site) -> Plant:
@@ -265,17 +278,17 @@ def plant(site: Site) -> Plant:
     return Plant(site.feeder, site.droop, site.meters, site.accuracy, 1)
 
 
-def volts(site: Site, v2_pu: Floats) -> Floats:
+def volts(base_volt: Floats, v2_pu: Floats) -> Floats:
     """Return voltages from squared voltages: ``v = base_volt sqrt(v2)``.
 
     Parameters
     ----------
-    site
-        The feeder.
-    v2_pu
-        Squared voltages, pu, any shape; a negative one (no voltage has it) gives 0.
+    base_volt : (n,)
+        1 pu of each, V: `Site.base_volt` or `Site.customer_volt`.
+    v2_pu : (…, n)
+        Squared voltages, pu; a negative one (no voltage has it) gives 0.
     """
-    return np.asarray(site.feeder.base_volt * np.sqrt(np.maximum(v2_pu, 0.0)), dtype=np.float64)
+    return np.asarray(base_volt * np.sqrt(np.maximum(v2_pu, 0.0)), dtype=np.float64)
 
 
 def to_frame(site: Site, snapshot: Snapshot) -> Frame:
@@ -302,11 +315,11 @@ def to_frame(site: Site, snapshot: Snapshot) -> Frame:
     snapshot
         The readings.
     """
-    base_volt, base_kva, model = site.feeder.base_volt, site.feeder.base_kva, site.loads
+    base_volt, base_kva, model = site.customer_volt[site.meters], site.feeder.base_kva, site.loads
     seen = np.isfinite(snapshot.v_volt)
     v = np.clip(snapshot.v_volt / base_volt, -ABSURD_PU, ABSURD_PU)
     y = np.where(seen, v * np.abs(v), np.nan)
-    v0_squared, v0_phases = _busbar(snapshot.v0_volt, base_volt)
+    v0_squared, v0_phases = _busbar(snapshot.v0_volt, site.feeder.base_volt)
     metered = np.full(model.load_peak.size, np.nan)
     metered[site.meters] = snapshot.p_kw / base_kva
     known = np.abs(metered) <= model.credible  # False for NaN
@@ -355,20 +368,14 @@ def _unsupported(tables: FeederTables) -> tuple[str, ...]:
     """What the format can say and the model cannot do yet."""
     problems = []
     closed = [line for line in tables.lines if line.closed]
-    for line in closed:
-        where = f"lines, line {line.line!r}"
-        if line.tap != 1.0:
-            problems.append(
-                f"{where}: tap {line.tap:g}: the model takes no transformer in mid-feeder yet, only 1"
-            )
     if all(line.r_ohm == line.x_ohm == 0.0 for line in closed):
         problems.append("lines: no closed line has an impedance; there is nothing to watch below the busbar")
     return tuple(problems)
 
 
-def _feeder(tables: FeederTables, lines: list[LineRow], found: Tree) -> Feeder:
-    meta = tables.meta
-    z_base = 3.0 * meta.voltage_volt**2 / (1000.0 * meta.base_kva)
+def _feeder(tables: FeederTables, base: Referred, found: Tree) -> Feeder:
+    meta, lines = tables.meta, base.lines
+    z_base = 3.0 * (base.branch * meta.voltage_volt) ** 2 / (1000.0 * meta.base_kva)
     return Feeder(
         name=meta.name,
         parent=indices(found.parent),

@@ -25,8 +25,9 @@ from feeders.equipment import (
 )
 from feeders.matrices import cells_of, series_ohm, shunt_us
 from feeders.schema import FeederTables, LineRow, validate
+from feeders.taps import Referred, refer
 from feeders.topology import LOOPS_SHOWN, Edge, Tree, tree
-from gridsec.arrays import Floats, Ints, Phasors
+from gridsec.arrays import Floats, Ints, Phasors, frozen
 from gridsec.detect import MeterAccuracy
 from gridsec.droop import Droop
 from gridsec.errors import FeederInvalid
@@ -46,6 +47,8 @@ class ThreePhaseSite:
         The feeder in SI, as its files say it.
     feeder
         The radial tree, pu; powers of single phases in thirds of `base_kva`.
+    base_volt : (b + 1,)
+        1 pu of every bus, V, see `feeders.taps`.
     droop, meters, meter_ids, accuracy, bus_of_file, xy, loads, digest
         As in `feeders.load.Site`, in units of `base_kva`: `gridsec.phases.per_customer` fits them.
     """
@@ -59,6 +62,7 @@ class ThreePhaseSite:
     bus_of_file: Mapping[str, int]
     xy: Floats | None
     loads: LoadModel
+    base_volt: Floats
     digest: str
 
 
@@ -114,24 +118,26 @@ def three_phase(tables: FeederTables) -> ThreePhaseSite:
     if found.ties:
         named = ", ".join(repr(closed[k].line) for k in found.ties[:LOOPS_SHOWN])
         raise FeederInvalid([f"lines: {named} close loops; only balanced feeders can be meshed"])
+    base = refer(tables, closed, found)
     metered = metered_customers(tables)
     return ThreePhaseSite(
         tables=tables,
-        feeder=_feeder(tables, [closed[k] for k in found.branch], found),
-        droop=inverters(tables),
+        feeder=_feeder(tables, base, found),
+        droop=inverters(tables, base.customer),
         meters=metered,
         meter_ids=tuple(tables.customers[k].meter for k in metered),
-        accuracy=accuracy(tables),
+        accuracy=accuracy(tables, base.customer),
         bus_of_file=found.group,
         xy=positions(tables, found),
         loads=load_model(tables),
+        base_volt=frozen(base.bus * meta.voltage_volt),
         digest=digest(tables),
     )
 
 
-def _feeder(tables: FeederTables, lines: list[LineRow], found: Tree) -> ThreePhaseFeeder:
-    meta = tables.meta
-    z_base = 3.0 * meta.voltage_volt**2 / (1000.0 * meta.base_kva)
+def _feeder(tables: FeederTables, base: Referred, found: Tree) -> ThreePhaseFeeder:
+    meta, lines = tables.meta, base.lines
+    z_base = 3.0 * (base.branch * meta.voltage_volt)[:, None, None] ** 2 / (1000.0 * meta.base_kva)
     phases = np.array([(True,) * 3, *(_present(line.phases) for line in lines)])
     both = phases[1:, :, None] & phases[1:, None, :]
     charging = np.array([shunt_of(line) for line in lines]) * (1e-6 * z_base)
@@ -188,10 +194,6 @@ def _unsupported(tables: FeederTables) -> tuple[str, ...]:
     for line in closed:
         where = f"lines, line {line.line!r}"
         given = (line.r0_ohm is not None) + (line.x0_ohm is not None)
-        if line.tap != 1.0:
-            problems.append(
-                f"{where}: tap {line.tap:g}: the model takes no transformer in mid-feeder yet, only 1"
-            )
         if _fuses(line):
             if line.phases != "abc":
                 problems.append(

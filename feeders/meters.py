@@ -194,13 +194,13 @@ class Meters:
         self.busbar_bias = errors.bias * accuracy.busbar_class * random.uniform(-1.0, 1.0, self._busbars)
         self._clock = channel.clock_s * random.uniform(-1.0, 1.0, self.count + 1)
 
-        nominal = site.tables.meta.voltage_volt
+        base = np.append(site.customer_volt[customer], [site.tables.meta.voltage_volt] * self._busbars)
         self._jitter = (
-            errors.jitter * nominal * np.append(accuracy.jitter, [accuracy.busbar_jitter] * self._busbars)
+            errors.jitter * base * np.append(accuracy.jitter, [accuracy.busbar_jitter] * self._busbars)
         )
         self._step = (
             errors.resolution
-            * nominal
+            * base
             * np.append(accuracy.resolution, [accuracy.busbar_resolution] * self._busbars)
         )
         self._p_step = errors.resolution * site.tables.meta.meters.p_resolution_kw

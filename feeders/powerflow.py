@@ -59,6 +59,8 @@ class Grid:
         Number of buses B.
     nominal_volt
         Nominal phase-to-neutral voltage, V.
+    tap : (L,), optional
+        Ratio of an ideal transformer at the first end of each line: the voltage there by that behind it.
     """
 
     ends: Ints
@@ -69,6 +71,7 @@ class Grid:
     customer_bus: Ints
     bus_count: int
     nominal_volt: float
+    tap: Floats | None = None
 
 
 class PowerFlow:
@@ -215,8 +218,7 @@ def _grid(site: Site) -> tuple[Grid, Ints]:
     r = np.array([line.r_ohm for line in closed], dtype=np.float64)
     x = np.array([line.x_ohm for line in closed], dtype=np.float64)
     b = np.array([line.b_us for line in closed], dtype=np.float64) * 1e-6
-    if any(line.tap != 1.0 for line in closed):
-        raise GridsecError("the AC power flow has no tap changers inside a feeder")
+    tap = np.array([line.tap for line in closed], dtype=np.float64)
     solid = (r == 0.0) & (x == 0.0)
     node, count = _fuse(ends[solid], len(names))
     grid = Grid(
@@ -228,6 +230,7 @@ def _grid(site: Site) -> tuple[Grid, Ints]:
         customer_bus=node[np.array([number[row.bus] for row in tables.customers], dtype=np.intp)],
         bus_count=count,
         nominal_volt=tables.meta.voltage_volt,
+        tap=tap[~solid],
     )
     order = np.full(len(site.feeder.buses), -1, dtype=np.intp)
     for name, i in number.items():
@@ -250,13 +253,20 @@ def _components(grid: Grid) -> dict[ComponentType, Any]:
     node["id"] = np.arange(grid.bus_count)
     node["u_rated"] = grid.nominal_volt * np.sqrt(3.0)
 
-    line = initialize_array(DatasetType.input, ComponentType.line, lines)
-    line["id"] = grid.bus_count + np.arange(lines)
-    line["from_node"], line["to_node"] = grid.ends[:, 0], grid.ends[:, 1]
-    line["from_status"] = line["to_status"] = 1
-    line["r1"], line["x1"] = grid.r_ohm, grid.x_ohm
-    line["c1"] = grid.b_siemens / (2.0 * np.pi * FREQUENCY_HZ)
+    number = grid.bus_count + np.arange(lines)
+    tapped = np.zeros(lines, dtype=np.bool_) if grid.tap is None else grid.tap != 1.0
+    line = initialize_array(DatasetType.input, ComponentType.line, int((~tapped).sum()))
+    branch = initialize_array(DatasetType.input, ComponentType.generic_branch, int(tapped.sum()))
+    for table, rows in ((line, ~tapped), (branch, tapped)):
+        table["id"] = number[rows]
+        table["from_node"], table["to_node"] = grid.ends[rows].T
+        table["from_status"] = table["to_status"] = 1
+        table["r1"], table["x1"] = grid.r_ohm[rows], grid.x_ohm[rows]
+    line["c1"] = grid.b_siemens[~tapped] / (2.0 * np.pi * FREQUENCY_HZ)
     line["tan1"] = 0.0
+    if grid.tap is not None:
+        branch["k"], branch["b1"] = grid.tap[tapped], grid.b_siemens[tapped]
+    branch["theta"] = branch["g1"] = 0.0
 
     load = initialize_array(DatasetType.input, ComponentType.sym_load, customers)
     load["id"] = _first_load(grid) + np.arange(customers)
@@ -274,6 +284,7 @@ def _components(grid: Grid) -> dict[ComponentType, Any]:
     return {
         ComponentType.node: node,
         ComponentType.line: line,
+        ComponentType.generic_branch: branch,
         ComponentType.sym_load: load,
         ComponentType.source: source,
     }

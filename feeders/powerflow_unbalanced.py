@@ -65,6 +65,8 @@ class UnbalancedGrid:
         Number of buses B.
     nominal_volt
         Nominal phase-to-neutral voltage, V.
+    tap : (L,), optional
+        Ratio of an ideal transformer at the first end of each line: the voltages there by those behind it.
     source_ohm : (3, 3), optional
         Impedance between the given voltage and the busbar, ohm. For a transformer Dyn, `sequence_ohm` of its
         short-circuit impedance (with that of the grid above) and its zero-sequence impedance, both seen from
@@ -81,6 +83,7 @@ class UnbalancedGrid:
     bus_count: int
     nominal_volt: float
     source_ohm: Phasors | None = None
+    tap: Floats | None = None
 
 
 class UnbalancedPowerFlow:
@@ -280,14 +283,16 @@ def _admittances(grid: UnbalancedGrid) -> csc_array:
         columns.append(np.tile(3 * other + here, here.size))
         values.append(block.ravel())
 
-    lines = zip(grid.ends.tolist(), grid.present, grid.z_ohm, grid.b_siemens, strict=True)
-    for (one, other), present, z, b in lines:
+    taps = np.ones(len(grid.ends)) if grid.tap is None else grid.tap
+    lines = zip(grid.ends.tolist(), taps.tolist(), grid.present, grid.z_ohm, grid.b_siemens, strict=True)
+    for (one, other), tap, present, z, b in lines:
         here = np.flatnonzero(present)
         series: Phasors = np.linalg.inv(z[np.ix_(here, here)])
         own: Phasors = series + 0.5j * b[np.ix_(here, here)]
-        for end, far in ((one, other), (other, one)):
-            stamp(end, end, here, own)
-            stamp(end, far, here, -series)
+        # Behind the transformer the voltage is v / tap, and its current there is i tap.
+        for end, far, ratio in ((one, other, tap), (other, one, 1.0)):
+            stamp(end, end, here, own / ratio**2)
+            stamp(end, far, here, -series / tap)
     if grid.source_ohm is not None:
         stamp(
             grid.busbar, grid.busbar, np.arange(3), np.asarray(np.linalg.inv(grid.source_ohm), np.complex128)
@@ -328,6 +333,7 @@ def _grid(tables: FeederTables, source_ohm: Phasors | None) -> tuple[UnbalancedG
         bus_count=len(number),
         nominal_volt=tables.meta.voltage_volt,
         source_ohm=source_ohm,
+        tap=np.array([line.tap for line in lines]),
     )
     return grid, node
 

@@ -260,7 +260,7 @@ def _fake_load(site: Site, scenario: Scenario, t: Floats) -> tuple[Floats, Float
 
 
 def _truth(site: Site, scenario: Scenario, sample: Sample) -> Truth:
-    base = site.feeder.base_volt
+    base = site.customer_volt
     reported = sample.reported.v_volt[0]
     inverters = np.zeros(site.droop.tau.size, dtype=np.bool_)
     for attack in scenario.inverter_attacks:
@@ -268,7 +268,7 @@ def _truth(site: Site, scenario: Scenario, sample: Sample) -> Truth:
     return Truth(
         v2=(sample.v_volt / base) ** 2,
         liars=sample.manipulated,
-        attack=(reported**2 - (reported - sample.shift_volt) ** 2) / base**2,
+        attack=(reported**2 - (reported - sample.shift_volt) ** 2) / base[site.meters] ** 2,
         inverters=inverters,
     )
 

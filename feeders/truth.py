@@ -73,7 +73,7 @@ def truth(site: Site, scenario: Scenario, first: int, end: float) -> Iterator[Bl
     customers = Customers(
         site, scenario.variation, scenario.seed, scenario.start, scenario.profile_s, season=scenario.season
     )
-    loop = ClosedLoop(power_flow(site), site.droop, site.feeder.base_kva, site.feeder.base_volt)
+    loop = ClosedLoop(power_flow(site), site.droop, site.feeder.base_kva, site.customer_volt)
     steps = substeps(site, scenario)
     course = _Course(loop, scenario.dt_s / steps)
     begin = first

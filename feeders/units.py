@@ -118,7 +118,7 @@ def _line_extras(parsed: Parsed) -> Doubts:
             yield "impedance", f"{where}, column b_us: {cells['b_us']:g} microsiemens is very large; in nS?"
     for where, cells in rows(parsed.lines, "tap"):
         if not 0.5 <= cells["tap"] <= 2.0:
-            yield "ratio", f"{where}, column tap: {cells['tap']:g} is no ratio near 1; 5 % up is 1.05"
+            yield "ratio", f"{where}, column tap: {cells['tap']:g} is no ratio near 1; 5 % up is 0.95"
 
 
 def _powers(parsed: Parsed) -> Doubts:

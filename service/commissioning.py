@@ -330,7 +330,8 @@ class Commissioning:
 
     def _meters(self, known: Commission) -> tuple[MeterStage, ...]:
         learned, learning = known.learned, known.learning
-        base, needed, t = self._site.feeder.base_volt, self._site.tables.meta.monitor.commission_s, self._t
+        base = self._site.customer_volt[self._site.meters]
+        needed, t = self._site.tables.meta.monitor.commission_s, self._t
         none = np.full(learned.at.size, np.nan)
         since, gathered = (none, none) if learning is None else (learning.since, learning.time_s)
         error = base * (np.sqrt(1.0 + learned.bias) - 1.0)

@@ -213,9 +213,12 @@ def build(site: Site, tick: Tick, max_attacked: int, estimate: Estimate, verdict
     estimate, verdict
         What the monitor made of it.
     """
-    v, std = volts(site, estimate.v2), std_volts(site, estimate)
+    v, std = volts(site.customer_volt, estimate.v2), std_volts(site, estimate)
     at = site.meters
-    numbers = np.column_stack((verdict.score, verdict.threshold, v[at], std[at], estimate.v2[at]))
+    v2 = (
+        estimate.v2 * (site.customer_volt / site.tables.meta.voltage_volt) ** 2
+    )  # of nominal, behind taps too
+    numbers = np.column_stack((verdict.score, verdict.threshold, v[at], std[at], v2[at]))
     attack = attack_volts(site, tick, verdict)
     kinds = verdict.kinds or (None,) * len(site.meter_ids)
     meters = []

@@ -59,7 +59,7 @@ def bus_volts(site: Site, v2_bus: Floats) -> tuple[Floats, Floats]:
     phases : (b + 1, 3) or (b + 1, 0)
         Voltage of each of its phases, V, NaN for one that it does not have; nothing on a balanced feeder.
     """
-    v = volts(site, v2_bus)
+    v = volts(site.base_volt, v2_bus)
     if not isinstance(site.feeder, PhasedFeeder):
         return v, np.zeros((v.size, 0))
     phases = np.where(site.feeder.tree.phases, v.reshape(-1, 3), np.nan)
@@ -76,7 +76,8 @@ def std_volts(site: Site, estimate: Estimate) -> Floats:
         The feeder, and what the estimator says.
     """
     half, share = (estimate.std, 1.0) if estimate.std.size else (estimate.bound, 1.0 / 3.0)
-    return np.asarray(0.5 * share * (volts(site, estimate.v2 + half) - volts(site, estimate.v2 - half)))
+    base = site.customer_volt
+    return np.asarray(0.5 * share * (volts(base, estimate.v2 + half) - volts(base, estimate.v2 - half)))
 
 
 def attack_volts(site: Site, tick: Tick, verdict: Verdict) -> Floats:
@@ -87,7 +88,7 @@ def attack_volts(site: Site, tick: Tick, verdict: Verdict) -> Floats:
     site, tick, verdict
         The feeder, what was known, and what the estimator says.
     """
-    base = site.feeder.base_volt
+    base = site.customer_volt[site.meters]
     reported = np.array([math.nan if r is None else r.v_volt for r in tick.readings], dtype=np.float64)
-    true = volts(site, (reported / base) ** 2 - verdict.attack)
+    true = volts(base, (reported / base) ** 2 - verdict.attack)
     return np.where(verdict.suspects, reported - true, 0.0)

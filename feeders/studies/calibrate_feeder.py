@@ -11,6 +11,7 @@ import numpy as np
 
 from feeders.load import Site, find, from_tables
 from feeders.load_phases import ThreePhaseSite, three_phase
+from feeders.taps import refuse
 from feeders.topology import Edge, tree
 from gridsec import phases as three
 from gridsec.arrays import Bools, Floats, Ints
@@ -117,6 +118,7 @@ def network(tables: FeederTables) -> Network:
         With every problem of the files.
     """
     site = _site(tables)
+    refuse(site)
     closed = [k for k, line in enumerate(tables.lines) if line.closed]
     rows = [tables.lines[k] for k in closed]
     edges = [Edge(row.line, row.from_bus, row.to_bus, row.r_ohm == row.x_ohm == 0.0) for row in rows]

@@ -371,7 +371,8 @@ def _each(  # noqa: PLR0917  # meters and inverters alike
         caught = np.flatnonzero(named[:, j] & lying)
         delay = (caught[0] - np.argmax(lying)) * step_s if caught.size else np.inf
         inverter = bool(j >= site.meters.size)
-        volt = np.nan if inverter else np.abs(played.shift[begin:, j]).max() * site.feeder.base_volt
+        base = np.nan if inverter else site.customer_volt[site.meters[j]]
+        volt = np.nan if inverter else np.abs(played.shift[begin:, j]).max() * base
         rows.append(
             {
                 "who": names[j],

@@ -32,6 +32,7 @@ from feeders.studies.droop_verdict import (
     worst,
 )
 from feeders.studies.journal import Journal, Progress, worked
+from feeders.taps import refuse
 from gridsec.droop import PRESETS, Droop
 from gridsec.studies.droop_network import Box
 from gridsec.studies.droop_rest import rest
@@ -205,12 +206,13 @@ def droop(
     Raises
     ------
     FeederInvalid
-        If the feeder has no inverters and no preset is given.
+        If the feeder has no inverters and no preset is given, or has taps.
     ValueError
         If options are out of range.
     OtherStudy
         If the journal is another study's.
     """
+    refuse(site)
     given = options or DroopOptions()
     study = _Study(Subject.of(site), chosen_fleet(site, given.preset, given.who), given, seed)
     low, high = study.limits
@@ -422,6 +424,7 @@ def presets_of(sites: Sequence[Site], options: DroopOptions | None = None, *, se
     """
     given, out = options or DroopOptions(), []
     for site in sites:
+        refuse(site)
         subject = Subject.of(site)
         for name in given.presets:
             study = _Study(subject, equip(site, name, given.who), given, seed)

@@ -8,6 +8,7 @@ import numpy as np
 
 from feeders.load import Snapshot, to_frame
 from feeders.studies.hidden import Curves
+from feeders.taps import refuse
 from gridsec.arrays import Floats
 from gridsec.detect import busbar_error, reading_error
 from gridsec.network import Power, between
@@ -41,7 +42,13 @@ def box(site: Site, *, share: float = SHARE, curves: Curves = Curves.DEADBAND) -
         Of the peak load.
     curves
         Where the inverters work; at nominal voltage that is the deadband.
+
+    Raises
+    ------
+    FeederInvalid
+        If the feeder has taps.
     """
+    refuse(site)
     rows = site.tables.customers
     drawn = np.array([share * (row.load_kw or 0.0) for row in rows])[site.meters]
     nominal = np.full(site.meters.size, site.feeder.base_volt)

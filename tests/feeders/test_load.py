@@ -98,14 +98,6 @@ def test_line_direction_does_not_matter(three: Site) -> None:
     np.testing.assert_array_equal(site.feeder.r, three.feeder.r)
 
 
-def test_taps_inside_a_feeder_are_refused(three: Site) -> None:
-    lines = (replace(three.tables.lines[0], tap=1.025), *three.tables.lines[1:])
-    with pytest.raises(FeederInvalid, match=r"tap 1\.025"):
-        from_tables(replace(three.tables, lines=lines))
-    with pytest.raises(FeederInvalid, match=r"line '2': tap 1\.025"):
-        from_tables(read(GOOD / "single-phase"))
-
-
 def test_what_takes_balanced_feeders_says_so(three: Site) -> None:
     assert three.balanced is three.feeder
     with pytest.raises(FeederInvalid, match="balanced feeders only"):
@@ -333,7 +325,7 @@ def test_the_interval_holds_the_truth(data: st.DataObject) -> None:
 
 def test_volts_undoes_the_square(three: Site) -> None:
     np.testing.assert_allclose(
-        volts(three, np.array([[1.0, 0.81], [-0.5, 1.21]])), [[230.0, 207.0], [0.0, 253.0]]
+        volts(np.full(2, 230.0), np.array([[1.0, 0.81], [-0.5, 1.21]])), [[230.0, 207.0], [0.0, 253.0]]
     )
 
 

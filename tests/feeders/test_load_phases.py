@@ -184,7 +184,6 @@ def test_a_balanced_feeder_has_the_matrices_of_the_balanced_loader() -> None:
         (0, {"r0_ohm": None}, "line '1', column r0_ohm: is missing"),
         (1, {"r0_ohm": None, "x0_ohm": None}, "line '2', column r0_ohm: is missing"),
         (2, {"r0_ohm": 0.1}, "line '3', column x0_ohm: is missing"),
-        (1, {"tap": 1.05}, "line '2': tap 1.05"),
         (2, {"r_ohm": 0.0, "x_ohm": 0.0}, "phases 'b' without impedance"),
         (0, {"r_ohm": 0.0, "x_ohm": 0.0}, "has an impedance only in the zero sequence"),
     ],

@@ -1,0 +1,219 @@
+"""Taps inside a feeder: the model referred to the busbar against AC power flows that have the transformer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from feeders.campaign import fake_load
+from feeders.inverters import ClosedLoop, Loads
+from feeders.load import Site, Snapshot, from_tables, load, to_frame, volts
+from feeders.load_phases import three_phase
+from feeders.meters import Channel, MeterErrors, Meters
+from feeders.powerflow import Grid, PowerFlow
+from feeders.powerflow_unbalanced import PlacesFlow, UnbalancedPowerFlow, power_flow
+from feeders.schema import FeederTables, LineRow
+from feeders.studies.calibrate_feeder import network
+from feeders.studies.detectable import detectable
+from feeders.studies.droop import droop
+from gridsec.droop import preset
+from gridsec.errors import FeederInvalid
+from gridsec.feeder import bus_voltages, model_error_bound
+from gridsec.phases import PhasedFeeder
+from gridsec.phases import bus_voltages as phase_voltages
+from gridsec.phases import model_error_bound as phase_error_bound
+from tests.feeders import villages
+
+TAPS = {"l2": 0.95, "l4": 1.04, "l5": 1.02}
+"""The second is given from the far end, so that it raises the voltage beyond it."""
+
+A = np.array([1.0, 1.0, 1 / 0.95, 1 / 0.95, 1.04, 1.04 / 1.02])
+"""By hand: bases of bb, n1, n2, n3, n5, n6 by the nominal voltage."""
+
+
+def tapped(tables: FeederTables, taps: dict[str, float]) -> FeederTables:
+    rows = (replace(line, tap=taps.get(line.line, 1.0)) for line in tables.lines)
+    return replace(tables, lines=tuple(rows))
+
+
+def village() -> Site:
+    return from_tables(tapped(villages.tables(), TAPS))
+
+
+def village_in_phases() -> Site:
+    tables = villages.tables()
+    lines = tuple(replace(line, r0_ohm=3 * line.r_ohm, x0_ohm=4 * line.x_ohm) for line in tables.lines)
+    phases = dict(zip("12345678", "abcabcab", strict=True))
+    customers = tuple(replace(row, phases=phases.get(row.customer[1], "abc")) for row in tables.customers)
+    customers = (replace(customers[0], phases="abc"), *customers[1:])
+    customers = tuple(replace(row, load_kw=row.load_kw / 3) for row in customers)
+    return from_tables(tapped(replace(tables, lines=lines, customers=customers), TAPS))
+
+
+def test_every_bus_has_its_base() -> None:
+    site = village()
+    assert site.tree.buses == ("bb", "n1", "n2", "n3", "n5", "n6")
+    np.testing.assert_allclose(site.base_volt, 230.0 * A, rtol=1e-15)
+    np.testing.assert_array_equal(site.customer_volt, site.base_volt[site.feeder.bus])
+    np.testing.assert_array_equal(village_in_phases().base_volt, np.repeat(site.base_volt, 3))
+
+
+def test_without_taps_nothing_changes() -> None:
+    plain = from_tables(villages.tables())
+    assert (plain.base_volt == 230.0).all()
+    z_base = 3.0 * 230.0**2 / (1000.0 * 100.0)
+    assert plain.tree.r[0] == 0.030 / z_base  # to the last bit
+    np.testing.assert_array_equal(plain.accuracy.resolution, 0.1 / 230.0)
+
+
+@pytest.mark.parametrize("reverse", [False, True])
+def test_one_tap_in_closed_form(reverse: bool) -> None:
+    """Two buses, unity power: with E the voltage behind the tap, ``V (E - V) = r P`` per phase, x = 0."""
+    ends = [[1, 0]] if reverse else [[0, 1]]
+    one = np.array([0.1])
+    grid = Grid(np.array(ends), one, 0.0 * one, 0.0 * one, 0, np.array([1]), 2, 230.0, np.array([0.95]))
+    _, (_, found) = PowerFlow.of(grid).solve(np.array([9.0]), np.zeros(1), 230.0)
+    ohm = 0.1 * (0.95**2 if reverse else 1.0)  # as seen from the customer's side
+    behind = 230.0 * 0.95 if reverse else 230.0 / 0.95
+    assert found == pytest.approx(0.5 * (behind + np.sqrt(behind**2 - 4 * ohm * 3000.0)), abs=1e-6)
+
+
+@given(seed=st.integers(0, 10_000))
+@settings(max_examples=20, deadline=None)
+def test_two_power_flows_and_the_model_agree(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    taps = {name: float(rng.uniform(0.9, 1.1)) for name in ("l1", "l2", "l3", "l4", "l5")}
+    tables = tapped(villages.tables(), taps)
+    lines = tuple(replace(line, r0_ohm=3 * line.r_ohm, x0_ohm=4 * line.x_ohm) for line in tables.lines)
+    site, whole = from_tables(tables), three_phase(replace(tables, lines=lines))
+    p_kw, q_kvar = rng.uniform(-5.0, 10.0, (2, 8))
+    customers, buses = PowerFlow(site).solve(p_kw, q_kvar, 233.0)
+    _, phases = UnbalancedPowerFlow(whole).solve(p_kw, q_kvar, 233.0)
+    np.testing.assert_allclose(phases, np.repeat(buses[:, None], 3, axis=1), rtol=0, atol=1e-6)
+    p, q, v0 = -p_kw / 100.0, -q_kvar / 100.0, (233.0 / 230.0) ** 2
+    np.testing.assert_allclose(
+        volts(site.base_volt, bus_voltages(site.balanced, p, q, v0, steps=40)), buses, rtol=0, atol=1e-6
+    )
+    once, bound = bus_voltages(site.balanced, p, q, v0), model_error_bound(site.balanced, p, q, v0)
+    assert (np.abs(once - (buses / site.base_volt) ** 2)[site.feeder.bus] <= bound + 1e-9).all()
+    np.testing.assert_array_equal(customers, buses[site.feeder.bus])
+
+
+def test_three_phases_within_the_bound() -> None:
+    site = village_in_phases()
+    assert isinstance(site.feeder, PhasedFeeder)
+    flow = power_flow(site)
+    assert isinstance(flow, PlacesFlow)
+    p_kw = np.array([row.load_kw for row in site.tables.customers])
+    _, places = flow.solve(p_kw, 0.3 * p_kw, np.array([229.0, 231.0, 234.0]))
+    tree, third = site.feeder.tree, 100.0 / 3.0
+    v0 = (np.array([229.0, 231.0, 234.0]) / 230.0) ** 2
+    drawn = -p_kw / third, -0.3 * p_kw / third
+    exact = (places / site.base_volt) ** 2
+    settled = phase_voltages(tree, *drawn, v0, steps=40).T.ravel()
+    np.testing.assert_allclose(settled, exact, rtol=0, atol=1e-8)
+    once, bound = phase_voltages(tree, *drawn, v0).T.ravel(), phase_error_bound(tree, *drawn, v0)
+    assert (np.abs(once - exact)[site.feeder.bus] <= bound + 1e-9).all()
+
+
+@pytest.mark.parametrize("site", [village(), village_in_phases()], ids=["balanced", "phases"])
+def test_readings_are_per_unit_of_their_own_base(site: Site) -> None:
+    count = site.meters.size
+    read = np.linspace(210.0, 250.0, count)
+    v0 = 231.0 if isinstance(site.feeder.buses, tuple) and site.base_volt.size == 6 else np.full(3, 231.0)
+    frame = to_frame(site, Snapshot(0.0, read, np.ones(count), np.zeros(count), v0))
+    np.testing.assert_allclose(volts(site.customer_volt[site.meters], frame.y), read, rtol=1e-14)
+    assert frame.v0_squared == pytest.approx((231.0 / 230.0) ** 2)
+    # Meters are as accurate in volts behind a tap as before it: class 0.5, 0.1 V, 0.05 % of nominal.
+    accuracy, base = site.accuracy, site.customer_volt[site.meters]
+    np.testing.assert_allclose(accuracy.resolution * base, 0.1, rtol=1e-14)
+    np.testing.assert_allclose(accuracy.jitter * base, 0.0005 * 230.0, rtol=1e-14)
+    np.testing.assert_array_equal(accuracy.class_fraction, 0.005)
+    errors = MeterErrors(bias=0.0, power=0.0)
+    meters, rows = Meters(site, errors, Channel(), 1), len(site.tables.customers)
+    true = np.full((4000, rows), 231.04)
+    registers = meters.read(
+        np.arange(4000), true, 0.0 * true, 0.0 * true, np.full((4000, *np.shape(v0)), 231.0)
+    )
+    assert np.abs(np.round(registers.v_volt / 0.1) * 0.1 - registers.v_volt).max() < 1e-9
+    spread = np.hypot(0.0005 * 230.0, 0.1 / np.sqrt(12.0))
+    np.testing.assert_allclose(registers.v_volt.std(axis=0), spread, rtol=0.05)
+
+
+def test_inverters_follow_the_standards_curve_in_true_volts() -> None:
+    site = village()
+    p_kw = np.array([1.0, -12.0, -8.0, 2.0, -15.0, 1.0, 2.0, -20.0])
+    loop = ClosedLoop(power_flow(site), site.droop, 100.0, site.customer_volt)
+    rest = loop.equilibrium(Loads(p_kw, 0.1 * np.abs(p_kw), 238.0))
+    rows = [site.tables.customers[k] for k in site.droop.customer]
+    expected = []
+    for row, v in zip(rows, rest.v_volt[site.droop.customer] / 230.0, strict=True):
+        curve = preset(row.droop)
+        expected.append(np.interp(v, curve.v, curve.q) * row.inverter_kva / 100.0)
+    assert np.abs(expected).min() > 0.01
+    np.testing.assert_allclose(rest.x, expected, rtol=0, atol=1e-6)
+    # At its breakpoints the curve that the model runs on is the same one.
+    for k, row in enumerate(rows):
+        true = np.array(preset(row.droop).v) * 230.0 / site.customer_volt[site.droop.customer[k]]
+        at = site.droop(1.0 - true[:, None] ** 2, np.full((4, 1), k))[:, 0]
+        np.testing.assert_allclose(at, np.array(preset(row.droop).q) * row.inverter_kva / 100.0, atol=1e-12)
+
+
+def test_the_trace_of_a_load_that_is_not_there_is_in_volts() -> None:
+    tables = villages.village_without_inverters().tables
+    site, customers = from_tables(tapped(tables, TAPS)), len(tables.customers)
+    loads = Loads(np.ones(customers), np.full(customers, 0.2), 231.0)
+    chosen, fake = fake_load(site, 3, 3, 0.02, loads=loads)
+    assert np.abs(fake.shift[chosen]).min() == pytest.approx(0.02, rel=1e-3)
+    more = np.zeros(customers)
+    more[3] = 1.0
+    flow = power_flow(site)
+    before, _ = flow.solve(loads.p_kw, loads.q_kvar, 231.0)
+    after, _ = flow.solve(loads.p_kw + fake.p_kw * more, loads.q_kvar + fake.q_kvar * more, 231.0)
+    np.testing.assert_allclose(230.0 * fake.shift, (after - before)[site.meters], rtol=0.03)
+
+
+@pytest.mark.parametrize(
+    "study",
+    [droop, lambda site: network(site.tables), lambda site: detectable(site, max_attacked=1)],
+    ids=["droop", "calibrate", "detectable"],
+)
+def test_studies_of_one_voltage_base_say_so(study: Callable[[Site], object]) -> None:
+    with pytest.raises(FeederInvalid, match="without taps only"):
+        study(village())
+
+
+def test_where_no_tap_can_be() -> None:
+    tables = villages.tables()
+    with pytest.raises(FeederInvalid, match=r"line 'link', column tap: 1\.1 on a line without impedance"):
+        from_tables(tapped(tables, {"link": 1.1}))
+    closed = replace(
+        tables,
+        meta=replace(tables.meta, meshed=True),
+        lines=tuple(replace(line, closed=True) for line in tables.lines),
+    )
+    assert from_tables(closed).ties.size == 2
+    with pytest.raises(FeederInvalid, match=r"line 'l2', column tap: 0\.95 where closed lines form loops"):
+        from_tables(tapped(closed, TAPS))
+
+
+def test_a_long_feeder_with_a_regulator() -> None:
+    """Kerber Vorstadtnetz with 5 % more in the middle of every street: nothing else of it moves."""
+    plain = load("kerber-vorstadtnetz")
+    half = plain.tree.parent.size // 2
+    tables = plain.tables
+    line = next(row for row in tables.lines if row.closed and plain.bus_of_file[row.to_bus] == half)
+    assert isinstance(line, LineRow)
+    site = from_tables(tapped(tables, {line.line: 0.95}))
+    behind = site.base_volt > 240.0
+    assert 0 < behind.sum() < behind.size
+    p_kw = np.zeros(site.feeder.bus.size)
+    for one, factor in ((plain, 1.0), (site, 1.0 / 0.95)):
+        _, buses = power_flow(one).solve(p_kw, p_kw, one.feeder.base_volt)
+        np.testing.assert_allclose(buses[behind] / one.feeder.base_volt, factor, rtol=1e-5)
+        np.testing.assert_allclose(buses[~behind] / one.feeder.base_volt, 1.0, rtol=1e-5)
