@@ -51,7 +51,8 @@ def feeders_show(feeder: Feeder) -> None:
     out.print(f"[bold]{escape(meta.name)}[/] {escape(meta.title)}")
     out.print(
         f"{meta.voltage_volt:g} V phase to neutral, {len(site.spanning.buses)} buses, "
-        f"{len(site.feeder.customers)} customers, {len(site.meter_ids)} meters, "
+        + (f"{len(site.ties)} closed ties, " if site.ties.size else "")
+        + f"{len(site.feeder.customers)} customers, {len(site.meter_ids)} meters, "
         f"watched every {meta.monitor.tick_s:g} s for up to {meta.monitor.max_attacked} manipulated meters"
     )
     table = Table("customer", "bus", "phases", "meter", "load kW", "PV kW", "inverter kVA", "droop")

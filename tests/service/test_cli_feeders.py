@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from benchmarks.mesh import baran_wu
+from feeders.schema import write
 from tests.service.commands import command
 
 run = command("feeders")
@@ -28,6 +31,29 @@ def test_a_bank_by_matrix_inequality_is_designed_once(
     code, again, _ = run(monkeypatch, capsys, *arguments)
     assert (code, kept.read_bytes()) == (0, before)
     assert again.splitlines()[1] == first.splitlines()[1]
+
+
+def test_a_meshed_feeder_is_checked_shown_and_designed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tables = baran_wu().tables
+    write(tables, tmp_path / "mesh")
+    write(replace(tables, meta=replace(tables.meta, meshed=False)), tmp_path / "radial")
+    code, said, _ = run(monkeypatch, capsys, "validate", str(tmp_path / "mesh"))
+    assert code == 0
+    assert said.count("is drawn as a tie") == 5
+    code, _, error = run(monkeypatch, capsys, "validate", str(tmp_path / "radial"))
+    assert code == 3
+    assert "meshed to true in feeder.toml" in " ".join(error.split())
+    code, said, _ = run(monkeypatch, capsys, "show", str(tmp_path / "mesh"))
+    assert code == 0
+    assert "33 buses, 5 closed ties, 32 customers" in " ".join(said.split())
+    code, said, _ = run(monkeypatch, capsys, "design", str(tmp_path / "mesh"))
+    assert code == 0
+    assert "reactance certificate" in said
+    code, _, error = run(monkeypatch, capsys, "design", str(tmp_path / "mesh"), "--estimator", "exact-bank")
+    assert code != 0
+    assert "takes radial feeders only" in " ".join(error.split())
 
 
 def test_what_cannot_be_watched_is_said(
