@@ -265,8 +265,8 @@ def _tree(site: Site, width: float) -> Placed:
     for one, other in site.ties.tolist():
         # The busbar is met in the row of the other end.
         a, b = (at(*poles.get(k, (0, poles.get(far, (0, 0))[1]))) for k, far in ((one, other), (other, one)))
-        x, y = 0.5 * (a[0] + b[0]), 0.5 * (a[1] + b[1])
-        closing.append((a, (x - 14.0, y) if upright else (x, y - 14.0), b))
+        mid = (0.5 * (a[0] + b[0]), 0.5 * (a[1] + b[1]))
+        closing.append((a, (mid[0] - 14.0, mid[1]) if upright else (mid[0], mid[1] - 14.0), b))
     first, last = at(0, 0), at(0, rows - 1)
     ends = (
         ((first[0] - 10, first[1]), (last[0] + 10, last[1]))

@@ -30,7 +30,7 @@ def loads(feeder: MeshedFeeder, seed: int, size: float = 0.02) -> tuple[Floats, 
 
 
 @given(seeds)
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_without_ties_it_is_the_radial_feeder(seed: int) -> None:
     feeder = random_mesh(seed, ties=0, charging=0.01)
     model = lindistflow(feeder.tree)
@@ -46,7 +46,7 @@ def test_without_ties_it_is_the_radial_feeder(seed: int) -> None:
 
 
 @given(seeds)
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_impedances_invert_the_admittances(seed: int) -> None:
     feeder = random_mesh(seed)
     lines = zip(feeder.ends, feeder.r + 1j * feeder.x, strict=True)
@@ -97,7 +97,7 @@ def test_a_ring_of_unlike_cables_can_couple_with_a_negative_sign() -> None:
 
 @pytest.mark.parametrize("charging", [0.0, 0.02])
 @given(seed=seeds, size=st.sampled_from([0.003, 0.02, 0.08]))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 def test_the_power_flow_is_within_the_bound(charging: float, seed: int, size: float) -> None:
     feeder = random_mesh(seed, charging=charging)
     p, q = loads(feeder, seed, size)
