@@ -95,69 +95,59 @@ def decide(now: Situation) -> tuple[Decision, Cause, str]:
     now
         The situation.
     """
-    undecided = Decision.UNDECIDED
+    blind = _blind(now)
+    if blind is not None:
+        return Decision.UNDECIDED, *blind
+    if now.named.any():
+        far = "further off than meter accuracy and load uncertainty allow"
+        return Decision.ATTACKED, Cause.RESIDUALS, f"Manipulated: {_list(now, now.named)}; {far}."
+    doubt = _doubt(now)
+    if doubt is not None:
+        return Decision.UNDECIDED, *doubt
+    return Decision.CLEAN, Cause.AGREEMENT, "All meters agree with the feeder."
+
+
+def _blind(now: Situation) -> tuple[Cause, str] | None:
+    """What keeps anybody from being named."""
     live, named = int(np.count_nonzero(now.live)), int(np.count_nonzero(now.named))
     need = 2 * now.max_attacked + 1
-    silent = ~now.live
-    pending = now.suspected & ~now.named
-    suspects = _list(now, now.named)
-    answers = (
-        (
-            not now.valid,
-            undecided,
-            Cause.DESIGN_INVALID,
-            "The design's certificate does not hold for this feeder; nothing is guaranteed.",
-        ),
-        (
-            live < need,
-            undecided,
-            Cause.TOO_FEW_METERS,
-            f"{live} of {live + int(silent.sum())} meters report; at least {need} are needed to tell "
-            f"{_liars(now.max_attacked)}.",
-        ),
-        (
-            not now.busbar,
-            undecided,
-            Cause.NO_BUSBAR,
-            "The busbar voltage is missing; it is replaced by what most meters imply, which is less exact.",
-        ),
-        (
-            named > now.max_attacked,
-            undecided,
-            Cause.TOO_MANY_SUSPECTS,
-            f"{named} meters disagree with the feeder ({suspects}), and at most {now.max_attacked} can be "
-            "told apart. A wrong busbar reading, switch or line in the model looks the same.",
-        ),
-        (
-            named > 0,
-            Decision.ATTACKED,
-            Cause.RESIDUALS,
-            f"Manipulated: {suspects}; further off than meter accuracy and load uncertainty allow.",
-        ),
-        (bool(silent.any()), undecided, Cause.SILENT_METERS, f"No reading from {_list(now, silent)}."),
-        (
-            not now.settled,
-            undecided,
-            Cause.SETTLING,
-            "The observers have not forgotten their initial state yet.",
-        ),
-        (
-            bool(pending.any()),
-            undecided,
-            Cause.AMBIGUOUS,
-            f"{_list(now, pending)}: further off than allowed lately, but not often enough to be named.",
-        ),
-        (
-            bool(now.wide.any()),
-            undecided,
-            Cause.AMBIGUOUS,
-            f"The loads are not known well enough to judge {_list(now, now.wide)}.",
-        ),
-    )
-    for holds, decision, cause, reason in answers:
-        if holds:
-            return decision, cause, reason
-    return Decision.CLEAN, Cause.AGREEMENT, "All meters agree with the feeder."
+    if not now.valid:
+        reason = "The design's certificate does not hold for this feeder; nothing is guaranteed."
+        return Cause.DESIGN_INVALID, reason
+    if live < need:
+        reason = (
+            f"{live} of {now.live.size} meters report; at least {need} are needed to tell "
+            f"{_liars(now.max_attacked)}."
+        )
+        return Cause.TOO_FEW_METERS, reason
+    if not now.busbar:
+        reason = (
+            "The busbar voltage is missing; it is replaced by what most meters imply, which is less exact."
+        )
+        return Cause.NO_BUSBAR, reason
+    if named > now.max_attacked:
+        reason = (
+            f"{named} meters disagree with the feeder ({_list(now, now.named)}), and at most "
+            f"{now.max_attacked} can be told apart. A wrong busbar reading, switch or line in the model looks "
+            "the same."
+        )
+        return Cause.TOO_MANY_SUSPECTS, reason
+    return None
+
+
+def _doubt(now: Situation) -> tuple[Cause, str] | None:
+    """What keeps the feeder from being called clean though nobody is named."""
+    silent, pending = ~now.live, now.suspected & ~now.named
+    if silent.any():
+        return Cause.SILENT_METERS, f"No reading from {_list(now, silent)}."
+    if not now.settled:
+        return Cause.SETTLING, "The observers have not forgotten their initial state yet."
+    if pending.any():
+        reason = f"{_list(now, pending)}: further off than allowed lately, but not often enough to be named."
+        return Cause.AMBIGUOUS, reason
+    if now.wide.any():
+        return Cause.AMBIGUOUS, f"The loads are not known well enough to judge {_list(now, now.wide)}."
+    return None
 
 
 def _liars(most: int) -> str:

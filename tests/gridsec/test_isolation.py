@@ -23,7 +23,7 @@ from gridsec.feeder import lindistflow, loss_correction
 from gridsec.isolation import Isolation, IsolationDesign, disagreement, init, members, step, support
 from gridsec.lmi.sampled import advance
 from gridsec.lure import close_loop, known_input
-from gridsec.observers.unknown_input import inverters, obstruction
+from gridsec.observers.unknown_input import UnknownInputPlant, inverters, obstruction
 from gridsec.online import Cause, Decision
 from gridsec.papers import yang2021, yang2021_feeder
 
@@ -48,7 +48,7 @@ def partial() -> IsolationDesign:
         plant.system.upper, plant.system.phi,
     )  # fmt: skip
     return isolation.design(
-        isolation.UnknownInputPlant(system, plant.inputs, plant.noise, plant.drift, plant.span),
+        UnknownInputPlant(system, plant.inputs, plant.noise, plant.drift, plant.span),
         max_inputs=1,
         max_sensors=1,
         rates=(0.8, 0.95, 0.985),
