@@ -128,8 +128,8 @@ def _blind(now: Situation) -> tuple[Cause, str] | None:
     if named > now.max_attacked:
         reason = (
             f"{named} meters disagree with the feeder ({_list(now, now.named)}), and at most "
-            f"{now.max_attacked} can be told apart. A wrong busbar reading, switch or line in the model looks "
-            "the same."
+            f"{now.max_attacked} can be told apart. A wrong busbar reading, switch or line in the model "
+            "looks the same."
         )
         return Cause.TOO_MANY_SUSPECTS, reason
     return None
