@@ -178,21 +178,12 @@ def design(
         If theta is too small for Lemma 1, or a left inverse is none.
     """
     p, m = len(system.partials), system.partials[0].inputs
-    wanted = set(groups(p, max_attacked)) if p > 2 * max_attacked >= 0 else set()
-    if not wanted:
+    if not p > 2 * max_attacked >= 0:
         raise NotObservable(range(p), p, f"{p} sensors, {max_attacked} attacked: more than twice are needed")
     thetas = np.broadcast_to(np.asarray(theta, dtype=np.float64), (p,))
     noises = np.broadcast_to(np.asarray(noise, dtype=np.float64), (p,))
     decays = _constants(system, thetas, noises, decay)
-    if inverses is None:
-        # Below every threshold that it will be compared to, so that it only saves time.
-        accept = min(one.epsilon for one in decays)
-        inverses = [nearest(system, group, accept=accept) for group in groups(p, max_attacked)]
-        whole = nearest(system, range(p), accept=accept) if whole is None else whole
-    if len(inverses) != len(wanted) or {inverse.sensors for inverse in inverses} != wanted:
-        raise NotObservable(
-            range(p), p, f"a left inverse for each set of {p - max_attacked} sensors is needed"
-        )
+    inverses, whole = _inverses(system, inverses, whole, decays, max_attacked)
     low, high = (np.broadcast_to(np.asarray(end, dtype=np.float64), (m,)) for end in (u_low, u_high))
     margins, proven = _margins(system, thetas, low, high)
     points = corners_and_interior(system, samples=100)
@@ -200,13 +191,10 @@ def design(
         check(system, inverse, points, tolerance=tolerance)
     eta, rest = (np.array([getattr(d, name) for d in decays]) for name in ("eta", "epsilon"))
     limit = np.maximum(2.0 * eta * system.z_bound, rest) + system.z_bound if reset else np.full(p, np.inf)
-    steep = [
-        upper_proven(part.jacobian, -system.x_bound, system.x_bound, gap=1e-2) for part in system.partials
-    ]
     K = gains(system, thetas)
     return HighGainDesign(
         system=system,
-        inverses=tuple(inverses),
+        inverses=inverses,
         whole=whole,
         theta=frozen(thetas),
         decays=decays,
@@ -214,13 +202,41 @@ def design(
         proven=proven,
         limit=frozen(limit),
         lowest=lowest,
-        steep=frozen(np.array([bracket.upper for bracket in steep])),
+        steep=frozen(_steep(system)),
         search=search,
         K=frozen(K),
         field=field(system),
         move=transition(system, K, step_s / substeps),
         substeps=substeps,
     )
+
+
+def _inverses(
+    system: System,
+    given: Sequence[Inverse] | None,
+    whole: Inverse | None,
+    decays: tuple[Decay, ...],
+    max_attacked: int,
+) -> tuple[tuple[Inverse, ...], Inverse | None]:
+    """Left inverses of all sets of p - q sensors, and of all sensors: those given, or the nearest points."""
+    p = len(system.partials)
+    wanted = groups(p, max_attacked)
+    if given is None:
+        # Below every threshold that it will be compared to, so that it only saves time.
+        accept = min(one.epsilon for one in decays)
+        whole = nearest(system, range(p), accept=accept) if whole is None else whole
+        return tuple(nearest(system, group, accept=accept) for group in wanted), whole
+    if len(given) != len(set(wanted)) or {inverse.sensors for inverse in given} != set(wanted):
+        raise NotObservable(
+            range(p), p, f"a left inverse for each set of {p - max_attacked} sensors is needed"
+        )
+    return tuple(given), whole
+
+
+def _steep(system: System) -> Floats:
+    """Upper bounds on Lip^(Phi_i)."""
+    ends = (-system.x_bound, system.x_bound)
+    return np.array([upper_proven(part.jacobian, *ends, gap=1e-2).upper for part in system.partials])
 
 
 def _constants(
