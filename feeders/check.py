@@ -21,7 +21,7 @@ RESERVED_METER = "substation"
 def feeder(parsed: Parsed) -> tuple[list[str], list[str]]:
     """Return every problem between cells, and notes on what is right but worth knowing."""
     report = Report()
-    for check in (_duplicates, _reserved, _limits, _power_factors, _presets, _profiles, _positions):
+    for check in (_duplicates, _reserved, _limits, _power_factors, _presets, _profiles, _positions, _taps):
         check(parsed, report)
     matrices.check(parsed, report)
     edges, found = _graph(parsed, report)
@@ -206,4 +206,16 @@ def _positions(parsed: Parsed, report: Report) -> None:
         if (cells["to_x"] is None) != (cells["to_y"] is None):
             report.problems.append(
                 f"{where}, columns to_x and to_y: one of them is missing; expected both or none"
+            )
+
+
+def _taps(parsed: Parsed, report: Report) -> None:
+    names = {phase: f"tap_{phase}" for phase in "abc"}
+    for where, cells in rows(parsed.lines, "phases", "tap", *names.values()):
+        given = [name for name in names.values() if cells[name] is not None]
+        wanted = [name for phase, name in names.items() if phase in cells["phases"]]
+        if given and (given != wanted or cells["tap"] != 1.0):
+            report.problems.append(
+                f"{where}, columns {', '.join(given)}: expected {', '.join(wanted)}, those of phases "
+                f"{cells['phases']!r}, and no tap beside them; or tap alone, of all of them"
             )

@@ -127,7 +127,13 @@ SHUNT_COLUMNS = _matrix(
     ("shunt susceptance of phase {}, microsiemens", "its entry of {} and {}, seldom above 0, microsiemens"),
     1e9,
 )
+TAP_COLUMNS = tuple(
+    Column(f"tap_{phase}", Kind.NUMBER, f"the same of phase {phase} alone", None, low=0.001, high=1e3)
+    for phase in "abc"
+)
 MATRIX_NAMES = frozenset(column.name for column in (*SERIES_COLUMNS, *SHUNT_COLUMNS))
+PHASE_NAMES = MATRIX_NAMES | {column.name for column in TAP_COLUMNS}
+"""Columns that only feeders in three phases have."""
 
 LINE_COLUMNS: tuple[Column, ...] = (
     Column("line", Kind.ID, "id of the line or switch"),
@@ -142,6 +148,7 @@ LINE_COLUMNS: tuple[Column, ...] = (
     Column("b_us", Kind.NUMBER, "total shunt susceptance, microsiemens per phase", 0.0, low=0.0, high=1e9),
     *SHUNT_COLUMNS,
     Column("tap", Kind.NUMBER, "ratio of an ideal transformer at from_bus", 1.0, low=0.001, high=1e3),
+    *TAP_COLUMNS,
     Column("closed", Kind.TRUTH, "whether the line carries current", True),
     Column("rating_a", Kind.NUMBER, "thermal limit, ampere", None, above=0.0, high=1e9),
     Column("to_x", Kind.NUMBER, "horizontal position of to_bus, any unit", None, low=-1e12, high=1e12),

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from feeders.columns import MATRIX_NAMES
+from feeders.columns import PHASE_NAMES
 from feeders.profiles import data_root
 from feeders.raw import CUSTOMERS_FILE, LINES_FILE, META_FILE, advice
 from feeders.schema import CustomerRow, FeederTables, read, to_json
@@ -80,7 +80,7 @@ def _names_phases(folder: Traversable) -> bool:
     """Whether a folder of ours is in three phases: the writer leaves out default columns."""
     tables = ((folder / name).read_text(encoding="utf-8") for name in (LINES_FILE, CUSTOMERS_FILE))
     columns = {column for table in tables for column in table.partition("\n")[0].split(",")}
-    return not columns.isdisjoint({"phases", *MATRIX_NAMES})
+    return not columns.isdisjoint({"phases", *PHASE_NAMES})
 
 
 def folder_of(path_or_name: Path | str) -> Path | None:

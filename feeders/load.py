@@ -223,7 +223,7 @@ def from_tables(tables: FeederTables) -> Site:
         bus_of_file=found.group,
         xy=positions(tables, found),
         loads=load_model(tables),
-        base_volt=frozen(base.bus * meta.voltage_volt),
+        base_volt=frozen(base.bus[:, 0] * meta.voltage_volt),
         digest=digest(tables),
     )
 
@@ -269,7 +269,7 @@ def _in_phases(tables: FeederTables) -> Site:
     """The site of a feeder whose customers have one phase each."""
     found = three_phase(tables)
     parts = {f.name: getattr(found, f.name) for f in fields(found)}
-    places = {"feeder": PhasedFeeder(found.feeder), "base_volt": frozen(np.repeat(found.base_volt, 3))}
+    places = {"feeder": PhasedFeeder(found.feeder), "base_volt": frozen(found.base_volt.ravel())}
     return Site(**parts | places)
 
 
@@ -375,7 +375,7 @@ def _unsupported(tables: FeederTables) -> tuple[str, ...]:
 
 def _feeder(tables: FeederTables, base: Referred, found: Tree) -> Feeder:
     meta, lines = tables.meta, base.lines
-    z_base = 3.0 * (base.branch * meta.voltage_volt) ** 2 / (1000.0 * meta.base_kva)
+    z_base = 3.0 * (base.branch[:, 0] * meta.voltage_volt) ** 2 / (1000.0 * meta.base_kva)
     return Feeder(
         name=meta.name,
         parent=indices(found.parent),

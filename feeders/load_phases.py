@@ -47,8 +47,8 @@ class ThreePhaseSite:
         The feeder in SI, as its files say it.
     feeder
         The radial tree, pu; powers of single phases in thirds of `base_kva`.
-    base_volt : (b + 1,)
-        1 pu of every bus, V, see `feeders.taps`.
+    base_volt : (b + 1, 3)
+        1 pu of every phase of every bus, V, see `feeders.taps`.
     droop, meters, meter_ids, accuracy, bus_of_file, xy, loads, digest
         As in `feeders.load.Site`, in units of `base_kva`: `gridsec.phases.per_customer` fits them.
     """
@@ -137,7 +137,8 @@ def three_phase(tables: FeederTables) -> ThreePhaseSite:
 
 def _feeder(tables: FeederTables, base: Referred, found: Tree) -> ThreePhaseFeeder:
     meta, lines = tables.meta, base.lines
-    z_base = 3.0 * (base.branch * meta.voltage_volt)[:, None, None] ** 2 / (1000.0 * meta.base_kva)
+    side = base.branch * meta.voltage_volt
+    z_base = 3.0 * (side[:, :, None] * side[:, None, :]) / (1000.0 * meta.base_kva)
     phases = np.array([(True,) * 3, *(_present(line.phases) for line in lines)])
     both = phases[1:, :, None] & phases[1:, None, :]
     charging = np.array([shunt_of(line) for line in lines]) * (1e-6 * z_base)

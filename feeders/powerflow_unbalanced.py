@@ -65,8 +65,8 @@ class UnbalancedGrid:
         Number of buses B.
     nominal_volt
         Nominal phase-to-neutral voltage, V.
-    tap : (L,), optional
-        Ratio of an ideal transformer at the first end of each line: the voltages there by those behind it.
+    tap : (L, 3), optional
+        Ratios of an ideal transformer at the first end of each line: the voltages there by those behind it.
     source_ohm : (3, 3), optional
         Impedance between the given voltage and the busbar, ohm. For a transformer Dyn, `sequence_ohm` of its
         short-circuit impedance (with that of the grid above) and its zero-sequence impedance, both seen from
@@ -283,16 +283,17 @@ def _admittances(grid: UnbalancedGrid) -> csc_array:
         columns.append(np.tile(3 * other + here, here.size))
         values.append(block.ravel())
 
-    taps = np.ones(len(grid.ends)) if grid.tap is None else grid.tap
-    lines = zip(grid.ends.tolist(), taps.tolist(), grid.present, grid.z_ohm, grid.b_siemens, strict=True)
+    taps = np.ones((len(grid.ends), 3)) if grid.tap is None else grid.tap
+    lines = zip(grid.ends.tolist(), taps, grid.present, grid.z_ohm, grid.b_siemens, strict=True)
     for (one, other), tap, present, z, b in lines:
         here = np.flatnonzero(present)
         series: Phasors = np.linalg.inv(z[np.ix_(here, here)])
         own: Phasors = series + 0.5j * b[np.ix_(here, here)]
-        # Behind the transformer the voltage is v / tap, and its current there is i tap.
-        for end, far, ratio in ((one, other, tap), (other, one, 1.0)):
-            stamp(end, end, here, own / ratio**2)
-            stamp(end, far, here, -series / tap)
+        # Behind the transformer a voltage is v / tap, and before it a current i / tap.
+        before, behind = 1.0 / tap[here], np.ones(here.size)
+        for end, far, mine, its in ((one, other, before, behind), (other, one, behind, before)):
+            stamp(end, end, here, own * np.outer(mine, mine))
+            stamp(end, far, here, -series * np.outer(mine, its))
     if grid.source_ohm is not None:
         stamp(
             grid.busbar, grid.busbar, np.arange(3), np.asarray(np.linalg.inv(grid.source_ohm), np.complex128)
@@ -333,7 +334,7 @@ def _grid(tables: FeederTables, source_ohm: Phasors | None) -> tuple[UnbalancedG
         bus_count=len(number),
         nominal_volt=tables.meta.voltage_volt,
         source_ohm=source_ohm,
-        tap=np.array([line.tap for line in lines]),
+        tap=np.array([line.taps for line in lines]).reshape(count, 3),
     )
     return grid, node
 

@@ -19,8 +19,8 @@ from feeders import check, raw
 from feeders.columns import (
     CUSTOMER_COLUMNS,
     LINE_COLUMNS,
-    MATRIX_NAMES,
     META_COLUMNS,
+    PHASE_NAMES,
     REQUIRED,
     Column,
     parse,
@@ -65,10 +65,25 @@ class LineRow:
     b_bc_us: float | None = None
     b_cc_us: float | None = None
     tap: float = 1.0
+    tap_a: float | None = None
+    tap_b: float | None = None
+    tap_c: float | None = None
     closed: bool = True
     rating_a: float | None = None
     to_x: float | None = None
     to_y: float | None = None
+
+    @property
+    def taps(self) -> tuple[float, float, float]:
+        """Ratio of the ideal transformer in each phase."""
+        a, b, c = (self.tap if own is None else own for own in (self.tap_a, self.tap_b, self.tap_c))
+        return a, b, c
+
+    @property
+    def in_phases(self) -> bool:
+        """Whether it needs three phases: not all of them, not transposed, or not the same tap in each."""
+        own = (self.r_aa_ohm, self.b_aa_us, self.tap_a)
+        return self.phases != "abc" or any(value is not None for value in own)
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,10 +191,8 @@ class FeederTables:
 
     @property
     def in_phases(self) -> bool:
-        """Whether it is one in three phases: not all of every row, or a line that is not transposed."""
-        return any(row.phases != "abc" for row in self.customers) or any(
-            row.phases != "abc" or row.r_aa_ohm is not None or row.b_aa_us is not None for row in self.lines
-        )
+        """Whether it is one in three phases."""
+        return any(row.phases != "abc" for row in self.customers) or any(row.in_phases for row in self.lines)
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,7 +259,7 @@ def from_json(obj: object) -> FeederTables:
 def to_json(tables: FeederTables) -> dict[str, Any]:
     """Return the JSON form: the same names as in the files, a list of rows per table.
 
-    Matrices are left out where there are none.
+    Matrices and taps of single phases are left out where there are none.
     """
     meta = asdict(tables.meta)
     meta["accept"] = list(tables.meta.accept)
@@ -280,7 +293,7 @@ def _tables(examination: Examination) -> FeederTables:
 
 def _ordered(row: dict[str, Any], columns: tuple[Column, ...]) -> dict[str, Any]:
     given = (column.name for column in columns)
-    return {name: row[name] for name in given if row[name] is not None or name not in MATRIX_NAMES}
+    return {name: row[name] for name in given if row[name] is not None or name not in PHASE_NAMES}
 
 
 # --- from cells to typed rows -------------------------------------------------------------------

@@ -3,7 +3,8 @@
 Behind a tap t, ``V_from = t V``, every voltage has another base: ``a_k V`` with V the nominal voltage and a_k
 the product of ``1 / t`` over the taps on the way from the busbar to bus k. With the impedances in the base of
 their own side, ``3 (a V)^2 / (1000 S)``, the ideal transformer is gone: in per unit this is a feeder without
-it. Only what goes between volts and per unit, customer by customer, needs a_k.
+it. Each phase may have a tap of its own; a mutual impedance is then in ``3 a_φ a_ψ V^2 / (1000 S)``, so that
+matrices stay symmetric. Only what goes between volts and per unit, customer by customer, needs a_k.
 """
 
 from __future__ import annotations
@@ -32,12 +33,12 @@ class Referred:
     ----------
     lines
         The line that feeds bus k + 1.
-    bus : (b + 1,)
-        a of every bus, 1 at the busbar.
-    branch : (b,)
+    bus : (b + 1, 3)
+        a of every phase of every bus, 1 at the busbar.
+    branch : (b, 3)
         That of each line's impedance and charging, which are behind its tap as seen from `from_bus`.
     customer : (N,)
-        That of every customer.
+        That of every customer, in the first of its phases.
     """
 
     lines: list[LineRow]
@@ -65,15 +66,16 @@ def refer(tables: FeederTables, closed: Sequence[LineRow], found: Tree) -> Refer
     if problems:
         raise FeederInvalid(problems)
     lines = [closed[k] for k in found.branch]
-    bus, branch = np.ones(len(found.buses)), np.ones(len(lines))
+    bus, branch = np.ones((len(found.buses), 3)), np.ones((len(lines), 3))
     for k, (line, above) in enumerate(zip(lines, found.parent, strict=True)):
         if found.group[line.from_bus] == above:
-            bus[k + 1] = branch[k] = bus[above] / line.tap
+            bus[k + 1] = branch[k] = bus[above] / line.taps
         else:
             branch[k] = bus[above]
-            bus[k + 1] = bus[above] * line.tap
+            bus[k + 1] = bus[above] * line.taps
     at = np.array([found.group[row.bus] for row in tables.customers], dtype=np.intp)
-    return Referred(lines, bus, branch, bus[at])
+    phase = np.array(["abc".index(row.phases[0]) for row in tables.customers], dtype=np.intp)
+    return Referred(lines, bus, branch, bus[at, phase])
 
 
 def refuse(site: Site | ThreePhaseSite) -> None:
@@ -84,8 +86,10 @@ def refuse(site: Site | ThreePhaseSite) -> None:
 
 def _problems(closed: Sequence[LineRow], found: Tree) -> list[str]:
     out = []
-    for line in (line for line in closed if line.tap != 1.0):
-        where = f"lines, line {line.line!r}, column tap: {line.tap:g}"
+    for line in (line for line in closed if set(line.taps) != {1.0}):
+        where = (
+            f"lines, line {line.line!r}, column tap: {' '.join(f'{tap:g}' for tap in sorted({*line.taps}))}"
+        )
         if line.r_ohm == line.x_ohm == 0.0:
             out.append(f"{where} on a line without impedance; expected the transformer's r_ohm and x_ohm")
         if found.ties:

@@ -116,9 +116,10 @@ def _line_extras(parsed: Parsed) -> Doubts:
     for where, cells in rows(parsed.lines, "b_us"):
         if cells["b_us"] > 1e5:
             yield "impedance", f"{where}, column b_us: {cells['b_us']:g} microsiemens is very large; in nS?"
-    for where, cells in rows(parsed.lines, "tap"):
-        if not 0.5 <= cells["tap"] <= 2.0:
-            yield "ratio", f"{where}, column tap: {cells['tap']:g} is no ratio near 1; 5 % up is 0.95"
+    for name in ("tap", "tap_a", "tap_b", "tap_c"):
+        for where, cells in rows(parsed.lines, name):
+            if cells[name] is not None and not 0.5 <= cells[name] <= 2.0:
+                yield "ratio", f"{where}, column {name}: {cells[name]:g} is no ratio near 1; 5 % up is 0.95"
 
 
 def _powers(parsed: Parsed) -> Doubts:

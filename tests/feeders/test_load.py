@@ -323,7 +323,7 @@ def test_the_interval_holds_the_truth(data: st.DataObject) -> None:
     assert (np.abs(-np.array(q_kvar) / 158.7 - frame.q) <= frame.q_error + 1e-12).all()
 
 
-def test_volts_undoes_the_square(three: Site) -> None:
+def test_volts_undoes_the_square() -> None:
     np.testing.assert_allclose(
         volts(np.full(2, 230.0), np.array([[1.0, 0.81], [-0.5, 1.21]])), [[230.0, 207.0], [0.0, 253.0]]
     )

@@ -17,7 +17,7 @@ from feeders.load_phases import three_phase
 from feeders.meters import Channel, MeterErrors, Meters
 from feeders.powerflow import Grid, PowerFlow
 from feeders.powerflow_unbalanced import PlacesFlow, UnbalancedPowerFlow, power_flow
-from feeders.schema import FeederTables, LineRow
+from feeders.schema import FeederTables, LineRow, from_json, to_json, validate
 from feeders.studies.calibrate_feeder import network
 from feeders.studies.detectable import detectable
 from feeders.studies.droop import droop
@@ -104,8 +104,20 @@ def test_two_power_flows_and_the_model_agree(seed: int) -> None:
     np.testing.assert_array_equal(customers, buses[site.feeder.bus])
 
 
-def test_three_phases_within_the_bound() -> None:
-    site = village_in_phases()
+OWN = {"tap_a": 0.95, "tap_b": 1.0, "tap_c": 1.03}
+
+
+@pytest.mark.parametrize("own", [{}, OWN], ids=["together", "each"])
+def test_three_phases_within_the_bound(own: dict[str, float]) -> None:
+    tables = village_in_phases().tables
+    changed = {"l2": {"tap": 1.0} | own, "l4": {"tap": 1.0} | own} if own else {}
+    lines = tuple(replace(line, **changed.get(line.line, {})) for line in tables.lines)
+    site = from_tables(replace(tables, lines=lines))
+    if own:
+        ratios = 230.0 / site.base_volt.reshape(-1, 3)
+        np.testing.assert_allclose(ratios[2], list(own.values()), rtol=1e-14)
+        np.testing.assert_allclose(ratios[4], [1 / tap for tap in own.values()], rtol=1e-14)
+        assert np.isfinite(site.accuracy.jitter).all()
     assert isinstance(site.feeder, PhasedFeeder)
     flow = power_flow(site)
     assert isinstance(flow, PlacesFlow)
@@ -186,6 +198,21 @@ def test_the_trace_of_a_load_that_is_not_there_is_in_volts() -> None:
 def test_studies_of_one_voltage_base_say_so(study: Callable[[Site], object]) -> None:
     with pytest.raises(FeederInvalid, match="without taps only"):
         study(village())
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"tap_a": 0.9}, OWN | {"tap": 1.1}, OWN | {"phases": "a"}, {"tap_b": 1.0, "phases": "a"}]
+)
+def test_taps_of_single_phases_are_those_of_its_phases(wrong: dict[str, object]) -> None:
+    tables = village_in_phases().tables
+    tables = tapped(tables, {})
+    lines = (replace(tables.lines[0], **wrong), *tables.lines[1:])
+    problems = [problem for problem in validate(replace(tables, lines=lines)) if "tap_" in problem]
+    assert len(problems) == 1
+    assert "expected" in problems[0]
+    right = replace(tables, lines=(replace(tables.lines[0], **OWN), *tables.lines[1:]))
+    assert validate(right) == ()
+    assert from_json(to_json(right)) == right
 
 
 def test_where_no_tap_can_be() -> None:
