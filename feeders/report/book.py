@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -87,9 +88,12 @@ def _facts(site: Site) -> dict[str, str]:
     kva = sum(row.inverter_kva for row in rows)
     classes = np.unique(site.accuracy.class_fraction * 100.0)
     spread = " to ".join(f"{value:g}" for value in dict.fromkeys((classes.min(), classes.max())))
+    each = Counter(row.phases for row in rows)
+    phased = {"abc"} != each.keys()
     return {
         "feeder": site.feeder.name,
         "customers": f"{len(rows)} customers",
+        **({"phases": ", ".join(f"{each[p]} on {p}" for p in sorted(each))} if phased else {}),
         "meters": f"{site.meters.size} meters, class {spread} %",
         "inverters": f"{site.droop.tau.size} inverters, {kva:.4g} kVA",
         "peak of all loads": f"{sum(row.load_kw for row in rows):.4g} kW",

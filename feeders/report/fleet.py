@@ -10,6 +10,7 @@ from feeders.report.charts import LINES, Bar, Curve, Row, curves, rows
 from feeders.report.drawing import Drawing
 from feeders.report.figure import Figure
 from feeders.report.section import Question, Section
+from feeders.report.spots import single_phase
 from feeders.report.words import Finding, Sentence, Side, Standing, Value, least, listed, number
 
 if TYPE_CHECKING:
@@ -42,6 +43,7 @@ def droop(site: Site, found: DroopStudy) -> Section:
     band = f"{number(limits[0], 1)} to {number(limits[1], 1)} V"
     ends = given.v0_low, given.v0_high
     busbar = f"at {ends[0]:g} pu" if ends[0] == ends[1] else f"from {ends[0]:g} to {ends[1]:g} pu"
+    alone = "" if ends[0] == ends[1] or single_phase(site) else ", each phase on its own"
     every = "continuously" if not given.interval_s else f"every {given.interval_s:g} s"
     delay = f", with a dead time of {given.dead} intervals" if given.dead else ""
     return Section(
@@ -62,9 +64,10 @@ def droop(site: Site, found: DroopStudy) -> Section:
             "part, alone": "share of the loop gain; what one inverter's slope may be multiplied with",
         },
         assumptions=(
-            f"Inverters: {given.preset or 'as in the files'}; they act {every}{delay}. Balanced power flow.",
+            f"Inverters: {given.preset or 'as in the files'}; they act {every}{delay}. "
+            f"{'Balanced' if single_phase(site) else 'Three-phase'} power flow.",
             f"Any loads up to {100.0 * given.load_high:g} % and generation up to {100.0 * given.pv_high:g} % "
-            f"of their peaks; busbar {busbar}; band {band}.",
+            f"of their peaks; busbar {busbar}{alone}; band {band}.",
         ),
     )
 
@@ -202,7 +205,7 @@ def _band_chart(customers: pd.DataFrame, width: float) -> Drawing:
             bars.append(Bar(low_rest, high_rest, "fill-a", "while loads move slowly", inset=6.0))
         data.append(
             Row(
-                str(row["customer"]),
+                f"{row['customer']}, {row['phase']}" if "phase" in row else str(row["customer"]),
                 tuple(bars),
                 f"{number(low, 1, Side.BELOW)} to {number(high, 1, Side.ABOVE)} V",
             )

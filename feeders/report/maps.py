@@ -218,15 +218,16 @@ def _glyph(spot: Spot, x: float, y: float, size: float) -> list[Mark]:
             marks = [Disc(x, y, size * (0.62 + 0.16 * spot.step), f"step{spot.step}", spot.tip)]
         case Shape.METER:
             marks = [Disc(x, y, size, "solid", spot.tip)]
-    return [*marks, *_leg(spot.phase, x, y, size)]
+    return [*_leg(spot, x, y, size), *marks]
 
 
-def _leg(phase: str, x: float, y: float, size: float) -> list[Mark]:
-    if not phase:
+def _leg(spot: Spot, x: float, y: float, size: float) -> list[Mark]:
+    """From below its glyph to a little beyond it."""
+    if not spot.phase:
         return []
-    angle = math.radians(LEGS[phase])
-    ends = tuple((x + r * size * math.sin(angle), y - r * size * math.cos(angle)) for r in (1.4, 2.2))
-    return [Line(ends, "line-ink")]
+    angle = math.radians(LEGS[spot.phase])
+    far = size * (1.3 if spot.shape is Shape.NONE else 2.1)
+    return [Line(((x, y), (x + far * math.sin(angle), y - far * math.cos(angle))), "line-ink")]
 
 
 Box = tuple[float, float, float, float]

@@ -11,7 +11,7 @@ from feeders.report.drawing import Drawing
 from feeders.report.figure import Figure
 from feeders.report.maps import Shape, Spot, draw_map
 from feeders.report.section import Question, Section
-from feeders.report.spots import names_of, size_map
+from feeders.report.spots import names_of, single_phase, size_map
 from feeders.report.words import (
     Finding,
     Sentence,
@@ -97,7 +97,8 @@ def detectable(site: Site, found: Detectable) -> Section:
         assumptions=(
             f"At most {liars} {plural(liars, 'meter lies', 'meters lie')} together; liars know the feeder, "
             "but not the honest errors of the moment.",
-            "Sequential monitor, before it has learned the fixed errors of its meters; balanced model; "
+            "Sequential monitor, before it has learned the fixed errors of its meters; "
+            f"{'balanced' if single_phase(site) else 'three-phase'} model; "
             "inverters in their deadbands; nominal voltage.",
             "Where the search for the worst collusion was cut short, sizes are what was proved until there: "
             "on the safe side.",

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from feeders.load import Site
 
-__all__ = ["names_of", "size_map", "spots_by_size"]
+__all__ = ["names_of", "single_phase", "size_map", "spots_by_size"]
 
 FEW: Final = 40
 """Up to so many numbers stand in a map themselves."""
@@ -72,6 +72,17 @@ def spots_by_size(
     if any(spot.shape is Shape.NONE for spot in spots):
         legend["no number"] = Spot(Shape.NONE)
     return spots, legend
+
+
+def single_phase(site: Site) -> bool:
+    """Whether a balanced feeder is spoken of, by its single-phase equivalent.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    """
+    return all(row.phases == "abc" for row in site.tables.customers)
 
 
 def names_of(site: Site, who: str) -> list[str]:

@@ -133,6 +133,8 @@ class DroopStudy:
         - `presets`, `time_constants`: verdict, margin, settling, overshoot, voltages of the worst customers.
         - `hosting`, `hosting_curve`, `hosting_draws`: see `feeders.studies.droop_hosting`;
           `hosting_probability`: the share of random orders in which so much generation breaks something.
+
+        In three phases `inverters`, `customers` and `witness` have a column `phase`.
     """
 
     feeder: str
@@ -409,7 +411,17 @@ def _tables(site: Site, done: dict[str, Any]) -> dict[str, pd.DataFrame]:
     if rows("hosting_draws"):
         tables["hosting_draws"] = pd.DataFrame(rows("hosting_draws"))
         tables["hosting_probability"] = _probability(tables["hosting_draws"])
+    _add_phases(site, [tables[name] for name in ("customers", "inverters", "witness")])
     return {name: table for name, table in tables.items() if len(table)}
+
+
+def _add_phases(site: Site, tables: Sequence[pd.DataFrame]) -> None:
+    """A column `phase` beside the customers, where they have single phases."""
+    of = {row.customer: row.phases for row in site.tables.customers}
+    for table in tables:
+        if len(table) and set(of.values()) != {"abc"}:
+            phase = [of[str(name)] for name in table["customer"]]
+            table.insert(list(table.columns).index("customer") + 1, "phase", phase)
 
 
 def presets_of(sites: Sequence[Site], options: DroopOptions | None = None, *, seed: int = 0) -> pd.DataFrame:
