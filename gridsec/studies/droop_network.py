@@ -115,13 +115,14 @@ def _phased(feeder: PhasedFeeder) -> Network:
     # 1 pu of the power of a phase is a third of S.
     drawn[np.arange(count), tree.phase, tree.at] = -3.0
     V, change = idle, np.inf
-    for _ in range(_ROUNDS if tree.half.any() else 1):
-        charged = 1j * np.einsum("kij,cjk->cik", tree.half, V)
-        flow = np.einsum("bij,cjb->cib", tree.z, below(tree, drawn + charged)[..., 1:])
-        new: Complex = idle - from_root(tree, flow)
-        V, change = new, float(np.abs(new - V).max())
-        if not change > _TOL:
-            break
+    with np.errstate(all="ignore"):
+        for _ in range(_ROUNDS if tree.half.any() else 1):
+            charged = 1j * np.einsum("kij,cjk->cik", tree.half, V)
+            flow = np.einsum("bij,cjb->cib", tree.z, below(tree, drawn + charged)[..., 1:])
+            new: Complex = idle - from_root(tree, flow)
+            V, change = new, float(np.abs(new - V).max())
+            if not change > _TOL:
+                break
     if tree.half.any() and not change <= _TOL:
         raise DesignInfeasible("voltages of the feeder without load", "its charging is too much")
     source = np.concatenate([ROTATION[tree.phase], ROTATION])
