@@ -25,7 +25,7 @@ from feeders.equipment import (
     positions,
 )
 from feeders.load_phases import three_phase
-from feeders.schema import CustomerRow, FeederTables, LineRow, validate
+from feeders.schema import CustomerRow, FeederTables, validate
 from feeders.taps import Referred, refer
 from feeders.topology import Edge, Tree, tree
 from gridsec.arrays import Floats, Ints, frozen
@@ -211,11 +211,10 @@ def from_tables(tables: FeederTables) -> Site:
     )
     base = refer(tables, closed, found)
     feeder = _feeder(tables, base, found)
-    ties = [closed[k] for k in found.ties]
     metered = metered_customers(tables)
     return Site(
         tables=tables,
-        feeder=_meshed(tables, feeder, ties, found) if ties else feeder,
+        feeder=_meshed(tables, feeder, base, found) if base.ties else feeder,
         droop=inverters(tables, base.customer),
         meters=metered,
         meter_ids=tuple(tables.customers[k].meter for k in metered),
@@ -390,9 +389,9 @@ def _feeder(tables: FeederTables, base: Referred, found: Tree) -> Feeder:
     )
 
 
-def _meshed(tables: FeederTables, feeder: Feeder, ties: list[LineRow], found: Tree) -> MeshedFeeder:
-    meta = tables.meta
-    z_base = 3.0 * meta.voltage_volt**2 / (1000.0 * meta.base_kva)
+def _meshed(tables: FeederTables, feeder: Feeder, base: Referred, found: Tree) -> MeshedFeeder:
+    meta, ties = tables.meta, base.ties
+    z_base = 3.0 * (base.tie[:, 0] * meta.voltage_volt) ** 2 / (1000.0 * meta.base_kva)
     return MeshedFeeder(
         tree=feeder,
         ends=np.array([(found.group[tie.from_bus], found.group[tie.to_bus]) for tie in ties], dtype=np.intp),

@@ -33,17 +33,23 @@ class Referred:
     ----------
     lines
         The line that feeds bus k + 1.
+    ties
+        The t lines that close loops.
     bus : (b + 1, 3)
         a of every phase of every bus, 1 at the busbar.
     branch : (b, 3)
         That of each line's impedance and charging, which are behind its tap as seen from `from_bus`.
+    tie : (t, 3)
+        The same of each tie.
     customer : (N,)
         That of every customer, in the first of its phases.
     """
 
     lines: list[LineRow]
+    ties: list[LineRow]
     bus: Floats
     branch: Floats
+    tie: Floats
     customer: Floats
 
 
@@ -62,10 +68,7 @@ def refer(tables: FeederTables, closed: Sequence[LineRow], found: Tree) -> Refer
     FeederInvalid
         If a tap is where it cannot be.
     """
-    problems = _problems(closed, found)
-    if problems:
-        raise FeederInvalid(problems)
-    lines = [closed[k] for k in found.branch]
+    lines, ties = [closed[k] for k in found.branch], [closed[k] for k in found.ties]
     bus, branch = np.ones((len(found.buses), 3)), np.ones((len(lines), 3))
     for k, (line, above) in enumerate(zip(lines, found.parent, strict=True)):
         if found.group[line.from_bus] == above:
@@ -73,9 +76,14 @@ def refer(tables: FeederTables, closed: Sequence[LineRow], found: Tree) -> Refer
         else:
             branch[k] = bus[above]
             bus[k + 1] = bus[above] * line.taps
+    tie = np.array([bus[found.group[line.from_bus]] / line.taps for line in ties]).reshape(-1, 3)
+    there = np.array([bus[found.group[line.to_bus]] for line in ties]).reshape(-1, 3)
+    problems = [*_problems(closed), *_around(ties, tie / there)]
+    if problems:
+        raise FeederInvalid(problems)
     at = np.array([found.group[row.bus] for row in tables.customers], dtype=np.intp)
     phase = np.array(["abc".index(row.phases[0]) for row in tables.customers], dtype=np.intp)
-    return Referred(lines, bus, branch, bus[at, phase])
+    return Referred(lines, ties, bus, branch, tie, bus[at, phase])
 
 
 def refuse(site: Site | ThreePhaseSite) -> None:
@@ -84,7 +92,7 @@ def refuse(site: Site | ThreePhaseSite) -> None:
         raise FeederInvalid(["lines, column tap: not 1 everywhere, and this takes feeders without taps only"])
 
 
-def _problems(closed: Sequence[LineRow], found: Tree) -> list[str]:
+def _problems(closed: Sequence[LineRow]) -> list[str]:
     out = []
     for line in (line for line in closed if set(line.taps) != {1.0}):
         where = (
@@ -92,6 +100,17 @@ def _problems(closed: Sequence[LineRow], found: Tree) -> list[str]:
         )
         if line.r_ohm == line.x_ohm == 0.0:
             out.append(f"{where} on a line without impedance; expected the transformer's r_ohm and x_ohm")
-        if found.ties:
-            out.append(f"{where} where closed lines form loops; expected 1 everywhere, or a radial feeder")
     return out
+
+
+def _around(ties: Sequence[LineRow], ratio: Floats) -> list[str]:
+    """Loops whose taps drive a current around without any load, which the model does not have."""
+    return [
+        f"lines, line {line.line!r} closes a loop around which the taps multiply to {own[0]:.6g}; expected 1"
+        for line, own in zip(ties, ratio, strict=True)
+        if (np.abs(own - 1.0) > _ROUNDING).any()
+    ]
+
+
+# Ratios around a loop are products of a few numbers of the files.
+_ROUNDING = 1e-9

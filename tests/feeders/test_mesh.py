@@ -99,6 +99,23 @@ def test_single_phases_cannot_be_meshed() -> None:
 # --- the model against the power flow -----------------------------------------------------------
 
 
+@pytest.mark.parametrize("taps", [{"l1": 0.95}, {"l2": 0.95, "tie": 1 / 0.95}, {"l4": 1.04, "tie": 1 / 1.04}])
+def test_taps_that_cancel_around_every_loop(taps: dict[str, float]) -> None:
+    """A regulator before the loop, one in each of two branches that meet again, and one given from afar."""
+    tables = closed(villages.tables())
+    lines = [replace(row, tap=taps.get(row.line, 1.0)) for row in tables.lines]
+    site = from_tables(replace(tables, lines=tuple(lines)))
+    assert np.unique(site.base_volt).size == 2
+    rng, base, feeder = np.random.default_rng(1), site.feeder.base_kva, site.feeder
+    p_kw, q_kvar = site.loads.load_peak * base * rng.uniform(-0.5, 1.0, (2, feeder.bus.size))
+    _, buses = power_flow(site).solve(p_kw, q_kvar, 233.0)
+    p, q, v0 = -p_kw / base, -q_kvar / base, (233.0 / 230.0) ** 2
+    exact = (buses / site.base_volt) ** 2
+    found, bound = bus_voltages(feeder, p, q, v0), model_error_bound(feeder, p, q, v0)
+    assert (np.abs(found - exact)[feeder.bus] <= bound + 1e-9).all()
+    np.testing.assert_allclose(bus_voltages(feeder, p, q, v0, steps=30), exact, rtol=0, atol=1e-8)
+
+
 @pytest.mark.parametrize("make", [*SITES, lambda: from_tables(closed(villages.tables()))])
 @given(seed=st.integers(0, 1000), load=st.sampled_from([0.1, 0.5, 1.0]))
 @settings(max_examples=6, deadline=None)

@@ -225,7 +225,9 @@ def test_where_no_tap_can_be() -> None:
         lines=tuple(replace(line, closed=True) for line in tables.lines),
     )
     assert from_tables(closed).ties.size == 2
-    with pytest.raises(FeederInvalid, match=r"line 'l2', column tap: 0\.95 where closed lines form loops"):
+    with pytest.raises(
+        FeederInvalid, match=r"line 'tie' closes a loop around which the taps multiply to 1\.03"
+    ):
         from_tables(tapped(closed, TAPS))
 
 
