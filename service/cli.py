@@ -7,12 +7,10 @@ no recording or cannot be written.
 
 from __future__ import annotations
 
-import asyncio
 import json
 import math
 import os
 import sys
-import threading
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -21,16 +19,14 @@ import typer
 from rich.markup import escape
 
 from gridsec.errors import DesignInfeasible, FeederInvalid, GridsecError, NotObservable
-from service import cli_feeders, cli_reproduce, cli_study, console
+from service import cli_feeders, cli_reproduce, cli_serve, cli_study, console
+from service.cli_serve import Endpoints
 from service.console import ADDRESS, DATABASE, FAILED, FEEDER, FILE, USAGE, Feeder, complain
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from feeders.load import Site
     from feeders.scenario import Scenario, Season
     from gridsec.attack import Attack
-    from service.app import Running
 
 app = typer.Typer(
     name="gridsec",
@@ -43,6 +39,7 @@ app.add_typer(cli_feeders.app, name="feeders")
 app.command("convert")(cli_feeders.convert)
 app.add_typer(cli_study.app, name="study")
 app.command()(cli_reproduce.reproduce)
+app.command()(cli_serve.serve)
 
 
 def main() -> None:
@@ -85,106 +82,6 @@ def exit_code(error: GridsecError) -> int:
         RecordingInvalid: FILE,
     }
     return next((code for kind, code in codes.items() if isinstance(error, kind)), FAILED)
-
-
-# ---------------------------------------------------------------------------------------------------- serve
-
-Endpoints = Annotated[
-    list[str] | None, typer.Option(help="zenoh endpoint to connect to, e.g. tcp/127.0.0.1:7447.")
-]
-
-
-@app.command()
-def serve(
-    *,
-    feeder: Annotated[
-        list[str] | None, typer.Option(help="Folder or name of a feeder; may be repeated.")
-    ] = None,
-    estimator: Annotated[
-        str | None, typer.Option(help="See `feeders estimators`. [default: as in the file]")
-    ] = None,
-    zenoh_listen: Annotated[
-        list[str] | None, typer.Option(help="zenoh endpoint to listen on. [default: tcp/127.0.0.1:7447]")
-    ] = None,
-    zenoh_connect: Endpoints = None,
-    zenoh_mode: Annotated[str | None, typer.Option(help="router, peer or client. [default: router]")] = None,
-    zenoh_config: Annotated[
-        Path | None, typer.Option(help="Your own zenoh configuration (json5): TLS, access rules, ...")
-    ] = None,
-    prefix: Annotated[str | None, typer.Option(help="First chunks of all keys. [default: gridsec]")] = None,
-    http: Annotated[
-        str | None, typer.Option(help="Address of REST and web page. [default: 127.0.0.1:8000]")
-    ] = None,
-    database: Annotated[
-        str | None,
-        typer.Option(help="sqlite:///file or postgresql+psycopg://... [default: sqlite:///gridsec.db]"),
-    ] = None,
-    clock: Annotated[
-        str | None, typer.Option(help="wall, or events: the readings tell the time. [default: wall]")
-    ] = None,
-    max_skew: Annotated[
-        float | None,
-        typer.Option(help="Refuse readings whose time is further off, s. [default: 60 or 2 ticks]"),
-    ] = None,
-    grace: Annotated[
-        float | None, typer.Option(help="How long a tick waits for readings, s. [default: half a tick]")
-    ] = None,
-    max_payload: Annotated[int | None, typer.Option(help="Largest payload, bytes. [default: 262144]")] = None,
-    queue: Annotated[int | None, typer.Option(help="Payloads that may wait. [default: 20000]")] = None,
-    max_feeders: Annotated[
-        int | None, typer.Option(help="Feeders that may be put over REST. [default: 100]")
-    ] = None,
-    log_level: Annotated[
-        str | None, typer.Option(help="debug, info, warning or error. [default: info]")
-    ] = None,
-    log_format: Annotated[str | None, typer.Option(help="console or json. [default: console]")] = None,
-    until_eof: Annotated[bool, typer.Option(hidden=True, help="End when standard input ends.")] = False,
-) -> None:
-    """Watch feeders until interrupted. Every option can also be set as GRIDSEC_..., e.g. GRIDSEC_HTTP."""
-    from service import logs
-    from service.app import serve as run
-    from service.settings import settings
-
-    chosen = settings(
-        {
-            "feeders": tuple(feeder) if feeder else None,
-            "estimator": estimator,
-            "zenoh_listen": tuple(zenoh_listen) if zenoh_listen else None,
-            "zenoh_connect": tuple(zenoh_connect) if zenoh_connect else None,
-            "zenoh_mode": zenoh_mode,
-            "zenoh_config": zenoh_config,
-            "prefix": prefix,
-            "http": http,
-            "database": database,
-            "clock": clock,
-            "max_skew_s": max_skew,
-            "grace_s": grace,
-            "max_payload": max_payload,
-            "queue": queue,
-            "max_feeders": max_feeders,
-            "log_level": log_level,
-            "log_format": log_format,
-        }
-    )
-    logs.set_up(chosen.log_level, chosen.log_format)
-
-    def announce(running: Running) -> None:
-        print(running.url, flush=True)
-        if until_eof:
-            _stop_at_eof(asyncio.get_running_loop(), running.stop)
-
-    asyncio.run(run(chosen, announce=announce))
-
-
-def _stop_at_eof(loop: asyncio.AbstractEventLoop, stop: Callable[[], None]) -> None:
-    """Stop when whoever started us has gone: its end of our standard input closes."""
-
-    def wait() -> None:
-        while os.read(sys.stdin.fileno(), 4096):
-            pass
-        loop.call_soon_threadsafe(stop)
-
-    threading.Thread(target=wait, name="gridsec-eof", daemon=True).start()
 
 
 # ----------------------------------------------------------------------------------------------------- demo

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from functools import partial
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 
@@ -17,52 +18,39 @@ class Metrics:
 
     def __init__(self) -> None:
         self._registry = CollectorRegistry()
-        registry = self._registry
-        self.samples = Counter("gridsec_samples", "Payloads received over zenoh.", registry=registry)
-        self.dropped = Counter(
-            "gridsec_samples_dropped", "Payloads dropped because the queue was full.", registry=registry
+        self._bus_before = asdict(BusCounts())
+        self._of_readings(self._registry)
+        self._of_ticks(self._registry)
+        self._of_storing(self._registry)
+
+    def _of_readings(self, registry: CollectorRegistry) -> None:
+        """What comes in."""
+        counter = partial(Counter, registry=registry)
+        self.samples = counter("gridsec_samples", "Payloads received over zenoh.")
+        self.dropped = counter("gridsec_samples_dropped", "Payloads dropped because the queue was full.")
+        self.readings = counter(
+            "gridsec_readings", "Well-formed readings, by what became of them.", ["feeder", "outcome"]
         )
-        self.readings = Counter(
-            "gridsec_readings",
-            "Well-formed readings, by what became of them.",
-            ["feeder", "outcome"],
-            registry=registry,
-        )
-        self.bad = Counter(
+        self.bad = counter(
             "gridsec_bad_readings",
             "Readings that could not be used, by reason; no feeder if it is unknown.",
             ["feeder", "reason"],
-            registry=registry,
         )
-        self.lost = Counter(
-            "gridsec_readings_lost",
-            "Readings missing by their running numbers.",
-            ["feeder"],
-            registry=registry,
+        self.lost = counter("gridsec_readings_lost", "Readings missing by their running numbers.", ["feeder"])
+        self.queue = Gauge("gridsec_queue_length", "Payloads waiting for the runtime.", registry=registry)
+        self.bus = counter("gridsec_zenoh", "What went through zenoh.", ["what"])
+
+    def _of_ticks(self, registry: CollectorRegistry) -> None:
+        """What is made of it."""
+        counter, gauge = partial(Counter, registry=registry), partial(Gauge, registry=registry)
+        self.ticks = counter("gridsec_ticks", "Ticks, by verdict.", ["feeder", "verdict"])
+        self.skipped = counter(
+            "gridsec_ticks_skipped", "Ticks skipped because the backlog was too long.", ["feeder"]
         )
-        self.ticks = Counter("gridsec_ticks", "Ticks, by verdict.", ["feeder", "verdict"], registry=registry)
-        self.skipped = Counter(
-            "gridsec_ticks_skipped",
-            "Ticks skipped because the backlog was too long.",
-            ["feeder"],
-            registry=registry,
-        )
-        self.seen = Gauge(
-            "gridsec_meters_seen", "Meters seen at the latest tick.", ["feeder"], registry=registry
-        )
-        self.suspects = Gauge(
-            "gridsec_suspects", "Meters under suspicion at the latest tick.", ["feeder"], registry=registry
-        )
-        self.learned = Gauge(
-            "gridsec_meters_learned", "Meters whose own error is known.", ["feeder"], registry=registry
-        )
-        self.alarms = Gauge("gridsec_alarms_active", "Alarms that stand.", ["feeder"], registry=registry)
-        self.transitions = Counter(
-            "gridsec_alarm_transitions",
-            "Stored alarm transitions.",
-            ["feeder", "kind", "change"],
-            registry=registry,
-        )
+        self.seen = gauge("gridsec_meters_seen", "Meters seen at the latest tick.", ["feeder"])
+        self.suspects = gauge("gridsec_suspects", "Meters under suspicion at the latest tick.", ["feeder"])
+        self.learned = gauge("gridsec_meters_learned", "Meters whose own error is known.", ["feeder"])
+        self.alarms = gauge("gridsec_alarms_active", "Alarms that stand.", ["feeder"])
         self.cycle = Histogram(
             "gridsec_cycle_seconds",
             "One round of the runtime: decode, align, estimate, store.",
@@ -76,21 +64,22 @@ class Metrics:
             buckets=_DELAY_BUCKETS,
             registry=registry,
         )
-        self.queue = Gauge("gridsec_queue_length", "Payloads waiting for the runtime.", registry=registry)
+
+    def _of_storing(self, registry: CollectorRegistry) -> None:
+        """What is kept of it."""
+        counter = partial(Counter, registry=registry)
+        self.transitions = counter(
+            "gridsec_alarm_transitions", "Stored alarm transitions.", ["feeder", "kind", "change"]
+        )
         self.unstored = Gauge(
             "gridsec_transitions_unstored", "Alarm transitions waiting for the database.", registry=registry
         )
-        self.store_failures = Counter(
-            "gridsec_store_failures", "Commits that the database refused.", registry=registry
-        )
-        self.forgotten = Counter(
+        self.store_failures = counter("gridsec_store_failures", "Commits that the database refused.")
+        self.forgotten = counter(
             "gridsec_records_forgotten",
             "What was given up because the database stayed away: reports, bad readings, transitions.",
             ["what"],
-            registry=registry,
         )
-        self.bus = Counter("gridsec_zenoh", "What went through zenoh.", ["what"], registry=registry)
-        self._bus_before = asdict(BusCounts())
 
     def count_bus(self, counts: BusCounts) -> None:
         """Take over the counts of the zenoh bus.

@@ -1,0 +1,120 @@
+"""`gridsec serve`: the service, until it is interrupted."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import sys
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from service.app import Running
+
+Feeders = Annotated[list[str] | None, typer.Option(help="Folder or name of a feeder; may be repeated.")]
+Estimator = Annotated[str | None, typer.Option(help="See `feeders estimators`. [default: as in the file]")]
+Listen = Annotated[
+    list[str] | None, typer.Option(help="zenoh endpoint to listen on. [default: tcp/127.0.0.1:7447]")
+]
+Endpoints = Annotated[
+    list[str] | None, typer.Option(help="zenoh endpoint to connect to, e.g. tcp/127.0.0.1:7447.")
+]
+Mode = Annotated[str | None, typer.Option(help="router, peer or client. [default: router]")]
+Config = Annotated[
+    Path | None, typer.Option(help="Your own zenoh configuration (json5): TLS, access rules, ...")
+]
+Prefix = Annotated[str | None, typer.Option(help="First chunks of all keys. [default: gridsec]")]
+Http = Annotated[str | None, typer.Option(help="Address of REST and web page. [default: 127.0.0.1:8000]")]
+Database = Annotated[
+    str | None,
+    typer.Option(help="sqlite:///file or postgresql+psycopg://... [default: sqlite:///gridsec.db]"),
+]
+ClockOf = Annotated[
+    str | None, typer.Option(help="wall, or events: the readings tell the time. [default: wall]")
+]
+MaxSkew = Annotated[
+    float | None,
+    typer.Option(help="Refuse readings whose time is further off, s. [default: 60 or 2 ticks]"),
+]
+Grace = Annotated[
+    float | None, typer.Option(help="How long a tick waits for readings, s. [default: half a tick]")
+]
+MaxPayload = Annotated[int | None, typer.Option(help="Largest payload, bytes. [default: 262144]")]
+Queue = Annotated[int | None, typer.Option(help="Payloads that may wait. [default: 20000]")]
+MaxFeeders = Annotated[int | None, typer.Option(help="Feeders that may be put over REST. [default: 100]")]
+LogLevel = Annotated[str | None, typer.Option(help="debug, info, warning or error. [default: info]")]
+LogFormat = Annotated[str | None, typer.Option(help="console or json. [default: console]")]
+UntilEof = Annotated[bool, typer.Option(hidden=True, help="End when standard input ends.")]
+
+
+def serve(
+    *,
+    feeder: Feeders = None,
+    estimator: Estimator = None,
+    zenoh_listen: Listen = None,
+    zenoh_connect: Endpoints = None,
+    zenoh_mode: Mode = None,
+    zenoh_config: Config = None,
+    prefix: Prefix = None,
+    http: Http = None,
+    database: Database = None,
+    clock: ClockOf = None,
+    max_skew: MaxSkew = None,
+    grace: Grace = None,
+    max_payload: MaxPayload = None,
+    queue: Queue = None,
+    max_feeders: MaxFeeders = None,
+    log_level: LogLevel = None,
+    log_format: LogFormat = None,
+    until_eof: UntilEof = False,
+) -> None:
+    """Watch feeders until interrupted. Every option can also be set as GRIDSEC_..., e.g. GRIDSEC_HTTP."""
+    from service import logs
+    from service.app import serve as run
+    from service.settings import settings
+
+    chosen = settings(
+        {
+            "feeders": tuple(feeder) if feeder else None,
+            "estimator": estimator,
+            "zenoh_listen": tuple(zenoh_listen) if zenoh_listen else None,
+            "zenoh_connect": tuple(zenoh_connect) if zenoh_connect else None,
+            "zenoh_mode": zenoh_mode,
+            "zenoh_config": zenoh_config,
+            "prefix": prefix,
+            "http": http,
+            "database": database,
+            "clock": clock,
+            "max_skew_s": max_skew,
+            "grace_s": grace,
+            "max_payload": max_payload,
+            "queue": queue,
+            "max_feeders": max_feeders,
+            "log_level": log_level,
+            "log_format": log_format,
+        }
+    )
+    logs.set_up(chosen.log_level, chosen.log_format)
+
+    def announce(running: Running) -> None:
+        print(running.url, flush=True)
+        if until_eof:
+            _stop_at_eof(asyncio.get_running_loop(), running.stop)
+
+    asyncio.run(run(chosen, announce=announce))
+
+
+def _stop_at_eof(loop: asyncio.AbstractEventLoop, stop: Callable[[], None]) -> None:
+    """Stop when whoever started us has gone: its end of our standard input closes."""
+
+    def wait() -> None:
+        while os.read(sys.stdin.fileno(), 4096):
+            pass
+        loop.call_soon_threadsafe(stop)
+
+    threading.Thread(target=wait, name="gridsec-eof", daemon=True).start()
