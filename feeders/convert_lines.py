@@ -12,7 +12,7 @@ import numpy as np
 from feeders.convert_changes import WHOLE, Change
 from feeders.convert_customers import rounded
 from feeders.load_phases import series_of, shunt_of
-from feeders.matrices import SHUNT_NAMES, cells_of, columns_of, passive, shunt_us
+from feeders.matrices import SERIES_NAMES, SHUNT_NAMES, cells_of, columns_of, passive, shunt_us
 from feeders.schema import LineRow
 from gridsec.arrays import Floats, Ints, Phasors
 
@@ -142,9 +142,9 @@ def balanced_charging(lines: Sequence[LineRow], changes: list[Change]) -> list[L
         Takes what that leaves out.
     """
     matrices = [shunt_us(cells_of(row)) for row in lines]
-    if any(row.phases != "abc" or row.r_aa_ohm is not None for row in lines) or not all(
-        matrix is None or cyclic(matrix) for matrix in matrices
-    ):
+    if any(
+        row.phases != "abc" or row.r_aa_ohm is not None or row.tap_a is not None for row in lines
+    ) or not all(matrix is None or cyclic(matrix) for matrix in matrices):
         return list(lines)
     given = [row.line for row, matrix in zip(lines, matrices, strict=True) if matrix is not None]
     changes.extend(Change(f"line {name}", CHARGING, "approximated", IN_EVERY_PHASE) for name in given)
@@ -187,6 +187,63 @@ def open_end(row: LineRow, bus: str, volt: float) -> LineRow | None:
         return None
     name = f"{row.line} open end"
     return replace(row, line=name, from_bus=bus, to_bus=f"{bus} {name}", closed=True)
+
+
+def turned(row: LineRow) -> LineRow:
+    """Return a line given from its other end; a tap t becomes 1/t, with the impedance on its other side.
+
+    Parameters
+    ----------
+    row
+        The line.
+    """
+    away = replace(row, from_bus=row.to_bus, to_bus=row.from_bus)
+    if set(row.taps) == {1.0}:
+        return away
+    if row.tap_a is None and row.tap_b is None and row.tap_c is None:
+        factor = dict.fromkeys(SERIES_NAMES, row.tap**2) | dict.fromkeys(SHUNT_NAMES, row.tap**-2)
+        factor |= dict.fromkeys(("r_ohm", "x_ohm", "r0_ohm", "x0_ohm"), row.tap**2) | {"b_us": row.tap**-2}
+        values = {name: (getattr(row, name), by) for name, by in factor.items()}
+        cells: dict[str, Any] = {
+            name: rounded(value * by) for name, (value, by) in values.items() if value is not None
+        }
+        return replace(away, tap=rounded(1.0 / row.tap), **cells)
+    phases = phases_of(row)
+    here = np.ix_(phases, phases)
+    side = np.outer(row.taps, row.taps)[here]
+    scaled = line_row(
+        row.line,
+        (row.to_bus, row.from_bus),
+        phases,
+        series=series_of(row)[here] * side,
+        shunt=1e-6 * shunt_of(row)[here] / side,
+        changes=[],
+    )
+    scaled = replace(scaled, closed=row.closed, rating_a=row.rating_a)
+    return with_taps(scaled, 1.0 / np.array(row.taps))
+
+
+def with_taps(row: LineRow, taps: Floats) -> LineRow:
+    """Return a line with a transformer at its first end: one ratio, or where they differ one for each phase.
+
+    Parameters
+    ----------
+    row
+        The line.
+    taps : (3,)
+        Ratios; only those of its phases count.
+    """
+    own = [rounded(float(tap)) for tap in taps]
+    phases = phases_of(row)
+    if len({own[phase] for phase in phases}) == 1:
+        return replace(row, tap=own[phases[0]], tap_a=None, tap_b=None, tap_c=None)
+    cells: dict[str, Any] = {f"tap_{'abc'[phase]}": own[phase] for phase in phases}
+    return replace(row, tap=1.0, **cells)
+
+
+def phases_of(row: LineRow) -> Ints:
+    """Return the phases of a line, ascending, 0 for a."""
+    return np.array(["abc".index(phase) for phase in sorted(row.phases)], dtype=np.intp)
 
 
 def merged(lines: Sequence[LineRow], busbar: str, changes: list[Change]) -> list[LineRow]:
@@ -233,7 +290,9 @@ def merged(lines: Sequence[LineRow], busbar: str, changes: list[Change]) -> list
                     Change(f"line {rows[k].line}", "closed", "changed", "open; switches join its two ends")
                 )
         elif len(members) > 1:
-            rows[members[0]] = _parallel([rows[k] for k in members], changes)
+            start = fused(rows[members[0]].from_bus)
+            alike = [rows[k] if fused(rows[k].from_bus) == start else turned(rows[k]) for k in members]
+            rows[members[0]] = _parallel(alike, changes)
             gone.update(members[1:])
     return [row for k, row in enumerate(rows) if k not in gone]
 
@@ -243,7 +302,7 @@ def _parallel(rows: list[LineRow], changes: list[Change]) -> LineRow:
     names = " + ".join(row.line for row in rows)
     first = rows[0]
     alike = len({row.phases for row in rows}) == 1
-    if not alike or any(row.r_aa_ohm is not None or row.b_aa_us is not None for row in rows):
+    if not alike or any((row.in_phases and len(row.phases) > 1) or row.tap != 1.0 for row in rows):
         return _side_by_side(rows, names, changes)
     changes.append(Change(f"lines {names}", WHOLE, "changed", f"in parallel; one line {first.line}"))
     positive = [complex(row.r_ohm, row.x_ohm) for row in rows]
@@ -272,10 +331,16 @@ def _side_by_side(rows: list[LineRow], names: str, changes: list[Change]) -> Lin
     first = rows[0]
     admittance: Phasors = np.zeros((3, 3), dtype=np.complex128)
     charge = np.zeros((3, 3))
+    taps = np.full(3, np.nan)
     for row in rows:
-        here = np.ix_(*[["abc".index(phase) for phase in sorted(row.phases)]] * 2)
+        own = phases_of(row)
+        here = np.ix_(own, own)
         admittance[here] += np.linalg.inv(series_of(row)[here])
         charge[here] += shunt_of(row)[here]
+        taps[own] = np.where(np.isnan(taps[own]), np.array(row.taps)[own], taps[own])
+        if np.abs(taps[own] - np.array(row.taps)[own]).max() > CYCLIC:
+            effect = f"that of {first.line} beside it; the current that their difference drives is left out"
+            changes.append(Change(f"line {row.line}", "tap", "approximated", effect))
     phases = np.flatnonzero(admittance.diagonal())
     there = np.ix_(phases, phases)
     changes.append(Change(f"lines {names}", WHOLE, "changed", f"side by side; one line {first.line}"))
@@ -288,4 +353,4 @@ def _side_by_side(rows: list[LineRow], names: str, changes: list[Change]) -> Lin
         changes=changes,
     )
     limit = min((row.rating_a for row in rows if row.rating_a is not None), default=None)
-    return replace(joined, rating_a=limit, to_x=first.to_x, to_y=first.to_y)
+    return with_taps(replace(joined, rating_a=limit, to_x=first.to_x, to_y=first.to_y), taps)

@@ -18,7 +18,7 @@ from feeders.convert_changes import WHOLE, BusbarUnclear, Change
 from feeders.convert_check import SourceState
 from feeders.convert_customers import USUAL_POWER_FACTOR, base_kva, with_meters
 from feeders.convert_draws import Draw, customers_of, is_even
-from feeders.convert_lines import balanced_charging, merged
+from feeders.convert_lines import balanced_charging, merged, turned
 from feeders.schema import FeederMeta, FeederTables, LineRow, LoadDefaults, validate
 from gridsec.arrays import Phasors
 from gridsec.errors import FeederInvalid, GridsecError
@@ -34,11 +34,14 @@ class Coupling:
         Its name, with its kind, and the buses it joins.
     power_kva
         What flows into it from each of them, by phase, kVA.
+    line
+        The line with a tap that it is between buses of one nominal voltage; None: it is none.
     """
 
     name: str
     buses: tuple[str, ...]
     power_kva: tuple[Phasors, ...]
+    line: LineRow | None = None
 
 
 @dataclass(slots=True)
@@ -199,6 +202,7 @@ def below(network: Network, root: str | None, opened: Sequence[str]) -> Part:
     changes = list(network.changes)
     rows = _opened(network.lines, opened, changes)
     busbar = _busbar(network, rows, root)
+    network, rows = _regulated(network, rows, busbar, changes)
     inside = _reached(busbar, rows)
     problems = _infeeds(network, rows, busbar, inside)
     volt = network.nominal[busbar]
@@ -367,6 +371,27 @@ def _beyond(network: Network, way: list[str]) -> set[str]:
     return {bus for each in network.couplings if way[-1] in each.buses for bus in each.buses} - set(way)
 
 
+def _regulated(
+    network: Network, rows: list[LineRow], busbar: str, changes: list[Change]
+) -> tuple[Network, list[LineRow]]:
+    """Take transformers below the busbar as the lines with taps that they are, where they are such."""
+    fused = _fused(busbar, rows)
+    everything = [*rows, *_as_rows(network.couplings)]
+    above = {bus for source in network.sources for bus in _reached(source, everything, without=fused)}
+    left, lines = [], []
+    for each in network.couplings:
+        volts = [network.nominal[bus] for bus in each.buses]
+        one_level = max(volts) - min(volts) <= 1e-6 * max(volts)
+        if each.line is None or not one_level or not above.isdisjoint(set(each.buses) - fused.keys()):
+            left.append(each)
+            continue
+        lines.append(each.line)
+        ratios = " ".join(f"{tap:.6g}" for tap in dict.fromkeys(each.line.taps))
+        effect = f"a line with the fixed ratio {ratios} that the source's power flow left it at"
+        changes.append(Change(each.name, "tap", "changed", effect))
+    return replace(network, couplings=left), [*rows, *lines]
+
+
 def _infeeds(network: Network, rows: list[LineRow], busbar: str, inside: Mapping[str, int]) -> list[str]:
     """Return what else feeds the feeder besides its busbar."""
     problems = []
@@ -397,8 +422,7 @@ def _kept(
     for row in rows:
         a, b = row.from_bus in inside, row.to_bus in inside
         if a and b:
-            turned = inside[row.to_bus] < inside[row.from_bus]
-            away = replace(row, from_bus=row.to_bus, to_bus=row.from_bus) if turned else row
+            away = turned(row) if inside[row.to_bus] < inside[row.from_bus] else row
             place = network.xy.get(away.to_bus)
             kept.append(replace(away, to_x=place[0], to_y=place[1]) if place else away)
         elif a or b:

@@ -19,7 +19,7 @@ import numpy as np
 
 from feeders.convert_changes import WHOLE, Change
 from feeders.convert_draws import Draw
-from feeders.convert_lines import capacitor, line_row, open_end
+from feeders.convert_lines import capacitor, line_row, open_end, with_taps
 from feeders.convert_network import Coupling, Network
 from feeders.schema import LineRow
 from gridsec.arrays import Floats, Phasors
@@ -37,6 +37,12 @@ DEAD: Final = 1e-4
 
 SAME_POWER: Final = 1e-6
 """Relative difference of two powers below which they are the same."""
+
+APART: Final = 1e-6
+"""Part of a transformer's largest admittance below which its phases have nothing in common."""
+
+NO_LOAD_KVA: Final = 1e-3
+"""Power that a transformer takes without load, kVA, from which on it is told that it is left out."""
 
 SERIES: Final = {"line", "reactor"}
 COUPLINGS: Final = {"transformer", "autotrans"}
@@ -296,7 +302,8 @@ def _take(dss: Any, each: _Element, network: Network, problems: list[str]) -> No
     elif each.kind == "capacitor":
         problems.append(f"{label} is in series between {each.buses[0]} and {each.buses[1]}; expected a shunt")
     elif each.kind in COUPLINGS:
-        network.couplings.append(Coupling(label, each.buses, each.power_kva))
+        line = _regulator(dss, each, network)
+        network.couplings.append(Coupling(label, each.buses, each.power_kva, line))
     elif each.kind in LOADS | GENERATORS:
         _draw(dss, each, network)
     elif each.kind in CONTROLS:
@@ -305,6 +312,54 @@ def _take(dss: Any, each: _Element, network: Network, problems: list[str]) -> No
     elif each.kind not in SILENT and each.kind != "vsource":
         change = Change(label, WHOLE, "left out", "has no place in a feeder; the check shows what that does")
         network.of_bus.append((each.buses[0], change))
+
+
+def _regulator(dss: Any, each: _Element, network: Network) -> LineRow | None:
+    """A transformer that is a line with a tap: two ends of the same phases, each phase apart, none turned.
+
+    With the admittance y behind a ratio t its admittances are ``y / t^2``, ``-y / t`` and, at the far end, y
+    beside what flows into it without load.
+    """
+    ends = [sorted((node, k) for k, node in enumerate(nodes) if node > 0) for nodes in each.nodes]
+    nodes = [node for node, _ in ends[0]]
+    alike = len(ends) == 2 and nodes == [node for node, _ in ends[-1]]
+    if not (alike and each.closed and nodes and len(set(nodes)) == len(nodes) and nodes[-1] <= PHASES):
+        return None
+    whole, count = _yprim(dss, each), len(nodes)
+    order = [k for _, k in ends[0]] + [len(each.nodes[0]) + k for _, k in ends[1]]
+    blocks = whole[np.ix_(order, order)].reshape(2, count, 2, count)
+    near, across, far = (np.diagonal(blocks[i, :, j]) for i, j in ((0, 0), (0, 1), (1, 1)))
+    crossed = max(
+        np.abs(blocks[i, :, j] - np.diag(np.diagonal(blocks[i, :, j]))).max() for i in (0, 1) for j in (0, 1)
+    )
+    if crossed > APART * np.abs(whole).max() or not near.all() or not across.all():
+        return None
+    ratio = -across / near
+    series = -1.0 / (ratio * across)
+    if (
+        np.abs(ratio.imag).max() > APART
+        or ratio.real.min() <= 0
+        or min(series.real.min(), series.imag.min()) < 0
+    ):
+        return None
+    idle = np.abs(far - 1.0 / series).sum() * network.nominal[each.buses[1]] ** 2 / 1000.0
+    label = f"{each.kind} {each.name}"
+    if idle > NO_LOAD_KVA:
+        network.of_bus.append(
+            (each.buses[1], Change(label, "no-load current", "left out", f"{idle:.3g} kVA"))
+        )
+    phases = np.array(nodes) - 1
+    row = line_row(
+        f"{each.kind}.{each.name}",
+        (each.buses[0], each.buses[1]),
+        phases,
+        series=np.diag(series),
+        shunt=np.zeros((count, count)),
+        changes=[],
+    )
+    taps = np.ones(PHASES)
+    taps[phases] = ratio.real
+    return with_taps(row, taps)
 
 
 def _is_shunt(each: _Element) -> bool:

@@ -250,6 +250,7 @@ def _couplings(tables: Tables, solved: Tables, network: Network) -> None:
                     label,
                     tuple(str(row[sides[k][0]]) for k in joined),
                     tuple(_by_phase(flow[sides[k][1]], flow[sides[k][2]]) for k in joined),
+                    _plain_line(row, label) if kind == "generic_branch" and _regulator(row) else None,
                 )
             )
 
@@ -257,6 +258,10 @@ def _couplings(tables: Tables, solved: Tables, network: Network) -> None:
 def _plain(row: Any) -> bool:
     neutral = all(np.isnan(row[name]) or row[name] == value for name, value in (("k", 1.0), ("theta", 0.0)))
     return bool(neutral and not row["g1"] > 0)
+
+
+def _regulator(row: Any) -> bool:
+    return bool(not row["theta"] and not row["g1"] > 0 and min(row["r1"], row["x1"]) >= 0)
 
 
 def _plain_line(row: Any, label: str) -> LineRow:
@@ -267,6 +272,7 @@ def _plain_line(row: Any, label: str) -> LineRow:
         rounded(float(row["r1"])),
         rounded(float(row["x1"])),
         b_us=rounded(1e6 * float(np.nan_to_num(row["b1"]))),
+        tap=1.0 if np.isnan(row["k"]) else rounded(float(row["k"])),
         closed=_closed(row),
     )
 

@@ -26,6 +26,7 @@ AGREEMENT: Final = 1e-3
 UPPER: Final = np.triu_indices(3)
 
 NAMES: Final = tuple(column.name for column in (*SERIES_COLUMNS, *SHUNT_COLUMNS))
+SERIES_NAMES: Final = tuple(column.name for column in SERIES_COLUMNS)
 SHUNT_NAMES: Final = tuple(column.name for column in SHUNT_COLUMNS)
 _cells = attrgetter(*NAMES)
 

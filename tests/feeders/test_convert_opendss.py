@@ -11,6 +11,7 @@ import pytest
 
 from feeders.convert import check_against_source, convert
 from feeders.convert_check import BALANCED_PU, UNBALANCED_PU
+from feeders.load import from_tables
 from feeders.schema import examine, read, write
 from gridsec.errors import FeederInvalid, GridsecError
 from tests.feeders.foreign import opendss
@@ -178,6 +179,85 @@ new load.shed bus1=B3.2 phases=1 kv=0.231 kw=5 pf=1
     across = rows["capacitor.across"]
     assert (across.phases, across.b_bc_us) == ("bc", pytest.approx(-3e9 / 400.0**2))
     assert examine(tmp_path / "x").problems == ()
+
+
+def test_regulators_are_lines_with_the_taps_they_stand_at(tmp_path: Path) -> None:
+    """One of three phases, one given from its far end, three of single phases under control."""
+    source = master(
+        tmp_path,
+        """
+new transformer.gang windings=2 phases=3 buses=(B1,B2) conns=(wye,wye) kvs=(.4,.4) kvas=(100,100)
+~ xhl=1 %rs=(.2,.2) taps=(1,1.05)
+new line.l2 bus1=B2 bus2=B3 linecode=lc length=150 units=m
+new transformer.back windings=2 phases=3 buses=(B4,B3) conns=(wye,wye) kvs=(.4,.4) kvas=(100,100)
+~ xhl=2 %rs=(.3,.3) taps=(0.975,1)
+new line.l4 bus1=B4 bus2=B5 linecode=lc length=90 units=m
+new transformer.ra windings=2 phases=1 buses=(B5.1,B6.1) kvs=(.231,.231) kvas=(50,50)
+~ xhl=.1 %loadloss=.01
+new transformer.rb windings=2 phases=1 buses=(B5.2,B6.2) kvs=(.231,.231) kvas=(50,50)
+~ xhl=.1 %loadloss=.01
+new transformer.rc windings=2 phases=1 buses=(B6.3,B5.3) kvs=(.231,.231) kvas=(50,50)
+~ xhl=.1 %loadloss=.01 taps=(1.01,1)
+new regcontrol.ca transformer=ra winding=2 vreg=118 band=1 ptratio=2
+new regcontrol.cb transformer=rb winding=2 vreg=114 band=1 ptratio=2
+new line.l6 bus1=B6 bus2=B7 phases=3 rmatrix=(.4|.1 .5|.1 .2 .4) xmatrix=(.6|.2 .7|.3 .2 .6)
+~ cmatrix=(9|0 9|0 0 9) length=0.1
+new load.mill bus1=B3 phases=3 kv=0.4 kw=20 pf=0.95 vminpu=0.5
+new load.home bus1=B7.1 phases=1 kv=0.231 kw=6 pf=0.95 vminpu=0.5
+new load.hut bus1=B7.2 phases=1 kv=0.231 kw=3 pf=0.9 vminpu=0.5
+new load.shed bus1=B7.3 phases=1 kv=0.231 kw=1 pf=0.9 vminpu=0.5
+""",
+    )
+    done = convert(source, tmp_path / "x")
+    assert done.check is not None
+    assert done.check.largest_pu < 1e-6
+    assert [each for each in done.changes if each.done == "approximated"] == []
+    tables = read(tmp_path / "x")
+    rows = {row.line: row for row in tables.lines}
+    gang, back, bank = rows["transformer.gang"], rows["transformer.back"], rows["transformer.ra"]
+    assert (gang.from_bus, gang.tap) == ("b1", pytest.approx(1 / 1.05, rel=1e-6))
+    assert gang.x_ohm == pytest.approx(0.01 * 0.4**2 * 1e3 / 100 * 1.05**2, rel=1e-5)
+    assert (back.from_bus, back.tap) == ("b3", pytest.approx(1 / 0.975, rel=1e-6))
+    assert bank.tap == 1.0
+    assert bank.tap_a is not None
+    assert bank.tap_b is not None
+    assert len({bank.tap_a, bank.tap_b, bank.tap_c}) == 3
+    assert bank.tap_a < 0.99  # its control has raised the voltage
+    assert bank.tap_c == pytest.approx(1 / 1.01, rel=1e-6)
+    said = "\n".join(done.notes)
+    assert ("transformer gang", "tap", "changed") in {
+        (each.element, each.prop, each.done) for each in done.changes
+    }
+    assert "left out: regcontrol ca, regcontrol cb" in said
+    # Nothing of it is a customer, and the loader takes it.
+    assert {row.customer for row in tables.customers} == {"shop", "mill", "home", "hut", "shed"}
+    site = from_tables(tables)
+    assert site.base_volt.max() / site.base_volt.min() > 1.05
+
+
+@pytest.mark.parametrize("percent", [0.0, 0.5])
+def test_a_balanced_feeder_with_a_regulator_stays_balanced(percent: float, tmp_path: Path) -> None:
+    source = master(
+        tmp_path,
+        f"""
+new transformer.gang windings=2 phases=3 buses=(B1,B2) conns=(wye,wye) kvs=(.4,.4) kvas=(100,100)
+~ xhl=1 %rs=(.2,.2) taps=(1,1.05)
+new transformer.twin windings=2 phases=3 buses=(B2,B1) conns=(wye,wye) kvs=(.4,.4) kvas=(100,100)
+~ xhl=1 %rs=(.2,.2) taps=(1.05,1) %noloadloss={percent}
+new line.l2 bus1=B2 bus2=B3 linecode=lc length=150 units=m
+new load.mill bus1=B3 phases=3 kv=0.4 kw=20 pf=0.95
+""",
+    )
+    done = convert(source, tmp_path / "x")
+    assert done.check is not None
+    assert not done.check.three_phase
+    assert (done.check.largest_pu < BALANCED_PU) == (percent == 0.0)
+    assert done.check.largest_pu < 5e-4
+    said = "\n".join(done.notes)
+    assert ("no-load current of transformer twin; 0.5 kVA" in said) == (percent > 0.0)
+    assert "side by side; one line transformer.gang" in said
+    site = from_tables(read(tmp_path / "x"))
+    assert site.base_volt[-1] == pytest.approx(site.base_volt[0] * 1.05, rel=1e-6)
 
 
 def test_a_matrix_that_no_line_has_is_taken_as_transposed(tmp_path: Path) -> None:

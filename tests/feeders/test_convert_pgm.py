@@ -240,3 +240,26 @@ def test_what_is_no_feeder_is_told(tmp_path: Path) -> None:
         convert(written(tmp_path, {"sym_load": []}), tmp_path / "y")
     assert len(caught.value.problems) == 2
     assert not (tmp_path / "y").exists()
+
+
+def test_branches_with_a_ratio_are_lines_with_a_tap(tmp_path: Path) -> None:
+    tables = street()
+    tables["node"] += [{"id": k, "u_rated": 400.0} for k in (8, 9)]
+    branch = {"from_status": 1, "to_status": 1, "x1": 0.02, "r1": 0.01, "g1": 0.0, "theta": 0.0, "sn": 1e5}
+    tables["generic_branch"] = [
+        {"id": 27, "from_node": 6, "to_node": 8, "b1": 3e-4, "k": 0.96} | branch,
+        {"id": 28, "from_node": 9, "to_node": 6, "b1": 0.0, "k": 0.98} | branch,
+    ]
+    tables["sym_load"] += [load(57, 8, 8e3, 2e3), load(58, 9, 8e3, 2e3)]
+    done = convert(written(tmp_path, tables), tmp_path / "x")
+    assert done.check is not None
+    assert not done.check.three_phase
+    assert done.check.largest_pu < BALANCED_PU
+    rows = {row.line: row for row in read(tmp_path / "x").lines}
+    assert rows["generic_branch 27"].tap == 0.96
+    back = rows["generic_branch 28"]  # from the busbar's side now
+    assert (back.from_bus, back.tap, back.r_ohm) == (
+        "6",
+        pytest.approx(1 / 0.98),
+        pytest.approx(0.01 * 0.98**2),
+    )
