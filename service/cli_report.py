@@ -14,7 +14,8 @@ import typer
 from rich.markup import escape
 
 from service import console
-from service.cli_plan import bar
+from service.cli_campaign import Seed
+from service.cli_plan import BusbarUnknown, Silent, Unknown, bar
 from service.console import FAILED, Studied, complain
 from service.foreign import converted
 
@@ -22,65 +23,58 @@ if TYPE_CHECKING:
     from service.study_report import Asked
 
 
+Page = Annotated[
+    Path, typer.Option(help="The page; figures, tables and journals go into a folder beside it.")
+]
+Studies = Annotated[
+    str | None,
+    typer.Option(help="Names of studies, with commas between them. [default: all there is data for]"),
+]
+MaxAttacked = Annotated[int, typer.Option(help="M: how many meters lie together at most.", min=1)]
+GoalOf = Annotated[
+    str, typer.Option(help="Protect so that liars are named: identify; noticed: notice; small: bound.")
+]
+LieVolt = Annotated[float | None, typer.Option(help="For bound: largest lie that may stay unnoticed, V.")]
+Scenarios = Annotated[int, typer.Option(help="How many attacks are simulated.", min=1)]
+Workers = Annotated[
+    int | None, typer.Option(help="Processes for simulated attacks. [default: all cores]", min=1)
+]
+Hosting = Annotated[bool, typer.Option("--hosting", help="Look for hosting capacities too.")]
+Readings = Annotated[
+    Path | None, typer.Option(help="A recording (Parquet or CSV) to compare the files with.")
+]
+At = Annotated[
+    str | None,
+    typer.Option(help="Date and time that the report bears, like 2026-11-21T12:00Z. [default: now]"),
+]
+
+
 def report(
     feeder: Studied = "simbench-lv-rural1",
     *,
-    out: Annotated[
-        Path, typer.Option(help="The page; figures, tables and journals go into a folder beside it.")
-    ] = Path("report.html"),
-    studies: Annotated[
-        str | None,
-        typer.Option(help="Names of studies, with commas between them. [default: all there is data for]"),
-    ] = None,
-    max_attacked: Annotated[int, typer.Option(help="M: how many meters lie together at most.", min=1)] = 2,
-    goal: Annotated[
-        str, typer.Option(help="Protect so that liars are named: identify; noticed: notice; small: bound.")
-    ] = "identify",
-    lie_volt: Annotated[
-        float | None, typer.Option(help="For bound: largest lie that may stay unnoticed, V.")
-    ] = None,
-    unknown: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="A customer whose powers nobody knows; may be repeated. [default: those without a meter]"
-        ),
-    ] = None,
-    silent: Annotated[
-        list[str] | None, typer.Option(help="A meter that is missing; may be repeated.")
-    ] = None,
-    busbar_unknown: Annotated[
-        bool, typer.Option("--busbar-unknown", help="The busbar's voltage is not metered.")
-    ] = False,
-    scenarios: Annotated[int, typer.Option(help="How many attacks are simulated.", min=1)] = 160,
-    seed: Annotated[int, typer.Option(help="Chooses everything random.", min=0)] = 0,
-    workers: Annotated[
-        int | None, typer.Option(help="Processes for simulated attacks. [default: all cores]", min=1)
-    ] = None,
-    hosting: Annotated[bool, typer.Option("--hosting", help="Look for hosting capacities too.")] = False,
-    readings: Annotated[
-        Path | None, typer.Option(help="A recording (Parquet or CSV) to compare the files with.")
-    ] = None,
-    at: Annotated[
-        str | None,
-        typer.Option(help="Date and time that the report bears, like 2026-11-21T12:00Z. [default: now]"),
-    ] = None,
+    out: Page = Path("report.html"),
+    studies: Studies = None,
+    max_attacked: MaxAttacked = 2,
+    goal: GoalOf = "identify",
+    lie_volt: LieVolt = None,
+    unknown: Unknown = None,
+    silent: Silent = None,
+    busbar_unknown: BusbarUnknown = False,
+    scenarios: Scenarios = 160,
+    seed: Seed = 0,
+    workers: Workers = None,
+    hosting: Hosting = False,
+    readings: Readings = None,
+    at: At = None,
 ) -> None:
     """Run studies and write a report on the feeder: one HTML file, to print or to send.
 
     Interrupted, the same command goes on where it was. What a study cannot answer, the report says.
     """
-    from feeders.load import load
-    from feeders.origin import origin
-    from feeders.report.book import report as make
-    from feeders.report.page import About
-    from feeders.studies.protect import Goal
-    from service.study_report import STUDIES, Asked, outcome, seeds, versions, write
+    from service.study_report import STUDIES, Asked
 
     chosen = _studies(studies, tuple(STUDIES), recorded=readings is not None)
-    if goal not in tuple(Goal):
-        raise typer.BadParameter(f"{goal!r}: expected one of {', '.join(Goal)}", param_hint="--goal")
-    if (goal == Goal.BOUND) != (lie_volt is not None):
-        raise typer.BadParameter("goes with --goal bound, and that with it", param_hint="--lie-volt")
+    _see_goal(goal, lie_volt)
     made = _moment(at)
     asked = Asked(
         feeder=feeder,
@@ -96,13 +90,33 @@ def report(
         hosting=hosting,
         readings=readings,
     )
+    _make(asked, chosen, out, made=made, command=_command(asked, out, studies))
+
+
+def _see_goal(goal: str, lie_volt: float | None) -> None:
+    from feeders.studies.protect import Goal
+
+    if goal not in tuple(Goal):
+        raise typer.BadParameter(f"{goal!r}: expected one of {', '.join(Goal)}", param_hint="--goal")
+    if (goal == Goal.BOUND) != (lie_volt is not None):
+        raise typer.BadParameter("goes with --goal bound, and that with it", param_hint="--lie-volt")
+
+
+def _make(asked: Asked, chosen: tuple[str, ...], out: Path, *, made: str, command: str) -> None:
+    """Run the studies and write the report."""
+    from feeders.load import load
+    from feeders.origin import origin
+    from feeders.report.book import report as make
+    from feeders.report.page import About
+    from service.study_report import outcome, seeds, versions, write
+
     folder = out.with_name(f"{out.stem}-files")
-    studied = converted(feeder, folder)
-    site = load(studied)
+    studied = converted(asked.feeder, folder)
+    site, source = load(studied), origin(studied)
     out.parent.mkdir(parents=True, exist_ok=True)
     outcomes = [outcome(name, site, asked, journals=folder / "journals", bar=bar) for name in chosen]
-    about = About(made, _command(asked, out, studies), versions(), seeds(chosen, asked), folder.name)
-    write(make(site, outcomes, about, origin(studied)), out, folder)
+    about = About(made, command, versions(), seeds(chosen, asked), folder.name)
+    write(make(site, outcomes, about, source), out, folder)
     console.out.print(escape(f"{out}: {len(outcomes)} studies; figures and tables in {folder}"))
     failed = [each for each in outcomes if each.result is None]
     for each in failed:
