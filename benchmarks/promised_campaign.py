@@ -76,8 +76,8 @@ def main(lies: int, feeder: str, journal: Path | None) -> int:
     used = [getrusage(who) for who in (RUSAGE_SELF, RUSAGE_CHILDREN)]
     cost = sum(one.ru_utime + one.ru_stime for one in used) / max(last - done[0][1], 1) / cores
     print(
-        f"{cores} processes, {each:.3f} s per scene; {LIES} lies of each: {each * LIES / 60.0:.0f} min by the "
-        f"clock, {cost * LIES / 60.0:.0f} min by the processor time, on {cores} cores with nothing else to do"
+        f"{cores} processes, {each:.3f} s per scene; {LIES} lies of each: {each * LIES / 60.0:.0f} min by "
+        f"the clock, {cost * LIES / 60.0:.0f} min by the processor time, with nothing else to do"
     )
     return int(found.promises["broken"].sum() > 0)
 
