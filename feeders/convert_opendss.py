@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 
 from feeders.convert_changes import WHOLE, Change
-from feeders.convert_draws import Draw
+from feeders.convert_draws import Draw, is_even
 from feeders.convert_lines import capacitor, line_row, open_end, with_taps
 from feeders.convert_network import Coupling, Network
 from feeders.schema import LineRow
@@ -41,8 +41,8 @@ SAME_POWER: Final = 1e-6
 APART: Final = 1e-6
 """Part of a transformer's largest admittance below which its phases have nothing in common."""
 
-NO_LOAD_KVA: Final = 1e-3
-"""Power that a transformer takes without load, kVA, from which on it is told that it is left out."""
+NO_LOAD: Final = 1e-5
+"""Part of a transformer's rating that it takes without load, from which on it is told that it is left out."""
 
 SERIES: Final = {"line", "reactor"}
 COUPLINGS: Final = {"transformer", "autotrans"}
@@ -344,7 +344,7 @@ def _regulator(dss: Any, each: _Element, network: Network) -> LineRow | None:
         return None
     idle = np.abs(far - 1.0 / series).sum() * network.nominal[each.buses[1]] ** 2 / 1000.0
     label = f"{each.kind} {each.name}"
-    if idle > NO_LOAD_KVA:
+    if idle > NO_LOAD * float(dss.Properties.Value("kva")):
         network.of_bus.append(
             (each.buses[1], Change(label, "no-load current", "left out", f"{idle:.3g} kVA"))
         )
@@ -446,15 +446,10 @@ def _shunt(dss: Any, each: _Element, network: Network) -> None:
 def _draw(dss: Any, each: _Element, network: Network) -> None:
     power = each.power_kva[0]
     used = [node for node in each.nodes[0] if 1 <= node <= PHASES]
-    even = len(used) == PHASES
     label = f"{each.kind} {each.name}"
-    apart = float(np.abs(power - power.mean()).max()) if even else 0.0
-    if (even and apart > 1e-9 * float(np.abs(power).max(initial=0.0))) or len(used) == 2:
-        effect = (
-            "in star, its power split evenly; exact where the voltages are balanced"
-            if even
-            else "in star, its phases' powers as the source's power flow has them; exact at these loads only"
-        )
+    even = len(used) == PHASES and (is_even(power) or not power.any())
+    if len(used) > 1 and not even:
+        effect = "in star, its phases' powers as the source's power flow has them; exact at these loads only"
         network.of_bus.append((each.buses[0], Change(label, "delta", "approximated", effect)))
     rating = None
     if each.kind in GENERATORS:
