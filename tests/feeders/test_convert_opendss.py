@@ -15,6 +15,7 @@ from feeders.load import from_tables
 from feeders.schema import examine, read, write
 from gridsec.errors import FeederInvalid, GridsecError
 from tests.feeders.foreign import opendss
+from tests.feeders.thirteen import thirteen
 
 pytest.importorskip("opendssdirect", reason="the extra `convert` is not installed")
 
@@ -233,6 +234,22 @@ new load.shed bus1=B7.3 phases=1 kv=0.231 kw=1 pf=0.9 vminpu=0.5
     assert {row.customer for row in tables.customers} == {"shop", "mill", "home", "hut", "shed"}
     site = from_tables(tables)
     assert site.base_volt.max() / site.base_volt.min() > 1.05
+
+
+@pytest.mark.parametrize("root", [None, "650"], ids=["behind-its-regulator", "with-its-regulator"])
+def test_the_ieee_13_node_feeder(root: str | None, tmp_path: Path) -> None:
+    (tmp_path / "thirteen.dss").write_text(thirteen())
+    done = convert(str(tmp_path / "thirteen.dss"), tmp_path / "x", root=root)
+    assert done.check is not None
+    assert done.check.largest_pu < 1e-7
+    approximated = {(each.element, each.prop) for each in done.changes if each.done == "approximated"}
+    assert approximated == {(f"load l{k}", "delta") for k in (0, 5, 6)}  # exact at these loads
+    tables = read(tmp_path / "x")
+    assert sum(row.r_aa_ohm is not None or row.r_bb_ohm is not None for row in tables.lines) >= 7
+    assert {row.phases for row in tables.lines} >= {"abc", "bc", "ca", "a", "c"}
+    site = from_tables(tables)
+    tapped = site.base_volt[3:6] / site.base_volt[:3]
+    assert (tapped.min() > 1.02) == (root == "650")
 
 
 @pytest.mark.parametrize("percent", [0.0, 0.5])
