@@ -125,7 +125,7 @@ def test_names_are_told_from_inventions() -> None:
         "tests/test_docs_papers.py::test_no_cell_is_empty",
         "test_docs_papers::test_no_cell_is_empty",
         "::test_no_cell_is_empty",
-        "test_bank.py::TestGuarantees::test_theorem_2",
+        "test_bank_guarantees.py::TestGuarantees::test_theorem_2",
         "TestGuarantees::theorem_2",
         "test_no_cell_is_empty",
         "names_are_told_…",
