@@ -11,8 +11,12 @@ import pytest
 
 from feeders.convert import check_against_source, convert
 from feeders.convert_check import BALANCED_PU, UNBALANCED_PU
-from feeders.load import from_tables
+from feeders.estimators import design
+from feeders.lies import Lie, Trick
+from feeders.load import from_tables, load
 from feeders.schema import examine, read, write
+from feeders.trials import LoadError, Trial, judge
+from feeders.trials import Meters as Quality
 from gridsec.errors import FeederInvalid, GridsecError
 from tests.feeders.foreign import opendss
 from tests.feeders.thirteen import thirteen
@@ -250,6 +254,21 @@ def test_the_ieee_13_node_feeder(root: str | None, tmp_path: Path) -> None:
     site = from_tables(tables)
     tapped = site.base_volt[3:6] / site.base_volt[:3]
     assert (tapped.min() > 1.02) == (root == "650")
+
+
+@pytest.mark.parametrize("lie", [None, Lie(Trick.BIAS, 5, 3.0, onset_s=10.0)], ids=["nobody", "five"])
+def test_the_ieee_13_node_feeder_is_watched(lie: Lie | None, tmp_path: Path) -> None:
+    """Five of sixteen meters lie, before and behind three different taps; nobody else is named."""
+    (tmp_path / "thirteen.dss").write_text(thirteen())
+    convert(str(tmp_path / "thirteen.dss"), tmp_path / "x", root="650")
+    trial = Trial(
+        load(tmp_path / "x"), 2, 22.0, load_error=LoadError(20.0, 7.0), meters=Quality.WHITE, lie=lie
+    )
+    found = judge(design(trial.stated), trial, settling_s=3.0)
+    assert found.liars.size == (5 if lie else 0)
+    assert (found.delay_s <= 3.0).all()
+    assert not found.accused.any()
+    assert np.percentile(found.error_all, 95) < 0.2
 
 
 @pytest.mark.parametrize("percent", [0.0, 0.5])
