@@ -10,8 +10,11 @@ from power_grid_model import ComponentType, DatasetType, initialize_array
 from power_grid_model.utils import json_serialize_to_file
 
 
-def opendss(path: Path, buses: int, *, balanced: bool, seed: int = 0) -> Path:
-    """A low-voltage network below an 11 kV source: lines of three kinds of definition, single-phase spurs."""
+def opendss(path: Path, buses: int, *, balanced: bool, poles: bool = False, seed: int = 0) -> Path:
+    """A low-voltage network below an 11 kV source: lines of three kinds of definition, single-phase spurs.
+
+    With poles, half of the lines hang on them side by side, without transposition.
+    """
     rng = np.random.default_rng(seed)
     lines = [
         "clear",
@@ -22,16 +25,27 @@ def opendss(path: Path, buses: int, *, balanced: bool, seed: int = 0) -> Path:
         "new linecode.cable nphases=3 rmatrix=(0.5|0.15 0.5|0.15 0.15 0.5) xmatrix=(0.4|0.3 0.4|0.3 0.3 0.4) "
         "cmatrix=(200|0 200|0 0 200) units=mi",
     ]
+    if poles:
+        lines += [
+            "new wiredata.al rac=0.3 runits=km gmrac=6 gmrunits=mm radius=8 radunits=mm",
+            "new linegeometry.pole nconds=4 nphases=3 reduce=yes",
+            *(
+                f"~ cond={k} wire=al x={x} h={h} units=m"
+                for k, x, h in ((1, -0.6, 8.5), (2, -0.1, 8.5), (3, 0.6, 8.5), (4, 0.0, 7.3))
+            ),
+        ]
     phases = {"board": (1, 2, 3)}
     names = ["board"]
     for k in range(1, buses):
         above = names[rng.integers(max(0, len(names) - max(8, buses // 6)), len(names))]
         here = phases[above]
-        if not balanced and len(here) == 3 and rng.random() < 0.4:
+        if not balanced and len(here) == 3 and rng.random() < (0.04 if poles else 0.4):
             here = (int(rng.integers(1, 4)),)
         dots = "".join(f".{node}" for node in here)
         metres = rng.uniform(5.0, 25.0)
-        shape = ["linecode=wire", "linecode=cable"][k % 2] if len(here) == 3 else ""
+        shape = (
+            ["geometry=pole" if poles else "linecode=wire", "linecode=cable"][k % 2] if len(here) == 3 else ""
+        )
         own = "" if shape else "r1=0.6 x1=0.08 r0=0.6 x0=0.08 c1=0 c0=0 units=km "
         lines.append(
             f"new line.l{k} bus1={above}{dots} bus2=n{k}{dots} phases={len(here)} {own}{shape} "

@@ -56,12 +56,15 @@ def test_voltages_are_opendss_own(buses: int, balanced: bool, tmp_path: Path) ->
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("balanced", [True, False])
-def test_large_networks(balanced: bool, tmp_path: Path) -> None:
-    done = convert(str(opendss(tmp_path / "city.dss", 600, balanced=balanced)), tmp_path / "city")
+@pytest.mark.parametrize(("balanced", "poles"), [(True, False), (False, False), (False, True)])
+def test_large_networks(balanced: bool, poles: bool, tmp_path: Path) -> None:
+    source = opendss(tmp_path / "city.dss", 600, balanced=balanced, poles=poles)
+    done = convert(str(source), tmp_path / "city")
     assert done.check is not None
     assert done.check.buses == 600
     assert done.check.largest_pu < (BALANCED_PU if balanced else UNBALANCED_PU)
+    bare = sum(row.r_aa_ohm is not None for row in read(tmp_path / "city").lines)
+    assert (bare > 50) == poles
 
 
 def test_everything_is_carried_over_or_named(tmp_path: Path) -> None:
