@@ -26,6 +26,7 @@ from service.commissioning import Happened, Step
 from service.errors import FeederFixed, TooManyFeeders
 from service.report import FeederReport, MeterReport
 from service.store import Store
+from tests.service.asking import T0, Setup
 from tests.service.databases import Cluster, find_postgresql
 
 CHROMIUM = [
@@ -33,7 +34,6 @@ CHROMIUM = [
     *("--disable-component-update", "--disable-sync"),
 ]
 
-T0 = 1_795_212_000.0
 NOMINAL = 230.94
 
 
@@ -360,3 +360,21 @@ def browser() -> Iterator[Browser]:
         made = playwright.chromium.launch(executable_path=found, args=CHROMIUM)
         yield made
         made.close()
+
+
+@pytest.fixture
+def store(url: str) -> Iterator[Store]:
+    """A store of its own, in each kind of database."""
+    with Store(url) as made:
+        yield made
+
+
+@pytest.fixture
+def setup(
+    village: type[Village], small_service: Callable[..., Any], serve: Callable[..., Any]
+) -> Iterator[Setup]:
+    """A service of two feeders, and who asks it."""
+    service = small_service(village("village"), village("town", 4))
+    made = Setup(service, serve(service))
+    with made.http:
+        yield made

@@ -1,67 +1,25 @@
+"""REST: feeders, alarms, errors, operations."""
+
 from __future__ import annotations
 
 import json
 import math
-import socket
 import sqlite3
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
-import fastapi.routing
 import httpx
 import pytest
 
 from gridsec.online import Cause
-from service import api, models
-from service.alarms import Change, Transition
+from service import models
 from service.report import CustomerReport, ExplanationReport, InverterReport
 from service.report import to_json as report_json
 from service.store import Rejected, connect
+from tests.service.asking import T0, Setup, Stream, is_problem
 
-T0 = 1_795_212_000.0
-LIE = {"H3": 9.0}
 ACK = f"/api/v1/alarms/{'0' * 26}/ack"
-
-
-class Setup:
-    def __init__(self, service: Any, server: Any) -> None:
-        self.service, self.server = service, server
-        self.village = next(iter(service.villages.values()))
-        self.http = httpx.Client(base_url=server.url, timeout=20)
-
-    def attack(self, t: float = T0, ticks: int = 4, **changes: Any) -> None:
-        for k in range(ticks):
-            self.service.tick(self.village.report(t + k, **({"lies": LIE} | changes)))
-
-    def calm(self, t: float, ticks: int = 8) -> None:
-        self.attack(t, ticks, lies={})
-
-    def get(self, path: str, **arguments: Any) -> httpx.Response:
-        return self.http.get(f"/api/v1{path}", **arguments)
-
-    def one(self) -> dict[str, Any]:
-        (alarm,) = self.get("/alarms").json()["alarms"]
-        return alarm
-
-
-@pytest.fixture
-def setup(village: type, small_service: Callable[..., Any], serve: Callable[..., Any]) -> Iterator[Setup]:
-    service = small_service(village("village"), village("town", 4))
-    made = Setup(service, serve(service))
-    with made.http:
-        yield made
-
-
-def is_problem(response: httpx.Response, status: int) -> dict[str, Any]:
-    assert response.status_code == status, (response.request.url, response.text)
-    assert response.headers["content-type"] == "application/problem+json"
-    body: dict[str, Any] = response.json()
-    assert models.Problem.model_validate(body).status == status
-    assert body["instance"] == response.request.url.path
-    assert body["detail"]
-    return body
 
 
 # ----------------------------------------------------------------------- feeders
@@ -300,6 +258,7 @@ def test_acknowledging(setup: Setup) -> None:
 
 
 JSON = {"Content-Type": "application/json"}
+
 ERRORS: list[tuple[str, str, bytes | None, dict[str, str], int]] = [
     ("GET", "/nothing", None, {}, 404),
     ("GET", "/api/v1/nothing", None, {}, 404),
@@ -453,183 +412,3 @@ def test_the_page_allows_no_foreign_code(setup: Setup) -> None:
     assert "://" not in response.text
     again = setup.http.get("/", headers={"If-None-Match": response.headers["etag"]})
     assert again.status_code == 304
-
-
-# --------------------------------------------------------------------- streams
-
-
-class Stream:
-    """A client of server-sent events that parses what the standard says."""
-
-    def __init__(self, setup: Setup, path: str, **headers: str) -> None:
-        self.context = setup.http.stream("GET", f"/api/v1{path}", headers=headers)
-        self.response = self.context.__enter__()
-        self.lines = self.response.iter_lines()
-
-    def next(self) -> dict[str, str]:
-        event: dict[str, str] = {}
-        for line in self.lines:
-            if line.startswith(":"):
-                event["comment"] = line[1:].strip()
-            elif line:
-                name, _, value = line.partition(": ")
-                event[name] = value
-            elif event:
-                return event
-        return {"end": "true"}
-
-    def alarms(self, count: int) -> list[tuple[int, str]]:
-        found = []
-        while len(found) < count:
-            event = self.next()
-            if "data" in event:
-                data = models.AlarmEvent.model_validate_json(event["data"])
-                assert event["event"] == "alarm"
-                assert int(event["id"]) == data.seq
-                found.append((data.seq, str(data.change)))
-        return found
-
-    def close(self) -> None:
-        self.context.__exit__(None, None, None)
-
-
-def test_alarms_arrive_as_they_happen(setup: Setup) -> None:
-    stream = Stream(setup, "/alarms/stream")
-    assert stream.response.headers["content-type"].startswith("text/event-stream")
-    assert stream.next() == {"comment": "connected", "id": "0", "retry": "2000"}
-    setup.attack()
-    event = stream.next()
-    assert json.loads(event["data"])["alarm"] == setup.one()
-    setup.http.post(f"/api/v1/alarms/{setup.one()['id']}/ack", json={"who": "Ada"})
-    assert stream.alarms(1) == [(2, "acknowledged")]
-    setup.calm(T0 + 10)
-    assert stream.alarms(1) == [(3, "cleared")]
-    stream.close()
-
-
-def test_a_client_that_comes_back_misses_nothing(setup: Setup) -> None:
-    setup.attack()
-    stream = Stream(setup, "/alarms/stream?after=0")
-    assert stream.alarms(1) == [(1, "raised")]
-    stream.close()
-    for k in range(1, 4):
-        setup.calm(T0 + 1000 * k)
-        setup.attack(T0 + 1000 * k + 20)
-    again = Stream(setup, "/alarms/stream?after=0", **{"Last-Event-ID": "1"})
-    expected = [(n, "cleared" if n % 2 == 0 else "raised") for n in range(2, 8)]
-    assert again.alarms(6) == expected
-    again.close()
-
-
-def test_a_number_from_another_database_begins_now(setup: Setup) -> None:
-    setup.attack()
-    stream = Stream(setup, "/alarms/stream", **{"Last-Event-ID": "999999999999999999999"})
-    assert stream.next()["id"] == "1"
-    setup.calm(T0 + 10)
-    assert stream.alarms(1) == [(2, "cleared")]
-    stream.close()
-
-
-def test_a_stream_of_one_feeder(setup: Setup) -> None:
-    stream = Stream(setup, "/alarms/stream?feeder=town")
-    setup.attack()
-    town = setup.service.villages["town"]
-    for k in range(4):
-        setup.service.tick(town.report(T0 + k, lies={"H1": 9.0}))
-    assert stream.alarms(1) == [(2, "raised")]
-    stream.close()
-
-
-def test_states_arrive_and_begin_with_the_latest(setup: Setup) -> None:
-    setup.attack(ticks=3)
-    stream = Stream(setup, "/feeders/village/stream")
-    assert stream.next()["comment"] == "connected"
-    first = stream.next()
-    assert first["event"] == "state"
-    assert json.loads(first["data"]) == report_json(setup.service.report("village"))
-    setup.calm(T0 + 5, 1)
-    assert json.loads(stream.next()["data"])["t"] == T0 + 5
-    stream.close()
-
-
-def test_a_quiet_stream_has_a_heartbeat(setup: Setup, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fastapi.routing, "_PING_INTERVAL", 0.1)
-    stream = Stream(setup, "/alarms/stream")
-    assert [stream.next()["comment"] for _ in range(3)] == ["connected", "ping", "ping"]
-    stream.close()
-
-
-def test_a_slow_client_costs_nothing_and_loses_nothing(setup: Setup) -> None:
-    setup.attack()
-    alarm = setup.service.books["village"].active[0]
-    transition = Transition(alarm, Change.RAISED, T0, None, "x" * 60_000)
-    with socket.create_connection(("127.0.0.1", setup.server.port)) as client:
-        client.sendall(b"GET /api/v1/alarms/stream?after=1 HTTP/1.1\r\nHost: x\r\n\r\n")
-        time.sleep(0.2)
-        for _ in range(20):  # 18 MB for a client that reads nothing, more than the sockets hold
-            setup.service.store.commit([transition] * 15)
-            setup.service.wake({"type": "alarm", "data": None})
-            assert setup.http.get("/healthz", timeout=5).status_code == 200
-        assert max(queue.qsize() for queue in setup.service.queues) <= 8
-        client.settimeout(20)
-        data = b""
-        while data.count(b"\nid: ") < 301:
-            data += client.recv(1 << 20)
-    seen = [int(line[4:]) for line in data.split(b"\n") if line.startswith(b"id: ")]
-    assert seen == list(range(1, 302))
-
-
-def test_streams_are_counted(setup: Setup, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(api, "MAX_STREAMS", 2)
-    one, two = Stream(setup, "/alarms/stream"), Stream(setup, "/feeders/village/stream")
-    assert one.next()["comment"] == two.next()["comment"] == "connected"
-    is_problem(setup.get("/alarms/stream"), 503)
-    two.close()
-    deadline = time.monotonic() + 10
-    while True:
-        third = Stream(setup, "/alarms/stream")
-        if third.response.status_code == 200:
-            break
-        third.close()
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-    assert third.next()["comment"] == "connected"
-    third.close()
-    one.close()
-
-
-def test_streams_end_when_the_service_stops(setup: Setup) -> None:
-    stream = Stream(setup, "/alarms/stream")
-    assert stream.next()["comment"] == "connected"
-    time.sleep(0.1)
-    begun = time.perf_counter()
-    setup.server.stop()
-    assert stream.next() == {"end": "true"}
-    assert time.perf_counter() - begun < 5
-    assert setup.service.queues == set()
-    stream.close()
-
-
-def test_a_stream_gives_way_when_the_store_fails(setup: Setup) -> None:
-    stream = Stream(setup, "/alarms/stream")
-    assert stream.next()["comment"] == "connected"
-    raw = sqlite3.connect(setup.service.store.name.removeprefix("sqlite:///"))
-    setup.attack(ticks=2)
-    setup.service.queues, quiet = set(), setup.service.queues
-    setup.attack(T0 + 2, ticks=1)
-    raw.execute("ALTER TABLE event RENAME TO away")
-    setup.service.queues = quiet
-    setup.service.wake({"type": "alarm", "data": None})
-    assert stream.next() == {"end": "true"}
-    raw.execute("ALTER TABLE away RENAME TO event")
-    raw.close()
-    again = Stream(setup, "/alarms/stream", **{"Last-Event-ID": "0"})
-    assert again.alarms(1) == [(1, "raised")]
-    again.close()
-    stream.close()
-
-
-def test_undecided_is_shown_as_such(setup: Setup) -> None:
-    setup.attack(ticks=1, lies={}, cause=Cause.AMBIGUOUS)
-    state = setup.get("/feeders/village/state").json()
-    assert (state["verdict"], state["cause"]) == ("undecided", "ambiguous")

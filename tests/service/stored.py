@@ -1,0 +1,44 @@
+"""Alarms and reports to store."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from gridsec.online import Cause, Decision
+from service.alarms import Alarm, AlarmKind, AlarmState, Change, Evidence, Severity, Transition
+from service.report import FeederReport, MeterReport
+from tests.service.asking import T0
+
+
+def an_alarm(number: int = 0, **changes: object) -> Alarm:
+    t = T0 + number
+    made = Alarm(
+        id=f"{number:026d}",
+        kind=AlarmKind.METER_MANIPULATED,
+        feeder="village",
+        meter="m1",
+        severity=Severity.CRITICAL,
+        state=AlarmState.RAISED,
+        count=1,
+        t_event=t - 2,
+        t_raised=t,
+        t_cleared=None,
+        reason="reports 240.0 V – «quoted» ' \" \\ 雪",
+        evidence=Evidence(1e-3 / 3, None, 0.1 + 0.2, 230.0, -5e-324),
+    )
+    return replace(made, **changes)  # type: ignore[arg-type]
+
+
+def raised(alarm: Alarm) -> Transition:
+    return Transition(alarm, Change.RAISED, alarm.t_raised)
+
+
+def a_report(
+    t: float, suspects: tuple[str, ...] = (), *, count: int = 3, volt: float = 230.0
+) -> FeederReport:
+    meters = tuple(
+        MeterReport(f"m{i}", "b1", i != 2, f"m{i}" in suspects, 1e-4, 2e-3, volt, volt - 0.5, 0.1, 1.0, 0.0)
+        for i in range(count)
+    )
+    verdict = (Decision.ATTACKED, Cause.RESIDUALS) if suspects else (Decision.CLEAN, Cause.AGREEMENT)
+    return FeederReport("village", t, verdict[0], "", verdict[1], 2, meters, (), (), 207.0, 253.0)

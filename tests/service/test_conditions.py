@@ -1,0 +1,155 @@
+"""What a report says of a feeder: conditions, of which alarms are made."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import pytest
+
+from gridsec.online import Cause
+from service.alarms import AlarmKind, Condition, Evidence, Severity, conditions
+from service.report import BUSBAR
+from tests.service.reports import inverter, meter, report, with_inverters
+
+UNDECIDED_CAUSES = [cause for cause in Cause if cause not in (Cause.AGREEMENT, Cause.RESIDUALS)]
+
+
+def said(found: Iterable[Condition]) -> dict[tuple[str, str | None], bool]:
+    return {(str(c.kind), c.meter): c.known for c in found}
+
+
+def test_a_clean_feeder_has_no_conditions() -> None:
+    assert conditions(report(meter("m1"), meter("m2"))) == []
+
+
+def test_a_suspect_is_a_condition_with_its_numbers() -> None:
+    liar = meter("m2", suspect=True, score=9e-3, v_volt_reported=240.0, attack_volt_estimated=10.0)
+    (found,) = conditions(report(meter("m1"), liar, cause=Cause.RESIDUALS))
+    assert (found.kind, found.meter, found.known) == (AlarmKind.METER_MANIPULATED, "m2", True)
+    assert found.severity is Severity.CRITICAL
+    assert found.evidence == Evidence(9e-3, 2e-3, 240.0, 230.0, 10.0)
+    assert "240.0 V" in found.reason
+    assert "230.0 V" in found.reason
+
+
+def test_evidence_says_what_a_manipulation_looks_like() -> None:
+    liar = meter("m2", suspect=True, kind="drift")
+    (found,) = conditions(report(liar, cause=Cause.RESIDUALS))
+    assert found.evidence.kind == "drift"
+
+
+def test_a_manipulated_inverter_is_a_condition_of_its_customer() -> None:
+    wrong = inverter(suspect=True, attack_kvar_estimated=-6.25)
+    other = inverter("Lovelace", meter=None)
+    (found,) = conditions(with_inverters(report(meter("m1"), cause=Cause.RESIDUALS), wrong, other))
+    assert (found.kind, found.subject, found.meter) == (AlarmKind.INVERTER_MANIPULATED, "Miller", "m1")
+    assert (found.severity, found.known) == (Severity.CRITICAL, True)
+    assert found.evidence == Evidence(attack_kvar_estimated=-6.25)
+    assert "the inverter of Miller injects -6.2 kvar" in found.reason
+
+
+@pytest.mark.parametrize("cause", [*UNDECIDED_CAUSES, Cause.AGREEMENT])
+def test_who_does_not_judge_inverters_says_nothing_about_them(cause: Cause) -> None:
+    """Neither an estimator that only knows meters nor an undecided one clears an inverter's alarm."""
+    judged = cause is not Cause.AGREEMENT
+    found = conditions(with_inverters(report(meter("m1"), cause=cause), inverter(judged=judged)))
+    assert [(c.subject, c.known) for c in found if c.kind is AlarmKind.INVERTER_MANIPULATED] == [
+        ("Miller", False)
+    ]
+
+
+@pytest.mark.parametrize("cause", UNDECIDED_CAUSES)
+def test_undecided_says_nothing_about_any_meter(cause: Cause) -> None:
+    found = said(conditions(report(meter("m1", suspect=True), meter("m2"), cause=cause)))
+    assert found["meter-manipulated", "m1"] is False
+    assert found["meter-manipulated", "m2"] is False
+
+
+@pytest.mark.parametrize("cause", [Cause.AGREEMENT, Cause.RESIDUALS])
+def test_a_silent_meter_is_neither_manipulated_nor_honest(cause: Cause) -> None:
+    unseen = meter("m2", seen=False, score=None, v_volt_reported=None)
+    found = said(conditions(report(meter("m1"), unseen, cause=cause)))
+    assert found["meter-manipulated", "m2"] is False
+    assert ("meter-manipulated", "m1") not in found
+
+
+def test_a_lying_meter_raises_no_voltage_alarm() -> None:
+    liar = meter("m1", suspect=True, v_volt_reported=260.0, v_volt_estimated=231.0)
+    found = said(conditions(report(liar, cause=Cause.RESIDUALS)))
+    assert found == {("meter-manipulated", "m1"): True}
+
+
+@pytest.mark.parametrize(
+    ("volt", "third", "expected"),
+    [
+        (253.0, 0.5, None),  # on the limit is inside
+        (253.1, 0.5, False),  # outside, but the truth may be inside: hold
+        (254.6, 0.5, True),  # the whole interval is outside
+        (254.5, 0.5, False),  # the interval just touches the limit
+        (207.0, 0.5, None),
+        (206.9, 0.5, False),
+        (205.4, 0.5, True),
+        (math.nan, 0.5, False),
+        (None, 0.5, False),
+        (260.0, None, False),
+        (260.0, math.inf, False),
+    ],
+)
+def test_voltage_limit_needs_the_whole_interval(
+    volt: float | None, third: float | None, expected: bool | None
+) -> None:
+    found = said(conditions(report(meter(v_volt_estimated=volt, v_volt_std=third))))
+    assert found.get(("voltage-limit", "m1")) is expected
+
+
+@pytest.mark.parametrize("cause", list(Cause))
+def test_voltage_limit_only_where_the_reconstruction_is_sound(cause: Cause) -> None:
+    found = said(conditions(report(meter(v_volt_estimated=260.0), cause=cause)))
+    sound = cause in (Cause.AGREEMENT, Cause.RESIDUALS, Cause.SILENT_METERS)
+    assert found["voltage-limit", "m1"] is sound
+
+
+def test_voltage_limit_says_which_side() -> None:
+    high, low = conditions(report(meter("m1", v_volt_estimated=260.0), meter("m2", v_volt_estimated=190.0)))
+    assert "above the limit of 253.0 V" in high.reason
+    assert "below the limit of 207.0 V" in low.reason
+
+
+def test_silence_is_data_loss_and_not_undecided() -> None:
+    unseen = meter("m2", seen=False, score=None, v_volt_reported=None)
+    found = conditions(report(meter("m1"), unseen, cause=Cause.SILENT_METERS, silent=(("m2", 12.0),)))
+    loss = next(c for c in found if c.kind is AlarmKind.DATA_LOSS)
+    assert (loss.meter, loss.known, loss.severity) == ("m2", True, Severity.MINOR)
+    assert "12 s" in loss.reason
+    assert said(found)["undecided", None] is False
+
+
+def test_a_meter_that_was_never_heard_is_data_loss_with_words_for_it() -> None:
+    unseen = meter("m1", seen=False)
+    found = conditions(report(unseen, cause=Cause.SILENT_METERS, silent=(("m1", math.inf),)))
+    loss = next(c for c in found if c.kind is AlarmKind.DATA_LOSS)
+    assert loss.reason == "no usable reading yet"
+
+
+def test_unseen_but_not_for_long_is_unknown() -> None:
+    found = said(conditions(report(meter("m1", seen=False), cause=Cause.SILENT_METERS)))
+    assert found["data-loss", "m1"] is False
+
+
+def test_a_silent_busbar_is_worse() -> None:
+    found = conditions(report(meter("m1"), cause=Cause.NO_BUSBAR, silent=((BUSBAR, 30.0),)))
+    loss = next(c for c in found if c.kind is AlarmKind.DATA_LOSS)
+    assert (loss.meter, loss.known, loss.severity) == (BUSBAR, True, Severity.MAJOR)
+    young = said(conditions(report(meter("m1"), cause=Cause.NO_BUSBAR)))
+    assert young["data-loss", BUSBAR] is False
+
+
+@pytest.mark.parametrize("cause", UNDECIDED_CAUSES)
+def test_undecided_is_an_alarm_unless_something_else_says_it(cause: Cause) -> None:
+    found = conditions(report(meter("m1"), cause=cause))
+    (undecided,) = (c for c in found if c.kind is AlarmKind.UNDECIDED)
+    covered = cause in (Cause.SETTLING, Cause.SILENT_METERS, Cause.NO_BUSBAR)
+    assert undecided.known is not covered
+    assert undecided.reason == "the reason"
+    assert undecided.meter is None

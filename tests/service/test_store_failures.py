@@ -1,0 +1,312 @@
+"""The store when it fails: databases that are locked, full, gone, old or killed; and what is kept then."""
+
+from __future__ import annotations
+
+import signal
+import sqlite3
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from service.commissioning import Happened, Step
+from service.kept import Kept
+from service.store import Store, StoreUnavailable, connect, schema
+from tests.service.databases import Cluster, both
+from tests.service.stored import T0, a_report, an_alarm, raised
+
+
+@pytest.mark.parametrize(
+    ("url", "words"),
+    [
+        ("nonsense", "no database address"),
+        ("mysql://localhost/x", "only sqlite and postgresql"),
+        ("sqlite://", "name a file"),
+        ("sqlite:///:memory:", "name a file"),
+        ("sqlite:////nonexistent-folder/x.db", "No such file or directory"),
+        ("sqlite:////proc/x.db", "cannot open"),
+        ("postgresql+psycopg://gridsec:secret@/x?host=/nonexistent-folder", "cannot open"),
+    ],
+)
+def test_a_database_that_cannot_be_used_is_a_clear_error(url: str, words: str) -> None:
+    with pytest.raises(StoreUnavailable, match=words) as caught:
+        Store(url)
+    assert "secret" not in str(caught.value)
+
+
+def test_a_file_that_is_no_database_is_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "notes.db"
+    path.write_text("These are my notes, not a database. " * 200)
+    before = path.read_bytes()
+    with pytest.raises(StoreUnavailable, match="not a database"):
+        Store(f"sqlite:///{path}")
+    assert path.read_bytes() == before
+
+
+@both
+def test_only_one_process_writes(url: str, family: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connect, "WAIT_S", 1.0)
+    words = "another process writes it" if family == "sqlite" else "lock timeout"
+    with Store(url), pytest.raises(StoreUnavailable, match=words):
+        Store(url)
+    with Store(url) as again:
+        again.check()
+
+
+@both
+def test_readers_cannot_write(store: Store, family: str) -> None:
+    words = "readonly" if family == "sqlite" else "read-only"
+    with pytest.raises(StoreUnavailable, match=words), store._read() as connection:
+        connection.execute(schema.FEEDER.delete())
+
+
+def test_reports_of_one_commit_are_thinned_out_like_those_of_many(tmp_path: Path) -> None:
+    suspects = [("m1",) if 13 <= k < 15 or k == 33 else () for k in range(40)]
+    reports = [a_report(T0 + k, named) for k, named in enumerate(suspects)]
+    with Store(f"sqlite:///{tmp_path}/one.db") as one, Store(f"sqlite:///{tmp_path}/many.db") as many:
+        one.commit(reports=reports)
+        for report in reports:
+            many.commit(reports=[report])
+        rows = one.history("village")
+        assert rows == many.history("village")
+    assert [row["t"] - T0 for row in rows] == [0, 10, 13, 15, 20, 30, 33, 34]
+
+
+def test_a_file_that_was_taken_away_is_missed_and_found_again(tmp_path: Path) -> None:
+    """An unlinked file takes every write and keeps none: that must not look like success."""
+    path, elsewhere = tmp_path / "s.db", tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    with Store(f"sqlite:///{path}") as store:
+        store.commit([raised(an_alarm(1))])
+        for name in ("s.db", "s.db-wal", "s.db-shm"):
+            (tmp_path / name).rename(elsewhere / name)
+        with pytest.raises(StoreUnavailable, match="removed"):
+            store.commit([raised(an_alarm(2))])
+        with pytest.raises(StoreUnavailable, match="removed"):
+            store.alarms()
+        assert not store.writable()
+        path.write_bytes(b"")
+        with pytest.raises(StoreUnavailable, match="replaced"):
+            store.check()
+        for name in ("s.db", "s.db-wal", "s.db-shm"):
+            (elsewhere / name).rename(tmp_path / name)
+        store.commit([raised(an_alarm(2))])
+        assert [alarm.id for alarm in store.alarms()[0]] == [an_alarm(2).id, an_alarm(1).id]
+
+
+def test_a_locked_database_is_given_up_soon(tmp_path: Path) -> None:
+    with Store(f"sqlite:///{tmp_path}/s.db") as store:
+        other = sqlite3.connect(tmp_path / "s.db", isolation_level=None)
+        other.execute("BEGIN IMMEDIATE")
+        begin = time.monotonic()
+        with pytest.raises(StoreUnavailable, match="locked"):
+            store.commit([raised(an_alarm())])
+        assert time.monotonic() - begin < 2.0
+        other.close()
+        store.commit([raised(an_alarm())])
+
+
+def test_whoever_asks_for_health_does_not_hold_up_a_commit(tmp_path: Path) -> None:
+    with Store(f"sqlite:///{tmp_path}/s.db") as store:
+        entered, leave = threading.Event(), threading.Event()
+
+        def write() -> None:
+            with store._lock:
+                entered.set()
+                assert leave.wait(10.0)
+
+        busy = threading.Thread(target=write)
+        busy.start()
+        assert entered.wait(10.0)
+        begin = time.monotonic()
+        store.check(wait=False)
+        assert time.monotonic() - begin < 1.0
+        leave.set()
+        busy.join()
+
+
+def test_sqlite_is_as_safe_as_it_says(tmp_path: Path) -> None:
+    with Store(f"sqlite:///{tmp_path}/s.db") as store, store._write() as connection:
+        pragma = {
+            name: connection.exec_driver_sql(f"PRAGMA {name}").scalar()
+            for name in ("journal_mode", "synchronous", "foreign_keys")
+        }
+        assert pragma == {"journal_mode": "wal", "synchronous": 2, "foreign_keys": 1}
+
+
+@both
+def test_what_was_learned_is_kept_as_it_is(store: Store) -> None:
+    assert store.commission("village") is None
+    assert store.commission_events("village") == []
+    other = Kept("town", T0, "{}")
+    begun = Happened("village", T0, Step.BEGUN, ("m1", "m2"), None, "")
+    store.commit(kept=[Kept("village", T0, '{"a": 1.0}'), other], happened=[begun])
+    wish = Happened("village", T0 + 5, Step.RECOMMISSIONED, ("m2",), "Ada", 'm2 replaced; it "hummed"')
+    store.commit(kept=[Kept("village", T0 + 5, '{"a": 2.0}')], happened=[wish])
+    assert store.commission("village") == Kept("village", T0 + 5, '{"a": 2.0}')
+    assert store.commission_events("village") == [begun, wish]
+    assert store.commission_events("village", 1) == [wish]
+    # A feeder that is deleted is forgotten, what happened to it is not, and others stay.
+    store.commit(without="village")
+    assert store.commission("village") is None
+    assert store.commission_events("village") == [begun, wish]
+    assert store.commission("town") == other
+
+
+@both
+def test_a_database_from_before_commissioning_was_kept_is_brought_forward(url: str) -> None:
+    with Store(url) as old, old._write() as connection:
+        for table in (schema.COMMISSION, schema.COMMISSION_EVENT):
+            table.drop(connection)
+        connection.execute(schema.VERSION.update().values(version=1))
+    with Store(url) as new:
+        new.commit(kept=[Kept("village", T0, "{}")])
+        assert new.commission("village") == Kept("village", T0, "{}")
+
+
+@both
+def test_older_schemas_are_brought_forward_and_newer_ones_refused(
+    url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Store(url) as one:
+        one.commit([raised(an_alarm())])
+
+    def step(connection: object) -> None:
+        connection.exec_driver_sql("ALTER TABLE feeder ADD COLUMN note TEXT")  # type: ignore[attr-defined]
+
+    known = schema.MIGRATIONS
+    monkeypatch.setattr(schema, "MIGRATIONS", (*known, step))
+    for _ in range(2):  # the second time there is nothing left to do, and the step would fail
+        with Store(url) as two:
+            assert two.alarm(an_alarm().id) == an_alarm()
+    monkeypatch.setattr(schema, "MIGRATIONS", known)
+    with pytest.raises(StoreUnavailable, match=r"version 3.* too old"):
+        Store(url)
+
+
+def test_a_failed_migration_leaves_the_database_as_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    url = f"sqlite:///{tmp_path}/m.db"
+    Store(url).close()
+
+    def step(connection: object) -> None:
+        connection.exec_driver_sql("ALTER TABLE feeder ADD COLUMN note TEXT")  # type: ignore[attr-defined]
+        connection.exec_driver_sql("nonsense")  # type: ignore[attr-defined]
+
+    known = schema.MIGRATIONS
+    monkeypatch.setattr(schema, "MIGRATIONS", (*known, step))
+    with pytest.raises(StoreUnavailable, match="syntax error"):
+        Store(url)
+    monkeypatch.setattr(schema, "MIGRATIONS", known)
+    with Store(url) as store:
+        store.put_feeder("village", {})
+    with sqlite3.connect(tmp_path / "m.db") as raw:
+        assert [row[1] for row in raw.execute("PRAGMA table_info(feeder)")] == ["name", "tables"]
+    raw.close()
+
+
+FULL_DISK = """
+    import resource, sys
+    sys.path.insert(0, {tests!r})
+    from service.store import Rejected, Store, StoreUnavailable
+    store = Store({url!r})
+    bad = [Rejected(0.0, "k" * 500, "r" * 500) for _ in range(100)]
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, resource.RLIM_INFINITY))
+    done = 0
+    try:
+        while True:
+            store.commit(rejected=bad)
+            done += 1
+    except StoreUnavailable as error:
+        print(error)
+    assert not store.writable() or store.rejected()
+    resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    assert store.writable()
+    assert len(store.rejected(5000)) == 100 * done
+    store.commit(rejected=bad)
+    assert len(store.rejected(5000)) == 100 * (done + 1)
+    store.close()
+"""
+
+
+def test_a_full_disk_is_a_clear_error_and_passes(tmp_path: Path) -> None:
+    code = textwrap.dedent(FULL_DISK).format(url=f"sqlite:///{tmp_path}/full.db", tests=str(Path.cwd()))
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "cannot write sqlite:///" in done.stdout
+
+
+@pytest.mark.postgresql
+def test_a_restart_of_postgresql_is_survived(cluster: Cluster) -> None:
+    with Store(cluster.database()) as store:
+        store.commit([raised(an_alarm(1))])
+        cluster.stop()
+        try:
+            assert not store.writable()
+            with pytest.raises(StoreUnavailable, match="cannot write"):
+                store.commit([raised(an_alarm(2))])
+            with pytest.raises(StoreUnavailable, match="cannot read"):
+                store.alarms()
+        finally:
+            cluster.start()
+        store.commit([raised(an_alarm(3))])
+        assert [a.id for a in store.alarms()[0]] == [an_alarm(3).id, an_alarm(1).id]
+
+
+WRITER = """
+    import sys, uuid
+    sys.path.insert(0, {tests!r})
+    from dataclasses import replace
+    from service.alarms import *
+    from service.store import Store
+    store = Store({url!r})
+    number = store.last_event
+    while True:
+        number += 1
+        alarm = Alarm(uuid.uuid4().hex[:26], AlarmKind.DATA_LOSS, "village", None, Severity.MINOR,
+                      AlarmState.RAISED, 1, 0.0, 1.0, None, "", Evidence())
+        over = replace(alarm, state=AlarmState.CLEARED, t_cleared=2.0)
+        a = store.commit([Transition(alarm, Change.RAISED, 1.0)])
+        print(alarm.id, a[0], "raised", flush=True)
+        b = store.commit([Transition(over, Change.CLEARED, 2.0)])
+        print(alarm.id, b[0], "cleared", flush=True)
+"""
+
+
+@both
+def test_nothing_acknowledged_is_lost_by_a_kill(url: str, family: str) -> None:
+    code = textwrap.dedent(WRITER).format(url=url, tests=str(Path.cwd()))
+    told: dict[int, tuple[str, str]] = {}
+    for wanted in (1, 20, 57, 90) if family == "sqlite" else (3, 40):
+        process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+        assert process.stdout is not None
+        lines = []
+        with process.stdout:
+            for line in process.stdout:
+                lines.append(line)
+                if len(lines) == wanted:
+                    process.send_signal(signal.SIGKILL)
+                    break
+            lines += process.stdout.readlines()
+        assert process.wait(timeout=30) == -signal.SIGKILL
+        assert len(lines) >= wanted
+        told |= {
+            int(number): (name, change)
+            for name, number, change in (line.split() for line in lines if line.endswith("\n"))
+        }
+    with Store(url) as store:
+        events = store.events_after(0, limit=1_000_000)
+        kept = {event.seq: (event.alarm.id, str(event.change)) for event in events}
+        assert told.items() <= kept.items()
+        # At most the last transaction before each kill was stored without being told.
+        assert len(kept) <= len(told) + 4
+        assert {event.seq for event in store.outbox_pending(1_000_000)} == set(kept)
+        latest = {event.alarm.id: event.alarm for event in events}
+        assert {a.id: a for a in store.alarms(limit=1_000_000)[0]} == latest
