@@ -44,6 +44,21 @@ def test_tables_are_printed_and_written(
     assert "not the journal of this study" in told
 
 
+def test_promises_are_played_and_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    some = ("campaign", "cigre-lv", "--promised", "--scenarios", "10", "--together", "5", "--duration", "30")
+    words = (*some, "--place", "random", "--workers", "1", "--out", str(tmp_path / "out"))
+    code, told, _ = run(monkeypatch, capsys, *words)
+    assert code == 0
+    assert "Promises of `study detectable`" in told
+    kept = pd.read_csv(tmp_path / "out" / "promises.csv").set_index("promise")
+    assert kept["lies"].to_dict() == {"hidden": 4, "named": 4}
+    assert kept["broken"].sum() == 0
+    assert kept["scenes"].max() == 2
+    assert set(pd.read_csv(tmp_path / "out" / "liars.csv")["kind"]) >= {"hidden_alone", "named"}
+
+
 def test_wrong_arguments_are_told(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
