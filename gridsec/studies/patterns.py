@@ -24,6 +24,7 @@ from scipy.sparse.csgraph import connected_components
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.index import Index, Sparsest, eigenspaces, fewest, kernel, linearise
 from gridsec.index.blocks import MOST_NODES, Matrix
+from gridsec.index.rows import fewest_rows
 from gridsec.lure import Lure
 from gridsec.network import Network, Power, between, busbar_places, one_busbar
 
@@ -211,6 +212,9 @@ def _fewest(seen: Matrix, must: int | None, tol: float, *, below: float, most: i
         if must is None or must in who:
             return Sparsest(float(who.size), who, np.ones(1))
         return Sparsest(np.inf, who[:0], np.zeros(0))
+    found = None if below > 0.0 else fewest_rows(seen, tol=tol, must=must)
+    if found is not None:
+        return found
     return fewest(list(seen[:, None, :]), np.eye(seen.shape[1]), tol=tol, must=must, below=below, most=most)
 
 
