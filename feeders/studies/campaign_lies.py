@@ -63,7 +63,8 @@ def attacks(
         told = np.array(kind.volts)
         some, signs = liars(site, case, random)
     if told.size:
-        return (Bias(some, t_on, t_off, case.size * signs * told[some] / site.feeder.base_volt),), ()
+        base = site.customer_volt[site.meters[some]]
+        return (Bias(some, t_on, t_off, case.size * signs * told[some] / base),), ()
     lie = Lie(kind.trick, case.liars, case.size)
     return (each_alone(lie, some, signs, t_on, t_off),), ()
 
