@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 import pytest
@@ -29,6 +30,11 @@ FEW = settings(max_examples=12)
 WHOLE, ALONE = apart("simbench-lv-rural1")
 
 
+@lru_cache(maxsize=4)
+def asymmetric(site: Site) -> UnbalancedPowerFlow:
+    return UnbalancedPowerFlow(site)
+
+
 def kw(site: Site, values: Floats) -> Floats:
     return -site.feeder.base_kva * values
 
@@ -37,7 +43,7 @@ def volts(site: Site, p: Floats, q: Floats, v0: Floats | float) -> Floats:
     """Voltages of the customers by the other power flow, pu; the busbar's voltages as they are."""
     base = site.feeder.base_volt
     given = np.broadcast_to(np.asarray(v0, dtype=np.float64), 3) * base
-    return UnbalancedPowerFlow(site).solve(kw(site, p), kw(site, q), given)[0] / base
+    return asymmetric(site).solve(kw(site, p), kw(site, q), given)[0] / base
 
 
 def random_box(site: Site, rng: np.random.Generator, size: float) -> Box:
@@ -128,6 +134,16 @@ def test_nothing_in_a_box_is_outside_of_its_bounds(seed: int, size: float) -> No
         before = p, q, v0, v
 
 
+def settled(site: Site, fleet: Droop, p: Floats, q: Floats, v0: Floats) -> tuple[Floats, Floats]:
+    """Injections and voltages at rest by damped steps, the phases of the busbar as they are."""
+    x = np.zeros(fleet.customer.size)
+    for _ in range(60):
+        own = np.bincount(fleet.customer, weights=x, minlength=p.size)
+        v = volts(site, p, q + own, v0)
+        x = x + 0.5 * (voltage_curve(fleet, v[fleet.customer]) - x)
+    return x, v
+
+
 @FEW
 @given(seed=st.integers(0, 200))
 def test_no_voltage_leaves_its_proven_band(seed: int) -> None:
@@ -135,31 +151,28 @@ def test_no_voltage_leaves_its_proven_band(seed: int) -> None:
     rng = np.random.default_rng([seed, 2])
     subject, fleet = Subject.of(site), equip(site, "ieee1547-b", Who.ALL)
     loads = random_box(site, rng, 1.0)
-    loads = replace(loads, v0_low=1.01, v0_high=1.01)
     try:
         ever = always(subject.net, fleet, loads)
         still = at_rest(subject.net, fleet, loads)
     except DesignInfeasible:
         return
     assert np.all(still.low >= ever.low)
+    before: Floats | None = None
     for _ in range(4):
         p, q, v0 = corner(loads, rng)
-        x, V = rest(subject.net, fleet, p + 1j * q, float(v0[0]))
-        s = injected(fleet, p + 1j * q, x)
-        v = volts(site, s.real, s.imag, v0)
-        np.testing.assert_allclose(np.abs(V), v, atol=1e-9)
-        np.testing.assert_allclose(voltage_curve(fleet, v[fleet.customer]), x, atol=1e-8)
-        assert np.all(v >= still.low)
-        assert np.all(v <= still.high)
-        other, _ = rest(subject.net, fleet, *_flat(corner(loads, rng)))
-        s = injected(fleet, p + 1j * q, other)
-        jumped = volts(site, s.real, s.imag, v0)
-        assert np.all(jumped >= ever.low)
-        assert np.all(jumped <= ever.high)
-
-
-def _flat(at: tuple[Floats, Floats, Floats]) -> tuple[np.ndarray, float]:
-    return at[0] + 1j * at[1], float(at[2][0])
+        x, v = settled(site, fleet, p, q, v0)
+        assert np.all(v >= still.low - 1e-7)
+        assert np.all(v <= still.high + 1e-7)
+        if np.ptp(v0) == 0.0:
+            found, V = rest(subject.net, fleet, p + 1j * q, float(v0[0]))
+            np.testing.assert_allclose(found, x, atol=1e-6)
+            np.testing.assert_allclose(np.abs(V), v, atol=1e-6)
+        if before is not None:  # a jump of all loads
+            s = injected(fleet, p + 1j * q, before)
+            jumped = volts(site, s.real, s.imag, v0)
+            assert np.all(jumped >= ever.low - 1e-7)
+            assert np.all(jumped <= ever.high + 1e-7)
+        before = x
 
 
 def test_phases_that_do_not_touch_are_three_fleets() -> None:
