@@ -353,6 +353,7 @@ def judge(
     ticks: list[tuple[float, Verdict, Truth]] = []
     all_errors: list[Floats] = []
     liar_errors: list[Floats] = []
+    of_nominal = trial.site.customer_volt / trial.site.tables.meta.voltage_volt
     step_ms: list[float] = []
     settled, lied = START + settling_s, False
     for frame, truth in frames(trial) if played is None else played:
@@ -365,7 +366,7 @@ def judge(
             settled = max(settled, frame.t + settling_s)
         lied = lies
         if frame.t >= settled:
-            error = _error_percent(estimate.v2, truth.v2)
+            error = of_nominal * _error_percent(estimate.v2, truth.v2)
             all_errors.append(error)
             liar_errors.append(error[trial.site.meters[truth.liars]])
     t = np.array([t for t, _, _ in ticks])

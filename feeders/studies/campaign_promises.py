@@ -80,7 +80,8 @@ def _collusions(site: Site, found: Detectable, share: float) -> tuple[tuple[floa
     """Lies of all meters, V: for each of them the worst that stay hidden although it takes part."""
     rule, p = monitor_rule(site, risk=found.risk, share=share), site.meters.size
     worst = [largest_shift(rule, np.eye(p)[j], found.max_attacked, seen=False, must=j).lies for j in range(p)]
-    volts = [np.sign(lies) * volts_of_lie(site, np.abs(lies)) for lies in worst]
+    base = site.customer_volt[site.meters]
+    volts = [np.sign(lies) * volts_of_lie(base, np.abs(lies)) for lies in worst]
     volts = [np.where(np.abs(row) > NOTHING, row, 0.0) for row in volts]
     return tuple(tuple(row.tolist()) for row in volts if row.any())
 

@@ -391,6 +391,7 @@ def _errors(  # noqa: PLR0917  # the same
     """Errors of the voltage, % of nominal, at liars while they lie and at everybody else."""
     with np.errstate(invalid="ignore"):
         error = 100.0 * np.abs(np.sqrt(seen.v2) - np.sqrt(played.v2[begin:]))
+    error *= site.customer_volt / site.tables.meta.voltage_volt
     error = np.where(np.isfinite(error), error, np.inf)
     lying: Bools = np.any(lies, axis=1)
     first = int(np.argmax(lying)) if lying.any() else 0

@@ -189,6 +189,7 @@ def _meter(  # noqa: PLR0917  # the feeder twice, and which of its meters
 ) -> dict[str, Any]:
     unit = (np.arange(site.meters.size) == j).astype(np.float64)
     customer = int(site.meters[j])
+    base = site.customer_volt[customer]
     row: dict[str, Any] = {
         "meter": site.meter_ids[j],
         "customer": site.feeder.customers[customer],
@@ -205,16 +206,16 @@ def _meter(  # noqa: PLR0917  # the feeder twice, and which of its meters
             "fits": largest_lie(worst, j, count).bound,
             "identified": largest_lie(worst, j, 2 * count).bound,
         }
-        row |= {f"{name}{suffix}": float(volts_of_lie(site, size)) for name, size in sizes.items()}
+        row |= {f"{name}{suffix}": float(volts_of_lie(base, size)) for name, size in sizes.items()}
     return row
 
 
 def _customer(site: Site, given: Rule, worst: Box, liars: int, i: int) -> dict[str, Any]:
-    bus = int(site.feeder.bus[i])
+    bus, base = int(site.feeder.bus[i]), site.customer_volt[i]
     moved = max(largest_shift(given, along, liars, seen=True).bound for along in given.weights(bus))
     return {
         "customer": site.feeder.customers[i],
         "bus": site.feeder.buses[bus],
-        "error": float(volts_of_lie(site, moved + given.spread(bus))),
-        "error_fits": float(volts_of_lie(site, worst_error(worst, i, liars).bound)),
+        "error": float(volts_of_lie(base, moved + given.spread(bus))),
+        "error_fits": float(volts_of_lie(base, worst_error(worst, i, liars).bound)),
     }

@@ -8,7 +8,6 @@ import numpy as np
 
 from feeders.load import Snapshot, to_frame
 from feeders.studies.hidden import Curves
-from feeders.taps import refuse
 from gridsec.arrays import Floats
 from gridsec.detect import busbar_error, reading_error
 from gridsec.network import Power, between
@@ -42,16 +41,10 @@ def box(site: Site, *, share: float = SHARE, curves: Curves = Curves.DEADBAND) -
         Of the peak load.
     curves
         Where the inverters work; at nominal voltage that is the deadband.
-
-    Raises
-    ------
-    FeederInvalid
-        If the feeder has taps.
     """
-    refuse(site)
     rows = site.tables.customers
     drawn = np.array([share * (row.load_kw or 0.0) for row in rows])[site.meters]
-    nominal = np.full(site.meters.size, site.feeder.base_volt)
+    nominal = site.customer_volt[site.meters]
     frame = to_frame(
         site, Snapshot(0.0, nominal, drawn, np.full(drawn.size, np.nan), float(site.feeder.base_volt))
     )
@@ -71,23 +64,23 @@ def box(site: Site, *, share: float = SHARE, curves: Curves = Curves.DEADBAND) -
     return Box(np.asarray(np.linalg.solve(loop, open_loop)), site.meters, reading)
 
 
-def volts_of_lie(site: Site, size: Floats | float) -> Floats:
-    """What a change of the squared voltage is in volts, at nominal voltage and downwards: the larger way, V.
+def volts_of_lie(base_volt: Floats | float, size: Floats | float) -> Floats:
+    """What a change of the squared voltage is in volts, at 1 pu and downwards: the larger way, V.
 
     Parameters
     ----------
-    site, size
-        The feeder, and squared pu.
+    base_volt, size
+        1 pu, V, as `Site.customer_volt` has it; and squared pu.
     """
-    return np.asarray(site.feeder.base_volt * (1.0 - np.sqrt(np.maximum(1.0 - np.asarray(size), 0.0))))
+    return np.asarray(base_volt * (1.0 - np.sqrt(np.maximum(1.0 - np.asarray(size), 0.0))))
 
 
-def squared(site: Site, volt: float) -> float:
+def squared(base_volt: Floats | float, volt: Floats | float) -> Floats:
     """The reverse of `volts_of_lie`.
 
     Parameters
     ----------
-    site, volt
-        The feeder, and volts.
+    base_volt, volt
+        1 pu, V; and volts.
     """
-    return 1.0 - max(1.0 - volt / site.feeder.base_volt, 0.0) ** 2
+    return np.asarray(1.0 - np.maximum(1.0 - np.asarray(volt) / base_volt, 0.0) ** 2)

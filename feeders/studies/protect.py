@@ -211,13 +211,13 @@ def _bounded(
     site: Site, max_attacked: int, lie_volt: float, share: float, curves: Curves
 ) -> tuple[Attacker, Measure]:
     """Whose lie is too large, and the largest there is, V."""
-    given = box(site, share=share, curves=curves)
+    given, base = box(site, share=share, curves=curves), site.customer_volt[site.meters]
 
     def largest(protected: Bools) -> float:
         sizes = [largest_lie(given, j, max_attacked, honest=protected).bound for j in range(protected.size)]
-        return float(volts_of_lie(site, max(sizes)))
+        return float(volts_of_lie(base, np.array(sizes)).max())
 
-    return lies_beyond(given, max_attacked, squared(site, lie_volt)), largest
+    return lies_beyond(given, max_attacked, squared(base, lie_volt)), largest
 
 
 def _kept(attacker: Attacker, journal: Journal) -> Attacker:

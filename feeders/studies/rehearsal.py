@@ -106,7 +106,7 @@ def rehearse(
 def _large(site: Site, found: Detectable, rng: np.random.Generator, j: int, *, together: bool) -> Floats:
     """A lie of meter j beyond its named size, and others in collusion; squared pu."""
     column = "named" if together else "named_alone"
-    sizes = np.array([squared(site, volt) for volt in found.meters[column]])
+    sizes = squared(site.customer_volt[site.meters], found.meters[column].to_numpy())
     lies = np.zeros(sizes.size)
     if together and found.max_attacked > 1:
         others = rng.choice(np.delete(np.arange(sizes.size), j), found.max_attacked - 1, replace=False)

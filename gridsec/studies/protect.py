@@ -89,7 +89,7 @@ def hides(given: Patterns, liars: int) -> Attacker:
     return attack
 
 
-def lies_beyond(box: Box, liars: int, size: float) -> Attacker:
+def lies_beyond(box: Box, liars: int, size: Floats | float) -> Attacker:
     """An attacker whose largest lie is larger than a bound and fits to an honest feeder.
 
     Parameters

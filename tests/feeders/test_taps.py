@@ -21,6 +21,7 @@ from feeders.schema import FeederTables, LineRow, from_json, to_json, validate
 from feeders.studies.calibrate_feeder import network
 from feeders.studies.detectable import detectable
 from feeders.studies.droop import droop
+from feeders.studies.protect import Goal, protect
 from gridsec.droop import preset
 from gridsec.errors import FeederInvalid
 from gridsec.feeder import bus_voltages, model_error_bound
@@ -190,11 +191,32 @@ def test_the_trace_of_a_load_that_is_not_there_is_in_volts() -> None:
     np.testing.assert_allclose(230.0 * fake.shift, (after - before)[site.meters], rtol=0.03)
 
 
-@pytest.mark.parametrize(
-    "study",
-    [droop, lambda site: network(site.tables), lambda site: detectable(site, max_attacked=1)],
-    ids=["droop", "calibrate", "detectable"],
-)
+def test_a_tap_at_the_head_is_another_nominal_voltage() -> None:
+    """Everything behind 0.96: the same lies in volts as on a feeder whose nominal voltage is V/0.96."""
+    plain = villages.village_without_inverters().tables
+    plain = replace(plain, customers=tuple(row for row in plain.customers if row.bus != "bb"))
+    behind = from_tables(tapped(plain, {"l1": 0.96}))
+    meters = replace(plain.meta.meters, jitter_percent=0.96 * plain.meta.meters.jitter_percent)
+    meta = replace(
+        plain.meta,
+        voltage_volt=plain.meta.voltage_volt / 0.96,
+        busbar_resolution_volt=plain.meta.busbar_resolution_volt / 0.96,
+        meters=meters,
+    )
+    other = from_tables(replace(plain, meta=meta))
+    one, two = detectable(behind, max_attacked=1), detectable(other, max_attacked=1)
+    for mine, its in ((one.meters, two.meters), (one.customers, two.customers)):
+        for name in mine.columns:
+            if mine[name].dtype == np.float64:
+                np.testing.assert_allclose(mine[name], its[name], rtol=1e-9, err_msg=name)
+    volt = float(one.meters["identified_alone"].median())
+    sites = (behind, other)
+    mine, its = (protect(site, max_attacked=1, goal=Goal.BOUND, lie_volt=volt) for site in sites)
+    assert list(mine.meters["meter"]) == list(its.meters["meter"])
+    np.testing.assert_allclose([mine.before, mine.after], [its.before, its.after], rtol=1e-9)
+
+
+@pytest.mark.parametrize("study", [droop, lambda site: network(site.tables)], ids=["droop", "calibrate"])
 def test_studies_of_one_voltage_base_say_so(study: Callable[[Site], object]) -> None:
     with pytest.raises(FeederInvalid, match="without taps only"):
         study(village())
