@@ -72,3 +72,18 @@ def test_detectable_tells_sizes_and_keeps_its_word(
     assert "3 lies up to the hidden size: 0 led to a name" in told
     assert "3 lies from the named size on: 0 missed, 0 with an honest meter named" in told
     assert len(pd.read_csv(tmp_path / "out" / "meters.csv")) == 6
+
+
+def test_feeders_in_three_phases_are_studied(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = ("--out", str(tmp_path))
+    code, told, _ = run(monkeypatch, capsys, "redundancy", "ieee-european-lv", *out)
+    assert code == 0
+    assert "53" in told
+    meters = pd.read_csv(tmp_path / "meters.csv")
+    assert meters["bus"].str[-2:].isin([".a", ".b", ".c"]).all()
+    assert pd.read_csv(tmp_path / "summary.csv")["index"].tolist() == [float("inf"), 53.0]
+    code, told, _ = run(monkeypatch, capsys, "protect", "ieee-european-lv")
+    assert code == 0
+    assert "protect 0 of 55 meters; no fewer suffice" in told
