@@ -32,6 +32,7 @@ app = typer.Typer(
     name="gridsec",
     help="Watches the voltages of distribution feeders and names the meters that lie.",
     no_args_is_help=True,
+    rich_markup_mode="markdown",  # brackets in help texts are brackets
     pretty_exceptions_enable=False,
     add_completion=False,
 )

@@ -25,7 +25,7 @@ from service.bus import BusConfig
 from service.demo import Outcome, verdict
 from service.ingest import Meters
 from service.simulate import Pace, play
-from tests.service.commands import command
+from tests.service.commands import command, plain
 from tests.service.running import FEEDER, free_port, until
 
 ENVIRONMENT = {k: v for k, v in os.environ.items() if not k.startswith("GRIDSEC_")}
@@ -184,6 +184,11 @@ def test_no_recording(gridsec: Run, tmp_path: Path) -> None:
     assert "missing.parquet" in refused(6, gridsec("replay", str(tmp_path / "missing.parquet")))
     out = str(tmp_path / "folder" / "x.parquet")
     assert "folder" in refused(6, gridsec("simulate", FEEDER, "--duration", "2", "--out", out))
+
+
+def test_brackets_in_help_texts_are_shown(gridsec: Run) -> None:
+    assert "[default: as in the file]" in plain(gridsec("serve", "--help").stdout)
+    assert "A setting of [monitor]" in plain(gridsec("study", "campaign", "--help").stdout)
 
 
 def test_wrong_usage(gridsec: Run) -> None:
