@@ -13,6 +13,7 @@ from feeders.load import find, from_tables, load
 from feeders.load_phases import ThreePhaseSite, load_three_phase, three_phase, three_phase_names
 from feeders.powerflow_unbalanced import UnbalancedPowerFlow
 from feeders.schema import FeederTables, LineRow, examine, from_json, read, to_json
+from feeders.studies.calibrate_search import longer
 from gridsec import feeder as balanced
 from gridsec.arrays import Floats, Phasors
 from gridsec.errors import FeederInvalid
@@ -102,6 +103,15 @@ def test_a_line_that_is_not_transposed_has_its_own_matrices() -> None:
     np.testing.assert_allclose(model, truth, rtol=0, atol=1e-9)
     # In files and in JSON, nothing of it is lost.
     assert from_json(to_json(tables)) == tables
+
+
+def test_a_line_of_another_length_has_another_matrix() -> None:
+    tables = single_phase()
+    one = bare(Z, tables.lines[0], b_us=3.0, **{f"b_{pair}_us": 3.0 * (pair[0] == pair[1]) for pair in PAIRS})
+    found = three_phase(replace(tables, lines=(longer(one, 1.3), *tables.lines[1:]))).feeder
+    base = 3 * 230.0**2 / (1000.0 * 100.0)
+    np.testing.assert_allclose(found.z[0] * base, 1.3 * Z, rtol=1e-14)
+    np.testing.assert_allclose(found.charging[0] / base, 3.9e-6 * np.eye(3), rtol=1e-14)
 
 
 @pytest.mark.parametrize("phases", ["ab", "bc", "ca"])
