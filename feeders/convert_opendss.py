@@ -322,7 +322,7 @@ def _regulator(dss: Any, each: _Element, network: Network) -> LineRow | None:
     """
     ends = [sorted((node, k) for k, node in enumerate(nodes) if node > 0) for nodes in each.nodes]
     nodes = [node for node, _ in ends[0]]
-    alike = len(ends) == 2 and nodes == [node for node, _ in ends[-1]]
+    alike = each.kind == "transformer" and len(ends) == 2 and nodes == [node for node, _ in ends[-1]]
     if not (alike and each.closed and nodes and len(set(nodes)) == len(nodes) and nodes[-1] <= PHASES):
         return None
     whole, count = _yprim(dss, each), len(nodes)
