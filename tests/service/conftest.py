@@ -28,6 +28,7 @@ from service.report import FeederReport, MeterReport
 from service.store import Store
 from tests.service.asking import T0, Setup
 from tests.service.databases import Cluster, find_postgresql
+from tests.service.looking import Site
 
 CHROMIUM = [
     *("--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"),
@@ -378,3 +379,27 @@ def setup(
     made = Setup(service, serve(service))
     with made.http:
         yield made
+
+
+@pytest.fixture
+def site_of(
+    browser: Browser, small_service: Callable[..., Any], serve: Callable[..., Any]
+) -> Iterator[Callable[..., Site]]:
+    """Served feeders; their pages may not complain."""
+    made: list[Site] = []
+
+    def make(*villages: Any) -> Site:
+        made.append(Site(browser, small_service(*villages), serve))
+        return made[-1]
+
+    yield make
+    for site in made:
+        site.close()
+        wrong = [c for c in site.complaints if site.expected is None or site.expected not in c]
+        assert wrong == []
+
+
+@pytest.fixture
+def site(site_of: Callable[..., Site], village: type[Village]) -> Site:
+    """One served feeder."""
+    return site_of(village())

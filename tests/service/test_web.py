@@ -1,84 +1,27 @@
+"""The web page: verdicts, customers, maps, on desks and phones."""
+
 from __future__ import annotations
 
 import random
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Page, expect
 
 from benchmarks.mesh import baran_wu
 from feeders.load import Site as FeederSite
 from feeders.load import load, names
 from gridsec.online import Cause
 from service.describe import detail
-from service.report import CustomerReport, InverterReport
+from tests.service.asking import T0
+from tests.service.looking import DESKTOP, PHONE, Site, customer
 
 pytestmark = pytest.mark.browser
-
-T0 = 1_795_212_000.0
-DESKTOP, PHONE = {"width": 1440, "height": 1000}, {"width": 390, "height": 844}
-
-
-class Site:
-    """A served feeder, and pages that look at it and may neither complain nor call anywhere else."""
-
-    def __init__(self, browser: Browser, service: Any, serve: Callable[..., Any]) -> None:
-        self.browser, self.service, self.serve = browser, service, serve
-        self.server = serve(service)
-        self.village = next(iter(service.villages.values()))
-        self.complaints: list[str] = []
-        self.expected: str | None = None  # what the browser itself may complain about
-        self.pages: list[Page] = []
-
-    def tick(self, t: float, ticks: int = 1, **changes: Any) -> None:
-        for k in range(ticks):
-            self.service.tick(self.village.report(t + k, **changes))
-
-    def open(self, size: dict[str, int] | None = None, path: str = "/", **options: Any) -> Page:
-        context = self.browser.new_context(viewport=size or DESKTOP, **options)  # type: ignore[arg-type]
-        page = context.new_page()
-        page.set_default_timeout(10_000)
-        page.on("console", lambda m: self.complaints.append(m.text) if m.type == "error" else None)
-        page.on("pageerror", lambda error: self.complaints.append(str(error)))
-        page.on("dialog", lambda dialog: self.complaints.append(f"dialog: {dialog.message}"))
-        page.on(
-            "request",
-            lambda r: None if r.url.startswith(self.server.url) else self.complaints.append(r.url),
-        )
-        page.goto(self.server.url + path)
-        self.pages.append(page)
-        return page
-
-    def close(self) -> None:
-        for page in self.pages:
-            page.context.close()
-
-
-@pytest.fixture
-def site_of(
-    browser: Browser, small_service: Callable[..., Any], serve: Callable[..., Any]
-) -> Iterator[Callable[..., Site]]:
-    made: list[Site] = []
-
-    def make(*villages: Any) -> Site:
-        made.append(Site(browser, small_service(*villages), serve))
-        return made[-1]
-
-    yield make
-    for site in made:
-        site.close()
-        wrong = [c for c in site.complaints if site.expected is None or site.expected not in c]
-        assert wrong == []
-
-
-@pytest.fixture
-def site(site_of: Callable[..., Site], village: type) -> Site:
-    return site_of(village())
 
 
 def real(village: type, of: FeederSite) -> Any:
@@ -90,10 +33,6 @@ def real(village: type, of: FeederSite) -> Any:
     made.buses, made.parent, made.customers = layout["buses"], layout["parent"], layout["customers"]
     made.meters = [c["meter"] for c in made.customers]
     return made
-
-
-def customer(page: Page, name: str) -> Any:
-    return page.locator(f'#diagram .customer[aria-label^="{name}:"]')
 
 
 def fill_of(page: Page, name: str) -> tuple[int, int, int]:
@@ -254,171 +193,6 @@ def test_all_meters_as_a_table_with_the_worst_first(site: Site) -> None:
     expect(rows.nth(1)).to_contain_text("silent")
     rows.nth(0).locator("button").click()
     expect(page.locator("#detail-title")).to_have_text("H9")
-
-
-# ------------------------------------------------------------------------- alarms
-
-
-def test_a_manipulated_inverter_and_its_alarm(site: Site) -> None:
-    wrong = InverterReport("H7", "drop-7", "H7", True, True, 4.5, -6.0)
-    customers = tuple(CustomerReport(f"H{k}", 230.0, 0.25) for k in range(13))
-    for k in range(4):
-        report = site.village.report(T0 + k, cause=Cause.RESIDUALS)
-        liar = replace(report.meters[2], suspect=True, attack_volt_estimated=9.0, kind="drift")
-        meters = (*report.meters[:2], liar, *report.meters[3:])
-        site.service.tick(replace(report, meters=meters, inverters=(wrong,), customers=customers))
-    page = site.open()
-    expect(page.locator("#chips")).to_contain_text("inverter of H7 −6.0 kvar")
-    alarm = page.locator('.alarm:has-text("Inverter manipulated")')
-    expect(alarm).to_contain_text("injects -6.0 kvar")
-    alarm.locator("a.where").click()
-    panel = page.locator("#detail-card")
-    expect(page.locator("#detail-title")).to_have_text("H7")
-    expect(panel).to_contain_text("+4.5 kvar")
-    expect(panel).to_contain_text("−6.0 kvar")
-    expect(panel).to_contain_text("Standard deviation")
-    expect(panel).to_contain_text("0.25 V")
-    expect(page.locator('.alarm:has-text("Meter manipulated")')).to_contain_text("drift")
-    page.select_option("#alarm-kind", "inverter-manipulated")
-    expect(page.locator(".alarm")).to_have_count(1)
-
-
-def test_an_alarm_is_acknowledged_with_a_name(site: Site) -> None:
-    site.tick(T0, 4, lies={"H3": 9.0})
-    page = site.open()
-    page.locator("button.ack").click()
-    page.locator("#ack-form .primary").click()  # no name: the form stays
-    expect(page.locator("#ack")).to_be_visible()
-    page.fill("#ack-who", "   ")
-    page.locator("#ack-form .primary").click()
-    expect(page.locator("#ack-error")).to_have_text("Please enter your name.")
-    page.fill("#ack-who", "Ada <b>")
-    page.fill("#ack-comment", "van sent")
-    page.locator("#ack-form .primary").click()
-    expect(page.locator("#ack")).to_be_hidden()
-    expect(page.locator(".alarm .answer")).to_have_text("Acknowledged by Ada <b>van sent")
-    expect(page.locator("button.ack")).to_have_count(0)
-    (alarm,) = site.service.store.alarms()[0]
-    assert (alarm.acknowledged_by, alarm.comment) == ("Ada <b>", "van sent")
-
-
-def test_what_is_learned_of_the_meters_and_a_replaced_one(site: Site) -> None:
-    site.tick(T0, 4, lies={"H3": 9.0})
-    page = site.open()
-    expect(page.locator("#commissioning")).to_contain_text("Meters' own errors learned on ")
-    customer(page, "H3").click()
-    panel = page.locator("#detail-card")
-    expect(panel).to_contain_text("+0.41 V")
-    expect(panel).to_contain_text("± 0.09 V, learned on ")
-    page.locator("#replaced").click()
-    expect(page.locator("#renew-what")).to_contain_text("Meter H3 of village")
-    page.fill("#renew-who", "Ada <b>")
-    page.fill("#renew-reason", "  ")
-    page.locator("#renew-form .primary").click()
-    expect(page.locator("#renew-error")).to_have_text("Please enter your name and the reason.")
-    page.fill("#renew-reason", "new <i>meter")
-    page.locator("#renew-form .primary").click()
-    expect(page.locator("#renew")).to_be_hidden()
-    expect(page.locator("#commissioning")).to_have_text("Learning 1 of 13 meters, 5 of 24 h.")
-    expect(panel).to_contain_text("not known yet 5 of 24 h heard")
-    (event,) = site.service.store.commission_events("village")
-    assert (event.who, event.reason, event.meters) == ("Ada <b>", "new <i>meter", ("H3",))
-
-
-def test_a_commissioning_that_begins_anew_says_why(site: Site) -> None:
-    site.service.learning.update(site.village.meters)
-    site.service.note = "the feeder has changed since (<b>lines)"
-    site.tick(T0)
-    page = site.open()
-    expect(page.locator("#commissioning")).to_have_text(
-        "Learning meters, 5 of 24 h. Begun anew: the feeder has changed since (<b>lines)."
-    )
-
-
-def test_the_second_operator_hears_who_was_first(site: Site) -> None:
-    site.tick(T0, 4, lies={"H3": 9.0})
-    one, two = site.open(), site.open()
-    two.locator("button.ack").click()
-    one.locator("button.ack").click()
-    one.fill("#ack-who", "Ada")
-    one.locator("#ack-form .primary").click()
-    expect(two.locator(".alarm .answer")).to_contain_text("Ada")  # it arrives behind the open dialogue
-    site.expected = "409"
-    two.fill("#ack-who", "Grace")
-    two.locator("#ack-form .primary").click()
-    expect(two.locator("#ack-error")).to_contain_text("already been acknowledged by Ada")
-
-
-def test_filters(site: Site, village: type) -> None:
-    town = village("town", 4)
-    site.service.villages["town"] = town
-    site.service.books["town"] = type(site.service.books["village"])("town")
-    site.tick(T0, 4, lies={"H3": 9.0}, silent=("H5",))
-    for k in range(4):
-        site.service.tick(town.report(T0 + k, lies={"H1": 5.0}))
-    page = site.open()
-    expect(page.locator(".alarm")).to_have_count(3)
-    page.select_option("#alarm-kind", "data-loss")
-    expect(page.locator(".alarm")).to_have_count(1)
-    page.select_option("#alarm-kind", "")
-    page.select_option("#alarm-scope", "this")
-    expect(page.locator(".alarm")).to_have_count(2)
-    page.select_option("#feeder", "town")
-    expect(page.locator(".alarm")).to_have_count(1)
-    page.select_option("#alarm-scope", "")
-    page.locator(".alarm a", has_text="H5 · village").click()
-    expect(page.locator("#detail-title")).to_have_text("H5")
-    expect(page.locator("#feeder")).to_have_value("village")
-
-
-def test_older_alarms_come_page_by_page(site: Site) -> None:
-    for k in range(12):
-        site.tick(T0 + 10_000 * k, 4, lies={f"H{i}": 8.0 for i in range(6)})
-        site.tick(T0 + 10_000 * k + 4, 8)
-    page = site.open()
-    page.select_option("#alarm-state", "all")
-    expect(page.locator(".alarm")).to_have_count(50)
-    page.locator("#alarm-more").click()
-    expect(page.locator(".alarm")).to_have_count(72)
-    expect(page.locator("#alarm-more")).to_be_hidden()
-
-
-# ------------------------------------------------------------ can it be believed?
-
-
-def test_a_lost_connection_is_said_and_healed(site: Site) -> None:
-    site.tick(T0, 4, lies={"H3": 9.0})
-    page = site.open()
-    expect(page.locator("#link")).to_have_text("live")
-    expect(page.locator(".alarm")).to_have_count(1)
-    site.expected = "net::ERR_"
-    site.server.stop()
-    expect(page.locator("#link")).to_contain_text("connection lost")
-    expect(page.locator("#decision")).to_have_text("NO LIVE DATA")
-    expect(page.locator("#reason")).to_contain_text("attacked")
-    expect(page.locator("#main")).to_have_attribute("data-fresh", "no")
-    site.tick(T0 + 4, 8)
-    site.server = site.serve(site.service, site.server.port)
-    expect(page.locator("#link")).to_have_text("live", timeout=20_000)
-    expect(page.locator("#decision")).to_have_text("CLEAN")
-    expect(page.locator(".alarm")).to_have_count(0)
-
-
-def test_old_data_is_not_shown_as_an_answer(site: Site) -> None:
-    site.tick(T0)
-    context = site.browser.new_context()
-    page = context.new_page()
-    page.clock.install()
-    page.goto(site.server.url)
-    expect(page.locator("#decision")).to_have_text("CLEAN")
-    page.clock.fast_forward(10_000)
-    expect(page.locator("#link")).to_contain_text("data stale")
-    expect(page.locator("#decision")).to_have_text("NO LIVE DATA")
-    expect(page.locator("#verdict")).to_have_attribute("data-verdict", "none")
-    site.tick(T0 + 1)
-    expect(page.locator("#decision")).to_have_text("CLEAN")
-    expect(page.locator("#link")).to_have_text("live")
-    context.close()
 
 
 # ------------------------------------------------------------ hostile and large

@@ -1,0 +1,177 @@
+"""The web page: alarms, what is learned of meters, and whether the page can be believed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from playwright.sync_api import expect
+
+from gridsec.online import Cause
+from service.report import CustomerReport, InverterReport
+from tests.service.asking import T0
+from tests.service.looking import Site, customer
+
+pytestmark = pytest.mark.browser
+
+
+def test_a_manipulated_inverter_and_its_alarm(site: Site) -> None:
+    wrong = InverterReport("H7", "drop-7", "H7", True, True, 4.5, -6.0)
+    customers = tuple(CustomerReport(f"H{k}", 230.0, 0.25) for k in range(13))
+    for k in range(4):
+        report = site.village.report(T0 + k, cause=Cause.RESIDUALS)
+        liar = replace(report.meters[2], suspect=True, attack_volt_estimated=9.0, kind="drift")
+        meters = (*report.meters[:2], liar, *report.meters[3:])
+        site.service.tick(replace(report, meters=meters, inverters=(wrong,), customers=customers))
+    page = site.open()
+    expect(page.locator("#chips")).to_contain_text("inverter of H7 −6.0 kvar")
+    alarm = page.locator('.alarm:has-text("Inverter manipulated")')
+    expect(alarm).to_contain_text("injects -6.0 kvar")
+    alarm.locator("a.where").click()
+    panel = page.locator("#detail-card")
+    expect(page.locator("#detail-title")).to_have_text("H7")
+    expect(panel).to_contain_text("+4.5 kvar")
+    expect(panel).to_contain_text("−6.0 kvar")
+    expect(panel).to_contain_text("Standard deviation")
+    expect(panel).to_contain_text("0.25 V")
+    expect(page.locator('.alarm:has-text("Meter manipulated")')).to_contain_text("drift")
+    page.select_option("#alarm-kind", "inverter-manipulated")
+    expect(page.locator(".alarm")).to_have_count(1)
+
+
+def test_an_alarm_is_acknowledged_with_a_name(site: Site) -> None:
+    site.tick(T0, 4, lies={"H3": 9.0})
+    page = site.open()
+    page.locator("button.ack").click()
+    page.locator("#ack-form .primary").click()  # no name: the form stays
+    expect(page.locator("#ack")).to_be_visible()
+    page.fill("#ack-who", "   ")
+    page.locator("#ack-form .primary").click()
+    expect(page.locator("#ack-error")).to_have_text("Please enter your name.")
+    page.fill("#ack-who", "Ada <b>")
+    page.fill("#ack-comment", "van sent")
+    page.locator("#ack-form .primary").click()
+    expect(page.locator("#ack")).to_be_hidden()
+    expect(page.locator(".alarm .answer")).to_have_text("Acknowledged by Ada <b>van sent")
+    expect(page.locator("button.ack")).to_have_count(0)
+    (alarm,) = site.service.store.alarms()[0]
+    assert (alarm.acknowledged_by, alarm.comment) == ("Ada <b>", "van sent")
+
+
+def test_what_is_learned_of_the_meters_and_a_replaced_one(site: Site) -> None:
+    site.tick(T0, 4, lies={"H3": 9.0})
+    page = site.open()
+    expect(page.locator("#commissioning")).to_contain_text("Meters' own errors learned on ")
+    customer(page, "H3").click()
+    panel = page.locator("#detail-card")
+    expect(panel).to_contain_text("+0.41 V")
+    expect(panel).to_contain_text("± 0.09 V, learned on ")
+    page.locator("#replaced").click()
+    expect(page.locator("#renew-what")).to_contain_text("Meter H3 of village")
+    page.fill("#renew-who", "Ada <b>")
+    page.fill("#renew-reason", "  ")
+    page.locator("#renew-form .primary").click()
+    expect(page.locator("#renew-error")).to_have_text("Please enter your name and the reason.")
+    page.fill("#renew-reason", "new <i>meter")
+    page.locator("#renew-form .primary").click()
+    expect(page.locator("#renew")).to_be_hidden()
+    expect(page.locator("#commissioning")).to_have_text("Learning 1 of 13 meters, 5 of 24 h.")
+    expect(panel).to_contain_text("not known yet 5 of 24 h heard")
+    (event,) = site.service.store.commission_events("village")
+    assert (event.who, event.reason, event.meters) == ("Ada <b>", "new <i>meter", ("H3",))
+
+
+def test_a_commissioning_that_begins_anew_says_why(site: Site) -> None:
+    site.service.learning.update(site.village.meters)
+    site.service.note = "the feeder has changed since (<b>lines)"
+    site.tick(T0)
+    page = site.open()
+    expect(page.locator("#commissioning")).to_have_text(
+        "Learning meters, 5 of 24 h. Begun anew: the feeder has changed since (<b>lines)."
+    )
+
+
+def test_the_second_operator_hears_who_was_first(site: Site) -> None:
+    site.tick(T0, 4, lies={"H3": 9.0})
+    one, two = site.open(), site.open()
+    two.locator("button.ack").click()
+    one.locator("button.ack").click()
+    one.fill("#ack-who", "Ada")
+    one.locator("#ack-form .primary").click()
+    expect(two.locator(".alarm .answer")).to_contain_text("Ada")  # it arrives behind the open dialogue
+    site.expected = "409"
+    two.fill("#ack-who", "Grace")
+    two.locator("#ack-form .primary").click()
+    expect(two.locator("#ack-error")).to_contain_text("already been acknowledged by Ada")
+
+
+def test_filters(site: Site, village: type) -> None:
+    town = village("town", 4)
+    site.service.villages["town"] = town
+    site.service.books["town"] = type(site.service.books["village"])("town")
+    site.tick(T0, 4, lies={"H3": 9.0}, silent=("H5",))
+    for k in range(4):
+        site.service.tick(town.report(T0 + k, lies={"H1": 5.0}))
+    page = site.open()
+    expect(page.locator(".alarm")).to_have_count(3)
+    page.select_option("#alarm-kind", "data-loss")
+    expect(page.locator(".alarm")).to_have_count(1)
+    page.select_option("#alarm-kind", "")
+    page.select_option("#alarm-scope", "this")
+    expect(page.locator(".alarm")).to_have_count(2)
+    page.select_option("#feeder", "town")
+    expect(page.locator(".alarm")).to_have_count(1)
+    page.select_option("#alarm-scope", "")
+    page.locator(".alarm a", has_text="H5 · village").click()
+    expect(page.locator("#detail-title")).to_have_text("H5")
+    expect(page.locator("#feeder")).to_have_value("village")
+
+
+def test_older_alarms_come_page_by_page(site: Site) -> None:
+    for k in range(12):
+        site.tick(T0 + 10_000 * k, 4, lies={f"H{i}": 8.0 for i in range(6)})
+        site.tick(T0 + 10_000 * k + 4, 8)
+    page = site.open()
+    page.select_option("#alarm-state", "all")
+    expect(page.locator(".alarm")).to_have_count(50)
+    page.locator("#alarm-more").click()
+    expect(page.locator(".alarm")).to_have_count(72)
+    expect(page.locator("#alarm-more")).to_be_hidden()
+
+
+# ------------------------------------------------------------ can it be believed?
+
+
+def test_a_lost_connection_is_said_and_healed(site: Site) -> None:
+    site.tick(T0, 4, lies={"H3": 9.0})
+    page = site.open()
+    expect(page.locator("#link")).to_have_text("live")
+    expect(page.locator(".alarm")).to_have_count(1)
+    site.expected = "net::ERR_"
+    site.server.stop()
+    expect(page.locator("#link")).to_contain_text("connection lost")
+    expect(page.locator("#decision")).to_have_text("NO LIVE DATA")
+    expect(page.locator("#reason")).to_contain_text("attacked")
+    expect(page.locator("#main")).to_have_attribute("data-fresh", "no")
+    site.tick(T0 + 4, 8)
+    site.server = site.serve(site.service, site.server.port)
+    expect(page.locator("#link")).to_have_text("live", timeout=20_000)
+    expect(page.locator("#decision")).to_have_text("CLEAN")
+    expect(page.locator(".alarm")).to_have_count(0)
+
+
+def test_old_data_is_not_shown_as_an_answer(site: Site) -> None:
+    site.tick(T0)
+    context = site.browser.new_context()
+    page = context.new_page()
+    page.clock.install()
+    page.goto(site.server.url)
+    expect(page.locator("#decision")).to_have_text("CLEAN")
+    page.clock.fast_forward(10_000)
+    expect(page.locator("#link")).to_contain_text("data stale")
+    expect(page.locator("#decision")).to_have_text("NO LIVE DATA")
+    expect(page.locator("#verdict")).to_have_attribute("data-verdict", "none")
+    site.tick(T0 + 1)
+    expect(page.locator("#decision")).to_have_text("CLEAN")
+    expect(page.locator("#link")).to_have_text("live")
+    context.close()
