@@ -30,7 +30,7 @@ from feeders.load import Site, load, to_frame
 from feeders.scenario import START, Scenario, simulate, snapshots
 
 FEEDERS = ("cigre-lv", "simbench-lv-rural1", "kerber-landnetz", "simbench-lv-rural3")
-TRICKS = (Trick.COORDINATED_POWER, Trick.COORDINATED, Trick.BIAS)
+TRICKS = (Trick.COORDINATED_POWER, Trick.POWER, Trick.COORDINATED, Trick.BIAS)
 DURATION_S, ONSET_S, SIZE, LIARS = 90.0, 30.0, 3.0, 2
 OUTCOMES = ("exactly", "some", "explained", "undecided", "honest named", "clean")
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
@@ -11,7 +11,7 @@ import numpy as np
 from feeders.campaign import NoSuchAttack, coordinated, fake_load, present_loads
 from feeders.variation import Stream, generator
 from gridsec.arrays import Floats, Ints
-from gridsec.attack import Attack, Bias, Drift, InverterAttack, Replay, Scaling, Stuck
+from gridsec.attack import Attack, Bias, Coordinated, Drift, InverterAttack, Replay, Scaling, Stuck
 
 if TYPE_CHECKING:
     from feeders.load import Site
@@ -30,6 +30,7 @@ class Trick(StrEnum):
     CLOCK_SHIFT = "clock-shift"
     COORDINATED = "coordinated"
     COORDINATED_POWER = "coordinated-power"
+    POWER = "power"
     INVERTER = "inverter"
 
 
@@ -47,7 +48,8 @@ class Lie:
         How much. Bias (random signs), together (the sign of `size` for all) and scaling: % of nominal.
         Drift: % of nominal per minute, random signs. Coordinated: % of nominal by which the trace of a load
         that does not exist moves the least affected liar; it is at a customer whose meter would be believed
-        to read it, if there is one. Replay and clock shift: how old the reports are,
+        to read it, if there is one. Power: the same load, but only that meter lies, and only about the power.
+        Replay and clock shift: how old the reports are,
         s. Inverter: % of its rating, random signs. Stuck: nothing.
     onset_s, end_s
         Seconds after the start of the run.
@@ -82,7 +84,7 @@ def manipulations(
     if lie is None:
         return (), ()
     t_on, t_off = scenario.start + lie.onset_s, scenario.start + min(lie.end_s, scenario.duration_s)
-    if lie.trick in (Trick.COORDINATED, Trick.COORDINATED_POWER):
+    if lie.trick in (Trick.COORDINATED, Trick.COORDINATED_POWER, Trick.POWER):
         return (_coordinated(site, lie, scenario, t_on, t_off),), ()
     random = generator(scenario.seed, Stream.ATTACK)
     there = site.droop.tau.size if lie.trick is Trick.INVERTER else site.meters.size
@@ -108,8 +110,10 @@ def _coordinated(site: Site, lie: Lie, scenario: Scenario, t_on: float, t_off: f
             meters, fake = fake_load(site, int(customer), lie.count, lie.size / 100.0, loads=loads)
         except NoSuchAttack:
             continue
-        power = lie.trick is Trick.COORDINATED_POWER
+        power = lie.trick is not Trick.COORDINATED
         attack = coordinated(site, meters, fake, t_on=t_on, t_off=t_off, power=power)
+        if lie.trick is Trick.POWER:
+            attack = _powers_of(attack)
         read_kw = loads.p_kw[customer] + fake.p_kw
         if abs(read_kw) <= site.loads.credible[customer] * site.feeder.base_kva:
             return attack
@@ -117,6 +121,18 @@ def _coordinated(site: Site, lie: Lie, scenario: Scenario, t_on: float, t_off: f
     if not told:
         raise NoSuchAttack(f"{site.feeder.name} has no place for the trace of a load of {lie.size:g} %")
     return told[0]
+
+
+def _powers_of(told: Coordinated) -> Coordinated:
+    """What of a story is about powers."""
+    own = (told.p_shift != 0.0) | (told.q_shift != 0.0)
+    return replace(
+        told,
+        meters=told.meters[own],
+        shift=np.zeros(np.count_nonzero(own)),
+        p_shift=told.p_shift[own],
+        q_shift=told.q_shift[own],
+    )
 
 
 def each_alone(lie: Lie, liars: Ints, signs: Floats, t_on: float, t_off: float) -> Attack:

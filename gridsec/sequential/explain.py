@@ -16,7 +16,7 @@ from gridsec.sequential import search
 from gridsec.sequential.commission import Learned
 from gridsec.sequential.conditional import Fit, Judged, Prior, admit, drop, fit, judge, misfit
 from gridsec.sequential.design import SequentialDesign
-from gridsec.sequential.dictionary import Dictionary
+from gridsec.sequential.dictionary import OF_A_LIAR, Dictionary
 from gridsec.sequential.search import Explanation, Found, Limits, Solution, likelier
 from gridsec.sequential.state import Trust
 from gridsec.sequential.windows import Window
@@ -278,7 +278,7 @@ class Search:
         fair = float(np.sqrt(search.price(fresh.size, 1)))
         limits = replace(self.here.limits, sigmas=min(self.here.limits.sigmas, fair))
         for j in np.flatnonzero(fresh).tolist():
-            other = self._descend(best.fit, keep, self.book, innocent=j, pairs=True, limits=limits)
+            other = self._descend(best.fit, keep, _doubtful(self.book), innocent=j, pairs=True, limits=limits)
             few = np.count_nonzero(self.here.enough & ~other.trusted) <= self.design.most
             honest = self.scales[self.s].limits.of(other.judged.std)[j]
             if few and abs(other.judged.offset[j]) <= honest:
@@ -382,6 +382,11 @@ class Search:
     def _believe(self, best: Explanation) -> Trust:
         accused = (*self.accused, *((k, self.s) for k in best.loosened))
         return believe(self.trust, self._trusted(best), self.s, accused)
+
+
+def _doubtful(book: Dictionary) -> Dictionary:
+    """The book for those who look for reasons not to name anybody."""
+    return replace(book, charge=np.minimum(book.charge, OF_A_LIAR))
 
 
 def _held(trust: Trust, s: int) -> Bools:
