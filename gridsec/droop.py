@@ -117,7 +117,17 @@ class Droop:
         rows : (k,)
             Indices of inverters.
         """
-        return Droop(self.customer[rows], self.v[rows], self.q[rows], self.tau[rows], self.vbar)
+        # What was derived and found right is so for some of the inverters too.
+        out: Droop = object.__new__(Droop)
+        own = {name: getattr(self, name)[rows] for name in ("v", "q", "tau", "slope", "limit")}
+        ramps = tuple(ramp.take(rows) for ramp in self._ramps)
+        object.__setattr__(out, "customer", frozen_ints(self.customer[rows]))
+        for name, values in own.items():
+            object.__setattr__(out, name, frozen(values))
+        object.__setattr__(out, "vbar", self.vbar)
+        object.__setattr__(out, "_ramps", ramps)
+        object.__setattr__(out, "_offset", _compact(_pick(self._offset, rows)))
+        return out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,6 +138,9 @@ class _Ramp:
     high: Floats
     zero: Floats
     slope: Floats
+
+    def take(self, rows: Ints) -> _Ramp:
+        return _Ramp(*(frozen(_pick(part, rows)) for part in (self.low, self.high, self.zero, self.slope)))
 
     def compact(self) -> _Ramp:
         return _Ramp(_compact(self.low), _compact(self.high), _compact(self.zero), _compact(self.slope))

@@ -18,11 +18,12 @@ from gridsec.detect import busbar_error
 from gridsec.errors import DesignInfeasible, NotObservable
 from gridsec.lmi import contraction
 from gridsec.lure import Lure, close_loop
-from gridsec.network import Network, Power, along, columns, own, sizes
+from gridsec.network import Network, Power, own, sizes
 from gridsec.plant import Plant
 from gridsec.sequential.conditional import Prior
 from gridsec.sequential.decoder import Decoder
 from gridsec.sequential.dictionary import Dictionary
+from gridsec.sequential.effects import Effects
 from gridsec.sequential.kinds import Shapes, Traces
 from gridsec.sequential.loads import LoadDoubt, injection_doubt, prior
 from gridsec.sequential.repeats import rules
@@ -212,6 +213,7 @@ def design(
     meters = plant.meters
     _check(plant, doubt, step_s)
     lure = close_loop(plant.feeder, plant.droop, meters)
+    effects = Effects(plant.feeder)
     injections = injection_doubt(plant.droop, plant.accuracy, meters, plant.feeder.bus.size)
     busbar = busbar_error(plant.accuracy, plant.droop.vbar**2, 2.0) / 2.0
     lengths = _lengths(options.scales_s, step_s)
@@ -233,8 +235,8 @@ def design(
         allowed=slope * accuracy.class_fraction,
         reach=np.abs(lure.C) @ (2.0 * plant.droop.limit),
         meter_of=_meter_of(plant),
-        book=_suspicions(plant, options),
-        shapes=_shapes(plant, options.alarms_per_year, step_s, lengths),
+        book=_suspicions(plant, effects, options),
+        shapes=_shapes(plant, effects, options.alarms_per_year, step_s, lengths),
         most=meters.size // 3 if max_attacked is None else max_attacked,
         most_p=_most_power(plant.feeder, Power.ACTIVE),
         most_q=_most_power(plant.feeder, Power.REACTIVE),
@@ -307,19 +309,19 @@ def _sigmas(rate: float, meters: int, length: int, step_s: float, lengths: tuple
     return float(norm.isf(min(rate / tests, 0.5) / 2.0))
 
 
-def _shapes(plant: Plant, rate: float, step_s: float, lengths: tuple[int, ...]) -> Shapes:
+def _shapes(plant: Plant, effects: Effects, rate: float, step_s: float, lengths: tuple[int, ...]) -> Shapes:
     """What manipulations look like at this feeder's meters."""
     accuracy, slope = plant.accuracy, 2.0 * _HIGH * plant.droop.vbar
     tests = plant.meters.size * (len(lengths) + _REPEATS) * YEAR_S / step_s
     return Shapes(
         rules=rules(accuracy.resolution, accuracy.jitter, min(rate / tests, 0.5), step_s),
-        traces=Traces(plant.feeder, plant.feeder.bus[plant.meters]),
+        traces=Traces(effects, plant.feeder.bus[plant.meters]),
         noise=slope**2 * (accuracy.jitter**2 + accuracy.resolution**2 / 12.0),
     )
 
 
-def _suspicions(plant: Plant, options: SequentialOptions) -> Dictionary:
-    """Columns of 2R for the customers' active powers, and of 2X for the inverters; made when asked for."""
+def _suspicions(plant: Plant, effects: Effects, options: SequentialOptions) -> Dictionary:
+    """Columns of 2R for the customers' active powers, and of 2X for the inverters."""
     feeder, meters, owner = plant.feeder, plant.meters, plant.droop.customer
     customers = feeder.bus.size
     of = np.concatenate([np.arange(customers), owner])
@@ -327,12 +329,12 @@ def _suspicions(plant: Plant, options: SequentialOptions) -> Dictionary:
     def changes(which: Ints) -> Floats:
         out = np.empty((len(feeder.buses), which.size))
         for power, some in ((Power.ACTIVE, which < customers), (Power.REACTIVE, which >= customers)):
-            out[:, some] = columns(feeder, power, of[which[some]])
+            out[:, some] = effects.columns(power, of[which[some]])
         return out
 
     def towards(weights: Floats) -> Floats:
-        load = along(feeder, Power.ACTIVE, meters, weights)
-        return np.concatenate([load, along(feeder, Power.REACTIVE, meters, weights)[owner]])
+        load = effects.along(Power.ACTIVE, meters, weights)
+        return np.concatenate([load, effects.along(Power.REACTIVE, meters, weights)[owner]])
 
     load, injection = (sizes(feeder, power, meters) for power in Power)
     return Dictionary(

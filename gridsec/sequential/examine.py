@@ -119,6 +119,8 @@ def ended(design: SequentialDesign, trust: Trust, seen: Examined, window: Window
             continue
         quiet = suspected & short.enough & ~short.still
         for later in range(s + 1, len(design.lengths)):
+            if not (quiet & seen.trust.still[later]).any():
+                continue
             variance = design.white / np.maximum(window.counts[s], 1) + wander * design.lengths[later]
             far = np.abs(means[later] - means[s]) > design.sigmas[s] * np.sqrt(variance)
             out |= quiet & seen.trust.still[later] & far

@@ -26,9 +26,10 @@ import numpy as np
 from scipy.stats import chi2
 
 from gridsec.arrays import Bools, Floats, Ints
-from gridsec.network import Network, Power, columns
+from gridsec.network import Power
 from gridsec.online import Kind
 from gridsec.sequential import repeats
+from gridsec.sequential.effects import Effects
 from gridsec.sequential.repeats import Memory, Rules
 
 # A named meter's readings are looked at every so many ticks.
@@ -49,8 +50,6 @@ _ALIKE, _SURE = 4.0, 5.0
 _TRACE = 0.05
 # Entries of two columns this close, as a part, are equal.
 _SAME = 1e-9
-# Traces that are looked at together.
-_PART = 256
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,27 +58,24 @@ class Traces:
 
     Attributes
     ----------
-    feeder
-        The feeder.
+    effects
+        Of the feeder.
     at : (p,)
         Bus of each meter.
     """
 
-    feeder: Network
+    effects: Effects
     at: Ints
 
     def of(self, meters: Ints) -> Iterator[Floats]:
         """All traces at some meters, (k, …) each, in parts that are small."""
-        every = np.arange(self.feeder.bus.size)
-        for power in Power:
-            for first in range(0, every.size, _PART):
-                yield columns(self.feeder, power, every[first : first + _PART])[self.at[meters]]
+        return self.effects.at(self.at[meters])
 
     def trace(self, which: int) -> Floats:
         """One of them, (p,)."""
-        customers = self.feeder.bus.size
+        customers = self.effects.feeder.bus.size
         power = Power.ACTIVE if which < customers else Power.REACTIVE
-        return np.asarray(columns(self.feeder, power, np.array([which % customers]))[self.at, 0])
+        return np.asarray(self.effects.columns(power, np.array([which % customers]))[self.at, 0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -434,7 +430,7 @@ def traced(traces: Traces, who: Ints, lies: Floats, variance: Floats) -> bool:
         return np.asarray(weight @ (lies[:, None] - power * of) ** 2)
 
     same = misfit(np.ones((who.size, 1)))[0]
-    most = min(_quantile(who.size - 1), same - 2.0 * np.log(2 * traces.feeder.bus.size))
+    most = min(_quantile(who.size - 1), same - 2.0 * np.log(2 * traces.effects.feeder.bus.size))
     if most < 0.0:
         return False
     # In three phases a load lowers its own phase and moves the others either way: how much counts.
