@@ -8,6 +8,9 @@ which each may differ from it,
 
 The second has one large number to explain all lies with, and so pays for one freedom instead of |L|: weak
 lies that fit to strong ones are named, and readings that err by chance into another direction are not.
+Who tells of a load that is not there has no choice of whose meters to use: any honest one that the load would
+move more than a lying one contradicts the story. So whose load it is says who lies, and such a set costs the
+choice of one of p customers, not that of |L| of p meters; other sets do not tell stories.
 With ``Q = K^-1`` and ``z = Q m`` of the same explanation without liars,
 
     J(L, C) - J({}) = ln det(I + C_L Q_LL) - z_L^T (I + C_L Q_LL)^-1 C_L z_L + price
@@ -23,6 +26,7 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
+from scipy.special import binom
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.sequential.rises import Problem, State
@@ -38,6 +42,10 @@ _ROUNDS = 6
 _WORSE = 30.0
 # Any two of so many meters may be where a search begins.
 _PAIRED = 8
+# Independent, all the same: other shapes are stories.
+_PLAIN = 2
+# Loads this much alike, as a part, are felt alike.
+_SAME = 1e-9
 
 
 Ranked = list[tuple[float, State]]
@@ -91,8 +99,9 @@ class _Base:
                 self.known[()] = (self.nobody, 0)
                 continue
             L = np.array(some)
-            J, _ = self._judged(L, self._shapes(L))
-            J += self._prices(size)
+            J = self._judged(L, self._plain(L))[0] + self._prices(size)
+            if size > 1 and self.problem.false is not None:
+                J = np.concatenate([J, self._stories(L)], axis=1)
             best = np.argmin(J, axis=1)
             for each, k, cost in zip(some, best.tolist(), J.min(axis=1).tolist(), strict=True):
                 self.known[each] = (self.nobody + cost, k)
@@ -105,36 +114,55 @@ class _Base:
         out, lies, weights = np.zeros(self.z.size, dtype=np.bool_), np.zeros(self.z.size), self.z
         if liars:
             L = np.array([liars])
-            C = self._shapes(L)[:, k : k + 1]
+            C = self._plain(L)[:, k : k + 1] if k < _PLAIN else self._told_of(L, L[:, k - _PLAIN])
             _, by = self._judged(L, C)
             out[L[0]], lies[L[0]] = True, by[0, 0]
             weights = self.z - self.Q[:, L[0]] @ by[0, 0]
         self.told[liars] = Set(out, self.powers, cost, weights, lies)
         return self.told[liars]
 
-    def _shapes(self, L: Ints) -> Floats:
-        """C of each set, (b, shapes, k, k): independent, all the same, and as if one of them drew more."""
+    def _plain(self, L: Ints) -> Floats:
+        """C of each set where lies are independent, and where they are all the same, (b, 1 or 2, k, k)."""
         lies, (count, k) = self.problem.lies, L.shape
-        apart = np.broadcast_to(lies.size**2 * np.eye(k), (count, 1, k, k))
-        if k == 1:
-            return apart
-        u = np.ones((count, 1, k))
-        if self.problem.false is not None:
-            R = self.problem.false.R[L[:, None, :], L[:, :, None]]
-            u = np.concatenate([u, R / np.diagonal(R, axis1=1, axis2=2)[:, :, None]], axis=1)
-        about = 1.0 + lies.differ**2 * np.eye(k)
-        return np.concatenate([apart, lies.amplitude**2 * about * u[..., None] * u[..., None, :]], axis=1)
+        C = lies.size**2 * np.eye(k)[None]
+        if k > 1:
+            C = np.stack([C[0], lies.amplitude**2 * (1.0 + lies.differ**2 * np.eye(k))])
+        return np.broadcast_to(C, (count, *C.shape))
 
     def _prices(self, k: int) -> Floats:
-        """What each shape costs a set of k beside its freedom, (shapes,)."""
-        lies = self.problem.lies
-        price = float(self.problem.prices[k])
+        """What both cost a set of k beside their freedom, (1 or 2,)."""
+        lies, price = self.problem.lies, float(self.problem.prices[k])
         apart = price + lies.apart * (k - 1)
-        if k == 1:
-            return np.array([apart])
-        same = price + lies.pair + lies.more * (k - 2)
-        drawn = np.full(k if self.problem.false is not None else 0, same + 2.0 * np.log(k))
-        return np.concatenate([[apart, same], drawn])
+        return np.array([apart, price + lies.pair + lies.more * (k - 2)][: min(k, _PLAIN)])
+
+    def _told_of(self, L: Ints, c: Ints) -> Floats:
+        """C of each set as the story of one customer, (b, 1, k, k)."""
+        lies, false = self.problem.lies, self.problem.false
+        assert false is not None  # noqa: S101  # the callers have looked
+        u = false.R[L, c[:, None]] / false.R[c, c][:, None]
+        about = 1.0 + lies.differ**2 * np.eye(L.shape[1])
+        return np.asarray(lies.amplitude**2 * about * u[:, :, None] * u[:, None, :])[:, None]
+
+    def _stories(self, L: Ints) -> Floats:
+        """Rise of J with the price where each of a set is whom the story is about, (b, k); inf for none."""
+        problem, (p, k) = self.problem, (self.problem.size, L.shape[1])
+        assert problem.false is not None  # noqa: S101  # the caller has looked
+        R = problem.false.R
+        among = R[L[:, :, None], L[:, None, :]]
+        low, high = (among.min(axis=1) * (1.0 + side) for side in (-_SAME, _SAME))
+        column = R[:, L]
+        more, least = (column > high).sum(axis=0), (column >= low).sum(axis=0)
+        ours = (among > high[:, None]).sum(axis=1)
+        out = np.full(L.shape, np.inf)
+        rows, of = np.nonzero(more == ours)
+        if rows.size:
+            # Of those that would feel it alike, some are chosen; whose story it is belongs to it.
+            own = (R[L, L] <= high)[rows, of]
+            ties, left = (least - more)[rows, of] - own, (k - ours)[rows, of] - own
+            choices = np.log(p * binom(ties, left)) - np.log(binom(p, k))
+            J = self._judged(L[rows], self._told_of(L[rows], L[rows, of]))[0][:, 0]
+            out[rows, of] = J + problem.prices[k] + problem.lies.story + 2.0 * choices
+        return out
 
     def _judged(self, L: Ints, C: Floats) -> tuple[Any, Any]:
         """Rise of J without the price, (b, shapes), and the lies, (b, shapes, k)."""
@@ -164,7 +192,25 @@ def worth(problem: Problem, ranked: Ranked) -> bool:
         return True
     if count > 1 and (problem.meters(best)[best.liars] <= _WORSE).any():
         return True
+    if problem.false is not None and _continued(problem, best):
+        return True
     return any(each.counts[0] > 1 and cost - lowest <= _WORSE for cost, each in ranked[1:])
+
+
+def _continued(problem: Problem, best: State) -> bool:
+    """Whether somebody's reading is odd who would be the next in a story of one of the liars."""
+    assert problem.false is not None  # noqa: S101  # the caller has looked
+    p, k = problem.size, best.counts[0] + 1
+    if k > min(MOST, p):
+        return False
+    prices, choice = problem.prices, 2.0 * float(np.log(p / binom(p, k)))
+    price = float(prices[k] - prices[k - 1]) + problem.lies.story + choice
+    odd = (best.g**2 > max(price, 0.0) * best.Q.diagonal()) & ~best.liars
+    if not odd.any():
+        return False
+    column = problem.false.R[:, best.liars]
+    weakest = np.partition(column, p - k, axis=0)[p - k]
+    return bool((column >= weakest * (1.0 - _SAME))[odd].any())
 
 
 def least(problem: Problem, k: int) -> float:
@@ -200,6 +246,7 @@ def alike(problem: Problem, ranked: Ranked) -> list[Set]:
     best = min(bases.values(), key=lambda base: min(base.known.values())[0])
     if not best.powers.any():
         best.costs(combinations(_strongest(best), 2))
+        best.costs(_stories(best))
     _descend(best)
     within = min(best.known.values())[0] + 2.0 * np.log(problem.lies.like)
     return [
@@ -208,6 +255,20 @@ def alike(problem: Problem, ranked: Ranked) -> list[Set]:
         for liars, (cost, _) in base.known.items()
         if cost <= within
     ]
+
+
+def _stories(base: _Base) -> Iterator[tuple[int, ...]]:
+    """Stories about one of the likeliest liars, up to two liars longer than that explanation."""
+    if base.problem.false is None:
+        return
+    R, size = base.problem.false.R, base.z**2 / base.Q.diagonal()
+    liars = min(base.known, key=lambda each: base.known[each][0])
+    for c in liars:
+        felt = np.round(R[:, c] / R[c, c], 9)
+        felt[c] = np.inf
+        order = np.lexsort((-size, -felt)).tolist()
+        for k in range(2, min(MOST, len(liars) + 2, len(order)) + 1):
+            yield tuple(sorted(order[:k]))
 
 
 def _strongest(base: _Base) -> list[int]:

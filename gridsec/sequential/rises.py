@@ -51,7 +51,9 @@ class Lies:
     apart
         What each liar after the first costs more where lies are independent.
     pair, more
-        What the second liar, and each further one, costs more where they are alike.
+        What the second liar, and each further one, costs more where they read off by the same amount.
+    story
+        What liars cost who tell of one customer's load, beside the choice of the customer.
     """
 
     size: float = 0.2
@@ -63,8 +65,9 @@ class Lies:
     amplitude: float = 0.06
     differ: float = 0.15
     apart: float = 4.0
-    pair: float = 4.0
+    pair: float = 4.5
     more: float = 2.0
+    story: float = 5.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)

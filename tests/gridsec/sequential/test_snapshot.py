@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import chain, combinations
+from math import comb
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from gridsec.sequential.snapshot import Explained, FalsePowers, Lies, identify
 
 P = 7
 LIES = Lies()
-APART = Lies(apart=0.0, pair=1e3, more=1e3)
+APART = Lies(apart=0.0, pair=1e3, more=1e3, story=1e3)
 
 
 Known = tuple[Prior, Floats, FalsePowers]
@@ -32,6 +33,17 @@ def street(rng: np.random.Generator) -> Known:
     )
 
 
+def tells(moved: Floats, liars: tuple[int, ...]) -> bool:
+    """Whether nobody else would be moved more than one of them."""
+    others = [moved[j] for j in range(P) if j not in liars]
+    return min(moved[list(liars)]) >= max(others, default=0.0) * (1.0 - 1e-9)
+
+
+def told(moved: Floats, c: int, size: int) -> int:
+    """How many sets of so many would tell the story of customer c, c among them."""
+    return sum(c in each and tells(moved, each) for each in combinations(range(P), size))
+
+
 def dense(
     known: Known, m: Floats, liars: tuple[int, ...], powers: tuple[int, ...] = (), *, drawn: bool = True
 ) -> float:
@@ -44,11 +56,18 @@ def dense(
         K += B @ B.T
     k, L = len(liars), np.array(liars, dtype=int)
     shapes = [(LIES.size**2 * np.eye(k), LIES.apart * (k - 1))]
-    for c in ((None, *liars) if drawn else (None,)) if k > 1 else ():
-        u = np.ones(k) if c is None else false.R[L, c] / false.R[c, c]
-        common = LIES.amplitude**2 * (np.outer(u, u) + LIES.differ**2 * np.diag(u**2))
-        choice = 0.0 if c is None else 2.0 * np.log(k)
-        shapes.append((common, LIES.pair + LIES.more * (k - 2) + choice))
+    if k > 1:
+        same = (np.ones(k), LIES.pair + LIES.more * (k - 2))
+        stories = [
+            (
+                false.R[L, c] / false.R[c, c],
+                LIES.story + 2.0 * np.log(P * told(false.R[:, c], c, k) / comb(P, k)),
+            )
+            for c in (liars if drawn else ())
+            if tells(false.R[:, c], liars)
+        ]
+        for u, price in (same, *stories):
+            shapes.append((LIES.amplitude**2 * (np.outer(u, u) + LIES.differ**2 * np.diag(u**2)), price))
     costs = []
     for C, price in shapes:
         both = K.copy()
