@@ -4,7 +4,9 @@
 
 Two meters show the trace of a load that is not there, at least 3 % deep, and the customer's own meter reports
 that load's power ("coordinated-power"). What is false fits together; only the honest neighbours contradict.
-As a control the same feeders and seeds with the trace alone, and with two independent lies of 3 %. Counted
+The reverse: one meter reports the power of a load that is not there and would be 2 % deep, and all voltages
+are true ("power"); what is false is then told as somebody's power, never as an honest meter. As a control
+the same feeders and seeds with the trace alone, and with two independent lies of 3 %. Counted
 is, over the minute of the lie: exactly the liars named and nobody else; some of them named; none, but the
 liars are among the explanations given; nobody named and UNDECIDED for another reason; an honest meter named;
 CLEAN.
@@ -30,17 +32,22 @@ from feeders.load import Site, load, to_frame
 from feeders.scenario import START, Scenario, simulate, snapshots
 
 FEEDERS = ("cigre-lv", "simbench-lv-rural1", "kerber-landnetz", "simbench-lv-rural3")
-TRICKS = (Trick.COORDINATED_POWER, Trick.POWER, Trick.COORDINATED, Trick.BIAS)
-DURATION_S, ONSET_S, SIZE, LIARS = 90.0, 30.0, 3.0, 2
+DURATION_S, ONSET_S, MOST = 90.0, 30.0, 2
+LIES = (
+    Lie(Trick.COORDINATED_POWER, 2, 3.0, ONSET_S),
+    Lie(Trick.POWER, 1, 2.0, ONSET_S),
+    Lie(Trick.COORDINATED, 2, 3.0, ONSET_S),
+    Lie(Trick.BIAS, 2, 3.0, ONSET_S),
+)
 OUTCOMES = ("exactly", "some", "explained", "undecided", "honest named", "clean")
 
 
-def outcome(site: Site, watcher: Watcher, trick: Trick, seed: int) -> str:
+def outcome(site: Site, watcher: Watcher, lie: Lie, seed: int) -> str:
     """What came of one run.
 
     Parameters
     ----------
-    site, watcher, trick, seed
+    site, watcher, lie, seed
         Where, who watches, what is done, and which run.
 
     Raises
@@ -50,7 +57,7 @@ def outcome(site: Site, watcher: Watcher, trick: Trick, seed: int) -> str:
     """
     profile = float(np.random.default_rng(seed).uniform(0.0, 13.9 * 86_400.0))
     quiet = Scenario(seed=seed, duration_s=DURATION_S, profile_s=profile)
-    attacks, _ = manipulations(site, Lie(trick, LIARS, SIZE, ONSET_S), quiet)
+    attacks, _ = manipulations(site, lie, quiet)
     truth = np.zeros(site.meters.size, dtype=np.bool_)
     truth[[int(j) for attack in attacks for j in attack.meters]] = True
     state, named, told = watcher.init(START - 1.0), np.zeros_like(truth), False
@@ -72,17 +79,17 @@ def main(seeds: int) -> None:
     """Count and print."""
     print("| feeder | lie | " + " | ".join(OUTCOMES) + " |\n|---|---|" + "---|" * len(OUTCOMES))
     for name in FEEDERS:
-        site = choose(load(name), max_attacked=LIARS, estimator=SEQUENTIAL)
+        site = choose(load(name), max_attacked=MOST, estimator=SEQUENTIAL)
         watcher = design(site)
-        for trick in TRICKS:
+        for lie in LIES:
             tally: Counter[str] = Counter()
             for seed in range(seeds):
                 try:
-                    tally[outcome(site, watcher, trick, seed)] += 1
+                    tally[outcome(site, watcher, lie, seed)] += 1
                 except NoSuchAttack:
                     continue
             print(
-                f"| {name} | {trick} | " + " | ".join(str(tally[each]) for each in OUTCOMES) + " |",
+                f"| {name} | {lie.trick} | " + " | ".join(str(tally[each]) for each in OUTCOMES) + " |",
                 flush=True,
             )
 

@@ -242,6 +242,21 @@ def test_coordinated_meters_show_the_trace_of_a_load() -> None:
         assert not np.delete(more, customer, axis=1).any()
 
 
+def test_a_false_power_moves_no_voltage() -> None:
+    """The same load as in the coordinated story, but nobody shows its trace."""
+    change, liars = shift(Trick.POWER)
+    assert not change.any()
+    assert liars[-1].sum() == 1
+    (attack,) = trial(Trick.COORDINATED_POWER).scenario.attacks
+    assert isinstance(attack, Coordinated)
+    (k,) = np.nonzero(attack.p_shift)[0]
+    for (told, _), (other, _) in zip(played(Trick.POWER), played(Trick.COORDINATED_POWER), strict=True):
+        np.testing.assert_array_equal(told.p, other.p)
+        np.testing.assert_array_equal(told.q, other.q)
+    (who,) = np.nonzero(liars[-1])
+    assert who.tolist() == [attack.meters[k]]
+
+
 def test_a_load_that_nobody_would_believe_is_no_measurement() -> None:
     """A load of 1.5 MW: the frame falls back on what the customer could draw, and says how wide that is."""
     pairs = played(Trick.COORDINATED_POWER, lie=Lie(Trick.COORDINATED_POWER, 2, 12.0))

@@ -36,7 +36,7 @@ def street(rng: np.random.Generator) -> Known:
 def tells(moved: Floats, liars: tuple[int, ...]) -> bool:
     """Whether nobody else would be moved more than one of them."""
     others = [moved[j] for j in range(P) if j not in liars]
-    return min(moved[list(liars)]) >= max(others, default=0.0) * (1.0 - 1e-9)
+    return bool(min(moved[list(liars)]) >= max(others, default=0.0) * (1.0 - 1e-9))
 
 
 def told(moved: Floats, c: int, size: int) -> int:
@@ -76,7 +76,7 @@ def dense(
         costs.append(float(m @ np.linalg.solve(both, m) + logs + price))
     a, b = LIES.seen
     sets = 2.0 * (betaln(a, P + b) - betaln(k + a, P - k + b))
-    return min(costs) + sets + LIES.each * k + LIES.false * len(powers)
+    return float(min(costs) + sets + LIES.each * k + LIES.false * len(powers))
 
 
 def subsets(most: int) -> list[tuple[int, ...]]:

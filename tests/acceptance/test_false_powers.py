@@ -1,0 +1,42 @@
+"""False powers with all voltages true: no honest meter answers for them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from feeders.estimators import SEQUENTIAL, choose, design
+from feeders.lies import Lie, Trick, manipulations
+from feeders.load import load, to_frame
+from feeders.scenario import START, Scenario, simulate, snapshots
+from gridsec.online import Cause, Decision
+
+ONSET_S = 30.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [1.0, 2.0])
+def test_a_power_that_is_false_is_told_as_a_power(size: float) -> None:
+    """CIGRE LV with its 6 meters, where one load moves half of them: AC power flow, eight runs."""
+    site = choose(load("cigre-lv"), max_attacked=2, estimator=SEQUENTIAL)
+    watcher, told = design(site), 0
+    for seed in range(8):
+        profile = float(np.random.default_rng(seed).uniform(0.0, 13.9 * 86_400.0))
+        quiet = Scenario(seed=seed, duration_s=60.0, profile_s=profile)
+        attacks, _ = manipulations(site, Lie(Trick.POWER, 1, size, ONSET_S), quiet)
+        (attack,) = attacks
+        state, loud = watcher.init(START - 1.0), False
+        for snapshot in snapshots(simulate(site, replace(quiet, attacks=attacks))):
+            state, _, verdict = watcher.step(state, to_frame(site, snapshot))
+            honest = np.delete(verdict.suspects, attack.meters)
+            assert not honest.any(), f"seed {seed}: {verdict.reason}"
+            if verdict.decision is Decision.UNDECIDED and verdict.cause is Cause.AMBIGUOUS:
+                loud = True
+                named = any(each.powers[site.meters[attack.meters]].any() for each in verdict.explanations)
+                accused = site.feeder.customers[site.meters[attack.meters[0]]] in verdict.reason
+                assert named or accused, verdict.reason
+        told += loud
+    # A load beyond the customer's connection is not believed in the first place, and changes nothing.
+    assert told >= 2
