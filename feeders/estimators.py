@@ -19,9 +19,9 @@ from gridsec.arrays import Bools, Floats
 from gridsec.certificates import certify
 from gridsec.errors import FeederInvalid
 from gridsec.families import decoders, partial, set_search, ticks, unknown_input, windowed
-from gridsec.feeder import lindistflow
 from gridsec.gains import CircleOptions, options_for
 from gridsec.lure import Lure, close_loop
+from gridsec.network import linear
 from gridsec.online import Estimate, Frame, Verdict
 from gridsec.sequential import Commission
 from gridsec.sequential.decoder import Decoder
@@ -245,7 +245,7 @@ def _direct_bank(site: Site, _: Job) -> monitor.MonitorDesign:
 
 def _lmi_bank(site: Site, job: Job) -> monitor.MonitorDesign:
     settings = site.tables.meta.monitor
-    lure = close_loop(plant(site).balanced, site.droop, site.meters)
+    lure = close_loop(site.feeder, site.droop, site.meters)
     found = bank_gains(
         lure,
         settings.max_attacked,
@@ -336,7 +336,7 @@ def lmi_options(site: Site, lure: Lure) -> CircleOptions:
 
 def _load_columns(site: Site) -> Floats:
     """Error of w for unit errors of all powers, (N, 2N): `2 R dp` and `2 X dq`."""
-    model, loads = lindistflow(site.balanced), site.loads
+    model, loads = linear(site.feeder), site.loads
     dp = loads.p_fraction * loads.load_peak + loads.p_floor
     dq = 0.5 * (loads.tan_max - loads.tan_min) * loads.load_peak + loads.q_floor
     return np.hstack([2.0 * model.R * dp, 2.0 * model.X * dq])

@@ -9,10 +9,10 @@ import numpy as np
 from gridsec import detect
 from gridsec.arrays import Bools, Floats
 from gridsec.detect import Uncertainty
-from gridsec.feeder import corrected, loss_correction
-from gridsec.lure import known_input
-from gridsec.network import by_place
+from gridsec.feeder import Feeder, corrected
+from gridsec.network import Network, by_place, interval_bounds, loss_correction
 from gridsec.online import Cause, Decision, Estimate, Frame, Verdict
+from gridsec.phases import PhasedFeeder
 from gridsec.plant import Plant, Setting
 
 
@@ -26,9 +26,9 @@ class Inputs:
     w: Floats  # (N,)
     net: Floats | None  # (p,) metered net reactive injection minus the assumed load's; NaN where unused
     q: Floats  # (N,) without the inverters, whatever is metered
-    v0_squared: float
+    v0_squared: Floats | float  # in three phases (3,)
     busbar: bool
-    correction: Floats  # (b + 1,) at the last estimate
+    correction: Floats  # (n,) at the last estimate
     now: Uncertainty
 
 
@@ -41,25 +41,25 @@ class Past:
     x : (m,)
         Estimated injections, pu.
     v0_squared
-        Squared busbar voltage, pu.
+        Squared busbar voltage, pu; in three phases one or (3,).
     named : (p,)
         Meters named as manipulated.
     """
 
     x: Floats
-    v0_squared: float
+    v0_squared: Floats | float
     named: Bools
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reconstruction:
-    """The voltages that a set of injections explains. N customers, b + 1 buses.
+    """The voltages that a set of injections explains. N customers, n places.
 
     Attributes
     ----------
-    v2_bus, v2 : (b + 1,), (N,)
-        Squared voltages of all buses, and of the customers', pu.
-    correction : (b + 1,)
+    v2_bus, v2 : (n,), (N,)
+        Squared voltages of all places, and of the customers', pu.
+    correction : (n,)
         What losses add to the linear model in them, squared pu.
     """
 
@@ -139,10 +139,11 @@ def reconstruct(setting: Setting, frame: Frame, inputs: Inputs, q: Floats) -> Re
     if plant.loss_correction:
         with np.errstate(all="ignore"):
             correction = loss_correction(
-                plant.balanced, frame.p, q, inputs.v0_squared, steps=plant.loss_correction
+                plant.feeder, frame.p, q, inputs.v0_squared, steps=plant.loss_correction
             )
         correction = np.where(np.isfinite(correction), correction, inputs.correction)
-    v2_bus = inputs.v0_squared + 2.0 * (model.R_bus @ frame.p + model.X_bus @ q) + correction
+    base = by_place(plant.feeder, inputs.v0_squared)
+    v2_bus = base + 2.0 * (model.R_bus @ frame.p + model.X_bus @ q) + correction
     return Reconstruction(v2_bus, v2_bus[plant.feeder.bus], correction)
 
 
@@ -162,29 +163,65 @@ def clean(setting: Setting, past: Past, frame: Frame) -> Inputs:
     at = plant.meters
     live = frame.seen & np.isfinite(frame.y)
     y = np.where(live, np.clip(frame.y, 0.0, NO_VOLTAGE), 0.0)
-    low, high = options.v2_limits
-    busbar = bool(np.isfinite(frame.v0_squared) and low <= frame.v0_squared <= high)
+    given, there = _busbar(plant.feeder, frame, options.v2_limits)
+    busbar = bool(np.all(there))
     # Without a busbar voltage the meters have to imply it, and then nobody's reactive power is believed.
     told = live & _credible(setting, frame) & busbar
     net = np.where(told, frame.q_net[at] - frame.q[at], np.nan) if told.any() else None
     q_all = injections(plant, frame, past.x, told)
     q_error = frame.q_error.copy()
     q_error[at] = np.where(told, frame.q_net_error[at], q_error[at])
-    v0 = frame.v0_squared if busbar else past.v0_squared
+    v0 = given if busbar else np.where(there, given, past.v0_squared)
+    here = _of_customers(plant.feeder, v0)
     correction, rest = _losses(plant, frame.p, q_all, v0, p_error=frame.p_error, q_error=q_error)
     base = setting.errors.R2 @ frame.p_error + setting.errors.X2 @ q_error + rest
     rise = 2.0 * (model.R @ frame.p + model.X @ q_all) + correction[plant.feeder.bus]
-    reading = detect.reading_error(plant.accuracy, v0 + rise[at] + base[at] + _ROOM, options.sigmas)
+    reading = detect.reading_error(plant.accuracy, here[at] + rise[at] + base[at] + _ROOM, options.sigmas)
     extra = np.where(told, np.maximum(frame.q_error[at] - frame.q_net_error[at], 0.0), 0.0)
     now = Uncertainty(np.minimum(base, NO_VOLTAGE), reading, live, told, extra)
-    if busbar:
-        error = detect.busbar_error(plant.accuracy, v0, options.sigmas)
-    else:
-        v0, error = _implied(setting, past, now, y - rise[at], v0)
-    now = replace(now, base=np.minimum(now.base + error, NO_VOLTAGE))
-    w = known_input(model, plant.droop.vbar, frame.p, frame.q, v0, correction[plant.feeder.bus])
+    error = busbar_errors(plant, v0, options.sigmas)
+    if not busbar:
+        v0, error = _implied(setting, past, now, y - rise[at], (v0, error, there))
+        here = _of_customers(plant.feeder, v0)
+    now = replace(now, base=np.minimum(now.base + _of_customers(plant.feeder, error), NO_VOLTAGE))
+    w = plant.droop.vbar**2 - here - 2.0 * (frame.p @ model.R.T + frame.q @ model.X.T)
+    w = w - correction[plant.feeder.bus]
     z = plant.droop.vbar**2 - y
     return Inputs(live, y, z, w, net, frame.q, v0, busbar, correction, now)
+
+
+def _busbar(
+    feeder: Network, frame: Frame, limits: tuple[float, float]
+) -> tuple[Floats | float, Bools | bool]:
+    """Squared voltage of the busbar as given, and whether that can be used; in three phases (3,) each."""
+    low, high = limits
+    if not isinstance(feeder, PhasedFeeder):
+        return frame.v0_squared, bool(np.isfinite(frame.v0_squared) and low <= frame.v0_squared <= high)
+    if frame.v0_phases is None:
+        # A mean says nothing of any phase.
+        return np.full(3, np.nan), np.zeros(3, dtype=np.bool_)
+    return frame.v0_phases, (frame.v0_phases >= low) & (frame.v0_phases <= high)
+
+
+def busbar_errors(plant: Plant, v0_squared: Floats | float, sigmas: float) -> Floats | float:
+    """Largest honest error of the squared busbar voltage; in three phases (3,) each.
+
+    Parameters
+    ----------
+    plant
+        The feeder, and what its meters promise.
+    v0_squared, sigmas
+        As in `gridsec.detect.busbar_error`.
+    """
+    if not isinstance(plant.feeder, PhasedFeeder):
+        return detect.busbar_error(plant.accuracy, float(v0_squared), sigmas)
+    each = np.broadcast_to(v0_squared, 3).tolist()
+    return np.array([detect.busbar_error(plant.accuracy, one, sigmas) for one in each])
+
+
+def _of_customers(feeder: Network, of_busbar: Floats | float) -> Floats:
+    """What the busbar has, for every customer, (N,)."""
+    return np.asarray(by_place(feeder, of_busbar)[feeder.bus])
 
 
 # Room for what inverters did since the last estimate, where only a meter's accuracy depends on it.
@@ -218,38 +255,61 @@ def injections(plant: Plant, frame: Frame, x: Floats, told: Bools) -> Floats:
 
 
 def _losses(
-    plant: Plant, p: Floats, q: Floats, v0: float, *, p_error: Floats, q_error: Floats
+    plant: Plant, p: Floats, q: Floats, v0: Floats | float, *, p_error: Floats, q_error: Floats
 ) -> tuple[Floats, Floats]:
-    """Loss correction (b + 1,), and how far it can be from the truth at each customer (N,)."""
-    feeder, steps = plant.balanced, plant.loss_correction
-    # The correction is nearly quadratic in the loads: its ends are where all of them err the same way.
-    ends = np.array([0.0, -1.0, 1.0])[:, None]
-    with np.errstate(all="ignore"):
-        three, left = corrected(feeder, p + ends * p_error, q + ends * q_error, v0, steps=max(steps, 1))
-    # What is left grows with the cube of the load, so the centre says nothing about the ends.
-    rest = left.max(axis=0)
-    three = np.nan_to_num(three, nan=0.0, posinf=0.0, neginf=0.0)
-    moved = np.abs(three[1:] - three[0]).max(axis=0)[feeder.bus]
+    """Loss correction (n,), and how far it can be from the truth at each customer (N,)."""
+    feeder, steps = plant.feeder, plant.loss_correction
+    if isinstance(feeder, Feeder):
+        # The correction is nearly quadratic in the loads: its ends are where all of them err the same way.
+        ends = np.array([0.0, -1.0, 1.0])[:, None]
+        with np.errstate(all="ignore"):
+            three, left = corrected(feeder, p + ends * p_error, q + ends * q_error, v0, steps=max(steps, 1))
+        # What is left grows with the cube of the load, so the centre says nothing about the ends.
+        rest = left.max(axis=0)
+        three = np.nan_to_num(three, nan=0.0, posinf=0.0, neginf=0.0)
+        moved = np.abs(three[1:] - three[0]).max(axis=0)[feeder.bus]
+        once = three[0]
+    else:
+        # Loads on other phases, or around a loop, may lift as well as lower: no end is the worst.
+        with np.errstate(all="ignore"):
+            once = loss_correction(feeder, p, q, v0, steps=max(steps, 1))
+        once = np.nan_to_num(once, nan=0.0, posinf=0.0, neginf=0.0)
+        moved, rest = interval_bounds(feeder, p, q, v0, p_error=p_error, q_error=q_error)
+        if steps > 1:
+            moved = moved + 2.0 * rest
     rest = np.nan_to_num(rest, nan=NO_VOLTAGE, posinf=NO_VOLTAGE)
     if steps == 0:
-        rest = rest + np.abs(three[0][feeder.bus])
-        return np.zeros(three.shape[1]), np.minimum(rest + moved, NO_VOLTAGE)
-    return np.asarray(three[0]), np.minimum(rest + moved, NO_VOLTAGE)
+        rest = rest + np.abs(once[feeder.bus])
+        return np.zeros(once.shape), np.minimum(rest + moved, NO_VOLTAGE)
+    return np.asarray(once), np.minimum(rest + moved, NO_VOLTAGE)
 
 
 def _implied(
-    setting: Setting, past: Past, now: Uncertainty, implied: Floats, last: float
-) -> tuple[float, float]:
-    """Squared busbar voltage that the meters imply, and its error.
+    setting: Setting,
+    past: Past,
+    now: Uncertainty,
+    implied: Floats,
+    busbar: tuple[Floats | float, Floats | float, Bools | bool],
+) -> tuple[Floats | float, Floats | float]:
+    """Squared busbar voltage and its error, where it is not metered those that the meters imply.
 
     The median lies between honest values as long as liars are fewer than half, and then its error is
-    at most the largest honest one.
+    at most the largest honest one. Of a phase only its own meters say anything.
     """
-    use = now.live & ~past.named
-    if np.count_nonzero(use) <= 2 * setting.max_attacked:
-        use = now.live
-    if np.count_nonzero(use) <= 2 * setting.max_attacked:
-        return last, NO_VOLTAGE
+    feeder, at = setting.plant.feeder, setting.plant.meters
     # The estimate of the injections is that of the last frame; in between each may have moved by its span.
-    stale = detect.gap(setting.errors, now, detect.widest(setting.errors))[setting.plant.meters]
-    return float(np.median(implied[use])), float(np.max((stale + now.reading)[use]))
+    stale = detect.gap(setting.errors, now, detect.widest(setting.errors))[at]
+    v0, error, there = (np.atleast_1d(np.array(value)) for value in busbar)
+    heard = np.equal.outer(feeder.bus[at] % 3, np.arange(3)) if there.size > 1 else np.ones((at.size, 1))
+    for k in np.flatnonzero(~there).tolist():
+        among = now.live & (heard[:, k] > 0)
+        use = among & ~past.named
+        if np.count_nonzero(use) <= 2 * setting.max_attacked:
+            use = among
+        if np.count_nonzero(use) <= 2 * setting.max_attacked:
+            error[k] = NO_VOLTAGE
+        else:
+            v0[k], error[k] = np.median(implied[use]), np.max((stale + now.reading)[use])
+    if isinstance(feeder, PhasedFeeder):
+        return v0, error
+    return float(v0[0]), float(error[0])

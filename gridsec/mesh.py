@@ -28,6 +28,7 @@ from scipy.sparse.linalg import splu
 from gridsec.arrays import Floats, Ints, Phasors, frozen, frozen_ints
 from gridsec.errors import FeederInvalid
 from gridsec.feeder import Feeder, common_paths
+from gridsec.intervals import Sweeps, bounds
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -293,6 +294,43 @@ def model_error_bound(feeder: MeshedFeeder, p: Floats, q: Floats, v0_squared: Fl
         holds = (theta < 1.0) & np.all(rho <= _NEAR * np.abs(second), axis=-1, keepdims=True)
         bound = np.where(holds, rho * (2.0 * np.abs(second) + rho), np.inf)
     return np.asarray(bound)
+
+
+def interval_bounds(
+    feeder: MeshedFeeder,
+    p: Floats,
+    q: Floats,
+    v0_squared: Floats | float,
+    *,
+    p_error: Floats,
+    q_error: Floats,
+) -> tuple[Floats, Floats]:
+    """How wrong the correction of `bus_voltages` can be for powers within intervals.
+
+    Parameters
+    ----------
+    feeder, p, q : (N,), v0_squared
+        As in `bus_voltages`, one operating point.
+    p_error, q_error : (N,)
+        How far the powers may be off, pu.
+
+    Returns
+    -------
+    (N,), (N,)
+        How far the correction moves, and what its first step leaves of the AC power flow, pu:
+        `gridsec.intervals.bounds`.
+    """
+    with np.errstate(all="ignore"):
+        s, _, idle = _start(feeder, p, q, v0_squared)
+        first = idle + np.conj(s / idle) @ feeder.between.T
+        second = idle + np.conj(s / first) @ feeder.between.T
+    error = np.hypot(p_error, q_error)
+    sweeps = Sweeps(idle, first, second, np.abs(s), lambda current: feeder.size @ current, np.zeros_like)
+    moved, rest = bounds(sweeps, error)
+    # The linear power flow has no charging, which the first sweep has.
+    linear = (feeder.R + 1j * feeder.X)[feeder.bus]
+    apart = np.abs(np.conj(idle)[:, None] * feeder.between / np.conj(idle) - linear)
+    return np.asarray(moved + 2.0 * (apart @ error)), rest
 
 
 # How near to the second iterate, as a part of it, a solution is looked for.

@@ -27,11 +27,12 @@ from gridsec.arrays import Bools, Floats, Ints
 from gridsec.certificates import Certificate, certify, small_gain, verify
 from gridsec.detect import ErrorBound, Majorant, Motion
 from gridsec.errors import DesignInfeasible
-from gridsec.feeder import LinDistFlow, lindistflow
+from gridsec.feeder import LinDistFlow
 from gridsec.frames import Inputs, Past, clean, injections, known, nothing_new, reconstruct
 from gridsec.judge import Situation, Tally, count, decide, residual_excess
 from gridsec.lmi import contraction
 from gridsec.lure import Lure, close_loop, rest
+from gridsec.network import linear
 from gridsec.online import Estimate, Frame, Verdict
 from gridsec.plant import MonitorDesign, MonitorState, Options, Plant
 from gridsec.stacked import StackedState
@@ -80,7 +81,7 @@ def design(
 
     References
     ----------
-    chong2020, Corollary 1, for any radial feeder and with what its errata ask for.
+    chong2020, Corollary 1, for any feeder and with what its errata ask for.
     """
     meters = plant.meters
     if np.unique(meters).size != meters.size:
@@ -93,8 +94,8 @@ def design(
         raise ValueError(f"step_s is {step_s}; it must be a positive number of seconds")
     if options is None:
         options = Options() if step_s <= 30.0 else Options(release=4)
-    lure = close_loop(plant.balanced, plant.droop, meters)
-    model = lindistflow(plant.balanced)
+    lure = close_loop(plant.feeder, plant.droop, meters)
+    model = linear(plant.feeder)
     bank = banks.design(lure, max_attacked, gains=gains, reactive=_reactive(model, meters, gains))
     errors = detect.error_model(plant.droop, model, meters, max_attacked)
     proven = lure

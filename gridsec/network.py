@@ -14,8 +14,8 @@ import numpy as np
 
 from gridsec import feeder as balanced
 from gridsec import mesh
-from gridsec.arrays import Floats, Ints
-from gridsec.feeder import Feeder, common_paths, path_sums
+from gridsec.arrays import Floats, Ints, frozen
+from gridsec.feeder import Feeder, LinDistFlow, common_paths, lindistflow, path_sums
 from gridsec.mesh import MeshedFeeder
 from gridsec.phases import PhasedFeeder, places
 
@@ -54,6 +54,19 @@ def one_busbar(feeder: Network, some: Ints, others: Ints) -> Floats | float:
     if not isinstance(feeder, PhasedFeeder):
         return 1.0
     return np.equal.outer(some % 3, others % 3).astype(np.float64)
+
+
+def hangs_on(feeder: Network) -> Floats:
+    """1 where a customer hangs on a phase of the busbar, else 0; (N, 3), or (N, 1) of one voltage.
+
+    Parameters
+    ----------
+    feeder
+        The feeder.
+    """
+    if not isinstance(feeder, PhasedFeeder):
+        return np.ones((feeder.bus.size, 1))
+    return np.equal.outer(feeder.bus % 3, np.arange(3)).astype(np.float64)
 
 
 def by_place(feeder: Network, of_busbar: Floats | float) -> Floats:
@@ -112,6 +125,67 @@ def model_error_bound(feeder: Network, p: Floats, q: Floats, v0_squared: Floats 
     if isinstance(feeder, MeshedFeeder):
         return mesh.model_error_bound(feeder, p, q, v0_squared)
     return places.model_error_bound(feeder, p, q, v0_squared)
+
+
+def linear(feeder: Network) -> LinDistFlow:
+    """Matrices of the linear power flow, rows for places in `R_bus` and `X_bus`.
+
+    Parameters
+    ----------
+    feeder
+        The feeder.
+    """
+    if isinstance(feeder, Feeder):
+        return lindistflow(feeder)
+    return LinDistFlow(frozen(feeder.R[feeder.bus]), frozen(feeder.X[feeder.bus]), feeder.R, feeder.X)
+
+
+def loss_correction(
+    feeder: Network, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int
+) -> Floats:
+    """What has to be added to the linear power flow at every place, (…, n).
+
+    Parameters
+    ----------
+    feeder, p, q, v0_squared
+        As in `bus_voltages`.
+    steps
+        Corrections, at least 1.
+    """
+    if isinstance(feeder, Feeder):
+        return balanced.loss_correction(feeder, p, q, v0_squared, steps=steps)
+    found = bus_voltages(feeder, p, q, v0_squared, steps=steps)
+    return found - bus_voltages(feeder, p, q, v0_squared, steps=0)
+
+
+def interval_bounds(
+    feeder: MeshedFeeder | PhasedFeeder,
+    p: Floats,
+    q: Floats,
+    v0_squared: Floats | float,
+    *,
+    p_error: Floats,
+    q_error: Floats,
+) -> tuple[Floats, Floats]:
+    """How wrong `loss_correction` can be for powers within intervals, see `gridsec.intervals`.
+
+    Parameters
+    ----------
+    feeder, p, q : (N,)
+        As in `bus_voltages`, one operating point.
+    v0_squared
+        As in `bus_voltages`.
+    p_error, q_error : (N,)
+        How far the powers may be off, pu.
+
+    Returns
+    -------
+    (N,), (N,)
+        How far the correction moves, and what its first step leaves of the AC power flow, pu.
+    """
+    if isinstance(feeder, MeshedFeeder):
+        return mesh.interval_bounds(feeder, p, q, v0_squared, p_error=p_error, q_error=q_error)
+    return places.interval_bounds(feeder, p, q, v0_squared, p_error=p_error, q_error=q_error)
 
 
 def columns(feeder: Network, power: Power, customers: Ints) -> Floats:

@@ -9,12 +9,10 @@ from gridsec.arrays import Floats, Ints
 from gridsec.certificates import Certificate
 from gridsec.detect import ErrorBound, ErrorModel, MeterAccuracy, error_model
 from gridsec.droop import Droop
-from gridsec.errors import DesignInfeasible
-from gridsec.feeder import Feeder, LinDistFlow, lindistflow
+from gridsec.feeder import LinDistFlow
 from gridsec.judge import Tally
 from gridsec.lure import Lure
-from gridsec.mesh import MeshedFeeder
-from gridsec.network import Network
+from gridsec.network import Network, linear
 from gridsec.online import Estimate, Verdict
 
 
@@ -41,17 +39,6 @@ class Plant:
     meters: Ints
     accuracy: MeterAccuracy
     loss_correction: int = 1
-
-    @property
-    def balanced(self) -> Feeder:
-        """The feeder, for estimators of balanced radial ones alone; raises DesignInfeasible for others."""
-        if isinstance(self.feeder, Feeder):
-            return self.feeder
-        meshed = isinstance(self.feeder, MeshedFeeder)
-        reason = "it takes radial feeders only, and closed lines form loops here"
-        raise DesignInfeasible(
-            f"estimator for {self.feeder.name}", reason if meshed else "it cannot watch single phases"
-        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +114,7 @@ def setting(
     plant, max_attacked, options, believes_q
         As in `Setting`; the options' defaults by default.
     """
-    model = lindistflow(plant.balanced)
+    model = linear(plant.feeder)
     errors = error_model(plant.droop, model, plant.meters, max_attacked)
     return Setting(plant, model, errors, Options() if options is None else options, max_attacked, believes_q)
 
@@ -208,7 +195,7 @@ class MonitorState:
     tally
         Who was above the threshold for how long, and who is named.
     v0_squared
-        Last squared busbar voltage, pu.
+        Last squared busbar voltage, pu; in three phases (3,).
     last
         The last estimate and verdict, for frames that cannot be used; None before the first one.
     """
@@ -223,5 +210,5 @@ class MonitorState:
     level: ErrorBound
     settled: bool
     tally: Tally
-    v0_squared: float
+    v0_squared: Floats | float
     last: tuple[Estimate, Verdict] | None

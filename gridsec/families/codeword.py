@@ -18,8 +18,9 @@ from gridsec.arrays import Bools, Floats, Ints
 from gridsec.decode.noise import CorrectionConstants, correction_constants
 from gridsec.decode.stacks import Stack
 from gridsec.detect import ErrorBound, Motion, Uncertainty
-from gridsec.frames import NO_VOLTAGE, Inputs, Reconstruction, injections, reconstruct
+from gridsec.frames import NO_VOLTAGE, Inputs, Reconstruction, busbar_errors, injections, reconstruct
 from gridsec.lure import POLICY, rest
+from gridsec.network import busbar_places, by_place, hangs_on
 from gridsec.observers import circle
 from gridsec.observers.circle import CircleDesign
 from gridsec.online import Frame
@@ -183,16 +184,16 @@ def code_word(  # noqa: PLR0917  # as _conclude
     plant, errors, lines = setting.plant, setting.errors, setting.model
     own, n, m = plant.droop.customer, frame.p.size, parts.x.size
     shared, rest_ = _split(setting, frame, inputs, alone)
-    scale = np.concatenate([parts.bound.free, frame.p_error, frame.q_error, [shared]])
+    scale = np.concatenate([parts.bound.free, frame.p_error, frame.q_error, shared])
     scale = np.minimum(scale, _LARGEST)
-    voltage = np.hstack([2.0 * lines.X[:, own], 2.0 * lines.R, 2.0 * lines.X, np.ones((n, 1))])
+    voltage = np.hstack([2.0 * lines.X[:, own], 2.0 * lines.R, 2.0 * lines.X, hangs_on(plant.feeder)])
     at = np.flatnonzero(inputs.live)
     where = plant.meters[at]
     driven = inputs.live[errors.meter_of] if at.size else np.zeros(m, dtype=np.bool_)
     inverters = np.flatnonzero(driven & (errors.meter_of >= 0))
     net = np.flatnonzero(inputs.live & np.isfinite(frame.q_net + frame.q_net_error)[plant.meters])
-    of_x = np.eye(m, m + 2 * n + 1)
-    total = np.zeros((n, m + 2 * n + 1))
+    of_x = np.eye(m, scale.size)
+    total = np.zeros((n, scale.size))
     total[own, np.arange(m)] = 1.0
     total[:, m + n : m + 2 * n] = np.eye(n)
     from_model = np.bincount(own, weights=parts.x, minlength=n) + frame.q
@@ -218,17 +219,18 @@ def code_word(  # noqa: PLR0917  # as _conclude
     return CodeWord(B, value / unit, block, unit, scale, reading, voltage * scale, rest_)
 
 
-def _split(setting: Setting, frame: Frame, inputs: Inputs, alone: Uncertainty) -> tuple[float, Floats]:
-    """Error of the busbar voltage, which all share, and what neither it nor the loads explain; (N,)."""
-    errors = setting.errors
+def _split(setting: Setting, frame: Frame, inputs: Inputs, alone: Uncertainty) -> tuple[Floats, Floats]:
+    """Error of the busbar voltage, which all (of a phase) share, and what else loads do not explain; (N,)."""
+    errors, feeder = setting.errors, setting.plant.feeder
     p_error, q_error = np.minimum(frame.p_error, _LARGEST), np.minimum(frame.q_error, _LARGEST)
     rest_ = np.maximum(alone.base - errors.R2 @ p_error - errors.X2 @ q_error, 0.0)
     rest_ = np.where(alone.base >= NO_VOLTAGE, NO_VOLTAGE, rest_)
     if not inputs.busbar:
         # What the meters imply of it is not told apart from the rest: count it in both.
-        return float(rest_.max(initial=0.0)), rest_
-    shared = detect.busbar_error(setting.plant.accuracy, frame.v0_squared, setting.options.sigmas)
-    return min(shared, NO_VOLTAGE), np.where(rest_ < NO_VOLTAGE, np.maximum(rest_ - shared, 0.0), rest_)
+        return np.full(busbar_places(feeder).stop, rest_.max(initial=0.0)), rest_
+    shared = np.atleast_1d(busbar_errors(setting.plant, inputs.v0_squared, setting.options.sigmas))
+    own = by_place(feeder, shared)[feeder.bus]
+    return np.minimum(shared, NO_VOLTAGE), np.where(rest_ < NO_VOLTAGE, np.maximum(rest_ - own, 0.0), rest_)
 
 
 def constants(word: CodeWord, meters: int, max_attacked: int, *, tol: float) -> CorrectionConstants:

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gridsec import detect
 from gridsec.arrays import Bools, Floats
 from gridsec.families.pairs import Believed, LeftOut, Pairs, Relation, Trial, believe, try_pair
 from gridsec.families.tubes import Doubt, Seen, Tube, Tubes, advance
-from gridsec.feeder import loss_correction
-from gridsec.frames import NO_VOLTAGE, Inputs, Past, clean
+from gridsec.feeder import Feeder
+from gridsec.frames import NO_VOLTAGE, Inputs, Past, busbar_errors, clean
 from gridsec.judge import Tally
+from gridsec.network import by_place, hangs_on, interval_bounds, loss_correction
 from gridsec.online import Estimate, Frame, Verdict
 from gridsec.plant import Setting
 
@@ -68,7 +68,7 @@ class UnknownInputState:
     x : (m,)
         Estimated injections, wrong parts included, pu.
     v0_squared
-        Last squared busbar voltage, pu.
+        Last squared busbar voltage, pu; in three phases (3,).
     named, inverters : (p,), (m,)
         Meters and inverters named as manipulated.
     last
@@ -80,7 +80,7 @@ class UnknownInputState:
     tubes: Tubes | None
     contradicted: Tally
     x: Floats
-    v0_squared: float
+    v0_squared: Floats | float
     named: Bools
     inverters: Bools
     last: tuple[Estimate, Verdict] | None
@@ -140,7 +140,7 @@ class Tick:
         own = (of[:, None] == plant.droop.customer).astype(np.float64)
         gain = self.design.gain[at]
         net = (np.arange(frame.q.size) == of[:, None]).astype(np.float64)
-        v, q = at.size, of.size
+        v, q, v0 = at.size, of.size, hangs_on(plant.feeder)[at]
         E = np.block(
             [
                 [
@@ -149,12 +149,19 @@ class Tick:
                     gain,
                     np.eye(v),
                     np.zeros((v, q)),
-                    np.ones((v, 1)),
+                    v0,
                 ],
-                [np.zeros((q, frame.p.size)), net, own, np.zeros((q, v)), np.eye(q), np.zeros((q, 1))],
+                [
+                    np.zeros((q, frame.p.size)),
+                    net,
+                    own,
+                    np.zeros((q, v)),
+                    np.eye(q),
+                    np.zeros((q, v0.shape[1])),
+                ],
             ]
         )
-        busbar = detect.busbar_error(plant.accuracy, inputs.v0_squared, now.options.sigmas)
+        busbar = np.atleast_1d(busbar_errors(plant, inputs.v0_squared, now.options.sigmas))
         half = np.concatenate(
             [
                 frame.p_error,
@@ -162,10 +169,11 @@ class Tick:
                 tube.half,
                 inputs.now.reading[live] + self.rest[at],
                 frame.q_net_error[of],
-                [min(busbar, NO_VOLTAGE)],
+                np.minimum(busbar, NO_VOLTAGE),
             ]
         )
-        half[-1 - v - q : -1] = np.maximum(half[-1 - v - q : -1], _EXACT)
+        readings = slice(half.size - busbar.size - v - q, half.size - busbar.size)
+        half[readings] = np.maximum(half[readings], _EXACT)
         r = np.concatenate(
             [
                 inputs.y[live] - self.v2[at] - gain @ tube.middle,
@@ -236,27 +244,38 @@ def _without_inverters(
     rest = inputs.now.base - now.errors.R2 @ frame.p_error - now.errors.X2 @ frame.q_error
     moved = np.zeros(rest.shape)
     if plant.loss_correction and state.x.size:
-        # Losses depend on what inverters inject: all at either end, one beyond.
-        reach, limit = design.doubt.reach, plant.droop.limit
-        ends = np.vstack([limit, -limit, state.x + np.diag(reach), state.x - np.diag(reach)])
-        customers = np.zeros((plant.droop.customer.size, frame.q.size))
-        customers[np.arange(plant.droop.customer.size), plant.droop.customer] = 1.0
-        with np.errstate(all="ignore"):
-            found = loss_correction(
-                plant.balanced,
-                frame.p,
-                frame.q + ends @ customers,
-                inputs.v0_squared,
-                steps=plant.loss_correction,
-            )
-        far = np.nan_to_num(np.abs(found - inputs.correction), nan=NO_VOLTAGE, posinf=NO_VOLTAGE)
-        moved = far[:2].max(axis=0) + max(design.max_inverters, 1) * far[2:].max(axis=0)
-        moved = moved[plant.feeder.bus]
-    # The busbar moves all alike, and has an error of its own.
-    busbar = detect.busbar_error(plant.accuracy, inputs.v0_squared, now.options.sigmas)
-    rest = np.where(inputs.now.base < NO_VOLTAGE, np.maximum(rest - busbar, 0.0), NO_VOLTAGE)
+        moved = _with_inverters(design, state, frame, inputs)
+    # The busbar moves all (of a phase) alike, and has an error of its own.
+    busbar = by_place(plant.feeder, busbar_errors(plant, inputs.v0_squared, now.options.sigmas))
+    rest = rest - busbar[plant.feeder.bus]
+    rest = np.where(inputs.now.base < NO_VOLTAGE, np.maximum(rest, 0.0), NO_VOLTAGE)
     error = np.minimum(inputs.now.base + moved, NO_VOLTAGE)
     return plant.droop.vbar**2 - inputs.w, error, rest + moved
+
+
+def _with_inverters(
+    design: UnknownInputDesign, state: UnknownInputState, frame: Frame, inputs: Inputs
+) -> Floats:
+    """How far the loss correction moves with what inverters may inject, honest or not; (N,)."""
+    plant, reach = design.setting.plant, design.doubt.reach
+    feeder, droop, steps = plant.feeder, plant.droop, plant.loss_correction
+    if not isinstance(feeder, Feeder):
+        count_ = frame.q.size
+        q = frame.q + np.bincount(droop.customer, weights=state.x, minlength=count_)
+        room = np.bincount(droop.customer, weights=reach + np.abs(state.x), minlength=count_)
+        far = interval_bounds(
+            feeder, frame.p, q, inputs.v0_squared, p_error=frame.p_error, q_error=frame.q_error + room
+        )
+        return np.minimum(far[0] + 3.0 * far[1], NO_VOLTAGE)
+    # Losses depend on what inverters inject: all at either end, one beyond.
+    ends = np.vstack([droop.limit, -droop.limit, state.x + np.diag(reach), state.x - np.diag(reach)])
+    customers = np.zeros((droop.customer.size, frame.q.size))
+    customers[np.arange(droop.customer.size), droop.customer] = 1.0
+    with np.errstate(all="ignore"):
+        found = loss_correction(feeder, frame.p, frame.q + ends @ customers, inputs.v0_squared, steps=steps)
+    far_off = np.nan_to_num(np.abs(found - inputs.correction), nan=NO_VOLTAGE, posinf=NO_VOLTAGE)
+    moved = far_off[:2].max(axis=0) + max(design.max_inverters, 1) * far_off[2:].max(axis=0)
+    return np.asarray(moved[feeder.bus])
 
 
 def _seen(design: UnknownInputDesign, inputs: Inputs, believed: Bools, v2: Floats, error: Floats) -> Seen:

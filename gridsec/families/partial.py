@@ -51,6 +51,7 @@ from gridsec.families.codeword import CodeWord, Parts, code_word, constants, obs
 from gridsec.frames import Inputs, Past, Reconstruction, clean, known, nothing_new
 from gridsec.judge import Situation, Tally, count, decide
 from gridsec.lure import close_loop
+from gridsec.network import busbar_places, by_place
 from gridsec.observers import circle
 from gridsec.observers.circle import CircleDesign
 from gridsec.online import Cause, Decision, Estimate, Explanation, Frame, Verdict
@@ -118,7 +119,7 @@ class PartialState:
     parts: Parts
     settled: bool
     tally: Tally
-    v0_squared: float
+    v0_squared: Floats | float
     last: tuple[Estimate, Verdict] | None
 
 
@@ -158,7 +159,7 @@ def design(
         why = f"{p} meters, of which {max_attacked} may lie; more than {2 * max_attacked} are needed"
         raise NotObservable(range(p), p, why)
     sets, rows = comb(p, max_attacked), 3 * p
-    unknowns = plant.droop.tau.size + 2 * len(plant.feeder.customers) + 1
+    unknowns = plant.droop.tau.size + 2 * len(plant.feeder.customers) + busbar_places(plant.feeder).stop
     if sets > MOST_SUBSETS or sets * rows * (rows + unknowns) > MOST_WORK * step_s:
         said = f"{sets} sets of up to {rows} rows every {step_s:g} s are too many"
         raise DesignInfeasible(f"fits without every {max_attacked} of {p} meters", said)
@@ -318,9 +319,9 @@ def _estimate(  # noqa: PLR0917  # as _conclude
     plant, lines, m = design.setting.plant, design.setting.model, after.parts.x.size
     own, n = plant.droop.customer, frame.p.size
     step_ = word.scale * found.xi[index]
-    dx, dp, dq = step_[:m], step_[m : m + n], step_[m + n : m + 2 * n]
+    dx, dp, dq, d0 = np.split(step_, [m, m + n, m + 2 * n])
     dq = dq + np.bincount(own, weights=dx, minlength=n)
-    v2_bus = model.v2_bus + 2.0 * (lines.R_bus @ dp + lines.X_bus @ dq) + step_[-1]
+    v2_bus = model.v2_bus + 2.0 * (lines.R_bus @ dp + lines.X_bus @ dq) + by_place(plant.feeder, d0)
     v2 = v2_bus[plant.feeder.bus]
     # Whoever lies, the unheard observer's own bound holds; and so does one of the credible fits'.
     gap = detect.gap(design.setting.errors, alone, after.parts.bound)

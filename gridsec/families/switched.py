@@ -112,7 +112,7 @@ class SetSearchState:
     innocent: Floats
     readings: Ints
     tally: Tally
-    v0_squared: float
+    v0_squared: Floats | float
     last: tuple[Estimate, Verdict] | None
 
 

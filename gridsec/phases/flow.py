@@ -29,6 +29,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gridsec.arrays import Floats, Phasors, frozen
+from gridsec.intervals import Sweeps, bounds
 from gridsec.phases.feeder import ROTATION, ThreePhaseFeeder
 from gridsec.trees import below, from_root, meetings
 
@@ -300,6 +301,49 @@ def corrected(
     return np.asarray(_square(again) - start.linear), _remainder(feeder, start, once)
 
 
+def interval_bounds(
+    feeder: ThreePhaseFeeder, p: Floats, q: Floats, v0_squared: Floats, *, p_error: Floats, q_error: Floats
+) -> tuple[Floats, Floats]:
+    """`corrected` for all powers within intervals: how far it moves, and what its first step leaves.
+
+    Parameters
+    ----------
+    feeder, p, q : (C,), v0_squared : (3,)
+        As in `loss_correction`, one operating point.
+    p_error, q_error : (C,)
+        How far the powers may be off, pu.
+
+    Returns
+    -------
+    (C,), (C,)
+        As `gridsec.intervals.bounds`; with phases of the busbar that are not alike, less exact by what
+        LinDist3Flow leaves of it.
+    """
+    start = _Start.of(feeder, p, q, v0_squared)
+    error = np.asarray(_at_buses(feeder, np.hypot(p_error, q_error) + 0j).real)
+    flat = np.broadcast_to(start.v0, start.s.shape)
+    half = np.abs(feeder.half)
+
+    def charge(change: Floats) -> Floats:
+        return np.asarray(np.einsum("kij,jk->ik", half, change)) if half.any() else np.zeros(change.shape)
+
+    sweeps = Sweeps(
+        flat,
+        start.phasors,
+        _sweep(feeder, start, start.phasors),
+        np.abs(start.s),
+        lambda current: _reach(feeder, current),
+        charge,
+    )
+    moved, rest = bounds(sweeps, error)
+    v0 = np.sqrt(np.asarray(v0_squared, dtype=np.float64))
+    # `linear` takes the phases of the busbar as equal.
+    apart = np.abs(feeder.z) * np.abs(v0[:, None] / v0 - 1.0)
+    moved = moved + 2.0 * from_root(feeder, np.einsum("bij,jb->ib", apart, below(feeder, error)[..., 1:]))
+    here = (feeder.phase, feeder.at)
+    return np.asarray(moved[here]), np.asarray(rest[here])
+
+
 def _check(steps: int) -> None:
     if steps < 1:
         raise ValueError(f"steps is {steps}; it must be at least 1")
@@ -376,7 +420,7 @@ def _remainder(feeder: ThreePhaseFeeder, start: _Start, once: Phasors) -> Floats
     return np.asarray(bound[..., feeder.phase, feeder.at])
 
 
-def _reach(feeder: ThreePhaseFeeder, change: Phasors) -> Floats:
+def _reach(feeder: ThreePhaseFeeder, change: Phasors | Floats) -> Floats:
     """Largest change of the voltages that currents changed at the buses can make."""
     current = below(feeder, np.abs(change))[..., 1:]
     return np.asarray(from_root(feeder, np.einsum("bij,...jb->...ib", np.abs(feeder.z), current)))

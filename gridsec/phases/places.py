@@ -126,3 +126,32 @@ def model_error_bound(feeder: PhasedFeeder, p: Floats, q: Floats, v0_squared: Fl
     """
     v0 = np.broadcast_to(np.asarray(v0_squared, dtype=np.float64), len(PHASES))
     return flow.model_error_bound(feeder.tree, 3.0 * p, 3.0 * q, v0)
+
+
+def interval_bounds(
+    feeder: PhasedFeeder,
+    p: Floats,
+    q: Floats,
+    v0_squared: Floats | float,
+    *,
+    p_error: Floats,
+    q_error: Floats,
+) -> tuple[Floats, Floats]:
+    """`gridsec.phases.flow.interval_bounds`, for every customer.
+
+    Parameters
+    ----------
+    feeder, p, q : (N,), v0_squared
+        As in `bus_voltages`, one operating point.
+    p_error, q_error : (N,)
+        How far the powers may be off, pu.
+
+    Returns
+    -------
+    (N,), (N,)
+        How far the correction moves, and what its first step leaves of the AC power flow, pu.
+    """
+    v0 = np.broadcast_to(np.asarray(v0_squared, dtype=np.float64), len(PHASES))
+    return flow.interval_bounds(
+        feeder.tree, 3.0 * p, 3.0 * q, v0, p_error=3.0 * p_error, q_error=3.0 * q_error
+    )

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 
 from gridsec.arrays import Floats
-from gridsec.errors import DesignInfeasible, FeederInvalid
+from gridsec.errors import FeederInvalid
 from gridsec.feeder import Feeder, lindistflow
 from gridsec.mesh import MeshedFeeder, impedances
 from gridsec.network import (
@@ -27,10 +27,8 @@ from gridsec.network import (
     variances,
 )
 from gridsec.phases import PHASES, PhasedFeeder
-from gridsec.plant import setting
 from tests.gridsec.meshes import ac, random_mesh
 from tests.gridsec.radial import random_feeder
-from tests.gridsec.street import make_plant
 from tests.gridsec.unbalanced import power_flow, random_three_phase
 
 seeds = st.integers(0, 100_000)
@@ -140,10 +138,3 @@ def test_what_is_refused() -> None:
     )
     with pytest.raises(FeederInvalid, match="has several phases; expected one customer for each"):
         PhasedFeeder(several)
-    plant = make_plant(np.random.default_rng(0))
-    other = type(plant)(phased(0), plant.droop, plant.meters, plant.accuracy)
-    with pytest.raises(DesignInfeasible, match="cannot watch single phases"):
-        setting(other, max_attacked=1)
-    other = type(plant)(random_mesh(0), plant.droop, plant.meters, plant.accuracy)
-    with pytest.raises(DesignInfeasible, match="takes radial feeders only, and closed lines form loops here"):
-        setting(other, max_attacked=1)

@@ -30,7 +30,8 @@ CUSTOMERS = 9
 
 def apart(one: Plant) -> Plant:
     """Three phases without mutual impedance, each of them the same street with customers of its own."""
-    tree, droop, count = one.balanced, one.droop, CUSTOMERS
+    tree, droop, count = one.feeder, one.droop, CUSTOMERS
+    assert isinstance(tree, Feeder)
     branches, phase = tree.r.size, np.repeat(np.arange(3), count)
     whole = ThreePhaseFeeder(
         name="street",
