@@ -111,7 +111,7 @@ def known(frame: Frame) -> Frame:
     """
     p, p_error = _power(frame.p, frame.p_error)
     q, q_error = _power(frame.q, frame.q_error)
-    told = np.isfinite(frame.q_net) & (frame.q_net_error >= 0.0) & (frame.q_net_error <= NO_POWER)
+    told = (np.abs(frame.q_net) <= NO_POWER) & (frame.q_net_error >= 0.0) & (frame.q_net_error <= NO_POWER)
     if p is frame.p and q is frame.q and bool((told | np.isnan(frame.q_net)).all()):
         return frame
     q_net = np.where(told, frame.q_net, np.nan)

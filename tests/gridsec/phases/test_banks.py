@@ -232,3 +232,25 @@ class TestCoupledPhases:
         here = plant.feeder.bus[plant.meters] % 3 == 1
         # The others keep theirs.
         assert verdict.threshold[~here].max() < verdict.threshold[here].min()
+
+    @pytest.mark.parametrize("family", [monitor, windowed, set_search, partial, unknown_input])
+    def test_absurd_frames_get_an_answer(self, family: ModuleType) -> None:
+        plant = coupled(2)
+        street = PhasedStreet(plant, np.random.default_rng(3), metered_q=np.arange(0, 7, 2))
+        design = family.design(plant, max_attacked=1, step_s=1.0)
+        rng, absurd = np.random.default_rng(8), np.array([np.nan, np.inf, -np.inf, -1.0, 0.0, 1e300, 1.0])
+        names = ("y", "p", "q", "p_error", "q_error", "q_net", "q_net_error", "v0_phases")
+        state = family.init(design, 1000.0)
+        for tick in range(30):
+            street.advance(1.0 if tick % 3 else 900.0)
+            frame = street.frame()
+            broken = {
+                name: np.where(rng.random(value.shape) < 0.2, rng.choice(absurd, value.shape), value)
+                for name, value in ((name, getattr(frame, name)) for name in names)
+            }
+            state, estimate, verdict = family.step(design, state, replace(frame, **broken))
+            assert np.isfinite(estimate.v2).all()
+            assert not np.isnan(estimate.bound).any()
+            assert verdict.decision is not Decision.CLEAN
+        again = family.step(design, state, frame)[2]
+        assert again.decision is Decision.UNDECIDED
