@@ -254,3 +254,24 @@ class TestCoupledPhases:
             assert verdict.decision is not Decision.CLEAN
         again = family.step(design, state, frame)[2]
         assert again.decision is Decision.UNDECIDED
+
+    @pytest.mark.parametrize("seed", range(18))
+    def test_random_streets_with_errors_at_their_ends(self, seed: int) -> None:
+        """Any spacing of readings, lost readings, metered reactive power, unequal phases, lies that jump."""
+        rng = np.random.default_rng([seed, 99])
+        family = (monitor, set_search, partial)[seed % 3]
+        plant = coupled(seed, customers=int(rng.integers(5, 9)), drop=float(rng.choice([0.02, 0.04, 0.06])))
+        count = plant.meters.size
+        design = family.design(plant, max_attacked=1, step_s=1.0)
+        told = np.arange(0, count, 2) if seed % 2 else None
+        street = PhasedStreet(plant, rng, extreme=True, metered_q=told, phases=rng.uniform(0.98, 1.02, 3))
+        state, liar = family.init(design, 1000.0), int(rng.integers(count))
+        honest = np.arange(count) != (liar if seed % 4 else -1)
+        for tick in range(16):
+            street.advance(float(rng.choice([0.3, 1.0, 5.0, 900.0])))
+            lie = {liar: float(rng.choice([-0.1, -0.04, 0.03, 0.08]))} if tick > 3 and seed % 4 else {}
+            silent = (int(rng.integers(count)),) if tick % 5 == 4 else ()
+            state, estimate, verdict = family.step(design, state, street.frame(lie, silent))
+            assert (np.abs(estimate.v2 - street.truth()) <= estimate.bound).all()
+            assert not (np.nan_to_num(verdict.score) > verdict.threshold)[honest].any()
+            assert not verdict.suspects[honest].any()
