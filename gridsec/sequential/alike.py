@@ -154,7 +154,8 @@ class _Base:
         more, least = (column > high).sum(axis=0), (column >= low).sum(axis=0)
         ours = (among > high[:, None]).sum(axis=1)
         out = np.full(L.shape, np.inf)
-        rows, of = np.nonzero(more == ours)
+        # Whom the load does not move, as a customer of the busbar, or moves the other way tells nothing of it.
+        rows, of = np.nonzero((more == ours) & (low > 0.0))
         if rows.size:
             # Of those that would feel it alike, some are chosen; whose story it is belongs to it.
             own = (R[L, L] <= high)[rows, of]
@@ -263,7 +264,7 @@ def _stories(base: _Base) -> Iterator[tuple[int, ...]]:
         return
     R, size = base.problem.false.R, base.z**2 / base.Q.diagonal()
     liars = min(base.known, key=lambda each: base.known[each][0])
-    for c in liars:
+    for c in (c for c in liars if R[c, c] > 0.0):
         felt = np.round(R[:, c] / R[c, c], 9)
         felt[c] = np.inf
         order = np.lexsort((-size, -felt)).tolist()

@@ -252,3 +252,20 @@ def test_without_readings_nobody_is_named() -> None:
     assert len(found) == 1
     assert not found[0].liars.any()
     assert found[0].probability == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_nobody_tells_of_a_load_that_moves_nothing(seed: int) -> None:
+    """A customer of the busbar has no column: what it draws moves no voltage, and who lies there is alone."""
+    rng = np.random.default_rng(seed)
+    _, noise, plain = street(rng)
+    R = plain.R.copy()
+    R[0] = R[:, 0] = 0.0
+    K = R @ np.diag(rng.uniform(0.005, 0.02, P) ** 2) @ R.T
+    false = FalsePowers(R, R, plain.p, plain.q)
+    m = rng.multivariate_normal(np.zeros(P), K + np.diag(noise))
+    lying = (0, 1 + seed % (P - 1))
+    m[list(lying)] += rng.choice([-0.1, 0.1], 2)
+    found = identify(Prior(K, np.arange(P), K.diagonal()), noise, m, LIVE, false=false)
+    assert who(found[0]) == lying
+    assert np.isfinite([(each.cost, each.probability) for each in found]).all()
