@@ -154,7 +154,7 @@ class _Base:
         more, least = (column > high).sum(axis=0), (column >= low).sum(axis=0)
         ours = (among > high[:, None]).sum(axis=1)
         out = np.full(L.shape, np.inf)
-        # Whom the load does not move, as a customer of the busbar, or moves the other way tells nothing of it.
+        # A meter that the load does not move, or moves the other way, says nothing of it.
         rows, of = np.nonzero((more == ours) & (low > 0.0))
         if rows.size:
             # Of those that would feel it alike, some are chosen; whose story it is belongs to it.
