@@ -6,6 +6,7 @@ import re
 import shutil
 import tempfile
 from collections import Counter
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -27,6 +28,7 @@ def converted(feeder: str, out: Path | None) -> str:
     """Return a feeder as `feeders.load.load` takes it; another tool's network is converted, and that is told.
 
     It is converted again each time: an OpenDSS file may lead to others that have changed while it has not.
+    What an earlier conversion left there is kept under another name unless it is the same.
 
     Parameters
     ----------
@@ -60,6 +62,7 @@ def converted(feeder: str, out: Path | None) -> str:
         "--open LINE (to cut a loop) or --meshed (to keep loops closed); then study FOLDER"
     )
     done: Conversion | None = None
+    before = _aside(folder) if folder.exists() else None
     try:
         done = convert(feeder, folder, name=_name(feeder))
     except FeederInvalid as error:
@@ -67,13 +70,32 @@ def converted(feeder: str, out: Path | None) -> str:
     except BusbarUnclear as error:
         raise BusbarUnclear(f"{error}\n{advice}") from error
     finally:
-        if done is None and temporary is not None:
-            shutil.rmtree(temporary)
+        if done is None:
+            shutil.rmtree(temporary or folder, ignore_errors=True)
+            if before is not None:
+                before.rename(folder)
     fates = Counter(change.done for change in done.changes)
-    counts = ", ".join(f"{count} {fate}" for fate, count in fates.items()) or "nothing changed"
+    counts = ", ".join(f"{times} {fate}" for fate, times in fates.items()) or "nothing changed"
     console.out.print(escape(f"{feeder} becomes {folder}: {counts}; the list: {folder / CHANGES_FILE}"))
+    if before is not None:
+        _settle(before, folder)
     show_check(done)
     return str(folder)
+
+
+def _aside(folder: Path) -> Path:
+    """Move an earlier conversion to a name that is free: somebody may have worked on it since."""
+    names = (folder.with_name(f"{folder.name}-{k}") for k in count(1))
+    return folder.rename(next(name for name in names if not name.exists()))
+
+
+def _settle(before: Path, folder: Path) -> None:
+    """Drop the earlier conversion if the new one says the same; otherwise keep it, and tell."""
+    kept = {path.relative_to(before): path.read_bytes() for path in before.rglob("*") if path.is_file()}
+    if all((folder / name).is_file() and (folder / name).read_bytes() == old for name, old in kept.items()):
+        shutil.rmtree(before)
+    else:
+        console.out.print(escape(f"what was in {folder} before is not the same; it is now in {before}"))
 
 
 def _name(feeder: str) -> str:

@@ -86,6 +86,29 @@ def test_a_folder_of_somebody_else_is_not_replaced(
     assert [path.name for path in own.iterdir()] == ["feeder.toml"]
 
 
+def test_what_was_edited_since_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, out = pgm(tmp_path / "grid.json", 9, balanced=True), tmp_path / "out"
+    again = ("redundancy", str(file), "--out", str(out))
+    assert run(monkeypatch, capsys, *again)[0] == 0
+    assert run(monkeypatch, capsys, *again)[0] == 0
+    assert sorted(path.name for path in out.glob("feeder*")) == ["feeder"]
+    customers = out / "feeder" / "customers.csv"
+    original = customers.read_bytes()
+    customers.write_bytes(original + b"# mine\n")
+    code, told, complaint = run(monkeypatch, capsys, *again)
+    assert code == 0, complaint
+    assert f"it is now in {out / 'feeder-1'}" in plain(told)
+    assert (out / "feeder-1" / "customers.csv").read_bytes() == original + b"# mine\n"
+    assert customers.read_bytes() == original
+    # A source that is none any more takes nothing away either.
+    file.write_text("{}", encoding="utf-8")
+    assert run(monkeypatch, capsys, *again)[0] == 1
+    assert customers.read_bytes() == original
+    assert sorted(path.name for path in out.glob("feeder*")) == ["feeder", "feeder-1"]
+
+
 def looped(folder: Path) -> Path:
     """An OpenDSS file with two loops."""
     source = opendss(folder / "town.dss", 9, balanced=True)
