@@ -63,8 +63,8 @@ def attacks(
         told = np.array(kind.volts)
         some, signs = liars(site, case, random)
     if told.size:
-        base = site.customer_volt[site.meters[some]]
-        return (Bias(some, t_on, t_off, case.size * signs * told[some] / base),), ()
+        nominal = site.tables.meta.voltage_volt
+        return (Bias(some, t_on, t_off, case.size * signs * told[some] / nominal),), ()
     lie = Lie(kind.trick, case.liars, case.size)
     return (each_alone(lie, some, signs, t_on, t_off),), ()
 

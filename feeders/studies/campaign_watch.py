@@ -227,8 +227,11 @@ def _lied(given: Prepared, played: _Played, honest: Scenario, case: Case) -> _Pl
         lying = replace(honest, attacks=some, inverter_attacks=wrong)
         return _Played.of(list(frames(trial, lying, stated=given.stated)))
     t = np.array([frame.t for frame in played.frames])
+    y = np.array([frame.y for frame in played.frames])
+    # Lies have sizes in parts of the nominal voltage, as in scenarios, frames in parts of each place's base.
+    of_nominal = given.site.customer_volt[given.site.meters] / given.site.tables.meta.voltage_volt
     # The root of a rounded square is the number itself.
-    v = np.sqrt(np.array([frame.y for frame in played.frames]))
+    v = np.sqrt(y) * of_nominal
     nothing = np.zeros_like(v)
 
     def past(when: Floats) -> Floats:
@@ -238,7 +241,8 @@ def _lied(given: Prepared, played: _Played, honest: Scenario, case: Case) -> _Pl
 
     told = apply_all(some, t, Reports(v, nothing, nothing), past).v
     lies = manipulated(some, t, v.shape[1])
-    y, some_lie = told * np.abs(told), np.any(lies, axis=1).tolist()
+    claimed = told / of_nominal
+    y, some_lie = np.where(lies, claimed * np.abs(claimed), y), np.any(lies, axis=1).tolist()
     return replace(
         played,
         frames=[
@@ -246,7 +250,7 @@ def _lied(given: Prepared, played: _Played, honest: Scenario, case: Case) -> _Pl
             for frame, row, lying in zip(played.frames, y, some_lie, strict=True)
         ],
         liars=lies,
-        shift=told - v,
+        shift=(told - v) / of_nominal,
     )
 
 

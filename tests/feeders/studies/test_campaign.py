@@ -41,6 +41,7 @@ from feeders.trials import LoadError, frames, judge
 from feeders.variation import Variation
 from gridsec.feeder import lindistflow
 from tests.feeders.studies.campaigns import PLAN, SITE
+from tests.feeders.test_taps import village
 
 
 @pytest.fixture(scope="module")
@@ -97,6 +98,34 @@ def test_lies_are_as_large_as_they_are_said_to_be(here: Campaign) -> None:
     told = here.liars.set_index("kind")
     assert told.loc[["bias"], "lie_volt"].to_numpy() == pytest.approx(0.03 * SITE.feeder.base_volt)
     assert told.loc[["inverter"], "lie_volt"].isna().all()
+
+
+def test_lies_behind_taps_are_those_of_the_full_play() -> None:
+    """In volts, whether a lie is put upon the scene or the scene is played anew with it."""
+    site = village()
+    p, nominal = site.meters.size, site.tables.meta.voltage_volt
+    kinds = (
+        Kind("bias", Trick.BIAS, (4.0,)),
+        Kind("told", Trick.BIAS, (1.0,), (7.0,) * p),
+        Kind("story", Trick.COORDINATED, (3.0,)),
+    )
+    plan = replace(PLAN, scenes=1, together=12, kinds=kinds, places=(Place.RANDOM,), alarms_per_year=(1.0,))
+    rows = campaign(site, plan).liars
+    trial = plan.trial(site, plan.moment(0))
+    honest = replace(trial.scenario, season=plan.moment(0).season)
+    base, behind = site.customer_volt[site.meters], set()
+    for case in (case for case in plan.cases(0) if case.kind != CLEAN):
+        told, _ = attacks(trial.stated, plan, case, honest)
+        shift = np.zeros(p)
+        for frame, truth in frames(trial, replace(honest, attacks=told)):
+            shift = np.maximum(shift, base * np.abs(np.sqrt(frame.y) - np.sqrt(frame.y - truth.attack)))
+        each = rows[rows["scenario"] == case.number].set_index("who")["lie_volt"]
+        expected = {site.meter_ids[k]: shift[k] for k in np.flatnonzero(shift)}
+        assert each.to_dict() == pytest.approx(expected, rel=1e-9)
+        if case.kind != "story":
+            assert each.to_numpy() == pytest.approx({"bias": 0.04 * nominal, "told": 7.0}[case.kind])
+        behind |= {case.kind for k in np.flatnonzero(shift) if base[k] != nominal}
+    assert behind == {"bias", "told", "story"}
 
 
 def test_cases_follow_from_their_numbers_alone() -> None:
