@@ -65,7 +65,7 @@ class Lies:
     amplitude: float = 0.06
     differ: float = 0.15
     apart: float = 4.0
-    pair: float = 4.5
+    pair: float = 5.0
     more: float = 2.0
     story: float = 5.5
 
