@@ -188,6 +188,7 @@ def _behind(tree: Feeder, grid: Grid, of: Transformer) -> tuple[Feeder, Grid]:
         r_ohm=np.append(grid.r_ohm, r * ohm),
         x_ohm=np.append(grid.x_ohm, x * ohm),
         b_siemens=np.append(grid.b_siemens, 0.0),
+        tap=None if grid.tap is None else np.append(grid.tap, 1.0),
         busbar=source,
         bus_count=source + 1,
     )
