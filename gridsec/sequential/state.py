@@ -66,7 +66,10 @@ class Doubts:
     Attributes
     ----------
     p, q : (N,)
-        Factors, powers of two, on the standard deviations of the design.
+        Factors, powers of two, on the standard deviations of the design: the largest that any residual which
+        is remembered was made with.
+    p_calm, q_calm : (N,)
+        For how many ticks a smaller one would have done.
     busbar
         Whether there is a busbar voltage; in three phases (3,).
     prior
@@ -78,6 +81,8 @@ class Doubts:
 
     p: Floats
     q: Floats
+    p_calm: Ints
+    q_calm: Ints
     busbar: Bools | bool
     prior: Prior
     sizes: Floats
@@ -164,7 +169,7 @@ def init(
     zeros = np.zeros(p, dtype=np.intp)
     no = np.zeros(p, dtype=np.bool_)
     none = np.zeros((s, p), dtype=np.bool_)
-    one = np.ones(customers)
+    one, never = np.ones(customers), np.zeros(customers, dtype=np.intp)
     return SequentialState(
         t=t,
         since=t,
@@ -187,7 +192,7 @@ def init(
             np.zeros(m, dtype=np.bool_),
         ),
         fits=(None,) * s,
-        doubts=Doubts(one, one, True, design.prior, design.book.std),
+        doubts=Doubts(one, one, never, never, True, design.prior, design.book.std),
         learning=known.learning,
         learned=known.learned,
         model_error=np.zeros(p),

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats
+from gridsec.arrays import Bools, Floats, Ints
 from gridsec.frames import NO_VOLTAGE, nothing_new
 from gridsec.network import bus_voltages, by_place, model_error_bound
 from gridsec.online import Estimate, Explanation, Frame, Verdict
@@ -286,17 +286,15 @@ _UNMETERED = 0.1
 
 def _doubts(design: SequentialDesign, before: Doubts, frame: Frame, busbar: Bools | bool) -> Doubts:
     """What this frame does not know; a new prior only where that changed."""
-    p, q = (
-        _factor(error, std, old)
-        for error, std, old in (
-            (frame.p_error, design.doubt.p, before.p),
-            (frame.q_error, design.doubt.q, before.q),
-        )
-    )
+    longest = design.lengths[-1]
+    p, p_calm = _factors(frame.p_error, design.doubt.p, before.p, before.p_calm, longest)
+    q, q_calm = _factors(frame.q_error, design.doubt.q, before.q, before.q_calm, longest)
     sizes = _claims(np.abs(frame.p), design.options.hidden_power, before.sizes)
     same = (new is old or np.array_equal(new, old) for new, old in ((p, before.p), (q, before.q)))
     if np.array_equal(busbar, before.busbar) and all(same):
-        return before if sizes is before.sizes else replace(before, sizes=sizes)
+        if sizes is before.sizes and p_calm is before.p_calm and q_calm is before.q_calm:
+            return before
+        return replace(before, sizes=sizes, p_calm=p_calm, q_calm=q_calm)
     doubt = replace(
         design.doubt,
         p=np.where(p > 1.0, np.maximum(design.doubt.p, _EXACT) * p, design.doubt.p),
@@ -314,7 +312,7 @@ def _doubts(design: SequentialDesign, before: Doubts, frame: Frame, busbar: Bool
             inverters=design.injections,
         )
     )
-    return Doubts(p, q, busbar, found, sizes)
+    return Doubts(p, q, p_calm, q_calm, busbar, found, sizes)
 
 
 def _claims(power: Floats, least: float, before: Floats) -> Floats:
@@ -329,6 +327,15 @@ def _claims(power: Floats, least: float, before: Floats) -> Floats:
 
 # Powers are known no better than this, pu.
 _EXACT = 1e-6
+
+
+def _factors(error: Floats, std: Floats, old: Floats, calm: Ints, longest: int) -> tuple[Floats, Ints]:
+    """`_factor`, but as long as residuals are remembered that were made with a larger one, that one."""
+    new = _factor(error, std, old)
+    if new is old:
+        return old, calm
+    held = (new < old) & (calm + 1 < longest)
+    return np.where(held, old, new), np.where(held, calm + 1, 0)
 
 
 def _factor(error: Floats, std: Floats, old: Floats) -> Floats:

@@ -40,3 +40,21 @@ def test_a_power_that_is_false_is_told_as_a_power(size: float) -> None:
         told += loud
     # A load beyond the customer's connection is not believed in the first place, and changes nothing.
     assert told >= 2
+
+
+def test_residuals_made_with_a_power_that_was_doubted_name_nobody_afterwards() -> None:
+    """A claim of 80 kW passes what is credible: from then on the customer's usual load stands for it."""
+    site = choose(load("kerber-landnetz"), max_attacked=2, estimator=SEQUENTIAL)
+    watcher, seed = design(site), 9
+    profile = float(np.random.default_rng(seed).uniform(0.0, 13.9 * 86_400.0))
+    quiet = Scenario(seed=seed, duration_s=90.0, profile_s=profile)
+    (attack,), _ = manipulations(site, Lie(Trick.COORDINATED_POWER, 2, 3.0, ONSET_S), quiet)
+    state, errors = watcher.init(START - 1.0), []
+    for snapshot in snapshots(simulate(site, replace(quiet, attacks=(attack,)))):
+        frame = to_frame(site, snapshot)
+        state, _, verdict = watcher.step(state, frame)
+        assert not np.delete(verdict.suspects, attack.meters).any(), verdict.reason
+        errors.append(float(frame.p_error[site.meters[attack.meters]].max()))
+    assert verdict.suspects[attack.meters].all()
+    # It is doubted from the onset on, and no longer believed at all later.
+    assert errors[20] < 0.01 < errors[-1] < 0.1 < errors[40]

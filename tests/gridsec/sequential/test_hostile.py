@@ -144,7 +144,7 @@ class TestWhatIsLearnedUnderDifficulties:
         plant = make_plant(rng, customers=12, drop=0.03)
         design, street = prepare(plant, commission_s=self.LEARN_S), Street(plant, rng)
         state, _ = watch(street, design, self.LEARN_S, lies=lies, change=change)
-        state, answers = watch(street, design, self.LEARN_S + 30, state=state, lies=lies)
+        state, answers = watch(street, design, self.LEARN_S + 90, state=state, lies=lies)
         honest = np.setdiff1d(np.arange(12), list(lies))
         assert not any(verdict.suspects[honest].any() for _, verdict in answers)
         return state, street
