@@ -65,6 +65,12 @@ class ThreePhaseSite:
     base_volt: Floats
     digest: str
 
+    @property
+    def customer_volt(self) -> Floats:
+        """1 pu at each customer, V, (N,): the mean of its phases."""
+        base, connected = self.base_volt[self.feeder.bus], self.feeder.connected
+        return np.asarray((base * connected).sum(axis=1) / connected.sum(axis=1))
+
 
 def load_three_phase(path_or_name: Path | str) -> ThreePhaseSite:
     """Load a feeder in three phases.

@@ -235,7 +235,8 @@ def _quiet(done: int, total: int) -> None:
 
 def _subject(site: Site | ThreePhaseSite, given: Frames, risk: float, tolerance: float) -> dict[str, Any]:
     content = hashlib.sha256()
-    for values in (given.t, given.v_volt, given.p_kw, given.q_kvar, given.v0_volt, given.count):
+    busbar = given.v0_volt, given.v0_phases
+    for values in (given.t, given.v_volt, given.p_kw, given.q_kvar, *busbar, given.count):
         content.update(np.ascontiguousarray(values).tobytes())
     return {
         "study": "calibrate",

@@ -295,7 +295,8 @@ def series(net: Network, given: Frames, drawn: Powers, excluded: Collection[str]
     order = [given.meter_ids.index(name) for name in site.meter_ids]
     v = given.v_volt[:, order] / site.feeder.base_volt
     seen = np.isfinite(v) & ~np.isin(site.meter_ids, list(excluded))
-    U = _voltages(net.feeder, drawn.p, drawn.q, (given.v0_volt / site.feeder.base_volt) ** 2)
+    busbar = given.v0_volt if isinstance(net.feeder, Feeder) else given.v0_phases
+    U = _voltages(net.feeder, drawn.p, drawn.q, (busbar / site.feeder.base_volt) ** 2)
     bus, phase = net.place.T
     return Series(
         t=given.t,
@@ -312,15 +313,14 @@ def series(net: Network, given: Frames, drawn: Powers, excluded: Collection[str]
 
 
 def _voltages(feeder: Feeder | ThreePhaseFeeder, p: Floats, q: Floats, v0_squared: Floats) -> Floats:
-    """Squared voltages of all buses with their losses, (T, F, b + 1)."""
+    """Squared voltages of all buses with their losses, (T, F, b + 1), from the busbar's, (T,) or (T, 3)."""
     if isinstance(feeder, Feeder):
         return bus_voltages(feeder, p, q, v0_squared, steps=_STEPS)[:, None, :]
-    busbar = np.repeat(v0_squared[:, None], 3, axis=1)
-    parts = [slice(k, k + _CHUNK) for k in range(0, v0_squared.size, _CHUNK)]
+    parts = [slice(k, k + _CHUNK) for k in range(0, len(v0_squared), _CHUNK)]
     # 1 pu of a phase's power is a third of the feeder's base.
     p3, q3 = (3.0 * feeder.connections(power) for power in (p, q))
     return np.concatenate(
-        [three.bus_voltages(feeder, p3[some], q3[some], busbar[some], steps=_STEPS) for some in parts]
+        [three.bus_voltages(feeder, p3[some], q3[some], v0_squared[some], steps=_STEPS) for some in parts]
     )
 
 

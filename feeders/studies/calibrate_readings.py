@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -44,6 +45,8 @@ class Frames:
         Means of the readings.
     v0_volt : (T,)
         The busbar's.
+    v0_phases : (T, 3)
+        Those of its phases; the mean of them where a frame has no more.
     count : (T, p + 1)
         Readings of each mean, the busbar's last.
     step_s
@@ -56,6 +59,7 @@ class Frames:
     p_kw: Floats
     q_kvar: Floats
     v0_volt: Floats
+    v0_phases: Floats
     count: Floats
     step_s: float
 
@@ -138,6 +142,7 @@ def _binned(site: Site | ThreePhaseSite, given: pd.DataFrame, column: Ints) -> F
             f"too little data: {T} frames over {span / 3600:.3g} h; at least {FEWEST_FRAMES} frames over "
             f"{wanted / 3600:.3g} h are needed, and days tell more than hours"
         )
+    phases = _phases(given, number, size[0])
     middle = first + (np.arange(size[0]) * together + 0.5 * (together - 1)) * step
     return Frames(
         meter_ids=site.meter_ids,
@@ -146,9 +151,26 @@ def _binned(site: Site | ThreePhaseSite, given: pd.DataFrame, column: Ints) -> F
         p_kw=values["p_kw"][0][there, :-1],
         q_kvar=values["q_kvar"][0][there, :-1],
         v0_volt=v[there, -1],
+        v0_phases=np.where(np.isfinite(phases), phases, v[:, -1:])[there],
         count=np.maximum(count[there], 1.0),
         step_s=step * together,
     )
+
+
+def _phases(given: pd.DataFrame, number: Ints, ticks: int) -> Floats:
+    """Means of the busbar's voltages of each phase, (T, 3); NaN where there is none."""
+    if "v_phases" not in given:
+        return np.full((ticks, 3), np.nan)
+    there = given["v_phases"].notna().to_numpy()
+    try:
+        rows = [
+            json.loads(each) if isinstance(each, str) else list(each) for each in given["v_phases"][there]
+        ]
+        told = np.array(rows, dtype=np.float64).reshape(len(rows), 3)
+    except (TypeError, ValueError) as error:
+        raise RecordingInvalid("readings: v_phases are three voltages, as [230.1, 230.4, 229.9]") from error
+    cell = (number[there, None] * 3 + np.arange(3)).ravel()
+    return _means(cell, told.ravel(), (ticks, 3))[0]
 
 
 def _step(t: Floats, column: Ints) -> float:

@@ -81,15 +81,19 @@ def site(tables: FeederTables) -> Site:
 
 
 def three_phase_readings(
-    given: ThreePhaseSite, seed: int, ticks: int, dt_s: float, hidden_kw: float
+    given: ThreePhaseSite, seed: int, ticks: int, dt_s: float, *, hidden_kw: float, apart: float = 0.0
 ) -> pd.DataFrame:
-    """Readings of a feeder of three phases by asymmetric AC power flow, as a table."""
+    """Readings of a feeder of three phases by asymmetric AC power flow, as a table.
+
+    With `apart` the busbar's phases a and c are so much above and below b, as a part.
+    """
     variation = Variation(hidden_kw=hidden_kw, hidden_kvar=0.5 * hidden_kw)
     t = START + dt_s * np.arange(ticks)
     customers = Customers(given, variation, seed, START, 0.0)  # type: ignore[arg-type]
     demand, (p, q) = customers.at(t), customers.hidden(t)
     flow = UnbalancedPowerFlow(given)
-    connections, _ = flow.solve_batch(demand.p_kw + p, demand.q_kvar + q, demand.v0_volt)
+    v0 = demand.v0_volt[:, None] * (1.0 + apart * np.array([1.0, 0.0, -1.0]))
+    connections, _ = flow.solve_batch(demand.p_kw + p, demand.q_kvar + q, v0)
     feeder = given.feeder
     first = np.searchsorted(feeder.of, np.arange(len(feeder.customers)))
     v = np.sqrt(np.add.reduceat(connections**2 * feeder.share, first, axis=1))
@@ -103,5 +107,6 @@ def three_phase_readings(
             "v_volt": np.column_stack([read.v_volt, read.v0_volt]).ravel(),
             "p_kw": np.column_stack([read.p_kw, none]).ravel(),
             "q_kvar": np.column_stack([read.q_kvar, none]).ravel(),
+            "v_phases": [each for row in v0.tolist() for each in (*[None] * len(given.meter_ids), row)],
         }
     )

@@ -178,6 +178,20 @@ def test_a_wrong_phase_is_found(tmp_path: Path) -> None:
     assert found.corrections[0].phases == was
 
 
+def test_phases_of_the_busbar_that_are_apart_are_no_errors_of_meters(tmp_path: Path) -> None:
+    """0.6 % above and below: with readings of each phase nothing is wrong, without them meters are."""
+    given = three_phase(find("ieee-european-lv"))
+    readings = three_phase_readings(given, seed=1, ticks=64, dt_s=900.0, hidden_kw=0.1, apart=0.006)
+    path = tmp_path / "readings.csv"
+    readings.to_csv(path, index=False)
+    assert "outside its class" not in set(calibrate(given, path, kinds=[Kind.METER]).meters["verdict"])
+    without = calibrate(given, readings.drop(columns="v_phases"), kinds=[Kind.METER]).meters
+    assert (without["verdict"] == "outside its class").sum() > 10
+    readings["v_phases"] = "230"
+    with pytest.raises(RecordingInvalid, match="v_phases are three voltages"):
+        calibrate(given, readings)
+
+
 def test_an_interrupted_study_goes_on_and_another_ones_journal_is_refused(tmp_path: Path) -> None:
     readings = recorded(tmp_path, scenario(1))
     wrong = site(moved(TABLES, "Load R15", "Bus R17"))
