@@ -208,6 +208,8 @@ def _unsupported(tables: FeederTables) -> tuple[str, ...]:
                 )
             if line.r0_ohm or line.x0_ohm:
                 problems.append(f"{where}: has an impedance only in the zero sequence; expected both or none")
+        elif given == 2 and line.phases == "abc" and line.r0_ohm == line.x0_ohm == 0.0:
+            problems.append(f"{where}: has no impedance in the zero sequence; expected that of its return")
         elif given == 1 or (given == 0 and len(line.phases) > 1 and series_ohm(cells_of(line)) is None):
             missing = "r0_ohm" if line.r0_ohm is None else "x0_ohm"
             problems.append(

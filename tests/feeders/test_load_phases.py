@@ -196,6 +196,7 @@ def test_a_balanced_feeder_has_the_matrices_of_the_balanced_loader() -> None:
         (2, {"r0_ohm": 0.1}, "line '3', column x0_ohm: is missing"),
         (2, {"r_ohm": 0.0, "x_ohm": 0.0}, "phases 'b' without impedance"),
         (0, {"r_ohm": 0.0, "x_ohm": 0.0}, "has an impedance only in the zero sequence"),
+        (0, {"r0_ohm": 0.0, "x0_ohm": 0.0}, "has no impedance in the zero sequence"),
     ],
 )
 def test_what_three_phases_need(line: int, changes: dict[str, float | None], said: str) -> None:
