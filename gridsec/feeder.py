@@ -361,8 +361,9 @@ def model_error_bound(feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats |
 
     Twice the size of the second fixed-point step, summed up without regard to signs: the steps shrink
     geometrically, and twice the next one bounds the sum of all that follow while each is at most half
-    its predecessor (in practice a few hundredths). Where the second step is *not* below half of the
-    first, near voltage collapse, the bound is infinite.
+    its predecessor (in practice a few hundredths). Heavy loads make the quotients grow from step to step, so
+    the second step has to be below a fifth of the first. Where it is not, towards voltage collapse, the bound
+    is infinite.
 
     Parameters
     ----------
@@ -377,6 +378,10 @@ def model_error_bound(feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats |
     return _remainder(feeder, _linear_flows(feeder, p, q, v0_squared))
 
 
+# Where the second step is more than this part of the first, later ones may shrink by less than half.
+_SHRINK = 0.2
+
+
 def _remainder(feeder: Feeder, flows: _Flows) -> Floats:
     with np.errstate(all="ignore"):
         current = (flows.P**2 + flows.charged**2) / flows.v2[..., 1:]
@@ -387,7 +392,7 @@ def _remainder(feeder: Feeder, flows: _Flows) -> Floats:
         first = from_root(feeder, _losses(feeder, np.abs(current), np.abs(charge), sign=1.0)[2])
         change = np.abs(feeder.half * (v2 - flows.v2))
         second = from_root(feeder, _losses(feeder, np.abs(later - current), change, sign=1.0)[2])
-        shrinks = np.max(second, axis=-1, keepdims=True) <= 0.5 * np.max(first, axis=-1, keepdims=True)
+        shrinks = np.max(second, axis=-1, keepdims=True) <= _SHRINK * np.max(first, axis=-1, keepdims=True)
         shrinks &= np.all(v2 > 0, axis=-1, keepdims=True) & np.all(flows.v2 > 0, axis=-1, keepdims=True)
         bound = np.where(shrinks, 2.0 * second, np.inf)
     return np.asarray(bound[..., feeder.bus])

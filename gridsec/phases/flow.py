@@ -260,8 +260,9 @@ def model_error_bound(feeder: ThreePhaseFeeder, p: Floats, q: Floats, v0_squared
     The next sweep changes the voltages by at most ``e``: the changed currents times the impedances on the
     path, summed up without regard to sign or angle. The sweeps shrink geometrically, and ``2 e`` bounds the
     sum of all that follow while each is at most half its predecessor (in practice a few hundredths); on the
-    squares that is ``2 e (2 |v| + 2 e)``. Where this sweep is *not* below half of the one before, near
-    voltage collapse, the bound is infinite. Busbar angles that are not balanced are not in it.
+    squares that is ``2 e (2 |v| + 2 e)``. Heavy loads make the quotients grow, so where this sweep is *not*
+    below a fifth of the one before, towards voltage collapse, the bound is infinite. Busbar angles that are
+    not balanced are not in it.
 
     Parameters
     ----------
@@ -409,13 +410,19 @@ def _forward(feeder: ThreePhaseFeeder, v0: Phasors, drawn: Phasors) -> Phasors:
     return np.asarray(v0 - from_root(feeder, np.einsum("bij,...jb->...ib", feeder.z, current)))
 
 
+# Where a sweep is more than this part of the one before, later ones may shrink by less than half.
+_SHRINK = 0.2
+
+
 def _remainder(feeder: ThreePhaseFeeder, start: _Start, once: Phasors) -> Floats:
     with np.errstate(all="ignore"):
         before = _drawn(feeder, start.s, start.phasors)
         first = _reach(feeder, before - start.flat)
         second = _reach(feeder, _drawn(feeder, start.s, once) - before)
         most = (-2, -1)
-        shrinks = np.max(second, axis=most, keepdims=True) <= 0.5 * np.max(first, axis=most, keepdims=True)
+        shrinks = np.max(second, axis=most, keepdims=True) <= _SHRINK * np.max(
+            first, axis=most, keepdims=True
+        )
         bound = np.where(shrinks, 2.0 * second * (2.0 * np.abs(once) + 2.0 * second), np.inf)
     return np.asarray(bound[..., feeder.phase, feeder.at])
 

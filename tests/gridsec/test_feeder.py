@@ -14,6 +14,7 @@ from hypothesis import given
 from gridsec.errors import FeederInvalid
 from gridsec.feeder import (
     Feeder,
+    bus_voltages,
     corrected,
     lindistflow,
     loss_correction,
@@ -152,6 +153,35 @@ def test_bound_is_infinite_beyond_voltage_collapse() -> None:
     assert model_error_bound(feeder, np.array([-1e3]), np.array([0.0]), 1.0)[0] == np.inf
     heavy = -0.4 / feeder.r[0]
     assert model_error_bound(feeder, np.array([heavy]), np.array([0.0]), 1.0)[0] == np.inf
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.3, 0.8, 1.2, 1.5])
+def test_bound_holds_up_to_voltage_collapse(angle: float) -> None:
+    """One line in closed form: ``u^2 - (1 + 2 (r p + x q)) u + |z|^2 |s|^2 = 0``, u the squared voltage."""
+    line = Feeder(
+        name="line",
+        parent=np.array([0]),
+        r=np.array([np.cos(angle)]),
+        x=np.array([np.sin(angle)]),
+        bus=np.array([1]),
+        customers=("c",),
+        buses=("a", "b"),
+        base_volt=230.0,
+        base_kva=100.0,
+        charging=np.zeros(1),
+    )
+    grid = np.meshgrid(np.linspace(0.01, 2.0, 200), np.linspace(-3.1, 3.1, 41))
+    size, turn = (each.ravel() for each in grid)
+    p, q = size * np.cos(turn), size * np.sin(turn)
+    bound = model_error_bound(line, p[:, None], q[:, None], np.ones(size.size))[:, 0]
+    found = bus_voltages(line, p[:, None], q[:, None], np.ones(size.size))[:, 1]
+    there = 1.0 + 2.0 * (line.r * p + line.x * q)
+    left = there**2 - 4.0 * size**2
+    assert np.isinf(bound[left < 0.0]).all()
+    some = np.isfinite(bound)
+    assert np.count_nonzero(some) > 1000
+    exact = 0.5 * (there + np.sqrt(np.maximum(left, 0.0)))
+    assert (np.abs(found - exact)[some] <= bound[some] + 1e-12).all()
 
 
 def test_no_flow_no_correction() -> None:

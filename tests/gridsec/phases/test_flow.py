@@ -203,6 +203,32 @@ def test_no_bound_near_collapse() -> None:
     assert np.isinf(model_error_bound(feeder, p, q, np.ones(3))).any()
 
 
+@pytest.mark.parametrize("angle", [0.0, 0.3, 0.8, 1.2, 1.5])
+def test_the_bound_holds_up_to_voltage_collapse(angle: float) -> None:
+    """Three lines that do not touch, in closed form: ``u^2 - (1 + 2 (r p + x q)) u + |z|^2 |s|^2 = 0``."""
+    plain, size = random_three_phase(1, branches=1), np.linspace(0.01, 1.0, 100)
+    line = replace(
+        plain,
+        z=(np.exp(1j * angle) * np.eye(3))[None],
+        phases=np.ones((2, 3), dtype=np.bool_),
+        charging=np.zeros((1, 3, 3)),
+        bus=np.ones(3, dtype=np.intp),
+        connected=np.eye(3, dtype=np.bool_),
+        customers=("a", "b", "c"),
+    )
+    for turn in np.linspace(-3.1, 3.1, 21):
+        s = size[:, None] * np.exp(1j * (turn + np.array([0.0, 0.4, 0.9])))
+        bound = model_error_bound(line, s.real, s.imag, np.ones((size.size, 3)))
+        found = bus_voltages(line, s.real, s.imag, np.ones((size.size, 3)))[..., 1]
+        there = 1.0 + 2.0 * (np.cos(angle) * s.real + np.sin(angle) * s.imag)
+        left = there**2 - 4.0 * np.abs(s) ** 2
+        some = np.isfinite(bound)
+        assert some[0].all()
+        assert (left[some] >= 0.0).all()
+        exact = 0.5 * (there + np.sqrt(np.maximum(left, 0.0)))
+        assert (np.abs(found - exact)[some] <= bound[some] + 1e-12).all()
+
+
 @pytest.mark.parametrize(("power", "v0"), [(np.nan, 1.0), (np.inf, 1.0), (-0.1, 0.0), (-0.1, np.nan)])
 def test_nothing_is_claimed_where_nothing_is_known(power: float, v0: float) -> None:
     """No exception, no warning, and no finite bound."""
