@@ -41,6 +41,7 @@ export class Diagram {
     this.scale = new Scale();
     this.view = "line";
     this.selected = null;
+    this.hovered = null;
     this.drawn = 0;
     new ResizeObserver(() => {
       if (this.feeder && Math.abs(this.box.clientWidth - this.drawn) > 8) this.build();
@@ -125,6 +126,7 @@ export class Diagram {
     });
     root.append(casing, layer);
     this.box.replaceChildren(root);
+    this.hover(null);
     this.paint();
   }
 
@@ -237,6 +239,7 @@ export class Diagram {
     const all = [...this.volts.values(), ...report.meters.map((m) => m.v_volt_estimated)].filter(isKnown);
     if (this.scale.fit(all, this.feeder.v_nominal_volt)) this.rescale();
     this.paint();
+    this.hover(this.hovered);
   }
 
   rescale() {
@@ -307,6 +310,7 @@ export class Diagram {
   }
 
   hover(id) {
+    this.hovered = id;
     const part = id === null || id === this.selected ? null : this.customers.get(id);
     this.tip.hidden = !part || !this.report;
     if (this.tip.hidden) return;

@@ -150,6 +150,15 @@ def test_a_customer_shows_what_its_meter_says_and_what_is_true(site: Site) -> No
     expect(panel).to_be_hidden()
 
 
+def test_what_is_told_at_the_pointer_follows_the_readings(site: Site) -> None:
+    page = site.open()
+    customer(page, "H3").hover()
+    expect(page.locator("#tip")).to_be_hidden()
+    for k, volts in enumerate((229.0, 227.0)):
+        site.tick(T0 + k, volts={"H3": volts})
+        expect(page.locator("#tip")).to_contain_text(f"meter says {volts:.1f} V")
+
+
 def test_the_diagram_works_by_keyboard(site: Site) -> None:
     site.tick(T0)
     page = site.open()
