@@ -44,6 +44,8 @@ _WORSE = 30.0
 _PAIRED = 8
 # Independent, all the same: other shapes are stories.
 _PLAIN = 2
+# Who is not off by this part of what a story expects does not tell it.
+_LIKE = 0.5
 # Loads this much alike, as a part, are felt alike.
 _SAME = 1e-9
 
@@ -87,6 +89,7 @@ class _Base:
         self.nobody = float(m @ self.z) + honest.logdet + problem.lies.false * at.counts[1]
         self.known: dict[tuple[int, ...], tuple[float, int]] = {}
         self.told: dict[tuple[int, ...], Set] = {}
+        self.felt: dict[int, Floats] = {}
 
     def costs(self, sets: Iterable[tuple[int, ...]]) -> None:
         """Learn J of some sets, and the likeliest shape of each."""
@@ -100,8 +103,9 @@ class _Base:
                 continue
             L = np.array(some)
             J = self._judged(L, self._plain(L))[0] + self._prices(size)
-            if size > 1 and self.problem.false is not None:
-                J = np.concatenate([J, self._stories(L)], axis=1)
+            stories = self._stories(L) if size > 1 and self.problem.false is not None else None
+            if stories is not None:
+                J = np.concatenate([J, stories], axis=1)
             best = np.argmin(J, axis=1)
             for each, k, cost in zip(some, best.tolist(), J.min(axis=1).tolist(), strict=True):
                 self.known[each] = (self.nobody + cost, k)
@@ -143,27 +147,37 @@ class _Base:
         about = 1.0 + lies.differ**2 * np.eye(L.shape[1])
         return np.asarray(lies.amplitude**2 * about * u[:, :, None] * u[:, None, :])[:, None]
 
-    def _stories(self, L: Ints) -> Floats:
+    def _stories(self, L: Ints) -> Floats | None:
         """Rise of J with the price where each of a set is whom the story is about, (b, k); inf for none."""
         problem, (p, k) = self.problem, (self.problem.size, L.shape[1])
         assert problem.false is not None  # noqa: S101  # the caller has looked
         R = problem.false.R
         among = R[L[:, :, None], L[:, None, :]]
-        low, high = (among.min(axis=1) * (1.0 + side) for side in (-_SAME, _SAME))
-        column = R[:, L]
-        more, least = (column > high).sum(axis=0), (column >= low).sum(axis=0)
-        ours = (among > high[:, None]).sum(axis=1)
+        weakest = among.min(axis=1)
+        # Whom the load does not move, as at the busbar, or moves the other way tells nothing of it.
+        rows, of = np.nonzero((weakest >= self._felt(k, L) * (1.0 - _SAME)) & (weakest > 0.0))
+        if not rows.size:
+            return None
+        low, high = (weakest[rows, of] * (1.0 + side) for side in (-_SAME, _SAME))
+        c, told = L[rows, of], among[rows, :, of]
+        # Of those that would feel it alike, some are chosen; whose story it is belongs to it.
+        more, own = (told > high[:, None]).sum(axis=1), R[c, c] <= high
+        ties = (R[:, c] >= low).sum(axis=0) - more - own
+        choices = np.log(p * binom(ties, k - more - own)) - np.log(binom(p, k))
         out = np.full(L.shape, np.inf)
-        # A meter that the load does not move, or moves the other way, says nothing of it.
-        rows, of = np.nonzero((more == ours) & (low > 0.0))
-        if rows.size:
-            # Of those that would feel it alike, some are chosen; whose story it is belongs to it.
-            own = (R[L, L] <= high)[rows, of]
-            ties, left = (least - more)[rows, of] - own, (k - ours)[rows, of] - own
-            choices = np.log(p * binom(ties, left)) - np.log(binom(p, k))
-            J = self._judged(L[rows], self._told_of(L[rows], L[rows, of]))[0][:, 0]
-            out[rows, of] = J + problem.prices[k] + problem.lies.story + 2.0 * choices
+        J = self._judged(L[rows], self._told_of(L[rows], c))[0][:, 0]
+        out[rows, of] = J + problem.prices[k] + problem.lies.story + 2.0 * choices
         return out
+
+    def _felt(self, k: int, c: Ints) -> Floats:
+        """How much at least the k meters feel some customers' loads that feel them most, the shape of c."""
+        false, p = self.problem.false, self.problem.size
+        assert false is not None  # noqa: S101  # the callers have looked
+        known = self.felt.setdefault(k, np.full(p, np.nan))
+        new = np.unique(c[np.isnan(known[c])])
+        if new.size:
+            known[new] = np.partition(false.R[:, new], p - k, axis=0)[p - k]
+        return np.asarray(known[c])
 
     def _judged(self, L: Ints, C: Floats) -> tuple[Any, Any]:
         """Rise of J without the price, (b, shapes), and the lies, (b, shapes, k)."""
@@ -199,19 +213,25 @@ def worth(problem: Problem, ranked: Ranked) -> bool:
 
 
 def _continued(problem: Problem, best: State) -> bool:
-    """Whether somebody's reading is odd who would be the next in a story of one of the liars."""
+    """Whether somebody reads as off as who comes next in a story that all liars tell about one of them."""
     assert problem.false is not None  # noqa: S101  # the caller has looked
-    p, k = problem.size, best.counts[0] + 1
+    p, k, R = problem.size, best.counts[0] + 1, problem.false.R
     if k > min(MOST, p):
         return False
-    prices, choice = problem.prices, 2.0 * float(np.log(p / binom(p, k)))
-    price = float(prices[k] - prices[k - 1]) + problem.lies.story + choice
-    odd = (best.g**2 > max(price, 0.0) * best.Q.diagonal()) & ~best.liars
-    if not odd.any():
+    # Several tell a story already, and one more has no choice; one alone does not.
+    price = float(problem.prices[k] - problem.prices[k - 1]) - 2.0 * float(np.log((p - k + 1.0) / k))
+    price += problem.lies.story if k == 2 else 0.0
+    odd = np.flatnonzero((best.g**2 > max(price, 0.0) * best.Q.diagonal()) & ~best.liars)
+    liars = np.flatnonzero(best.liars)
+    liars = liars[R[liars, liars] > 0.0]
+    if not odd.size or not liars.size:
         return False
-    column = problem.false.R[:, best.liars]
-    weakest = np.partition(column, p - k, axis=0)[p - k]
-    return bool((column >= weakest * (1.0 - _SAME))[odd].any())
+    column = R[:, liars]
+    told = column >= np.partition(column, p - k, axis=0)[p - k] * (1.0 - _SAME)
+    off = best.g[odd] / best.Q[odd, odd]
+    expected = column[odd] * (problem.a2 * best.g[liars] / R[liars, liars])
+    like = off[:, None] * expected >= _LIKE * expected**2
+    return bool((told[best.liars].all(axis=0) & (told[odd] & like).any(axis=0)).any())
 
 
 def least(problem: Problem, k: int) -> float:
@@ -259,7 +279,7 @@ def alike(problem: Problem, ranked: Ranked) -> list[Set]:
 
 
 def _stories(base: _Base) -> Iterator[tuple[int, ...]]:
-    """Stories about one of the likeliest liars, up to two liars longer than that explanation."""
+    """Stories about one of the likeliest liars, about as long as that explanation."""
     if base.problem.false is None:
         return
     R, size = base.problem.false.R, base.z**2 / base.Q.diagonal()
@@ -268,7 +288,7 @@ def _stories(base: _Base) -> Iterator[tuple[int, ...]]:
         felt = np.round(R[:, c] / R[c, c], 9)
         felt[c] = np.inf
         order = np.lexsort((-size, -felt)).tolist()
-        for k in range(2, min(MOST, len(liars) + 2, len(order)) + 1):
+        for k in range(max(2, len(liars) - 1), min(MOST, len(liars) + 2, len(order)) + 1):
             yield tuple(sorted(order[:k]))
 
 
