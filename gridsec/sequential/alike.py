@@ -44,8 +44,8 @@ _WORSE = 30.0
 _PAIRED = 8
 # Independent, all the same: other shapes are stories.
 _PLAIN = 2
-# Who is not off by this part of what a story expects does not tell it.
-_LIKE = 0.5
+# Who is not off by this part of what liars have in common, or not unusually, by the square, is none of them.
+_LIKE, _UNUSUAL = 0.5, 2.0
 # Loads this much alike, as a part, are felt alike.
 _SAME = 1e-9
 
@@ -156,12 +156,15 @@ class _Base:
         weakest = among.min(axis=1)
         # Whom the load does not move, as at the busbar, or moves the other way tells nothing of it.
         rows, of = np.nonzero((weakest >= self._felt(k, L) * (1.0 - _SAME)) & (weakest > 0.0))
+        low, high = (weakest[rows, of] * (1.0 + side) for side in (-_SAME, _SAME))
+        c, more = L[rows, of], (among[rows, :, of] > high[:, None]).sum(axis=1)
+        # Others who feel it as little as some of a set may be many, but none of them feels it more.
+        tells = (R[:, c] > high).sum(axis=0) == more
+        rows, of, c, more, low, high = (each[tells] for each in (rows, of, c, more, low, high))
         if not rows.size:
             return None
-        low, high = (weakest[rows, of] * (1.0 + side) for side in (-_SAME, _SAME))
-        c, told = L[rows, of], among[rows, :, of]
         # Of those that would feel it alike, some are chosen; whose story it is belongs to it.
-        more, own = (told > high[:, None]).sum(axis=1), R[c, c] <= high
+        own = R[c, c] <= high
         ties = (R[:, c] >= low).sum(axis=0) - more - own
         choices = np.log(p * binom(ties, k - more - own)) - np.log(binom(p, k))
         out = np.full(L.shape, np.inf)
@@ -207,9 +210,17 @@ def worth(problem: Problem, ranked: Ranked) -> bool:
         return True
     if count > 1 and (problem.meters(best)[best.liars] <= _WORSE).any():
         return True
-    if problem.false is not None and _continued(problem, best):
+    if _like_all(problem, best) or (problem.false is not None and _continued(problem, best)):
         return True
     return any(each.counts[0] > 1 and cost - lowest <= _WORSE for cost, each in ranked[1:])
+
+
+def _like_all(problem: Problem, best: State) -> bool:
+    """Whether somebody else reads about as far off as the liars do on average."""
+    others = np.flatnonzero((best.g**2 > _UNUSUAL * best.Q.diagonal()) & ~best.liars)
+    expected = problem.a2 * float(best.g[best.liars].mean())
+    off = best.g[others] / best.Q[others, others]
+    return bool((off * expected >= _LIKE * expected**2).any())
 
 
 def _continued(problem: Problem, best: State) -> bool:
