@@ -10,7 +10,9 @@ import pytest
 from scipy.special import betaln
 
 from gridsec.arrays import Bools, Floats
+from gridsec.sequential.alike import _Base
 from gridsec.sequential.conditional import Prior
+from gridsec.sequential.rises import Problem, State
 from gridsec.sequential.snapshot import Explained, FalsePowers, Lies, identify
 
 P = 7
@@ -131,15 +133,45 @@ def test_lies_that_are_alike_are_found_where_they_are_weak(like_a_load: bool) ->
         right_apart += who(identify(prior, noise, m, LIVE, lies=APART, false=false)[0]) == tuple(
             lying.tolist()
         )
-        same = found[0].cost - found[-1].cost
-        if len(found) > 1 and not found[-1].powers.any() and found[-1].liars.any():
-            assert same == pytest.approx(costs[who(found[0])] - costs[who(found[-1])], abs=1e-6)
+        for other in found[1:]:
+            if who(other) in costs and not other.powers.any():
+                gap = costs[who(other)] - costs[who(found[0])]
+                assert other.cost - found[0].cost == pytest.approx(gap, abs=1e-6)
         K = prior.between + np.diag(noise)
         np.testing.assert_allclose(K @ found[0].weights + found[0].lies, m, atol=1e-9)
     assert named >= 15
     # The search is local: three of seven that agree may look like the other four.
     assert exact >= 0.6 * named
     assert right >= right_apart
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("size", [2, 3, 4])
+def test_who_tells_a_story_and_how_many_could(size: int, seed: int) -> None:
+    """A branching feeder, where many feel a load alike: against all sets."""
+    rng = np.random.default_rng(seed)
+    above = np.array([-1, *(int(rng.integers(k)) for k in range(1, P))])
+    on_path = np.eye(P)
+    for k in range(1, P):
+        on_path[k] += on_path[above[k]]
+    R = on_path @ np.diag(rng.uniform(0.01, 0.05, P)) @ on_path.T
+    false = FalsePowers(R, R, np.ones(P), np.ones(P))
+    problem = Problem(LIES, np.ones(P), false, None)
+    nobody = State(np.zeros(P, dtype=np.bool_), np.zeros(P, dtype=np.bool_), *([np.zeros(P)] * 4), 0.0)
+    nobody.Q = np.eye(P)
+    base = _Base(problem, nobody, np.zeros(P))
+    L = np.array(list(combinations(range(P), size)))
+    found = base._stories(L)
+    assert found is not None
+    for liars, row in zip(L.tolist(), found, strict=True):
+        for c, cost in zip(liars, row.tolist(), strict=True):
+            assert np.isfinite(cost) == tells(R[:, c], tuple(liars))
+            if np.isfinite(cost):
+                u = R[liars, c] / R[c, c]
+                C = LIES.amplitude**2 * (np.outer(u, u) + LIES.differ**2 * np.diag(u**2))
+                price = LIES.story + 2.0 * np.log(P * told(R[:, c], c, size) / comb(P, size))
+                freedom = np.linalg.slogdet(np.eye(size) + C)[1]
+                assert cost == pytest.approx(freedom + problem.prices[size] + price, abs=1e-9)
 
 
 def test_one_set_of_all_meters() -> None:
