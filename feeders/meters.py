@@ -14,7 +14,7 @@ import numpy as np
 
 from feeders.variation import Stream, generator
 from gridsec.arrays import Floats, Ints
-from gridsec.phases import PhasedFeeder
+from gridsec.network import InPhases
 
 if TYPE_CHECKING:
     from feeders.load import Site
@@ -176,7 +176,7 @@ class Meters:
     def __init__(self, site: Site, errors: MeterErrors, channel: Channel, seed: int) -> None:
         accuracy, customer = site.accuracy, site.meters
         self.count = customer.size
-        self._busbars = 3 if isinstance(site.feeder, PhasedFeeder) else 1
+        self._busbars = 3 if isinstance(site.feeder, InPhases) else 1
         self._channel = channel
         self._errors = errors
         self._seed = seed

@@ -26,7 +26,7 @@ from scipy.sparse.linalg import splu
 
 from feeders.powerflow import PowerFlow, PowerFlowDiverged
 from gridsec.arrays import Bools, Floats, Ints, Phasors
-from gridsec.phases import PhasedFeeder
+from gridsec.network import InPhases
 
 if TYPE_CHECKING:
     from feeders.load import Site
@@ -234,7 +234,7 @@ class UnbalancedPowerFlow:
 
 
 class PlacesFlow:
-    """The same in the places of a `gridsec.phases.PhasedFeeder`, with the methods of the balanced power flow.
+    """The same in the places of a feeder in three phases, with the methods of the balanced power flow.
 
     Parameters
     ----------
@@ -265,7 +265,7 @@ def power_flow(site: Site) -> PowerFlow | PlacesFlow:
     site
         The feeder.
     """
-    return PlacesFlow(site) if isinstance(site.feeder, PhasedFeeder) else PowerFlow(site)
+    return PlacesFlow(site) if isinstance(site.feeder, InPhases) else PowerFlow(site)
 
 
 def sequence_ohm(positive: complex, zero: complex) -> Phasors:

@@ -29,7 +29,7 @@ from feeders.variation import Variation
 from gridsec import attack as attacks
 from gridsec.arrays import Bools, Floats
 from gridsec.errors import GridsecError
-from gridsec.phases import PhasedFeeder
+from gridsec.network import InPhases
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -389,7 +389,7 @@ def _table(ids: list[str], rows: dict[str, Any]) -> Any:
 
 
 def _readings_schema(site: Site) -> Any:
-    return READINGS.append(PHASES) if isinstance(site.feeder, PhasedFeeder) else READINGS
+    return READINGS.append(PHASES) if isinstance(site.feeder, InPhases) else READINGS
 
 
 def _truth_schema(site: Site) -> Any:

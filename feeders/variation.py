@@ -19,7 +19,7 @@ from scipy.signal import lfilter
 
 from feeders.profiles import Season, library
 from gridsec.arrays import Floats
-from gridsec.phases import PhasedFeeder
+from gridsec.network import InPhases
 
 if TYPE_CHECKING:
     from feeders.load import Site
@@ -241,7 +241,7 @@ class Customers:
         self._sky = Fluctuation(seed, Stream.COMMON_CLOUD, 1, variation.cloud_correlation_s)
         self._busbar = Fluctuation(seed, Stream.BUSBAR, 1, variation.busbar_correlation_s)
         self._unbalance = None
-        if isinstance(site.feeder, PhasedFeeder):
+        if isinstance(site.feeder, InPhases):
             self._unbalance = Fluctuation(seed, Stream.UNBALANCE, 3, variation.busbar_correlation_s)
         self._hidden_p = Fluctuation(seed, Stream.HIDDEN_P, count, variation.hidden_correlation_s)
         self._hidden_q = Fluctuation(seed, Stream.HIDDEN_Q, count, variation.hidden_correlation_s)

@@ -10,9 +10,8 @@ from gridsec import detect
 from gridsec.arrays import Bools, Floats
 from gridsec.detect import Uncertainty
 from gridsec.feeder import Feeder, corrected
-from gridsec.network import Network, by_place, interval_bounds, loss_correction
+from gridsec.network import InPhases, Network, by_place, interval_bounds, loss_correction
 from gridsec.online import Cause, Decision, Estimate, Frame, Verdict
-from gridsec.phases import PhasedFeeder
 from gridsec.plant import Plant, Setting
 
 
@@ -195,7 +194,7 @@ def _busbar(
 ) -> tuple[Floats | float, Bools | bool]:
     """Squared voltage of the busbar as given, and whether that can be used; in three phases (3,) each."""
     low, high = limits
-    if not isinstance(feeder, PhasedFeeder):
+    if not isinstance(feeder, InPhases):
         return frame.v0_squared, bool(np.isfinite(frame.v0_squared) and low <= frame.v0_squared <= high)
     if frame.v0_phases is None:
         # A mean says nothing of any phase.
@@ -213,7 +212,7 @@ def busbar_errors(plant: Plant, v0_squared: Floats | float, sigmas: float) -> Fl
     v0_squared, sigmas
         As in `gridsec.detect.busbar_error`.
     """
-    if not isinstance(plant.feeder, PhasedFeeder):
+    if not isinstance(plant.feeder, InPhases):
         return detect.busbar_error(plant.accuracy, float(v0_squared), sigmas)
     each = np.broadcast_to(v0_squared, 3).tolist()
     return np.array([detect.busbar_error(plant.accuracy, one, sigmas) for one in each])
@@ -310,6 +309,6 @@ def _implied(
             error[k] = NO_VOLTAGE
         else:
             v0[k], error[k] = np.median(implied[use]), np.max((stale + now.reading)[use])
-    if isinstance(feeder, PhasedFeeder):
+    if isinstance(feeder, InPhases):
         return v0, error
     return float(v0[0]), float(error[0])

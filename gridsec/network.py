@@ -3,7 +3,8 @@
 A *place* has one squared voltage: a bus of a balanced feeder, a phase of a bus of another. The linear power
 flow is ``v^2 = v0^2 + 2 R p + 2 X q`` with rows for places and columns for customers. On a balanced radial
 feeder its entries are those of common paths, and everything is a sum over the tree. On a meshed one it is
-still symmetric between customers, but may have negative entries; in three phases it is not symmetric either.
+still symmetric between customers, but may have negative entries; in three phases, meshed or not, it is not
+symmetric either.
 """
 
 from __future__ import annotations
@@ -16,10 +17,13 @@ from gridsec import feeder as balanced
 from gridsec import mesh
 from gridsec.arrays import Floats, Ints, frozen
 from gridsec.feeder import Feeder, LinDistFlow, common_paths, lindistflow, path_sums
-from gridsec.mesh import MeshedFeeder
+from gridsec.mesh import Meshed, PhasedMesh
 from gridsec.phases import PhasedFeeder, places
 
-Network = Feeder | MeshedFeeder | PhasedFeeder
+InPhases = PhasedFeeder | PhasedMesh
+"""A feeder in three phases, with three voltages of the busbar."""
+
+Network = Feeder | Meshed | InPhases
 """A feeder that an estimator can watch."""
 
 
@@ -38,7 +42,7 @@ def busbar_places(feeder: Network) -> slice:
     feeder
         The feeder.
     """
-    return slice(0, 3 if isinstance(feeder, PhasedFeeder) else 1)
+    return slice(0, 3 if isinstance(feeder, InPhases) else 1)
 
 
 def one_busbar(feeder: Network, some: Ints, others: Ints) -> Floats | float:
@@ -51,7 +55,7 @@ def one_busbar(feeder: Network, some: Ints, others: Ints) -> Floats | float:
     some, others : (j,), (k,)
         The places.
     """
-    if not isinstance(feeder, PhasedFeeder):
+    if not isinstance(feeder, InPhases):
         return 1.0
     return np.equal.outer(some % 3, others % 3).astype(np.float64)
 
@@ -64,7 +68,7 @@ def hangs_on(feeder: Network) -> Floats:
     feeder
         The feeder.
     """
-    if not isinstance(feeder, PhasedFeeder):
+    if not isinstance(feeder, InPhases):
         return np.ones((feeder.bus.size, 1))
     return np.equal.outer(feeder.bus % 3, np.arange(3)).astype(np.float64)
 
@@ -79,7 +83,7 @@ def by_place(feeder: Network, of_busbar: Floats | float) -> Floats:
     of_busbar
         One number, or in three phases one for each.
     """
-    if not isinstance(feeder, PhasedFeeder):
+    if not isinstance(feeder, InPhases):
         return np.full(len(feeder.buses), of_busbar)
     return np.tile(np.broadcast_to(np.asarray(of_busbar, dtype=np.float64), 3), len(feeder.tree.buses))
 
@@ -107,7 +111,7 @@ def bus_voltages(
     """
     if isinstance(feeder, Feeder):
         return balanced.bus_voltages(feeder, p, q, v0_squared, steps=steps)
-    if isinstance(feeder, MeshedFeeder):
+    if isinstance(feeder, Meshed):
         return mesh.bus_voltages(feeder, p, q, v0_squared, steps=steps)
     return places.bus_voltages(feeder, p, q, v0_squared, steps=steps)
 
@@ -122,7 +126,7 @@ def model_error_bound(feeder: Network, p: Floats, q: Floats, v0_squared: Floats 
     """
     if isinstance(feeder, Feeder):
         return balanced.model_error_bound(feeder, p, q, v0_squared)
-    if isinstance(feeder, MeshedFeeder):
+    if isinstance(feeder, Meshed):
         return mesh.model_error_bound(feeder, p, q, v0_squared)
     return places.model_error_bound(feeder, p, q, v0_squared)
 
@@ -159,7 +163,7 @@ def loss_correction(
 
 
 def interval_bounds(
-    feeder: MeshedFeeder | PhasedFeeder,
+    feeder: Meshed | PhasedFeeder,
     p: Floats,
     q: Floats,
     v0_squared: Floats | float,
@@ -183,7 +187,7 @@ def interval_bounds(
     (N,), (N,)
         How far the correction moves, and what its first step leaves of the AC power flow, pu.
     """
-    if isinstance(feeder, MeshedFeeder):
+    if isinstance(feeder, Meshed):
         return mesh.interval_bounds(feeder, p, q, v0_squared, p_error=p_error, q_error=q_error)
     return places.interval_bounds(feeder, p, q, v0_squared, p_error=p_error, q_error=q_error)
 
@@ -321,5 +325,5 @@ def _branch(feeder: Feeder, power: Power) -> Floats:
     return feeder.r if power is Power.ACTIVE else feeder.x
 
 
-def _matrix(feeder: MeshedFeeder | PhasedFeeder, power: Power) -> Floats:
+def _matrix(feeder: Meshed | PhasedFeeder, power: Power) -> Floats:
     return feeder.R if power is Power.ACTIVE else feeder.X

@@ -29,14 +29,14 @@ SHOWN = 40
 def feeders_list() -> None:
     """List the feeders that come with gridsec."""
     from feeders.load import load, names
-    from gridsec.phases import PhasedFeeder
+    from gridsec.network import InPhases
 
     table = Table("name", "title", "phases", "customers", "meters", "inverters", "M")
     for name in names(balanced=False):
         site = load(name)
         counts = (len(site.feeder.customers), len(site.meter_ids), site.droop.customer.size)
         cells = (*map(str, counts), str(site.tables.meta.monitor.max_attacked))
-        phases = "single-phase" if isinstance(site.feeder, PhasedFeeder) else "balanced"
+        phases = "single-phase" if isinstance(site.feeder, InPhases) else "balanced"
         table.add_row(name, escape(site.tables.meta.title), phases, *cells)
     out.print(table)
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from feeders.load import Site, Snapshot, volts
 from gridsec.arrays import Floats
+from gridsec.network import InPhases
 from gridsec.online import Estimate, Verdict
-from gridsec.phases import PhasedFeeder
 from service.align import Tick
 
 
@@ -38,7 +38,7 @@ def _busbar(site: Site, tick: Tick) -> Floats | float:
         return math.nan
     phases = tick.busbar.v_phases
     # A balanced feeder has one voltage, and a phase that is not measured does not take it away.
-    one = phases is None or not isinstance(site.feeder, PhasedFeeder)
+    one = phases is None or not isinstance(site.feeder, InPhases)
     return tick.busbar.v_volt if one else np.array(phases)
 
 
@@ -60,7 +60,7 @@ def bus_volts(site: Site, v2_bus: Floats) -> tuple[Floats, Floats]:
         Voltage of each of its phases, V, NaN for one that it does not have; nothing on a balanced feeder.
     """
     v = volts(site.base_volt, v2_bus)
-    if not isinstance(site.feeder, PhasedFeeder):
+    if not isinstance(site.feeder, InPhases):
         return v, np.zeros((v.size, 0))
     phases = np.where(site.feeder.tree.phases, v.reshape(-1, 3), np.nan)
     off = np.where(np.isnan(phases), -1.0, np.abs(phases - site.feeder.base_volt))

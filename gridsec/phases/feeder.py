@@ -183,13 +183,25 @@ def _branch_problems(feeder: ThreePhaseFeeder) -> list[str]:
             out.append(f"{where}: it has no phase; expected one, two or three")
         elif (here & ~there).any():
             out.append(
-                f"{where}: phases {_named(here)!r} but only {_named(there)!r} arrive at "
-                f"{feeder.buses[above]!r}"
+                f"{where}: phases {named(here)!r} but only {named(there)!r} arrive at {feeder.buses[above]!r}"
             )
-        for what, block in (("z", feeder.z[k]), ("charging", feeder.charging[k])):
-            out.extend(f"{where}: {what} {problem}" for problem in _block_problems(block, here))
-        out.extend(f"{where}: {problem}" for problem in _impedance_problems(feeder.z[k], here))
+        out.extend(f"{where}: {problem}" for problem in line_problems(feeder.z[k], feeder.charging[k], here))
     return out
+
+
+def line_problems(z: Phasors, charging: Floats, present: Bools) -> list[str]:
+    """What is wrong with the impedances and susceptances of a line.
+
+    Parameters
+    ----------
+    z, charging : (3, 3)
+        Series impedance and total shunt susceptance, pu.
+    present : (3,)
+        Phases that the line has.
+    """
+    blocks = (("z", z), ("charging", charging))
+    out = [f"{what} {problem}" for what, block in blocks for problem in _block_problems(block, present)]
+    return out + _impedance_problems(z, present)
 
 
 def _block_problems(block: Phasors | Floats, here: Bools) -> list[str]:
@@ -226,8 +238,8 @@ def _customer_problems(feeder: ThreePhaseFeeder) -> list[str]:
             out.append(f"customer {name!r}: is connected to no phase")
         elif (wanted & ~feeder.phases[bus]).any():
             out.append(
-                f"customer {name!r}: phases {_named(wanted)!r} but bus {feeder.buses[bus]!r} has only "
-                f"{_named(feeder.phases[bus])!r}"
+                f"customer {name!r}: phases {named(wanted)!r} but bus {feeder.buses[bus]!r} has only "
+                f"{named(feeder.phases[bus])!r}"
             )
     for what, names in (("customer", feeder.customers), ("bus", feeder.buses)):
         counted = Counter(names)
@@ -235,5 +247,6 @@ def _customer_problems(feeder: ThreePhaseFeeder) -> list[str]:
     return out
 
 
-def _named(present: Bools) -> str:
+def named(present: Bools) -> str:
+    """Letters of the phases that are present, (3,)."""
     return "".join(phase for phase, there in zip(PHASES, present, strict=True) if there)

@@ -28,7 +28,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gridsec.arrays import Floats, Phasors, frozen
+from gridsec.arrays import Floats, Ints, Phasors, frozen
 from gridsec.intervals import Sweeps, bounds
 from gridsec.phases.feeder import ROTATION, ThreePhaseFeeder
 from gridsec.trees import below, from_root, meetings
@@ -69,14 +69,33 @@ def lindist3flow(feeder: ThreePhaseFeeder) -> LinDist3Flow:
     ----------
     Gan and Low 2014; Arnold et al. 2016. Derivation: docs/theory-three-phase.md.
     """
-    rotated = _rotated(feeder)
-    whole = np.zeros((len(feeder.buses), 3, 3), dtype=np.complex128)
-    for k, above in enumerate(feeder.parent.tolist()):
-        whole[k + 1] = whole[above] + rotated[k]
-    shared = meetings(feeder.parent, feeder, feeder.at)
-    W_bus = np.stack([whole[shared, phi, feeder.phase] for phi in range(3)])
+    W_bus = common_paths(feeder, _rotated(feeder), feeder.at, feeder.phase)
     W = W_bus[feeder.phase, feeder.at]
     return LinDist3Flow(*(frozen(part) for part in (W.real, W.imag, W_bus.real, W_bus.imag)))
+
+
+def common_paths(feeder: ThreePhaseFeeder, blocks: Phasors, at: Ints, phase: Ints) -> Phasors:
+    """Entries of the branches' blocks, summed over the path that every bus shares with each of some others.
+
+    Parameters
+    ----------
+    feeder
+        The feeder.
+    blocks : (b, 3, 3)
+        What is summed; for the series impedances ``z``, the sums are voltages that a current makes.
+    at, phase : (k,)
+        Buses, and the columns of the blocks.
+
+    Returns
+    -------
+    (3, b + 1, k)
+        The sums, a row for each phase of every bus.
+    """
+    whole = np.zeros((len(feeder.buses), 3, 3), dtype=np.complex128)
+    for k, above in enumerate(feeder.parent.tolist()):
+        whole[k + 1] = whole[above] + blocks[k]
+    shared = meetings(feeder.parent, feeder, at)
+    return np.stack([whole[shared, phi, phase] for phi in range(3)])
 
 
 def sensitivities(

@@ -8,9 +8,8 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.frames import NO_VOLTAGE, nothing_new
-from gridsec.network import bus_voltages, by_place, model_error_bound
+from gridsec.network import InPhases, bus_voltages, by_place, model_error_bound
 from gridsec.online import Estimate, Explanation, Frame, Verdict
-from gridsec.phases import PhasedFeeder
 from gridsec.sequential.commission import conclude as learn
 from gridsec.sequential.commission import gather, ripe
 from gridsec.sequential.conclude import Tick, conclude
@@ -269,7 +268,7 @@ def _busbar(
 ) -> tuple[Floats | float, Bools | bool]:
     """Squared voltage of the busbar, the last one where there is none now, and whether it is metered."""
     low, high = design.options.v2_limits
-    if not isinstance(design.plant.feeder, PhasedFeeder):
+    if not isinstance(design.plant.feeder, InPhases):
         metered = bool(np.isfinite(frame.v0_squared) and low <= frame.v0_squared <= high)
         return frame.v0_squared if metered else state.v0_squared, metered
     # One voltage for all phases says where they are, but not how far from it each.

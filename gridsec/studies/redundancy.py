@@ -15,8 +15,8 @@ import numpy as np
 from gridsec.arrays import Bools, Ints
 from gridsec.feeder import Feeder
 from gridsec.index import Index
-from gridsec.network import Network
-from gridsec.phases import PhasedFeeder, ThreePhaseFeeder
+from gridsec.network import InPhases, Network
+from gridsec.phases import ThreePhaseFeeder
 from gridsec.studies.patterns import Patterns, fewest_meters
 
 __all__ = ["Meter", "Part", "meter_redundancy", "part_redundancy", "parts", "tree_bus"]
@@ -105,7 +105,7 @@ def tree_bus(feeder: Network) -> Ints:
     feeder
         The feeder.
     """
-    return feeder.tree.at if isinstance(feeder, PhasedFeeder) else feeder.bus
+    return feeder.tree.at if isinstance(feeder, InPhases) else feeder.bus
 
 
 def parts(feeder: Feeder | ThreePhaseFeeder, buses: Ints) -> Sequence[Part]:

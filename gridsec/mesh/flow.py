@@ -1,0 +1,153 @@
+"""The power flow of a meshed feeder through the inverse of its admittances, balanced or in three phases.
+
+``V = W + Z conj(s / V)`` holds for the places of three phases as for the buses of a balanced feeder, with W
+what the busbar's phases make of them without load. Nothing below asks how many phases there are, whether Z is
+symmetric, or for any sign in it. Derivations: docs/theory-mesh.md.
+
+References
+----------
+.. [1] C. Wang, A. Bernstein, J.-Y. Le Boudec, M. Paolone, "Explicit conditions on existence and uniqueness
+   of load-flow solutions in distribution networks", IEEE Trans. Smart Grid 9(2), 2018: the fixed point.
+.. [2] A. Bernstein, C. Wang, E. Dall'Anese, J.-Y. Le Boudec, C. Zhao, "Load flow in multiphase distribution
+   networks: existence, uniqueness, non-singularity and linear models", IEEE Trans. Power Systems 33(6), 2018.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gridsec.arrays import Floats, Phasors
+from gridsec.intervals import Sweeps, bounds
+from gridsec.mesh.balanced import MeshedFeeder
+from gridsec.mesh.phased import PhasedMesh
+from gridsec.phases.feeder import PHASES, ROTATION
+
+Meshed = MeshedFeeder | PhasedMesh
+"""A feeder whose closed lines form loops."""
+
+
+def bus_voltages(
+    feeder: Meshed, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1
+) -> Floats:
+    """Squared voltage of every place, losses and charging corrected; in three phases unequal ones, too.
+
+    The fixed-point iteration ``V <- W + Z conj(s / V)`` from ``V = W``: its first iterate has the voltages of
+    the linear power flow and the square of its drops, and every step after it gains one order in the load, as
+    a step of `gridsec.feeder.loss_correction` does.
+
+    Parameters
+    ----------
+    feeder
+        The feeder.
+    p, q : (…, N)
+        Net active and reactive injection of each customer (generation positive), pu.
+    v0_squared : (…) or scalar
+        Squared busbar voltage, pu; in three phases (3,), one for each, or scalar.
+    steps
+        Steps after the first iterate; with none the linear power flow alone.
+
+    Returns
+    -------
+    (…, n)
+        Squared voltages, pu; on a balanced feeder n = b + 1.
+    """
+    if not steps:
+        base = np.asarray(v0_squared, dtype=np.float64)[..., None]
+        if isinstance(feeder, PhasedMesh):
+            base = np.tile(np.broadcast_to(v0_squared, len(PHASES)), len(feeder.tree.buses))
+        return np.asarray(base + 2.0 * (p @ feeder.R.T + q @ feeder.X.T))
+    s, idle, here = _start(feeder, p, q, v0_squared)
+    V = here
+    for _ in range(steps):
+        V = here + np.conj(s / V) @ feeder.between.T
+    V = idle + np.conj(s / V) @ feeder.transfer.T
+    return np.asarray(V.real**2 + V.imag**2)
+
+
+def model_error_bound(feeder: Meshed, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:
+    """How far `v^2` after one correction can be from the AC power flow, for every customer.
+
+    V1 and V2 are the iterates of `bus_voltages`, ``d = |V2 - V1|``, and
+    ``M_ij = |Z_ij| |s_j| / (c_j min(|V1_j|, c_j))`` with ``c = 0.9 |V2|``. A step sends whatever is within
+    ``rho <= 0.1 |V2|`` of V2 no further than ``M (rho + d)`` from V2. So if ``M M d <= theta M d`` for a
+    theta below 1, and ``rho = M d / (1 - theta)``, the disks of radius rho around V2 are sent into
+    themselves: they hold a solution of the AC power flow (Brouwer), and only one, because theta also bounds
+    the contraction there. Where theta is 1 or more, or rho above 0.1 |V2|, the bound is infinite.
+
+    Parameters
+    ----------
+    feeder, p, q, v0_squared
+        As in `bus_voltages`.
+
+    Returns
+    -------
+    (…, N)
+        Bound on the error of `v^2`, pu.
+
+    References
+    ----------
+    Wang et al. 2018, for the existence of the solution; the componentwise bound: docs/theory-mesh.md.
+    """
+    with np.errstate(all="ignore"):
+        s, _, idle = _start(feeder, p, q, v0_squared)
+        first = idle + np.conj(s / idle) @ feeder.between.T
+        second = idle + np.conj(s / first) @ feeder.between.T
+        low = (1.0 - _NEAR) * np.abs(second)
+        weight = np.abs(s) / (low * np.minimum(low, np.abs(first)))
+        once = (weight * np.abs(second - first)) @ feeder.size.T
+        twice = (weight * once) @ feeder.size.T
+        theta = np.max(np.where(twice > 0.0, twice / once, 0.0), axis=-1, keepdims=True, initial=0.0)
+        rho = once / (1.0 - theta)
+        holds = (theta < 1.0) & np.all(rho <= _NEAR * np.abs(second), axis=-1, keepdims=True)
+        bound = np.where(holds, rho * (2.0 * np.abs(second) + rho), np.inf)
+    return np.asarray(bound)
+
+
+def interval_bounds(
+    feeder: Meshed,
+    p: Floats,
+    q: Floats,
+    v0_squared: Floats | float,
+    *,
+    p_error: Floats,
+    q_error: Floats,
+) -> tuple[Floats, Floats]:
+    """How wrong the correction of `bus_voltages` can be for powers within intervals.
+
+    Parameters
+    ----------
+    feeder, p, q : (N,), v0_squared
+        As in `bus_voltages`, one operating point.
+    p_error, q_error : (N,)
+        How far the powers may be off, pu.
+
+    Returns
+    -------
+    (N,), (N,)
+        How far the correction moves, and what its first step leaves of the AC power flow, pu:
+        `gridsec.intervals.bounds`.
+    """
+    with np.errstate(all="ignore"):
+        s, _, idle = _start(feeder, p, q, v0_squared)
+        first = idle + np.conj(s / idle) @ feeder.between.T
+        second = idle + np.conj(s / first) @ feeder.between.T
+    error = np.hypot(p_error, q_error)
+    sweeps = Sweeps(idle, first, second, np.abs(s), lambda current: feeder.size @ current, np.zeros_like)
+    moved, rest = bounds(sweeps, error)
+    # The linear power flow has no charging and equal phases of the busbar, the first sweep those there are.
+    linear = (feeder.R + 1j * feeder.X)[feeder.bus]
+    apart = np.abs(np.conj(idle)[:, None] * feeder.between / np.conj(idle) - linear)
+    return np.asarray(moved + 2.0 * (apart @ error)), rest
+
+
+# How near to the second iterate, as a part of it, a solution is looked for.
+_NEAR = 0.1
+
+
+def _start(
+    feeder: Meshed, p: Floats, q: Floats, v0_squared: Floats | float
+) -> tuple[Phasors, Phasors, Phasors]:
+    """Powers of the customers (…, N), and voltages without load of all places (…, n) and of theirs."""
+    v0 = np.sqrt(np.asarray(v0_squared, dtype=np.float64))
+    idle = feeder.idle @ (v0 * ROTATION) if isinstance(feeder, PhasedMesh) else v0[..., None] * feeder.idle
+    return np.asarray(p + 1j * q), np.asarray(idle), np.asarray(idle[..., feeder.bus])
