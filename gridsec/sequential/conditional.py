@@ -90,6 +90,11 @@ class Fit:
         out[np.ix_(at, at)] = self.inverse
         return out
 
+    def trusting(self) -> tuple[Ints, Floats]:
+        """The trusted meters, and the inverse covariance of these alone, (t,) and (t, t)."""
+        at = np.flatnonzero(self.trusted)
+        return at, self.inverse if len(self.inverse) == at.size else self.inverse[np.ix_(at, at)]
+
     def weights(self, m: Floats) -> Floats:
         """Q m, (p,)."""
         if len(self.inverse) == self.noise.size:
@@ -300,10 +305,10 @@ def judge(now: Fit, m: Floats) -> Judged:
 
 
 def _judged(now: Fit, m: Floats, weights: Floats, w: Floats) -> Judged:
-    diagonal, at = now.diagonal(), now.prior.meters
-    with np.errstate(divide="ignore", invalid="ignore"):
-        offset = np.where(now.trusted, weights / diagonal, m - w[at])
-        variance = np.where(now.trusted, 1.0 / diagonal, now.variance[at] + now.noise)
+    trusted, at = now.trusted, now.prior.meters
+    pivot = np.where(trusted, now.diagonal(), 1.0)
+    offset = np.where(trusted, weights / pivot, m - w[at])
+    variance = np.where(trusted, 1.0 / pivot, now.variance[at] + now.noise)
     return Judged(weights, offset, np.sqrt(variance), w, float(m @ weights))
 
 

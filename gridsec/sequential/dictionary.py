@@ -74,7 +74,7 @@ Step = Callable[[], Move]
 
 
 class Powers:
-    """Gains of loosening, kept up to date: diag(A^T Q A) changes with Q by squares of one vector.
+    """Gains of loosening, kept up to date: Q A changes with Q by rank one, diag(A^T Q A) by squares.
 
     Parameters
     ----------
@@ -93,7 +93,9 @@ class Powers:
         self.columns = dictionary.columns(self.index)
         self.seen = self.columns[now.prior.meters]
         self.std, self.meter = dictionary.std[self.index], dictionary.meter[self.index]
-        self.form = np.einsum("ij,ij->j", now.Q @ self.seen, self.seen)
+        now.inverse = now.Q
+        self.spread = now.inverse @ self.seen
+        self.form = np.einsum("ij,ij->j", self.spread, self.seen)
         self.accused: list[int] = []
 
     @property
@@ -135,7 +137,9 @@ class Powers:
         move
             The change.
         """
-        self.form += move.factor * (move.q @ self.seen) ** 2
+        along = move.q @ self.seen
+        self.spread += np.multiply.outer(move.factor * move.q, along)
+        self.form += move.factor * along**2
         return move
 
     def _alone(self, weights: Floats) -> Floats:
@@ -144,9 +148,9 @@ class Powers:
 
     def _with_meter(self, weights: Floats) -> Floats:
         """The same if its meter were dropped as well, (k,); -inf where that has none, or is not trusted."""
-        at, Q = self.meter, self.now.Q
-        a, b = self.std**-2.0 + self.form, Q[at, at]
-        c = np.einsum("ki,ik->k", Q[at], self.seen)
+        at = self.meter
+        a, b = self.std**-2.0 + self.form, self.now.diagonal()[at]
+        c = self.spread[at, np.arange(at.size)]
         u, v = weights @ self.seen, weights[at]
         free = (at >= 0) & self.now.trusted[at]
         determinant = np.where(free, a * b - c * c, 1.0)

@@ -248,7 +248,7 @@ class Search:
         found = Found(self._descend(start, self.keep)) if few else None
         free = None
         if found is None or self._suspected(found) > self.design.options.several:
-            free = self._free()
+            free = self._free(found)
             if (free.best.trusted & self.keep).any():
                 held = self._fit(free.best.trusted & ~self.keep)
                 found = likelier(found, Found(self._descend(held, self.keep, fresh=True)))
@@ -308,16 +308,28 @@ class Search:
         enough = self.here.enough
         return min(int(np.count_nonzero(enough & ~each.trusted)) for each in (found.best, *found.others))
 
-    def _free(self) -> Found:
-        """What is found from starts that owe nothing to what was believed."""
+    def _free(self, held: Found | None) -> Found:
+        """What is found from starts that owe nothing to what was believed.
+
+        A descent stays where another one has ended: `held` too, unless there is somebody whom it only may
+        not admit.
+        """
         found: Found | None = None
+        ends = [] if held is None or self._holds_back(held.best) else [held.best]
         for chosen in self._starts():
-            # A descent stays where another one has ended.
-            if found is None or not np.array_equal(chosen & self.here.enough, found.best.trusted):
-                new = self._descend(self._fit(chosen), np.zeros_like(chosen), fresh=True)
-                found = likelier(found, Found(new))
+            end = next((end for end in ends if np.array_equal(chosen & self.here.enough, end.trusted)), None)
+            if end is None:
+                end = self._descend(self._fit(chosen), np.zeros_like(chosen), fresh=True)
+                ends.append(end)
+            if found is None or end is not found.best:
+                found = likelier(found, Found(end))
         assert found is not None  # noqa: S101  # there is a start
         return found
+
+    def _holds_back(self, found: Solution) -> bool:
+        """Whether it would admit somebody who must stay distrusted."""
+        judged, who = found.judged, self.keep & self.here.enough & ~found.trusted
+        return bool((who & (np.abs(judged.offset) < self.here.limits.of(judged.std))).any())
 
     def _starts(self) -> tuple[Bools, Bools]:
         """A robust fit, and the meters close to the model."""

@@ -346,7 +346,9 @@ def robust(prior: Prior, noise: Floats, m: Floats, live: Bools, bound: Floats) -
     if not at.size:
         return trusted
     d, y, limit = noise[at], m[at], bound[at] ** 2
-    rest = _residual(prior, at, d, y)
+    # In the order of LAPACK; symmetric, so the transpose is the same.
+    signal = prior.of_meters[np.ix_(prior.meters[at], at)].T
+    rest = _residual(signal, d, y)
     largest = float(np.max(rest * rest / limit))
     if largest <= 1.0:
         trusted[at] = True
@@ -356,7 +358,7 @@ def robust(prior: Prior, noise: Floats, m: Floats, live: Bools, bound: Floats) -
         ratio = np.maximum(rest * rest / limit, np.finfo(np.float64).tiny)
         soft = np.sqrt(hardness * (hardness + 1.0) / ratio) - hardness
         weight = np.clip(soft, 0.0, 1.0)
-        rest = _residual(prior, at, d / np.maximum(weight, _FEATHER), y)
+        rest = _residual(signal, d / np.maximum(weight, _FEATHER), y)
         if np.all((weight == 0.0) | (weight == 1.0)):
             break
         hardness *= _HARDER
@@ -364,10 +366,10 @@ def robust(prior: Prior, noise: Floats, m: Floats, live: Bools, bound: Floats) -
     return trusted
 
 
-def _residual(prior: Prior, at: Ints, noise: Floats, y: Floats) -> Floats:
-    """``y - w_hat`` for some meters with their noise."""
-    whole = prior.of_meters[np.ix_(prior.meters[at], at)].T
-    whole[np.diag_indices(at.size)] += noise
+def _residual(signal: Floats, noise: Floats, y: Floats) -> Floats:
+    """``y - w_hat`` of meters with covariance `signal` and their noise."""
+    whole = signal.copy(order="F")
+    whole[np.diag_indices(y.size)] += noise
     return np.asarray(noise * solved(whole, y))
 
 
@@ -417,26 +419,23 @@ def swaps(found: Solution, live: Bools, within: float, limits: Limits) -> list[S
     """
     now, judged = found.fit, found.judged
     prior, accused, out = now.prior, np.flatnonzero(live & ~now.trusted), []
-    inside, Q = now.loose[prior.meters], now.Q
-    for first in range(0, accused.size, _COLUMNS):
+    inside, (at, Q) = now.loose[prior.meters], now.trusting()
+    for first in range(0, accused.size if at.size else 0, _COLUMNS):
         who = accused[first : first + _COLUMNS]
-        columns = prior.of_meters[np.ix_(prior.meters, who)]
+        columns = prior.of_meters[np.ix_(prior.meters[at], who)]
         if inside.shape[1]:
-            columns += inside @ inside[who].T
+            columns += inside[at] @ inside[who].T
         v, s = Q @ columns, judged.std[who] ** 2
-        weights = judged.weights[:, None] - v * (judged.offset[who] / s)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            gain = weights**2 / (Q.diagonal()[:, None] + v**2 / s)
-        gain[~now.trusted] = -np.inf
+        weights = judged.weights[at, None] - v * (judged.offset[who] / s)
+        gain = weights**2 / (Q.diagonal()[:, None] + v**2 / s)
         best, each = gain.argmax(axis=0), np.arange(who.size)
         worse = judged.offset[who] ** 2 / s - gain[best, each]
         v, weight = v[best, each], weights[best, each]
         pivot = Q.diagonal()[best] + v**2 / s
-        with np.errstate(divide="ignore", invalid="ignore"):  # where nobody is trusted
-            precision = 1.0 / s - (v / s) ** 2 / pivot
-            offset = (judged.offset[who] + v * weight / pivot) / (s * precision)
+        precision = 1.0 / s - (v / s) ** 2 / pivot
+        offset = (judged.offset[who] + v * weight / pivot) / (s * precision)
         std = np.ones(now.trusted.size)
         std[who] = 1.0 / np.sqrt(precision)
         near = np.flatnonzero((worse <= within) & (np.abs(offset) <= limits.of(std)[who]))
-        out += [Swap(int(who[k]), int(best[k]), max(float(worse[k]), 0.0)) for k in near.tolist()]
+        out += [Swap(int(who[k]), int(at[best[k]]), max(float(worse[k]), 0.0)) for k in near.tolist()]
     return sorted(out, key=lambda swap: swap.worse)
