@@ -135,7 +135,8 @@ def _graph(parsed: Parsed, report: Report) -> tuple[list[Edge], Tree | None]:
             report.problems.append(f"{where}: from_bus and to_bus are both {one!r}; a line needs two buses")
         elif cells.get("closed", False):
             zero = cells.get("r_ohm") == 0 and cells.get("x_ohm") == 0
-            edges.append(Edge(cells.get("line", "?"), one, other, zero))
+            phases = len(cells.get("phases") or "abc")
+            edges.append(Edge(cells.get("line", "?"), one, other, zero, phases=phases))
     found = tree(busbar if busbar is not None else next(iter(known), ""), edges, known)
     _loops(found, edges, parsed.top("meshed") is True, report)
     whole = all({"from_bus", "to_bus", "closed"} <= row.cells.keys() for row in parsed.lines or ())

@@ -24,7 +24,7 @@ from feeders.equipment import (
     names,
     positions,
 )
-from feeders.load_phases import three_phase
+from feeders.load_phases import spanned
 from feeders.schema import CustomerRow, FeederTables, validate
 from feeders.taps import Referred, refer
 from feeders.topology import Edge, Tree, tree
@@ -33,7 +33,7 @@ from gridsec.detect import MeterAccuracy
 from gridsec.droop import Droop
 from gridsec.errors import FeederInvalid
 from gridsec.feeder import Feeder
-from gridsec.mesh import MeshedFeeder
+from gridsec.mesh import Meshed, MeshedFeeder, PhasedMesh
 from gridsec.monitor import Plant
 from gridsec.network import Network
 from gridsec.online import Frame
@@ -116,7 +116,7 @@ class Site:
     @property
     def ties(self) -> Ints:
         """Buses at both ends of the lines that close loops in `spanning`, (t, 2)."""
-        return self.feeder.ends if isinstance(self.feeder, MeshedFeeder) else np.zeros((0, 2), dtype=np.intp)
+        return self.feeder.ends if isinstance(self.feeder, Meshed) else np.zeros((0, 2), dtype=np.intp)
 
     @property
     def tree(self) -> Feeder | ThreePhaseFeeder:
@@ -127,7 +127,7 @@ class Site:
         FeederInvalid
             If closed lines form loops.
         """
-        if isinstance(self.feeder, MeshedFeeder):
+        if isinstance(self.feeder, Meshed):
             raise FeederInvalid(["lines: closed lines form loops, and this takes radial feeders only"])
         return self.spanning
 
@@ -266,9 +266,10 @@ def _parts(row: CustomerRow) -> list[CustomerRow]:
 
 def _in_phases(tables: FeederTables) -> Site:
     """The site of a feeder whose customers have one phase each."""
-    found = three_phase(tables)
+    found, ties = spanned(tables)
     parts = {f.name: getattr(found, f.name) for f in fields(found)}
-    places = {"feeder": PhasedFeeder(found.feeder), "base_volt": frozen(found.base_volt.ravel())}
+    feeder = PhasedMesh(found.feeder, *ties) if ties.ends.size else PhasedFeeder(found.feeder)
+    places = {"feeder": feeder, "base_volt": frozen(found.base_volt.ravel())}
     return Site(**parts | places)
 
 

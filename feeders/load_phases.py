@@ -5,10 +5,10 @@ Customers have one phase or all three. What the monitors run on, `feeders.load.l
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from feeders.equipment import (
 from feeders.matrices import cells_of, series_ohm, shunt_us
 from feeders.schema import FeederTables, LineRow, validate
 from feeders.taps import Referred, refer
-from feeders.topology import LOOPS_SHOWN, Edge, Tree, tree
+from feeders.topology import Edge, Tree, tree
 from gridsec.arrays import Floats, Ints, Phasors, frozen
 from gridsec.detect import MeterAccuracy
 from gridsec.droop import Droop
@@ -35,6 +35,15 @@ from gridsec.phases import PHASES, ThreePhaseFeeder, sequence_matrix
 
 if TYPE_CHECKING:
     from gridsec.arrays import Bools
+
+
+class Ties(NamedTuple):
+    """Lines that close loops, as `gridsec.mesh.PhasedMesh` takes them: ends, phases, z and charging."""
+
+    ends: Ints
+    phases: Bools
+    z: Phasors
+    charging: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,21 +121,40 @@ def three_phase(tables: FeederTables) -> ThreePhaseSite:
     Raises
     ------
     FeederInvalid
-        If the tables are not valid, or lack what three phases need.
+        If the tables are not valid, lack what three phases need, or have closed loops.
+    """
+    site, ties = spanned(tables)
+    if ties.ends.size:
+        raise FeederInvalid(["lines: closed lines form loops, and this takes radial feeders only"])
+    return site
+
+
+def spanned(tables: FeederTables) -> tuple[ThreePhaseSite, Ties]:
+    """`three_phase` of a tree that brings every phase of every bus, and the lines that close loops in it.
+
+    Parameters
+    ----------
+    tables
+        The feeder's tables.
+
+    Raises
+    ------
+    FeederInvalid
+        If the tables are not valid, or no tree does.
     """
     problems = validate(tables) or _unsupported(tables)
     if problems:
         raise FeederInvalid(problems)
     meta = tables.meta
     closed = [line for line in tables.lines if line.closed]
-    edges = [Edge(row.line, row.from_bus, row.to_bus, _fuses(row)) for row in closed]
+    edges = [Edge(row.line, row.from_bus, row.to_bus, _fuses(row), phases=len(row.phases)) for row in closed]
     found = tree(meta.busbar, edges)
-    if found.ties:
-        named = ", ".join(repr(closed[k].line) for k in found.ties[:LOOPS_SHOWN])
-        raise FeederInvalid([f"lines: {named} close loops; only balanced feeders can be meshed"])
     base = refer(tables, closed, found)
+    beyond = _beyond(base.lines, base.ties, found)
+    if beyond:
+        raise FeederInvalid(beyond)
     metered = metered_customers(tables)
-    return ThreePhaseSite(
+    site = ThreePhaseSite(
         tables=tables,
         feeder=_feeder(tables, base, found),
         droop=inverters(tables, base.customer),
@@ -139,28 +167,56 @@ def three_phase(tables: FeederTables) -> ThreePhaseSite:
         base_volt=frozen(base.bus * meta.voltage_volt),
         digest=digest(tables),
     )
+    return site, _ties(tables, base, found)
 
 
 def _feeder(tables: FeederTables, base: Referred, found: Tree) -> ThreePhaseFeeder:
     meta, lines = tables.meta, base.lines
     side = base.branch * meta.voltage_volt
-    z_base = 3.0 * (side[:, :, None] * side[:, None, :]) / (1000.0 * meta.base_kva)
-    phases = np.array([(True,) * 3, *(_present(line.phases) for line in lines)])
-    both = phases[1:, :, None] & phases[1:, None, :]
-    charging = np.array([shunt_of(line) for line in lines]) * (1e-6 * z_base)
+    present, z, charging = _blocks(lines, side, meta.base_kva)
     return ThreePhaseFeeder(
         name=meta.name,
         parent=np.array(found.parent, dtype=np.intp),
-        z=np.where(both, np.array([series_of(line) for line in lines]) / z_base, 0.0),
-        phases=phases,
+        z=z,
+        phases=np.vstack([np.ones((1, 3), dtype=np.bool_), present]),
         bus=np.array([found.group[row.bus] for row in tables.customers], dtype=np.intp),
         connected=np.array([_present(row.phases) for row in tables.customers]).reshape(-1, 3),
         customers=tuple(row.customer for row in tables.customers),
         buses=found.buses,
         base_volt=meta.voltage_volt,
         base_kva=meta.base_kva,
-        charging=np.where(both, charging, 0.0),
+        charging=charging,
     )
+
+
+def _ties(tables: FeederTables, base: Referred, found: Tree) -> Ties:
+    ends = [(found.group[tie.from_bus], found.group[tie.to_bus]) for tie in base.ties]
+    side = base.tie * tables.meta.voltage_volt
+    blocks = _blocks(base.ties, side, tables.meta.base_kva)
+    return Ties(np.array(ends, dtype=np.intp).reshape(-1, 2), *blocks)
+
+
+def _blocks(lines: Sequence[LineRow], side: Floats, base_kva: float) -> tuple[Bools, Phasors, Floats]:
+    """Phases (L, 3), impedances and susceptances (L, 3, 3) of lines with the voltage bases `side` (L, 3)."""
+    z_base = 3.0 * (side[:, :, None] * side[:, None, :]) / (1000.0 * base_kva)
+    present = np.array([_present(line.phases) for line in lines], dtype=np.bool_).reshape(-1, 3)
+    both = present[:, :, None] & present[:, None, :]
+    z = np.array([series_of(line) for line in lines]).reshape(-1, 3, 3) / z_base
+    charging = np.array([shunt_of(line) for line in lines]).reshape(-1, 3, 3) * (1e-6 * z_base)
+    return present, np.where(both, z, 0.0), np.where(both, charging, 0.0)
+
+
+def _beyond(lines: Sequence[LineRow], ties: Sequence[LineRow], found: Tree) -> list[str]:
+    """Phases that reach a bus only through a line that closes a loop: what the tree cannot say."""
+    there = [set(PHASES), *(set(line.phases) for line in lines)]
+    return [
+        f"lines, line {tie.line!r} closes a loop and brings phase {phase!r} to {bus!r}, which no line of the "
+        "tree has there; expected lines in parallel of single phases as one row with a matrix"
+        for tie in ties
+        for bus in (tie.from_bus, tie.to_bus)
+        for phase in tie.phases
+        if phase not in there[found.group[bus]]
+    ]
 
 
 def series_of(line: LineRow) -> Phasors:

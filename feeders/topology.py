@@ -13,12 +13,13 @@ LOOPS_SHOWN = 20
 
 @dataclass(frozen=True, slots=True)
 class Edge:
-    """A closed line: its id, its two buses, and whether it has any impedance."""
+    """A closed line: its id, its two buses, whether it has any impedance, how many phases."""
 
     line: str
     from_bus: str
     to_bus: str
     zero: bool
+    phases: int = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,16 +98,12 @@ def tree(busbar: str, edges: Sequence[Edge], others: Iterable[str] = ()) -> Tree
             fused.join(edge.from_bus, edge.to_bus)
             connected.join(edge.from_bus, edge.to_bus)
     neighbours: dict[str, list[tuple[int, str]]] = {bus: [] for bus in fused.rank}
-    closing = []
+    closing = _closing(edges, connected)
     for k, edge in enumerate(edges):
-        if edge.zero:
-            continue
-        a, b = fused.find(edge.from_bus), fused.find(edge.to_bus)
-        if connected.join(a, b):
+        if not edge.zero and k not in closing:
+            a, b = fused.find(edge.from_bus), fused.find(edge.to_bus)
             neighbours[a].append((k, b))
             neighbours[b].append((k, a))
-        else:
-            closing.append(k)
     index, parent, branch = _walk(fused.find(busbar), neighbours)
     short = [k for k in closing if fused.find(edges[k].from_bus) == fused.find(edges[k].to_bus)]
     shown = sorted([*short, *[k for k in closing if k not in short][:LOOPS_SHOWN]])
@@ -124,6 +121,16 @@ def tree(busbar: str, edges: Sequence[Edge], others: Iterable[str] = ()) -> Tree
         loops,
         tuple(map(tuple, pieces.values())),
     )
+
+
+def _closing(edges: Sequence[Edge], connected: _Sets) -> list[int]:
+    """Edges that close loops, those of fewer phases and the later ones rather than others (Kruskal).
+
+    If any tree brings every phase to wherever it goes, this one does: its lines have the most phases together
+    that a tree can have, one less for each phase than buses have it.
+    """
+    order = sorted((k for k, edge in enumerate(edges) if not edge.zero), key=lambda k: -edges[k].phases)
+    return sorted(k for k in order if not connected.join(edges[k].from_bus, edges[k].to_bus))
 
 
 def _walk(

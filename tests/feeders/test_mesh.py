@@ -90,14 +90,6 @@ def test_a_line_between_two_names_of_one_bus_stays_an_error() -> None:
     assert problem.startswith("lines: short is short-circuited")
 
 
-def test_single_phases_cannot_be_meshed() -> None:
-    tables = closed(villages.tables())
-    lines = tuple(replace(row, r0_ohm=3 * row.r_ohm, x0_ohm=3 * row.x_ohm) for row in tables.lines)
-    rows = (replace(tables.customers[0], phases="b"), *tables.customers[1:])
-    with pytest.raises(FeederInvalid, match="'tie' close loops; only balanced feeders can be meshed"):
-        from_tables(replace(tables, lines=lines, customers=rows))
-
-
 # --- the model against the power flow -----------------------------------------------------------
 
 
