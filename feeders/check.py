@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import defaultdict
 from typing import Any
 
-from feeders import matrices, profiles, units
+from feeders import levels, matrices, profiles, units
 from feeders.records import Parsed, Report, rows, some
 from feeders.topology import Edge, Tree, tree
 from gridsec.droop import PRESETS
@@ -136,7 +136,7 @@ def _graph(parsed: Parsed, report: Report) -> tuple[list[Edge], Tree | None]:
         elif cells.get("closed", False):
             zero = cells.get("r_ohm") == 0 and cells.get("x_ohm") == 0
             phases = len(cells.get("phases") or "abc")
-            edges.append(Edge(cells.get("line", "?"), one, other, zero, phases=phases))
+            edges.append(Edge(cells.get("line", "?"), one, other, zero, cells.get("to_volt"), phases=phases))
     found = tree(busbar if busbar is not None else next(iter(known), ""), edges, known)
     _loops(found, edges, parsed.top("meshed") is True, report)
     whole = all({"from_bus", "to_bus", "closed"} <= row.cells.keys() for row in parsed.lines or ())
@@ -153,7 +153,15 @@ def _graph(parsed: Parsed, report: Report) -> tuple[list[Edge], Tree | None]:
     else:
         report.problems.append(f"{parsed.place}, key busbar: no closed line is connected to {busbar!r}")
     _fused(found, report)
+    _levels(found, edges, parsed, report)
     return edges, found
+
+
+def _levels(found: Tree, edges: list[Edge], parsed: Parsed, report: Report) -> None:
+    volt = parsed.top("voltage_volt")
+    places = {cells["line"]: where for where, cells in rows(parsed.lines, "line")}
+    for k, problem in levels.problems(found, edges, volt) if volt is not None else ():
+        report.problems.append(f"{places.get(edges[k].line, 'lines')}, column to_volt: {problem}")
 
 
 def _loops(found: Tree, edges: list[Edge], meshed: bool, report: Report) -> None:

@@ -135,7 +135,7 @@ def inverters(tables: FeederTables, ratio: Floats) -> Droop:
     tables
         The feeder's tables.
     ratio : (N,)
-        Of each customer's voltage base and the nominal voltage, in which curves are standardised.
+        Of each customer's voltage base and its nominal voltage, in which curves are standardised.
     """
     own = [k for k, row in enumerate(tables.customers) if row.inverter_kva > 0]
     rows = [tables.customers[k] for k in own]
@@ -150,17 +150,27 @@ def inverters(tables: FeederTables, ratio: Floats) -> Droop:
     return made if (base == 1.0).all() else replace(made, v=made.v / base[:, None])
 
 
-def accuracy(tables: FeederTables, ratio: Floats) -> MeterAccuracy:
-    """Return what the meters promise, in the voltage base of each; arguments as of `inverters`."""
+def accuracy(tables: FeederTables, base_volt: Floats, nominal_volt: Floats) -> MeterAccuracy:
+    """Return what the meters promise, in the voltage base of each.
+
+    Parameters
+    ----------
+    tables
+        The feeder's tables.
+    base_volt, nominal_volt : (N,)
+        1 pu at each customer, and its nominal voltage, V.
+    """
     meta = tables.meta
     metered = metered_customers(tables)
-    rows, base = [tables.customers[k] for k in metered], ratio[metered]
+    rows, base = [tables.customers[k] for k in metered], base_volt[metered]
     return MeterAccuracy(
         class_fraction=frozen(_either(rows, "class_percent", meta.meters.class_percent) / 100.0),
-        resolution=frozen(
-            _either(rows, "resolution_volt", meta.meters.resolution_volt) / (base * meta.voltage_volt)
+        resolution=frozen(_either(rows, "resolution_volt", meta.meters.resolution_volt) / base),
+        jitter=frozen(
+            _either(rows, "jitter_percent", meta.meters.jitter_percent)
+            / 100.0
+            / (base / nominal_volt[metered])
         ),
-        jitter=frozen(_either(rows, "jitter_percent", meta.meters.jitter_percent) / 100.0 / base),
         busbar_class=meta.busbar_class_percent / 100.0,
         busbar_resolution=meta.busbar_resolution_volt / meta.voltage_volt,
         busbar_jitter=meta.busbar_jitter_percent / 100.0,

@@ -86,6 +86,8 @@ class Site:
         What is known of the customers' powers.
     base_volt : (n,)
         1 pu of every place, V: the nominal voltage, but behind taps its part, see `feeders.taps`.
+    nominal_volt : (n,)
+        Nominal voltage of every place, V: another one than the busbar's behind a transformer.
     digest
         SHA-256 of the content: key of design caches. It changes with every value and with the order of
         the rows (which is the order of all arrays), not with layout, comments or unknown columns.
@@ -101,12 +103,18 @@ class Site:
     xy: Floats | None
     loads: LoadModel
     base_volt: Floats
+    nominal_volt: Floats
     digest: str
 
     @property
     def customer_volt(self) -> Floats:
         """1 pu at every customer, V, (N,)."""
         return np.asarray(self.base_volt[self.feeder.bus])
+
+    @property
+    def customer_nominal(self) -> Floats:
+        """Nominal voltage of every customer, V, (N,)."""
+        return np.asarray(self.nominal_volt[self.feeder.bus])
 
     @property
     def spanning(self) -> Feeder | ThreePhaseFeeder:
@@ -215,14 +223,15 @@ def from_tables(tables: FeederTables) -> Site:
     return Site(
         tables=tables,
         feeder=_meshed(tables, feeder, base, found) if base.ties else feeder,
-        droop=inverters(tables, base.customer),
+        droop=inverters(tables, base.customer / base.customer_nominal),
         meters=metered,
         meter_ids=tuple(tables.customers[k].meter for k in metered),
-        accuracy=accuracy(tables, base.customer),
+        accuracy=accuracy(tables, base.customer, base.customer_nominal),
         bus_of_file=found.group,
         xy=positions(tables, found),
         loads=load_model(tables),
-        base_volt=frozen(base.bus[:, 0] * meta.voltage_volt),
+        base_volt=frozen(base.bus[:, 0]),
+        nominal_volt=frozen(base.nominal),
         digest=digest(tables),
     )
 
@@ -269,7 +278,11 @@ def _in_phases(tables: FeederTables) -> Site:
     found, ties = spanned(tables)
     parts = {f.name: getattr(found, f.name) for f in fields(found)}
     feeder = PhasedMesh(found.feeder, *ties) if ties.ends.size else PhasedFeeder(found.feeder)
-    places = {"feeder": feeder, "base_volt": frozen(found.base_volt.ravel())}
+    places = {
+        "feeder": feeder,
+        "base_volt": frozen(found.base_volt.ravel()),
+        "nominal_volt": frozen(np.repeat(found.nominal_volt, len(PHASES))),
+    }
     return Site(**parts | places)
 
 
@@ -375,7 +388,7 @@ def _unsupported(tables: FeederTables) -> tuple[str, ...]:
 
 def _feeder(tables: FeederTables, base: Referred, found: Tree) -> Feeder:
     meta, lines = tables.meta, base.lines
-    z_base = 3.0 * (base.branch[:, 0] * meta.voltage_volt) ** 2 / (1000.0 * meta.base_kva)
+    z_base = 3.0 * base.branch[:, 0] ** 2 / (1000.0 * meta.base_kva)
     return Feeder(
         name=meta.name,
         parent=indices(found.parent),
@@ -392,7 +405,7 @@ def _feeder(tables: FeederTables, base: Referred, found: Tree) -> Feeder:
 
 def _meshed(tables: FeederTables, feeder: Feeder, base: Referred, found: Tree) -> MeshedFeeder:
     meta, ties = tables.meta, base.ties
-    z_base = 3.0 * (base.tie[:, 0] * meta.voltage_volt) ** 2 / (1000.0 * meta.base_kva)
+    z_base = 3.0 * base.tie[:, 0] ** 2 / (1000.0 * meta.base_kva)
     return MeshedFeeder(
         tree=feeder,
         ends=np.array([(found.group[tie.from_bus], found.group[tie.to_bus]) for tie in ties], dtype=np.intp),

@@ -58,6 +58,8 @@ class ThreePhaseSite:
         The radial tree, pu; powers of single phases in thirds of `base_kva`.
     base_volt : (b + 1, 3)
         1 pu of every phase of every bus, V, see `feeders.taps`.
+    nominal_volt : (b + 1,)
+        Nominal voltage of every bus, V.
     droop, meters, meter_ids, accuracy, bus_of_file, xy, loads, digest
         As in `feeders.load.Site`, in units of `base_kva`: `gridsec.phases.per_customer` fits them.
     """
@@ -72,6 +74,7 @@ class ThreePhaseSite:
     xy: Floats | None
     loads: LoadModel
     base_volt: Floats
+    nominal_volt: Floats
     digest: str
 
     @property
@@ -157,14 +160,15 @@ def spanned(tables: FeederTables) -> tuple[ThreePhaseSite, Ties]:
     site = ThreePhaseSite(
         tables=tables,
         feeder=_feeder(tables, base, found),
-        droop=inverters(tables, base.customer),
+        droop=inverters(tables, base.customer / base.customer_nominal),
         meters=metered,
         meter_ids=tuple(tables.customers[k].meter for k in metered),
-        accuracy=accuracy(tables, base.customer),
+        accuracy=accuracy(tables, base.customer, base.customer_nominal),
         bus_of_file=found.group,
         xy=positions(tables, found),
         loads=load_model(tables),
-        base_volt=frozen(base.bus * meta.voltage_volt),
+        base_volt=frozen(base.bus),
+        nominal_volt=frozen(base.nominal),
         digest=digest(tables),
     )
     return site, _ties(tables, base, found)
@@ -172,7 +176,7 @@ def spanned(tables: FeederTables) -> tuple[ThreePhaseSite, Ties]:
 
 def _feeder(tables: FeederTables, base: Referred, found: Tree) -> ThreePhaseFeeder:
     meta, lines = tables.meta, base.lines
-    side = base.branch * meta.voltage_volt
+    side = base.branch
     present, z, charging = _blocks(lines, side, meta.base_kva)
     return ThreePhaseFeeder(
         name=meta.name,
@@ -191,7 +195,7 @@ def _feeder(tables: FeederTables, base: Referred, found: Tree) -> ThreePhaseFeed
 
 def _ties(tables: FeederTables, base: Referred, found: Tree) -> Ties:
     ends = [(found.group[tie.from_bus], found.group[tie.to_bus]) for tie in base.ties]
-    side = base.tie * tables.meta.voltage_volt
+    side = base.tie
     blocks = _blocks(base.ties, side, tables.meta.base_kva)
     return Ties(np.array(ends, dtype=np.intp).reshape(-1, 2), *blocks)
 

@@ -7,6 +7,7 @@ shows as a disagreement. Balanced three-phase, slack at the metered busbar, load
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Self
 
@@ -57,10 +58,11 @@ class Grid:
         Bus of each customer.
     bus_count
         Number of buses B.
-    nominal_volt
-        Nominal phase-to-neutral voltage, V.
+    nominal_volt : scalar or (B,)
+        Nominal phase-to-neutral voltage, V; or that of each bus.
     tap : (L,), optional
-        Ratio of an ideal transformer at the first end of each line: the voltage there by that behind it.
+        Ratio of an ideal transformer at the first end of each line: the voltage there by that behind it, each
+        in parts of its nominal voltage.
     """
 
     ends: Ints
@@ -70,7 +72,7 @@ class Grid:
     busbar: int
     customer_bus: Ints
     bus_count: int
-    nominal_volt: float
+    nominal_volt: Floats | float
     tap: Floats | None = None
 
 
@@ -102,7 +104,7 @@ class PowerFlow:
     def _prepare(self, grid: Grid, order: Ints) -> None:
         self.grid = grid
         self._order = order
-        self._scale = grid.nominal_volt
+        self._scale = np.broadcast_to(grid.nominal_volt, (grid.bus_count,))
         self._model = PowerGridModel(_components(grid))
         self._loads = _load_update(grid, (grid.customer_bus.size,))
         self._source = _source_update(grid, (1,))
@@ -172,7 +174,7 @@ class PowerFlow:
         loads["p_specified"] = p_kw * 1e3
         loads["q_specified"] = q_kvar * 1e3
         source = _source_update(self.grid, (count, 1))
-        source["u_ref"][:, 0] = v0_volt / self._scale
+        source["u_ref"][:, 0] = v0_volt / self._scale[self.grid.busbar]
         by_node = self._calculate(
             "u_pu",
             update_data={ComponentType.sym_load: loads, ComponentType.source: source},
@@ -184,7 +186,7 @@ class PowerFlow:
     def _solve(self, p_kw: Floats, q_kvar: Floats, v0_volt: Floats | float, column: str) -> Floats:
         np.multiply(p_kw, 1e3, out=self._loads["p_specified"])
         np.multiply(q_kvar, 1e3, out=self._loads["q_specified"])
-        self._source["u_ref"] = v0_volt / self._scale
+        self._source["u_ref"] = v0_volt / self._scale[self.grid.busbar]
         self._model.update(
             update_data={ComponentType.sym_load: self._loads, ComponentType.source: self._source}
         )
@@ -219,23 +221,55 @@ def _grid(site: Site) -> tuple[Grid, Ints]:
     x = np.array([line.x_ohm for line in closed], dtype=np.float64)
     b = np.array([line.b_us for line in closed], dtype=np.float64) * 1e-6
     tap = np.array([line.tap for line in closed], dtype=np.float64)
+    to_volt = np.array([line.to_volt for line in closed], dtype=np.float64)
     solid = (r == 0.0) & (x == 0.0)
     node, count = _fuse(ends[solid], len(names))
+    busbar, ends = int(node[number[tables.meta.busbar]]), node[ends]
     grid = Grid(
-        ends=node[ends[~solid]],
+        ends=ends[~solid],
         r_ohm=r[~solid],
         x_ohm=x[~solid],
         b_siemens=b[~solid],
-        busbar=int(node[number[tables.meta.busbar]]),
+        busbar=busbar,
         customer_bus=node[np.array([number[row.bus] for row in tables.customers], dtype=np.intp)],
         bus_count=count,
-        nominal_volt=tables.meta.voltage_volt,
+        nominal_volt=levels(ends, to_volt, busbar, tables.meta.voltage_volt, count),
         tap=tap[~solid],
     )
     order = np.full(len(site.feeder.buses), -1, dtype=np.intp)
     for name, i in number.items():
         order[site.bus_of_file[name]] = node[i]
     return grid, order
+
+
+def levels(ends: Ints, to_volt: Floats, busbar: int, volt: float, count: int) -> Floats:
+    """Return the nominal voltage of every bus, V: from the busbar on, until a transformer changes it.
+
+    Parameters
+    ----------
+    ends : (L, 2)
+        The buses at both ends of each line.
+    to_volt : (L,)
+        Nominal voltage of the second of them, V; NaN where it is that of the first.
+    busbar, volt
+        The busbar, and its nominal voltage, V.
+    count
+        Number of buses.
+    """
+    if np.isnan(to_volt).all():
+        return np.full(count, volt)
+    near: dict[int, list[tuple[int, float]]] = defaultdict(list)
+    for (one, other), there in zip(ends.tolist(), to_volt.tolist(), strict=True):
+        near[one].append((other, there))
+        if np.isnan(there):
+            near[other].append((one, there))
+    found, order = {busbar: volt}, [busbar]
+    for bus in order:
+        for other, there in near[bus]:
+            if other not in found:
+                found[other] = found[bus] if np.isnan(there) else there
+                order.append(other)
+    return np.array([found[bus] for bus in range(count)])
 
 
 def _fuse(pairs: Ints, count: int) -> tuple[Ints, int]:
@@ -251,10 +285,12 @@ def _components(grid: Grid) -> dict[ComponentType, Any]:
     lines, customers = len(grid.ends), grid.customer_bus.size
     node = initialize_array(DatasetType.input, ComponentType.node, grid.bus_count)
     node["id"] = np.arange(grid.bus_count)
-    node["u_rated"] = grid.nominal_volt * np.sqrt(3.0)
+    level = np.broadcast_to(grid.nominal_volt, (grid.bus_count,))
+    node["u_rated"] = level * np.sqrt(3.0)
 
     number = grid.bus_count + np.arange(lines)
-    tapped = np.zeros(lines, dtype=np.bool_) if grid.tap is None else grid.tap != 1.0
+    tap = np.ones(lines) if grid.tap is None else grid.tap
+    tapped = (tap != 1.0) | (level[grid.ends[:, 0]] != level[grid.ends[:, 1]])
     line = initialize_array(DatasetType.input, ComponentType.line, int((~tapped).sum()))
     branch = initialize_array(DatasetType.input, ComponentType.generic_branch, int(tapped.sum()))
     for table, rows in ((line, ~tapped), (branch, tapped)):
@@ -264,8 +300,7 @@ def _components(grid: Grid) -> dict[ComponentType, Any]:
         table["r1"], table["x1"] = grid.r_ohm[rows], grid.x_ohm[rows]
     line["c1"] = grid.b_siemens[~tapped] / (2.0 * np.pi * FREQUENCY_HZ)
     line["tan1"] = 0.0
-    if grid.tap is not None:
-        branch["k"], branch["b1"] = grid.tap[tapped], grid.b_siemens[tapped]
+    branch["k"], branch["b1"] = tap[tapped], grid.b_siemens[tapped]
     branch["theta"] = branch["g1"] = 0.0
 
     load = initialize_array(DatasetType.input, ComponentType.sym_load, customers)

@@ -24,7 +24,7 @@ import numpy as np
 from scipy.sparse import coo_array, csc_array
 from scipy.sparse.linalg import splu
 
-from feeders.powerflow import PowerFlow, PowerFlowDiverged
+from feeders.powerflow import PowerFlow, PowerFlowDiverged, levels
 from gridsec.arrays import Bools, Floats, Ints, Phasors
 from gridsec.network import InPhases
 
@@ -63,8 +63,8 @@ class UnbalancedGrid:
         Phases of each customer; its power is split evenly.
     bus_count
         Number of buses B.
-    nominal_volt
-        Nominal phase-to-neutral voltage, V.
+    nominal_volt : scalar or (B,)
+        Nominal phase-to-neutral voltage, V; or that of each bus.
     tap : (L, 3), optional
         Ratios of an ideal transformer at the first end of each line: the voltages there by those behind it.
     source_ohm : (3, 3), optional
@@ -81,7 +81,7 @@ class UnbalancedGrid:
     customer_bus: Ints
     connected: Bools
     bus_count: int
-    nominal_volt: float
+    nominal_volt: Floats | float
     source_ohm: Phasors | None = None
     tap: Floats | None = None
 
@@ -211,15 +211,16 @@ class UnbalancedPowerFlow:
 
     def _currents(self, idle: Phasors, power: Phasors) -> Phasors:
         """Currents that the connections inject, from their powers and their voltages without load."""
-        tolerance = TOLERANCE_PU * self.grid.nominal_volt
+        level = np.broadcast_to(self.grid.nominal_volt, (self.grid.bus_count,))
+        tolerance = TOLERANCE_PU * level[self._node // 3]
         transfer = self._transfer[self._node].T
         v = idle
         failed = np.zeros(idle.shape[0], dtype=np.bool_)
         with np.errstate(all="ignore"):
             for _ in range(ITERATIONS):
                 before, v = v, idle + np.conj(power / v) @ transfer
-                change = np.abs(v - before).max(axis=1, initial=0.0)
-                failed = ~(change <= tolerance)
+                change = (np.abs(v - before) / tolerance).max(axis=1, initial=0.0)
+                failed = ~(change <= 1.0)
                 if not failed.any() or not np.isfinite(change).all():
                     break
         if failed.any():
@@ -322,19 +323,24 @@ def _grid(tables: FeederTables, source_ohm: Phasors | None) -> tuple[UnbalancedG
     number = {root: k for k, root in enumerate(dict.fromkeys(map(find, list(above))))}
     node = {bus: number[find(bus)] for bus in above}
     lines = [line for line in closed if not line.r_ohm == line.x_ohm == 0.0]
-    count = len(lines)
+    count, busbar = len(lines), node[tables.meta.busbar]
+    ends = np.array([(node[line.from_bus], node[line.to_bus]) for line in lines], dtype=np.intp)
+    ends = ends.reshape(-1, 2)
+    to_volt = np.array([line.to_volt for line in lines], dtype=np.float64)
+    nominal = levels(ends, to_volt, busbar, tables.meta.voltage_volt, len(number))
+    taps = np.array([line.taps for line in lines]).reshape(count, 3)
     grid = UnbalancedGrid(
-        ends=np.array([(node[line.from_bus], node[line.to_bus]) for line in lines], dtype=np.intp),
+        ends=ends,
         present=np.array([_present(line.phases) for line in lines]),
         z_ohm=np.array([_series(line) for line in lines]).reshape(count, 3, 3),
         b_siemens=np.array([_shunt(line) for line in lines]).reshape(count, 3, 3),
-        busbar=node[tables.meta.busbar],
+        busbar=busbar,
         customer_bus=np.array([node[row.bus] for row in tables.customers], dtype=np.intp),
         connected=np.array([_present(row.phases) for row in tables.customers]).reshape(-1, 3),
         bus_count=len(number),
-        nominal_volt=tables.meta.voltage_volt,
+        nominal_volt=nominal,
         source_ohm=source_ohm,
-        tap=np.array([line.taps for line in lines]).reshape(count, 3),
+        tap=taps * (nominal[ends[:, 0]] / nominal[ends[:, 1]])[:, None],
     )
     return grid, node
 

@@ -68,6 +68,7 @@ class LineRow:
     tap_a: float | None = None
     tap_b: float | None = None
     tap_c: float | None = None
+    to_volt: float | None = None
     closed: bool = True
     rating_a: float | None = None
     to_x: float | None = None
@@ -259,7 +260,7 @@ def from_json(obj: object) -> FeederTables:
 def to_json(tables: FeederTables) -> dict[str, Any]:
     """Return the JSON form: the same names as in the files, a list of rows per table.
 
-    Matrices and taps of single phases are left out where there are none.
+    Matrices, taps of single phases and voltages behind transformers are left out where there are none.
     """
     meta = asdict(tables.meta)
     meta["accept"] = list(tables.meta.accept)
@@ -293,7 +294,8 @@ def _tables(examination: Examination) -> FeederTables:
 
 def _ordered(row: dict[str, Any], columns: tuple[Column, ...]) -> dict[str, Any]:
     given = (column.name for column in columns)
-    return {name: row[name] for name in given if row[name] is not None or name not in PHASE_NAMES}
+    seldom = {*PHASE_NAMES, "to_volt"}
+    return {name: row[name] for name in given if row[name] is not None or name not in seldom}
 
 
 # --- from cells to typed rows -------------------------------------------------------------------

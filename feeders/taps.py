@@ -1,10 +1,12 @@
-"""Taps: ideal transformers of fixed ratio inside a feeder, referred to the busbar's side.
+"""Taps and transformers inside a feeder: ideal ones of fixed ratio, referred to the busbar's side.
 
-Behind a tap t, ``V_from = t V``, every voltage has another base: ``a_k V`` with V the nominal voltage and a_k
-the product of ``1 / t`` over the taps on the way from the busbar to bus k. With the impedances in the base of
-their own side, ``3 (a V)^2 / (1000 S)``, the ideal transformer is gone: in per unit this is a feeder without
-it. Each phase may have a tap of its own; a mutual impedance is then in ``3 a_φ a_ψ V^2 / (1000 S)``, so that
-matrices stay symmetric. Only what goes between volts and per unit, customer by customer, needs a_k.
+Behind a tap t, ``V_from = t V``, every voltage has another base: ``a_k V_k`` with V_k the nominal voltage of
+bus k, which transformers may have changed on the way, and a_k the product of ``1 / t`` over the taps between
+the busbar and bus k. With the impedances in the base of their own side, ``3 (a V)^2 / (1000 S)``, the ideal
+transformer is gone: in per unit this is a feeder without it. Each phase may have a tap of its own; a mutual
+impedance is then in ``3 a_φ a_ψ V^2 / (1000 S)``, so that matrices stay symmetric. Only what goes between
+volts and per unit, customer by customer, needs a_k V_k; what is standardised in parts of the nominal voltage
+needs V_k.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from feeders.levels import nominal_volts
 from feeders.schema import FeederTables, LineRow
 from feeders.topology import Tree
 from gridsec.arrays import Floats
@@ -27,7 +30,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Referred:
-    """A feeder's tree with its voltage bases, as factors on the nominal voltage. N customers, b + 1 buses.
+    """A feeder's tree with its voltages. N customers, b + 1 buses.
 
     Attributes
     ----------
@@ -35,22 +38,26 @@ class Referred:
         The line that feeds bus k + 1.
     ties
         The t lines that close loops.
+    nominal : (b + 1,)
+        Nominal voltage of every bus, V.
     bus : (b + 1, 3)
-        a of every phase of every bus, 1 at the busbar.
+        Voltage base of every phase of every bus, V.
     branch : (b, 3)
         That of each line's impedance and charging, which are behind its tap as seen from `from_bus`.
     tie : (t, 3)
         The same of each tie.
-    customer : (N,)
-        That of every customer, in the first of its phases.
+    customer, customer_nominal : (N,)
+        Voltage base of every customer, in the first of its phases, and its nominal voltage, V.
     """
 
     lines: list[LineRow]
     ties: list[LineRow]
+    nominal: Floats
     bus: Floats
     branch: Floats
     tie: Floats
     customer: Floats
+    customer_nominal: Floats
 
 
 def refer(tables: FeederTables, closed: Sequence[LineRow], found: Tree) -> Referred:
@@ -69,13 +76,8 @@ def refer(tables: FeederTables, closed: Sequence[LineRow], found: Tree) -> Refer
         If a tap is where it cannot be.
     """
     lines, ties = [closed[k] for k in found.branch], [closed[k] for k in found.ties]
-    bus, branch = np.ones((len(found.buses), 3)), np.ones((len(lines), 3))
-    for k, (line, above) in enumerate(zip(lines, found.parent, strict=True)):
-        if found.group[line.from_bus] == above:
-            bus[k + 1] = branch[k] = bus[above] / line.taps
-        else:
-            branch[k] = bus[above]
-            bus[k + 1] = bus[above] * line.taps
+    nominal = np.array(nominal_volts(found, closed, tables.meta.voltage_volt))
+    bus, branch = _factors(lines, found)
     tie = np.array([bus[found.group[line.from_bus]] / line.taps for line in ties]).reshape(-1, 3)
     there = np.array([bus[found.group[line.to_bus]] for line in ties]).reshape(-1, 3)
     problems = [*_problems(closed), *_around(ties, tie / there)]
@@ -83,13 +85,34 @@ def refer(tables: FeederTables, closed: Sequence[LineRow], found: Tree) -> Refer
         raise FeederInvalid(problems)
     at = np.array([found.group[row.bus] for row in tables.customers], dtype=np.intp)
     phase = np.array(["abc".index(row.phases[0]) for row in tables.customers], dtype=np.intp)
-    return Referred(lines, ties, bus, branch, tie, bus[at, phase])
+
+    def own(rows: Sequence[LineRow]) -> Floats:
+        return nominal[[found.group[line.to_bus] for line in rows], None]
+
+    base = bus * nominal[:, None]
+    return Referred(
+        lines, ties, nominal, base, branch * own(lines), tie * own(ties), base[at, phase], nominal[at]
+    )
+
+
+def _factors(lines: Sequence[LineRow], found: Tree) -> tuple[Floats, Floats]:
+    """The products of taps, ``a`` of every bus and of every line's impedance, in each phase."""
+    bus, branch = np.ones((len(found.buses), 3)), np.ones((len(lines), 3))
+    for k, (line, above) in enumerate(zip(lines, found.parent, strict=True)):
+        if found.group[line.from_bus] == above:
+            bus[k + 1] = branch[k] = bus[above] / line.taps
+        else:
+            branch[k] = bus[above]
+            bus[k + 1] = bus[above] * line.taps
+    return bus, branch
 
 
 def refuse(site: Site | ThreePhaseSite) -> None:
-    """Raise `FeederInvalid` if a feeder has taps, for what knows one voltage base only."""
+    """Raise `FeederInvalid` if a feeder has taps or transformers, for what knows one voltage base only."""
     if (site.base_volt != site.feeder.base_volt).any():
-        raise FeederInvalid(["lines, column tap: not 1 everywhere, and this takes feeders without taps only"])
+        raise FeederInvalid(
+            ["lines, columns tap and to_volt: not one voltage, and this takes feeders without taps only"]
+        )
 
 
 def _problems(closed: Sequence[LineRow]) -> list[str]:

@@ -13,12 +13,13 @@ LOOPS_SHOWN = 20
 
 @dataclass(frozen=True, slots=True)
 class Edge:
-    """A closed line: its id, its two buses, whether it has any impedance, how many phases."""
+    """A closed line: its id, its buses, whether it has any impedance, the voltage it leads to, its phases."""
 
     line: str
     from_bus: str
     to_bus: str
     zero: bool
+    to_volt: float | None = None
     phases: int = 3
 
 

@@ -6,8 +6,9 @@ Each doubt has a name; `accept = ["<name>"]` in feeder.toml says that the value 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
+from feeders.levels import nominal_volts
 from feeders.records import Parsed, Report, rows
 from feeders.topology import Edge, Tree
 
@@ -25,6 +26,9 @@ PER_KM = (
     (1.15, 0.08), (0.524, 0.08), (0.5939, 0.372), (1.4824, 0.4),
 )  # fmt: skip
 
+LINE_XR, TRANSFORMER_XR = 20.0, 100.0
+"""Reactance by resistance beyond which a line, or a large transformer, has neither."""
+
 Doubts = Iterator[tuple[str, str]]
 
 
@@ -40,12 +44,23 @@ def check(parsed: Parsed, edges: Sequence[Edge], found: Tree | None, report: Rep
     report
         Takes the sentences.
     """
-    for doubts in (_voltage, _impedances, _per_km, _line_extras, _powers, _classes):
-        for name, sentence in doubts(parsed):
-            _doubt(parsed, report, name, sentence)
+    volt = parsed.top("voltage_volt")
+    level: dict[str, float] = {}
+    if found is not None and volt is not None:
+        nominal = nominal_volts(found, edges, volt)
+        level = {bus: nominal[k] for bus, k in found.group.items()}
+    doubts = [*_voltage(parsed)]
+    if volt is not None:
+        doubts += [*_impedances(parsed, level, volt), *_per_km(parsed, level, volt)]
+    doubts += [
+        *_line_extras(parsed),
+        *_powers(parsed, level, math.inf if volt is None else volt),
+        *_classes(parsed),
+    ]
     if found is not None:
-        for name, sentence in _drop(parsed, edges, found):
-            _doubt(parsed, report, name, sentence)
+        doubts += _drop(parsed, edges, found, level)
+    for name, sentence in doubts:
+        _doubt(parsed, report, name, sentence)
 
 
 def _doubt(parsed: Parsed, report: Report, name: str, sentence: str) -> None:
@@ -55,51 +70,58 @@ def _doubt(parsed: Parsed, report: Report, name: str, sentence: str) -> None:
         report.problems.append(f'{sentence} (if it is right: accept = ["{name}"] in feeder.toml)')
 
 
-def _is_low(parsed: Parsed) -> bool:
-    volt = parsed.top("voltage_volt")
-    return volt is not None and volt < LOW_VOLTAGE
-
-
 def _voltage(parsed: Parsed) -> Doubts:
-    volt = parsed.top("voltage_volt")
-    where = f"{parsed.place}, key voltage_volt"
-    if volt is None:
-        return
-    if volt < 50:
-        yield "voltage", f"{where}: {volt:g} V looks like kilovolts; expected volts"
-    if any(abs(volt - pair) < 1e-3 * pair for pair in PHASE_TO_PHASE):
-        yield (
-            "voltage",
-            f"{where}: {volt:g} V looks like a phase-to-phase voltage; expected phase to neutral, "
-            f"{volt / math.sqrt(3):.2f}",
-        )
+    places = [(f"{parsed.place}, key voltage_volt", parsed.top("voltage_volt"))]
+    places += [
+        (f"{where}, column to_volt", cells["to_volt"]) for where, cells in rows(parsed.lines, "to_volt")
+    ]
+    for where, volt in places:
+        if volt is None:
+            continue
+        if volt < 50:
+            yield "voltage", f"{where}: {volt:g} V looks like kilovolts; expected volts"
+        if any(abs(volt - pair) < 1e-3 * pair for pair in PHASE_TO_PHASE):
+            yield (
+                "voltage",
+                f"{where}: {volt:g} V looks like a phase-to-phase voltage; expected phase to neutral, "
+                f"{volt / math.sqrt(3):.2f}",
+            )
 
 
-def _impedances(parsed: Parsed) -> Doubts:
-    if parsed.top("voltage_volt") is None:
-        return
-    largest = 5.0 if _is_low(parsed) else 100.0
+def _impedances(parsed: Parsed, level: Mapping[str, float], volt: float) -> Doubts:
+    """A line's impedance is that of its `to_bus`'s side, at the nominal voltage there."""
     for where, cells in rows(parsed.lines, "r_ohm", "x_ohm"):
         r, x = cells["r_ohm"], cells["x_ohm"]
+        transformer = cells.get("to_volt") is not None
+        here = cells["to_volt"] if transformer else level.get(cells.get("to_bus", ""), volt)
+        largest = 5.0 if here < LOW_VOLTAGE else 100.0
+        steep = TRANSFORMER_XR if transformer else LINE_XR
         for name, value in (("r_ohm", r), ("x_ohm", x)):
             if value > largest:
                 yield (
                     "impedance",
                     f"{where}, column {name}: {value:g} ohm is very large; in milliohm, perhaps?",
                 )
-        if x > 20 * r:
-            yield "ratio", f"{where}: x_ohm {x:g} is above 20 times r_ohm {r:g}; columns or units mixed up?"
+        if x > steep * r:
+            yield (
+                "ratio",
+                f"{where}: x_ohm {x:g} is above {steep:g} times r_ohm {r:g}; columns or units mixed up?",
+            )
         elif 0 < x < 0.005 * r:
             yield "ratio", f"{where}: r_ohm {r:g} is above 200 times x_ohm {x:g}; columns or units mixed up?"
 
 
-def _per_km(parsed: Parsed) -> Doubts:
-    pairs = [(cells["r_ohm"], cells["x_ohm"]) for _, cells in rows(parsed.lines, "r_ohm", "x_ohm")]
+def _per_km(parsed: Parsed, level: Mapping[str, float], volt: float) -> Doubts:
+    pairs = [
+        (cells["r_ohm"], cells["x_ohm"])
+        for _, cells in rows(parsed.lines, "r_ohm", "x_ohm")
+        if cells.get("to_volt") is None and level.get(cells.get("to_bus", ""), volt) < LOW_VOLTAGE
+    ]
     pairs = [(r, x) for r, x in pairs if r > 0 or x > 0]
     standard = all(
         any(abs(r - a) <= 0.005 * a and abs(x - b) <= 0.02 * b for a, b in PER_KM) for r, x in pairs
     )
-    if parsed.lines and _is_low(parsed) and len(pairs) >= 2 and standard:
+    if parsed.lines and len(pairs) >= 2 and standard:
         place = parsed.lines[0].where.partition(",")[0]
         yield (
             "impedance",
@@ -122,10 +144,10 @@ def _line_extras(parsed: Parsed) -> Doubts:
                 yield "ratio", f"{where}, column {name}: {cells[name]:g} is no ratio near 1; 5 % up is 0.95"
 
 
-def _powers(parsed: Parsed) -> Doubts:
-    largest = 1000.0 if _is_low(parsed) else 1e5
+def _powers(parsed: Parsed, level: Mapping[str, float], volt: float) -> Doubts:
     for column in ("load_kw", "pv_kw", "inverter_kva"):
         for where, cells in rows(parsed.customers, column):
+            largest = 1000.0 if level.get(cells.get("bus", ""), volt) < LOW_VOLTAGE else 1e5
             if cells[column] > largest:
                 yield "load", f"{where}, column {column}: {cells[column]:g} is very large; in W or VA?"
 
@@ -146,11 +168,10 @@ def _classes(parsed: Parsed) -> Doubts:
             yield "class", f"{where}: {value:g} % is doubtful; {hint}"
 
 
-def _drop(parsed: Parsed, edges: Sequence[Edge], found: Tree) -> Doubts:
+def _drop(parsed: Parsed, edges: Sequence[Edge], found: Tree, level: Mapping[str, float]) -> Doubts:
     """Whether the lines could carry the loads at all: ``sum of r p / (3 V^2)`` along the worst path."""
-    volt = parsed.top("voltage_volt")
     ohm = {cells["line"]: cells["r_ohm"] for _, cells in rows(parsed.lines, "line", "r_ohm")}
-    if volt is None or found.loops or any(edges[k].line not in ohm for k in found.branch):
+    if not level or found.loops or any(edges[k].line not in ohm for k in found.branch):
         return
     below = [0.0] * len(found.buses)
     for _, cells in rows(parsed.customers, "bus", "load_kw"):
@@ -160,7 +181,8 @@ def _drop(parsed: Parsed, edges: Sequence[Edge], found: Tree) -> Doubts:
         below[found.parent[k]] += below[k + 1]
     drop = [0.0] * len(found.buses)
     for k, above in enumerate(found.parent):
-        drop[k + 1] = drop[above] + ohm[edges[found.branch[k]].line] * below[k + 1] / (3.0 * volt**2)
+        line = edges[found.branch[k]]
+        drop[k + 1] = drop[above] + ohm[line.line] * below[k + 1] / (3.0 * level[line.to_bus] ** 2)
     worst = max(range(len(drop)), key=drop.__getitem__)
     if drop[worst] > 1.0:
         yield (

@@ -1,0 +1,63 @@
+"""Nominal voltages of a feeder's buses: that of the busbar, until a transformer leads to another.
+
+`to_volt` of a line is the nominal voltage of its `to_bus` where that of its `from_bus` is another one. It is
+stated on the way from the busbar; a line that closes a loop must find it at both its ends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from feeders.schema import LineRow
+    from feeders.topology import Edge, Tree
+
+SAME_LEVEL: Final = 1e-6
+"""Part by which two nominal voltages may differ and still be one: 230.94 and 400 / sqrt(3)."""
+
+
+def same_level(one: float, other: float) -> bool:
+    """Return whether two nominal voltages are one."""
+    return abs(one - other) <= SAME_LEVEL * max(one, other)
+
+
+def nominal_volts(found: Tree, edges: Sequence[Edge | LineRow], volt: float) -> list[float]:
+    """Return the nominal voltage of every bus, V, phase to neutral.
+
+    Parameters
+    ----------
+    found, edges
+        The tree, and the closed lines that it was made of.
+    volt
+        That of the busbar, V.
+    """
+    nominal = [volt]
+    for k, above in zip(found.branch, found.parent, strict=True):
+        line = edges[k]
+        changes = line.to_volt is not None and found.group[line.from_bus] == above
+        nominal.append(line.to_volt if changes and line.to_volt is not None else nominal[above])
+    return nominal
+
+
+def problems(found: Tree, edges: Sequence[Edge | LineRow], volt: float) -> Iterator[tuple[int, str]]:
+    """Yield every line whose `to_volt` cannot be, with what is wrong; arguments as of `nominal_volts`."""
+    nominal = nominal_volts(found, edges, volt)
+    above, ties = dict(zip(found.branch, found.parent, strict=True)), set(found.ties)
+    for k, line in enumerate(edges):
+        if line.from_bus not in found.group:
+            continue
+        here, there = found.group[line.from_bus], found.group[line.to_bus]
+        told = nominal[here] if line.to_volt is None else line.to_volt
+        if here == there and not same_level(told, nominal[here]):
+            yield k, f"{told:g} on a line without impedance; expected the transformer's r_ohm and x_ohm"
+        elif line.to_volt is not None and above.get(k) == there:
+            yield k, f"{told:g}, but {line.to_bus!r} is on the side of the busbar; {_TURN}"
+        elif k in ties and not same_level(told, nominal[there]):
+            yield k, f"{told:g} V at {line.to_bus!r}, {nominal[there]:g} V around the loop; expected the same"
+
+
+_TURN: Final = (
+    "expected from_bus and to_bus exchanged, with the impedances of the other side: a transformer leads away "
+    "from the busbar"
+)
