@@ -8,22 +8,21 @@ from hypothesis import given, settings
 
 from gridsec.arrays import Floats
 from gridsec.mesh import MeshedFeeder
-from gridsec.network import bus_voltages, interval_bounds, loss_correction
+from gridsec.network import InPhases, bus_voltages, interval_bounds, loss_correction
 from gridsec.phases import PhasedFeeder
 from tests.gridsec.meshes import ac, random_mesh
-from tests.gridsec.unbalanced import power_flow, random_three_phase
+from tests.gridsec.unbalanced import ac_places, random_phased_mesh, random_three_phase
 
 
-def exact(feeder: PhasedFeeder | MeshedFeeder, p: Floats, q: Floats, v0: Floats | float) -> Floats:
+def exact(feeder: InPhases | MeshedFeeder, p: Floats, q: Floats, v0: Floats | float) -> Floats:
     """Squared voltages of the customers by an AC power flow."""
     if isinstance(feeder, MeshedFeeder):
         return ac(feeder, p, q, float(v0))[feeder.bus]
-    found = np.abs(power_flow(feeder.tree, 3.0 * p, 3.0 * q, np.asarray(v0))) ** 2
-    return np.asarray(found.T.ravel()[feeder.bus])
+    return np.asarray(ac_places(feeder, p, q, v0)[feeder.bus])
 
 
 def contained(
-    feeder: PhasedFeeder | MeshedFeeder, rng: np.random.Generator, v0: Floats | float, size: float
+    feeder: InPhases | MeshedFeeder, rng: np.random.Generator, v0: Floats | float, size: float
 ) -> None:
     """Corners of random intervals, and points within, stay inside both bounds."""
     count = feeder.bus.size
@@ -56,6 +55,13 @@ def test_three_phases(seed: int, charging: float) -> None:
 def test_loops(seed: int, charging: float) -> None:
     rng = np.random.default_rng(seed)
     contained(random_mesh(seed, charging=charging, customers=6), rng, rng.uniform(0.95, 1.05) ** 2, 0.01)
+
+
+@given(st.integers(0, 100_000), st.sampled_from([0.0, 0.02]))
+@settings(max_examples=12, deadline=None)
+def test_loops_in_three_phases(seed: int, charging: float) -> None:
+    rng = np.random.default_rng(seed)
+    contained(random_phased_mesh(seed, charging=charging), rng, rng.uniform(0.95, 1.05, 3) ** 2, 0.01)
 
 
 def test_without_intervals_only_the_model_is_left() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import hypothesis.strategies as st
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from gridsec.errors import FeederInvalid
 from gridsec.feeder import Feeder, lindistflow
 from gridsec.mesh import MeshedFeeder, impedances
 from gridsec.network import (
+    InPhases,
     Network,
     Power,
     along,
@@ -29,7 +32,7 @@ from gridsec.network import (
 from gridsec.phases import PHASES, PhasedFeeder
 from tests.gridsec.meshes import ac, random_mesh
 from tests.gridsec.radial import random_feeder
-from tests.gridsec.unbalanced import power_flow, random_three_phase
+from tests.gridsec.unbalanced import ac_places, random_phased_mesh, random_three_phase
 
 seeds = st.integers(0, 100_000)
 
@@ -49,18 +52,14 @@ def dense(feeder: Network, power: Power) -> Floats:
         return Z.real if power is Power.ACTIVE else Z.imag
     step, none, out = 1e-5, np.zeros(feeder.bus.size), []
     for c in range(feeder.bus.size):
-        # 1 pu of the power of a phase is a third of S.
-        unit = 3.0 * step * (np.arange(feeder.bus.size) == c)
+        unit = step * (np.arange(feeder.bus.size) == c)
         one = (unit, none) if power is Power.ACTIVE else (none, unit)
-        up, down = (
-            np.abs(power_flow(feeder.tree, *(sign * each for each in one), np.ones(3))) ** 2
-            for sign in (1, -1)
-        )
-        out.append(((up - down) / (4.0 * step)).T.ravel())
+        up, down = (ac_places(feeder, *(sign * each for each in one), 1.0) for sign in (1, -1))
+        out.append((up - down) / (4.0 * step))
     return np.array(out).T
 
 
-@pytest.mark.parametrize("kind", [random_feeder, random_mesh, phased])
+@pytest.mark.parametrize("kind", [random_feeder, random_mesh, phased, random_phased_mesh])
 @given(seed=seeds)
 @settings(max_examples=15, deadline=None)
 def test_every_word_is_that_of_the_dense_matrix(kind: object, seed: int) -> None:
@@ -69,7 +68,7 @@ def test_every_word_is_that_of_the_dense_matrix(kind: object, seed: int) -> None
     rng, count = np.random.default_rng(seed), feeder.bus.size
     metered = np.sort(rng.choice(count, max(1, count // 2), replace=False))
     weights, variance = rng.normal(size=metered.size), rng.uniform(0.0, 2.0, count)
-    tol = 1e-7 if isinstance(feeder, PhasedFeeder) else 1e-9
+    tol = 1e-7 if isinstance(feeder, InPhases) else 1e-9
     for power in Power:
         M = dense(feeder, power)
         there = ~np.isnan(M).any(axis=1)
@@ -89,19 +88,22 @@ def test_every_word_is_that_of_the_dense_matrix(kind: object, seed: int) -> None
         same(variances(feeder, power, variance)[there], whole.diagonal()[there])
 
 
-@given(seeds)
+@pytest.mark.parametrize("kind", [phased, random_phased_mesh])
+@given(seed=seeds)
 @settings(max_examples=30, deadline=None)
-def test_voltages_of_the_places_within_their_bound_of_the_power_flow(seed: int) -> None:
-    feeder = phased(seed)
+def test_voltages_of_the_places_within_their_bound_of_the_power_flow(
+    kind: Callable[[int], InPhases], seed: int
+) -> None:
+    feeder = kind(seed)
     rng = np.random.default_rng(seed)
     p, q = 0.01 * rng.normal(-0.5, 1.0, (2, feeder.bus.size)) / 3.0
     v0 = rng.uniform(0.95, 1.05, 3) ** 2
-    exact = (np.abs(power_flow(feeder.tree, 3.0 * p, 3.0 * q, v0)) ** 2).T.ravel()
+    exact = ac_places(feeder, p, q, v0)
     found, bound = bus_voltages(feeder, p, q, v0), model_error_bound(feeder, p, q, v0)
     np.testing.assert_allclose(found[busbar_places(feeder)], v0, rtol=1e-14)
     assert (np.abs(found - exact)[feeder.bus] <= bound + 1e-12).all()
     many = bus_voltages(feeder, np.stack([p, 0.0 * p]), np.stack([q, 0.0 * q]), v0)
-    np.testing.assert_array_equal(many[0], found)
+    np.testing.assert_allclose(many[0], found, rtol=0, atol=1e-14)
     linear = by_place(feeder, v0) + 2.0 * (feeder.R @ p + feeder.X @ q)
     np.testing.assert_allclose(bus_voltages(feeder, p, q, v0, steps=0), linear, rtol=0, atol=1e-12)
 
