@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
+from feeders.studies.bases import Bases
 from feeders.studies.droop_fleets import Who, box, chosen_fleet, equip, points
 from feeders.studies.droop_hosting import Conditions, Plan, capacity, curve, draw, shares_of
 from feeders.studies.droop_safety import Kept, Safety, nobody, safety
@@ -32,7 +33,6 @@ from feeders.studies.droop_verdict import (
     worst,
 )
 from feeders.studies.journal import Journal, Progress, worked
-from feeders.taps import refuse
 from gridsec.droop import PRESETS, Droop
 from gridsec.studies.droop_network import Box
 from gridsec.studies.droop_rest import rest
@@ -62,7 +62,7 @@ class DroopOptions:
     v0_low, v0_high
         Limits of the busbar's voltage, pu; points of operation have the middle, hosting the upper one.
     v_min, v_max
-        The band, pu; None: the limits of the feeder's files.
+        The band, parts of the nominal voltage; None: the limits of the feeder's files.
     load_high, pv_high
         Largest shares of the peaks in the box of all loads.
     presets
@@ -208,13 +208,12 @@ def droop(
     Raises
     ------
     FeederInvalid
-        If the feeder has no inverters and no preset is given, or has taps.
+        If the feeder has no inverters and no preset is given.
     ValueError
         If options are out of range.
     OtherStudy
         If the journal is another study's.
     """
-    refuse(site)
     given = options or DroopOptions()
     study = _Study(Subject.of(site), chosen_fleet(site, given.preset, given.who), given, seed)
     low, high = study.limits
@@ -326,7 +325,7 @@ def _compared(study: _Study, fleet: Droop) -> dict[str, Any]:
     parts = [*told, judge(subject, fleet, study.update, study.box)]
     rows = step_rows(site, _runs(study, fleet))
     s = np.array([each.p_low + 1j * each.q_low for each in at.values()])
-    v = site.feeder.base_volt * np.abs(rest(subject.net, fleet, s, study.v0)[1])
+    low, high = Bases.of(site).extremes(np.abs(rest(subject.net, fleet, s, study.v0)[1]))
     kept: Safety = safety(subject, fleet, study.box, study.limits)
     return {
         "inverters": int(fleet.tau.size),
@@ -336,8 +335,8 @@ def _compared(study: _Study, fleet: Droop) -> dict[str, Any]:
         "margin": margin(subject, fleet, study.update, study.box),
         "settling_s": _most(rows, "settling_s"),
         "overshoot_percent": _most(rows, "overshoot_percent"),
-        "v_low_volt": float(v.min()),
-        "v_high_volt": float(v.max()),
+        "v_low_volt": low,
+        "v_high_volt": high,
         "band_rest": str(kept.rest),
         "band_always": str(kept.always),
     }
@@ -436,7 +435,6 @@ def presets_of(sites: Sequence[Site], options: DroopOptions | None = None, *, se
     """
     given, out = options or DroopOptions(), []
     for site in sites:
-        refuse(site)
         subject = Subject.of(site)
         for name in given.presets:
             study = _Study(subject, equip(site, name, given.who), given, seed)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from feeders.studies.bases import Bases
 from feeders.studies.hidden import customer_indices
 from gridsec.arrays import Floats, Ints
 from gridsec.droop import Droop, fleet
@@ -18,7 +19,17 @@ from gridsec.studies.droop_network import Box
 if TYPE_CHECKING:
     from feeders.load import Site
 
-__all__ = ["KVA_PER_KW", "Who", "box", "chosen_fleet", "equip", "inverter_names", "point", "points"]
+__all__ = [
+    "KVA_PER_KW",
+    "Who",
+    "box",
+    "chosen_fleet",
+    "equip",
+    "inverter_names",
+    "made",
+    "point",
+    "points",
+]
 
 KVA_PER_KW: Final = 1.1
 """Rating of an inverter for each kW of generation behind it: at full sun 0.46 of it is left for q."""
@@ -88,7 +99,26 @@ def equip(
         kva or rows[k].inverter_kva or (KVA_PER_KW * rows[k].pv_kw if rows[k].pv_kw > 0 else SMALLEST_KVA)
         for k in own
     ]
-    return fleet(own, preset, np.array(rated), site.feeder.base_kva)
+    return made(site, own, preset, np.array(rated))
+
+
+def made(site: Site, own: Ints, preset: str, kva: Floats) -> Droop:
+    """Inverters of a preset, whose curve is one of the nominal voltage at their customer.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    own : (m,)
+        Customers.
+    preset
+        One of `gridsec.droop.PRESETS`.
+    kva : (m,)
+        Ratings, kVA.
+    """
+    usual = fleet(own, preset, kva, site.feeder.base_kva)
+    ratio = Bases.of(site).ratio[own]
+    return usual if (ratio == 1.0).all() else replace(usual, v=usual.v / ratio[:, None])
 
 
 def chosen_fleet(site: Site, preset: str | None, who: Who = Who.PV) -> Droop:

@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from feeders.powerflow import PowerFlowDiverged
-from feeders.studies.droop_fleets import KVA_PER_KW, point
+from feeders.studies.bases import Bases, line_rows
+from feeders.studies.droop_fleets import KVA_PER_KW, made, point
 from feeders.studies.droop_verdict import CLEARLY, Subject, judge
 from feeders.studies.hidden import customer_indices
 from gridsec.arrays import Floats, Ints
-from gridsec.droop import Droop, fleet
+from gridsec.droop import Droop
 from gridsec.studies.droop_network import Box, currents, sensitivity
 from gridsec.studies.droop_rest import injected, rest
 from gridsec.studies.droop_stability import Update, growth, slopes
@@ -45,7 +46,7 @@ class Conditions:
     v0
         Voltage of the busbar, pu.
     v_min, v_max
-        The band, pu.
+        The band, parts of the nominal voltage.
     update
         When inverters act.
     """
@@ -98,22 +99,21 @@ def shares_of(site: Site, customers: Sequence[str] | None) -> Floats:
 
 
 def ratings_pu(site: Site) -> Floats:
-    """Largest current of every branch, pu; infinity where the files give none, (b,)."""
-    tables = site.tables
-    group, parent = site.bus_of_file, site.tree.parent
-    out = np.full(parent.size, np.inf)
-    base_amps = 1000.0 * site.feeder.base_kva / (3.0 * site.feeder.base_volt)
-    for line in tables.lines:
-        if line.closed and line.rating_a is not None and group[line.from_bus] != group[line.to_bus]:
-            # Buses are in topological order: the later one is fed through this line.
-            out[max(group[line.from_bus], group[line.to_bus]) - 1] = line.rating_a / base_amps
-    return out
+    """Largest current of every conductor of every line, pu; infinity where the files give none, (L, k).
+
+    In the order and the units of `gridsec.studies.droop_network.currents`.
+    """
+    lines = [site.tables.lines[k] for k in line_rows(site)]
+    amps = np.array([np.inf if line.rating_a is None else line.rating_a for line in lines])
+    # An ideal transformer is at from_bus: the impedance is in the base of to_bus.
+    behind = [site.bus_of_file[line.to_bus] for line in lines]
+    volt = site.base_volt.reshape(len(site.spanning.buses), -1)[behind]
+    return np.asarray(amps[:, None] * 3.0 * volt / (1000.0 * site.feeder.base_kva))
 
 
 def _fleet(site: Site, plan: Plan, kw: float) -> Droop:
     own = np.flatnonzero(plan.share > 0.0) if plan.preset and kw > 0.0 else np.zeros(0, dtype=np.intp)
-    rated = KVA_PER_KW * kw * plan.share[own]
-    return fleet(own, plan.preset or "ieee1547-b", rated, site.feeder.base_kva)
+    return made(site, own, plan.preset or "ieee1547-b", KVA_PER_KW * kw * plan.share[own])
 
 
 def _loads(site: Site, plan: Plan, kw: float, at: Conditions) -> Box:
@@ -135,7 +135,7 @@ def checked(subject: Subject, plan: Plan, kw: float, at: Conditions, ratings: Fl
         All of it, kW.
     at
         Loads, busbar, limits.
-    ratings : (b,)
+    ratings : (L, k)
         From `ratings_pu`.
 
     Returns
@@ -145,7 +145,7 @@ def checked(subject: Subject, plan: Plan, kw: float, at: Conditions, ratings: Fl
         high`, `voltage low`, `line ...` or `unstable`.
     """
     site, droop = subject.site, _fleet(subject.site, plan, kw)
-    loads, volt = _loads(site, plan, kw, at), site.feeder.base_volt
+    loads, bases = _loads(site, plan, kw, at), Bases.of(site)
     s = loads.p_low + 1j * loads.q_low
     x, V = rest(subject.net, droop, s, at.v0)
     if not np.isfinite(V).all():
@@ -158,25 +158,36 @@ def checked(subject: Subject, plan: Plan, kw: float, at: Conditions, ratings: Fl
             "broken": "no power flow",
         }
     net, own, v = injected(droop, s, x), droop.customer, np.abs(V)
-    full = currents(subject.feeder, subject.net, net, V, at.v0) / ratings
+    full = (currents(site.feeder, subject.net, net, V, at.v0) / ratings).max(axis=1)
     near = 1e-7
     steep = slopes(droop, v[own] - near, v[own] + near)
     J = sensitivity(subject.net, net, V).dv_dq[np.ix_(own, own)]
     grows = growth(J, steep, droop.tau, at.update)
     worst = int(np.argmax(full))
+    lowest, highest = bases.band(at.v_min, at.v_max)
     broken = (
-        "voltage high" * bool(v.max() > at.v_max)
-        or "voltage low" * bool(v.min() < at.v_min)
-        or f"line to {site.tree.buses[worst + 1]}" * bool(full[worst] > 1.0)
+        "voltage high" * bool((v > highest).any())
+        or "voltage low" * bool((v < lowest).any())
+        or _named(site, worst) * bool(full[worst] > 1.0)
         or "unstable" * bool(grows > 1.0 + CLEARLY)
     )
+    low_volt, high_volt = bases.extremes(v)
     return {
-        "v_low_volt": volt * float(v.min()),
-        "v_high_volt": volt * float(v.max()),
+        "v_low_volt": low_volt,
+        "v_high_volt": high_volt,
         "line_percent": 100.0 * float(full[worst]),
         "growth": grows,
         "broken": broken,
     }
+
+
+def _named(site: Site, line: int) -> str:
+    """A line of `currents` in words."""
+    tree = site.spanning
+    if line < tree.parent.size:
+        return f"line to {tree.buses[line + 1]}"
+    one, other = site.ties[line - tree.parent.size]
+    return f"line from {tree.buses[one]} to {tree.buses[other]}"
 
 
 def _largest(holds: Callable[[float], bool], most: float) -> float:
@@ -240,7 +251,7 @@ def _confirmed(subject: Subject, droop: Droop, loads: Box) -> float:
         volts, _ = subject.flow.solve(net.real, net.imag, feeder.base_volt * loads.v0_low)
     except PowerFlowDiverged:
         return float("inf")
-    return float(np.max(np.abs(volts - feeder.base_volt * np.abs(V))))
+    return float(np.max(np.abs(volts - subject.site.customer_volt * np.abs(V))))
 
 
 def curve(subject: Subject, plan: Plan, amounts: Sequence[float], at: Conditions) -> list[dict[str, Any]]:

@@ -18,6 +18,7 @@ from typing import Any, Final
 import numpy as np
 
 from feeders.powerflow import PowerFlowDiverged
+from feeders.studies.bases import Bases
 from feeders.studies.droop_verdict import Subject
 from gridsec.arrays import Floats
 from gridsec.droop import Droop, voltage_curve
@@ -88,41 +89,42 @@ def safety(subject: Subject, droop: Droop, loads: Box, limits: tuple[float, floa
     loads
         Limits of the injections without the fleet; every customer moves in them as it likes.
     limits
-        The band, pu.
+        The band, parts of the nominal voltage.
     """
-    reasons: list[str] = []
+    bases, reasons = Bases.of(subject.site), list[str]()
+    within = bases.band(*limits)
     ever = _or_none(always, subject.net, droop, loads, reasons)
     still = _or_none(at_rest, subject.net, droop, loads, reasons)
     still = ever if still is None else still
     found = {
-        name: None if _inside(band, limits) else _witness(subject, droop, loads, limits, jump=jump)
+        name: None if _inside(band, within) else _witness(subject, droop, loads, within, jump=jump)
         for name, band, jump in (("rest", still, False), ("always", ever, True))
     }
     # What happens at rest happens.
     found["always"] = found["always"] or found["rest"]
     nothing = Band(*np.full((2, loads.p_low.size), np.nan))
     e, r = ever or nothing, still or nothing
-    volt, names = subject.site.feeder.base_volt, subject.site.feeder.customers
+    volt, names = bases.volt, subject.site.feeder.customers
     rows = [
         {
             "customer": names[k],
-            "low_volt": volt * float(e.low[k]),
-            "high_volt": volt * float(e.high[k]),
-            "low_rest_volt": volt * float(r.low[k]),
-            "high_rest_volt": volt * float(r.high[k]),
-            "kept": bool(e.low[k] >= limits[0] and e.high[k] <= limits[1]),
-            "kept_rest": bool(r.low[k] >= limits[0] and r.high[k] <= limits[1]),
+            "low_volt": float(volt[k] * e.low[k]),
+            "high_volt": float(volt[k] * e.high[k]),
+            "low_rest_volt": float(volt[k] * r.low[k]),
+            "high_rest_volt": float(volt[k] * r.high[k]),
+            "kept": bool(e.low[k] >= within[0][k] and e.high[k] <= within[1][k]),
+            "kept_rest": bool(r.low[k] >= within[0][k] and r.high[k] <= within[1][k]),
         }
         for k in range(len(names))
     ]
     return Safety(
-        rest=_verdict(still, limits, found["rest"]),
-        always=_verdict(ever, limits, found["always"]),
+        rest=_verdict(still, within, found["rest"]),
+        always=_verdict(ever, within, found["always"]),
         why="; ".join(dict.fromkeys(reasons)),
-        low_volt=volt * float(e.low.min()),
-        high_volt=volt * float(e.high.max()),
-        low_rest_volt=volt * float(r.low.min()),
-        high_rest_volt=volt * float(r.high.max()),
+        low_volt=bases.extremes(e.low)[0],
+        high_volt=bases.extremes(e.high)[1],
+        low_rest_volt=bases.extremes(r.low)[0],
+        high_rest_volt=bases.extremes(r.high)[1],
         rows=rows,
         witness=(found["rest"] or found["always"] or []),
     )
@@ -138,18 +140,22 @@ def _or_none(
         return None
 
 
-def _inside(band: Band | None, limits: tuple[float, float]) -> bool:
+Limits = tuple[Floats, Floats]
+"""The band, pu of every customer."""
+
+
+def _inside(band: Band | None, limits: Limits) -> bool:
     return band is not None and bool(np.all(band.low >= limits[0]) and np.all(band.high <= limits[1]))
 
 
-def _verdict(band: Band | None, limits: tuple[float, float], witness: list[dict[str, Any]] | None) -> Kept:
+def _verdict(band: Band | None, limits: Limits, witness: list[dict[str, Any]] | None) -> Kept:
     if _inside(band, limits):
         return Kept.KEPT
     return Kept.VIOLATED if witness else Kept.UNDECIDED
 
 
 def _witness(
-    subject: Subject, droop: Droop, loads: Box, limits: tuple[float, float], *, jump: bool
+    subject: Subject, droop: Droop, loads: Box, limits: Limits, *, jump: bool
 ) -> list[dict[str, Any]] | None:
     """Loads in the box with which a voltage is beyond the band, at rest or after a jump of all loads."""
     s, v0 = _candidates(subject.net, droop, loads)
@@ -192,7 +198,7 @@ def _confirmed(
     subject: Subject,
     droop: Droop,
     at: tuple[Complex, float, Floats],
-    limits: tuple[float, float],
+    limits: Limits,
     *,
     jump: bool,
 ) -> list[dict[str, Any]]:
@@ -205,9 +211,10 @@ def _confirmed(
         )
     except PowerFlowDiverged:
         return []
-    v = volts / feeder.base_volt
+    v = volts / subject.site.customer_volt
+    beyond = (v < limits[0]) | (v > limits[1])
     off = np.max(np.abs(voltage_curve(droop, v[droop.customer]) - x), initial=0.0)
-    if not (v.min() < limits[0] or v.max() > limits[1]) or (not jump and off > EXACT):
+    if not beyond.any() or (not jump and off > EXACT):
         return []
     return [
         {
@@ -218,7 +225,7 @@ def _confirmed(
             "inverter_kvar": feeder.base_kva * float(net[k].imag - s[k].imag),
             "busbar_volt": v0 * feeder.base_volt,
             "v_volt": float(volts[k]),
-            "beyond": bool(v[k] < limits[0] or v[k] > limits[1]),
+            "beyond": bool(beyond[k]),
         }
         for k in range(v.size)
     ]

@@ -18,6 +18,7 @@ import pandas as pd
 
 from feeders.powerflow import PowerFlow, PowerFlowDiverged
 from feeders.powerflow_unbalanced import PlacesFlow
+from feeders.studies.bases import Bases
 from feeders.studies.droop_fleets import point
 from gridsec.arrays import Floats
 from gridsec.droop import Droop, voltage_curve
@@ -141,7 +142,8 @@ def simulate(
         How many updates at most.
     """
     site, flow = plant
-    base_kva, base_volt, own = site.feeder.base_kva, site.feeder.base_volt, droop.customer
+    base_kva, own = site.feeder.base_kva, droop.customer
+    base_volt, v0_volt = site.customer_volt, site.feeder.base_volt * loads.v0_low
     owner = np.equal.outer(own, np.arange(loads.p_low.size)).astype(np.float64)
     if not update.interval_s:
         update = Update(float(np.min(droop.tau)) / FINE / (1.0 + gain))
@@ -155,7 +157,7 @@ def simulate(
     for k in range(updates + 1):
         try:
             q = loads.q_low + x @ owner
-            v = flow.solve(-base_kva * loads.p_low, -base_kva * q, base_volt * loads.v0_low)[0] / base_volt
+            v = flow.solve(-base_kva * loads.p_low, -base_kva * q, v0_volt)[0] / base_volt
         except PowerFlowDiverged:
             outcome = Outcome.COLLAPSES
             break
@@ -195,24 +197,28 @@ def step_rows(site: Site, runs: Mapping[str, Run]) -> list[dict[str, Any]]:
         By name.
     """
     rows: list[dict[str, Any]] = []
+    bases = Bases.of(site)
     for name, run in runs.items():
         row: dict[str, Any] = {"step": name, "outcome": str(run.outcome)}
         if not len(run.v):
             rows.append(row)
             continue
-        end = run.v[-1] if run.outcome is not Outcome.OSCILLATES else run.v[len(run.v) // 2 :].mean(axis=0)
-        change = end - run.v[0]
-        size = float(np.max(np.abs(change), initial=0.0))
-        away = np.max(np.abs(run.v - end), axis=1, initial=0.0)
+        v = bases.ratio * run.v  # parts of the nominal voltage
+        end = v[-1] if run.outcome is not Outcome.OSCILLATES else v[len(v) // 2 :].mean(axis=0)
+        change = end - v[0]
+        most = int(np.argmax(np.abs(change)))
+        size = float(np.abs(change[most]))
+        away = np.max(np.abs(v - end), axis=1, initial=0.0)
         late = np.flatnonzero(away > max(BAND * size, LEAST_PU))
-        past = np.max((run.v - end) * np.sign(change), initial=0.0)
+        past = np.max((v - end) * np.sign(change), initial=0.0)
+        low, high = bases.extremes(end / bases.ratio)
         settles = run.outcome is Outcome.SETTLES
         row |= {
             "settling_s": (float(run.t[late[-1] + 1]) if late.size else 0.0) if settles else math.nan,
             "overshoot_percent": 100.0 * float(past) / size if size > LEAST_PU else 0.0,
-            "change_volt": size * site.feeder.base_volt,
-            "end_low_volt": float(end.min()) * site.feeder.base_volt,
-            "end_high_volt": float(end.max()) * site.feeder.base_volt,
+            "change_volt": size * float(bases.nominal[most]),
+            "end_low_volt": low,
+            "end_high_volt": high,
             "worst_customer": site.feeder.customers[int(np.argmax(np.abs(end - 1.0)))],
         }
         rows.append(row)
@@ -236,7 +242,7 @@ def trajectories(site: Site, runs: Mapping[str, Run]) -> pd.DataFrame:
                     "step": name,
                     "t_s": np.repeat(run.t, customers),
                     "customer": list(site.feeder.customers) * instants,
-                    "v_volt": (site.feeder.base_volt * run.v).ravel(),
+                    "v_volt": (site.customer_volt * run.v).ravel(),
                 }
             )
         )

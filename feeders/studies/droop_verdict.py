@@ -22,8 +22,7 @@ from feeders.studies.droop_steps import Outcome, simulate
 from gridsec.arrays import Floats
 from gridsec.droop import Droop
 from gridsec.errors import DesignInfeasible, FeederInvalid
-from gridsec.feeder import Feeder
-from gridsec.phases import PhasedFeeder
+from gridsec.network import InPhases
 from gridsec.studies.droop_network import Box, Network, network, sensitivity
 from gridsec.studies.droop_rest import Share, injected, rest, shares, shares_of_gain
 from gridsec.studies.droop_stability import Loop, Update, growth, loop, proof, reach, slopes, steepened
@@ -77,22 +76,18 @@ class Subject:
         The feeder.
     flow
         AC power flow for simulation.
-    feeder
-        The site's own, radial.
     net
         AC power flow for proofs.
     """
 
     site: Site
     flow: PowerFlow | PlacesFlow
-    feeder: Feeder | PhasedFeeder
     net: Network
 
     @classmethod
     def of(cls, site: Site) -> Subject:
-        """Both power flows of a feeder; `FeederInvalid` if it has closed ties."""
-        feeder = site.feeder if isinstance(site.feeder, PhasedFeeder) else site.balanced
-        return cls(site, power_flow(site), feeder, network(feeder))
+        """Both power flows of a feeder."""
+        return cls(site, power_flow(site), network(site.feeder))
 
 
 @dataclass(frozen=True, slots=True)
@@ -318,7 +313,7 @@ def inverter_rows(
 def _shares(site: Site, given: Loop) -> Share:
     """By the modes of a loop of reactances in common; in three phases by its gain without regard to sign."""
     limit = proof(given).factor
-    if isinstance(site.feeder, Feeder):
+    if not isinstance(site.feeder, InPhases):
         return shares(given, limit * float(np.linalg.norm(0.5 * (given.S + given.S.T), 2)))
     own = shares_of_gain(given)
     # What all may do together, one may do alone.

@@ -7,8 +7,9 @@ no linear model and no sampling stands between the bound and the AC power flow.
 
 In three phases V is turned back by the angles of the busbar, `V_i / a_i` with a = (1, e^{-j 2 pi / 3},
 e^{j 2 pi / 3}) by phase, and `Z_ij a_j / a_i` takes the place of Z_ij: the equation is the same, magnitudes
-are those of the phases, and without charging Z is `R + j X` of `gridsec.phases`. Nothing here asks Z to be
-symmetric, or its parts not to be negative.
+are those of the phases, and without charging Z is `R + j X` of `gridsec.phases`. With closed loops Z is the
+inverse of the admittance matrix without the busbar (`gridsec.mesh`). Nothing here asks Z to be symmetric, its
+parts not to be negative, or the feeder to be a tree.
 
 References
 ----------
@@ -25,9 +26,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gridsec.arrays import Floats
+from gridsec.arrays import Floats, Ints
 from gridsec.errors import DesignInfeasible
 from gridsec.feeder import Feeder, common_paths
+from gridsec.mesh import Meshed, MeshedFeeder, PhasedMesh
 from gridsec.phases import ROTATION, PhasedFeeder
 from gridsec.trees import below, from_root
 
@@ -81,7 +83,7 @@ class Network:
     E_bus: Complex
 
 
-def network(feeder: Feeder | PhasedFeeder) -> Network:
+def network(feeder: Feeder | Meshed | PhasedFeeder) -> Network:
     """The impedances of a feeder, `(I + j Z0 B)^-1 Z0` with Z0 from the series impedances and B the charging.
 
     Parameters
@@ -96,6 +98,8 @@ def network(feeder: Feeder | PhasedFeeder) -> Network:
     """
     if isinstance(feeder, PhasedFeeder):
         return _phased(feeder)
+    if isinstance(feeder, Meshed):
+        return _meshed(feeder)
     everywhere = np.arange(len(feeder.buses))
     Z0 = common_paths(feeder, feeder.r, everywhere) + 1j * common_paths(feeder, feeder.x, everywhere)
     loaded = np.eye(everywhere.size) + 1j * Z0 * feeder.half
@@ -104,6 +108,16 @@ def network(feeder: Feeder | PhasedFeeder) -> Network:
     Z_bus, E_bus = both[:, :-1], both[:, -1]
     E = E_bus[feeder.bus]
     return Network(Z_bus[feeder.bus], E, E[:, None], Z_bus, E_bus)
+
+
+def _meshed(feeder: Meshed) -> Network:
+    """The inverses that a meshed feeder has, in three phases turned back by the angles of the busbar."""
+    idle, Z_bus = feeder.idle.reshape(len(feeder.buses), -1), feeder.transfer
+    if isinstance(feeder, PhasedMesh):
+        back = np.conj(ROTATION)[np.arange(len(idle)) % 3][:, None]
+        idle, Z_bus = back * idle * ROTATION, back * Z_bus * ROTATION[feeder.tree.phase]
+    E_bus, own = idle.sum(axis=1), feeder.bus
+    return Network(Z_bus[own], E_bus[own], idle[own], Z_bus, E_bus)
 
 
 def _phased(feeder: PhasedFeeder) -> Network:
@@ -166,9 +180,9 @@ def solve(net: Network, s: Complex, v0: Floats | float) -> Complex:
 
 
 def currents(
-    feeder: Feeder | PhasedFeeder, net: Network, s: Complex, V: Complex, v0: Floats | float
+    feeder: Feeder | Meshed | PhasedFeeder, net: Network, s: Complex, V: Complex, v0: Floats | float
 ) -> Floats:
-    """Largest current at either end of every branch, in three phases that of its fullest conductor, pu.
+    """Largest current at either end of every conductor of every line, pu. L lines: branches, then ties.
 
     Parameters
     ----------
@@ -177,16 +191,32 @@ def currents(
 
     Returns
     -------
-    (…, b)
-        Magnitudes, in units of `base_kva / (3 base_volt)`.
+    (…, L, k)
+        Magnitudes, in units of `base_kva / (3 base_volt)` with the base of the line's impedance; k is 1, or
+        in three phases 3.
     """
     at = np.asarray(v0, dtype=np.float64)[..., None] * net.E_bus + np.conj(s / V) @ net.Z_bus.T
     if isinstance(feeder, PhasedFeeder):
         return _phase_currents(feeder, np.conj(s / V), at)
-    above, here = at[..., feeder.parent], at[..., 1:]
-    series = (above - here) / (feeder.r + 1j * feeder.x)
-    shunt = 0.5j * feeder.charging
-    return np.maximum(np.abs(series + shunt * above), np.abs(series - shunt * here))
+    if isinstance(feeder, PhasedMesh):
+        return _mesh_currents(feeder, at)
+    ends, z, charging = _lines(feeder)
+    above, here = at[..., ends[:, 0]], at[..., ends[:, 1]]
+    series, shunt = (above - here) / z, 0.5j * charging
+    return np.maximum(np.abs(series + shunt * above), np.abs(series - shunt * here))[..., None]
+
+
+def _lines(feeder: Feeder | MeshedFeeder) -> tuple[Ints, Complex, Floats]:
+    """Ends, impedance and charging of every branch, and then of every tie."""
+    tree = feeder if isinstance(feeder, Feeder) else feeder.tree
+    ends, z = np.column_stack([tree.parent, np.arange(1, len(tree.buses))]), tree.r + 1j * tree.x
+    if isinstance(feeder, Feeder):
+        return ends, z, tree.charging
+    return (
+        np.vstack([ends, feeder.ends]),
+        np.concatenate([z, feeder.r + 1j * feeder.x]),
+        np.concatenate([tree.charging, feeder.charging]),
+    )
 
 
 def _phase_currents(feeder: PhasedFeeder, injected: Complex, at: Complex) -> Floats:
@@ -202,7 +232,25 @@ def _phase_currents(feeder: PhasedFeeder, injected: Complex, at: Complex) -> Flo
     above, here = (
         np.einsum("bij,...jb->...ib", shunt, V[..., ends]) for ends in (tree.parent, slice(1, None))
     )
-    return np.asarray(np.maximum(np.abs(series + above), np.abs(series - here)).max(axis=-2))
+    return np.asarray(np.swapaxes(np.maximum(np.abs(series + above), np.abs(series - here)), -1, -2))
+
+
+def _mesh_currents(feeder: PhasedMesh, at: Complex) -> Floats:
+    """`currents` of the phases, from the voltages of the places (…, n) over the impedances between them."""
+    tree = feeder.tree
+    V = (at * np.tile(ROTATION, len(tree.buses))).reshape(*at.shape[:-1], len(tree.buses), 3)
+    ends = np.vstack([np.column_stack([tree.parent, np.arange(1, len(tree.buses))]), feeder.ends])
+    y: Complex = np.zeros((len(ends), 3, 3), dtype=np.complex128)
+    for out, z, there in zip(y, [*tree.z, *feeder.z], [*tree.phases[1:], *feeder.phases], strict=True):
+        out[np.ix_(there, there)] = np.linalg.inv(z[np.ix_(there, there)])
+    shunt = 0.5j * np.concatenate([tree.charging, feeder.charging])
+    above, here = V[..., ends[:, 0], :], V[..., ends[:, 1], :]
+
+    def over(matrices: Complex, v: Complex) -> Complex:
+        return np.asarray(np.einsum("lij,...lj->...li", matrices, v))
+
+    series = over(y, above - here)
+    return np.maximum(np.abs(series + over(shunt, above)), np.abs(series - over(shunt, here)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

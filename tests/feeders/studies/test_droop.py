@@ -88,9 +88,19 @@ def near_the_edge(site: Site, rng: np.random.Generator, loads: Box, update: Upda
 
 
 def run_together(
-    site: Site, fleets: list[Droop], updates: list[Update], loads: list[Box], seed: int
+    site: Site,
+    fleets: list[Droop],
+    updates: list[Update],
+    loads: list[Box],
+    seed: int,
+    *,
+    volt: Floats | float = 230.0,
+    steps: int = STEPS,
 ) -> Floats:
-    """Movement of every fleet that does not die out, part of its limit; from a random state, by AC."""
+    """Movement of every fleet that does not die out, part of its limit; from a random state, by AC.
+
+    The fleets' curves are in parts of `volt`.
+    """
     rng, base = np.random.default_rng(seed), site.feeder
     flow, count = power_flow(site), len(base.customers)
     p = np.array([-base.base_kva * b.p_low for b in loads])
@@ -108,10 +118,10 @@ def run_together(
     asked, dead = [x] * 3, np.array([u.dead for u in updates])
     collapsed = np.zeros(len(fleets), dtype=bool)
     last: list[Floats] = []
-    for _ in range(STEPS):
+    for _ in range(steps):
         q = np.where(collapsed[:, None], 0.0, drawn - base.base_kva * x)
         try:
-            v = flow.solve_batch(p, q, v0)[0] / base.base_volt
+            v = flow.solve_batch(p, q, v0)[0] / volt
         except PowerFlowDiverged as error:
             collapsed[int(str(error).split("set ")[1].rstrip(")"))] = True
             continue

@@ -58,7 +58,7 @@ def test_power_flow_against_sweeps(seed: int, charging: float) -> None:
     v2 = sweep(feeder, p, q, 1.02**2)
     np.testing.assert_allclose(np.abs(V) ** 2, v2[feeder.bus], atol=1e-11)
     # Currents: what they dissipate is what goes in and does not come out.
-    amps = currents(feeder, net, p + 1j * q, V, 1.02)
+    amps = currents(feeder, net, p + 1j * q, V, 1.02)[:, 0]
     if not charging:
         at = 1.02 * net.E_bus + net.Z_bus @ np.conj((p + 1j * q) / V)
         out = at[feeder.parent[feeder.parent == 0]] * 0.0
