@@ -180,7 +180,8 @@ def _impedances(feeder: PhasedMesh) -> Phasors:
         across = paths(one, phase) - paths(other, phase)  # T C
         own = np.equal.outer(tie, tie) * feeder.z[tie[:, None], phase[:, None], phase]
         loops = own + across[3 * one + phase] - across[3 * other + phase]
-        if np.linalg.cond(loops) > _SINGULAR:
+        size = np.sqrt(np.abs(np.diagonal(loops)))
+        if not size.all() or np.linalg.cond(loops / np.outer(size, size)) > _SINGULAR:
             raise FeederInvalid(["ties: the impedances around a loop add up to nothing"])
         Z = Z - across @ np.linalg.solve(loops, across[feeder.bus].T)
     return np.asarray(3.0 * Z)
