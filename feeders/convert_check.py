@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from feeders.load import from_tables
-from feeders.load_phases import three_phase
+from feeders.load_phases import spanned
 from feeders.powerflow import PowerFlow
 from feeders.powerflow_unbalanced import UnbalancedPowerFlow
 from feeders.schema import FeederTables
@@ -126,7 +126,7 @@ def compare(state: SourceState, tables: FeederTables) -> SourceCheck:
     size = np.abs(state.busbar_volt)
     phases = tables.in_phases or bool(np.ptp(size) > UNIFORM * size[0]) or not _uniform(state)
     if phases:
-        unbalanced = three_phase(tables)
+        unbalanced, _ = spanned(tables)
         v0 = np.asarray(state.busbar_volt, dtype=np.complex128)
         _, volts = UnbalancedPowerFlow(unbalanced).solve(power.real, power.imag, v0)
         index = unbalanced.bus_of_file
