@@ -181,7 +181,7 @@ def fake_load(
     one = np.array([customer])
     R, X = (0.5 * columns(site.feeder, power, one)[site.feeder.bus] for power in Power)
     v = without.v_volt / site.customer_volt
-    nominal = site.tables.meta.voltage_volt
+    nominal = site.customer_nominal
     pattern = (load_pattern(R, X, 0, ratio, v) * (site.customer_volt / nominal))[site.meters]
     chosen = _affected(site, customer, pattern, meters) if isinstance(meters, int) else meters
     try:

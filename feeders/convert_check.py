@@ -129,20 +129,21 @@ def compare(state: SourceState, tables: FeederTables) -> SourceCheck:
         unbalanced, _ = spanned(tables)
         v0 = np.asarray(state.busbar_volt, dtype=np.complex128)
         _, volts = UnbalancedPowerFlow(unbalanced).solve(power.real, power.imag, v0)
-        index = unbalanced.bus_of_file
+        index, level = unbalanced.bus_of_file, unbalanced.nominal_volt
     else:
         site = from_tables(tables)
         _, single_phase = PowerFlow(site).solve(power.real, power.imag, float(size[0]))
         volts, index = np.repeat(single_phase[:, None], 3, axis=1), site.bus_of_file
+        level = site.nominal_volt
     common = [bus for bus in state.volts if bus in index]
     if not common:
         raise GridsecError("the source's power flow and the feeder have no bus in common")
     ours = volts[[index[bus] for bus in common]]
-    nominal = tables.meta.voltage_volt
+    nominal = level[[index[bus] for bus in common]]
     apart = _apart(ours, [state.volts[bus] for bus in common]) / nominal
     found = None
     if state.as_found:
-        found = float(_apart(ours, [state.as_found[bus] for bus in common]).max() / nominal)
+        found = float((_apart(ours, [state.as_found[bus] for bus in common]) / nominal).max())
     worst = int(apart.argmax())
     return SourceCheck(state.tool, len(common), phases, float(apart[worst]), common[worst], found)
 

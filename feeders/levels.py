@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from feeders.schema import LineRow
     from feeders.topology import Edge, Tree
+    from gridsec.arrays import Floats
 
 SAME_LEVEL: Final = 1e-6
 """Part by which two nominal voltages may differ and still be one: 230.94 and 400 / sqrt(3)."""
@@ -20,6 +21,20 @@ SAME_LEVEL: Final = 1e-6
 def same_level(one: float, other: float) -> bool:
     """Return whether two nominal voltages are one."""
     return abs(one - other) <= SAME_LEVEL * max(one, other)
+
+
+def told(nominal_volt: Floats, form: str = ".1f") -> str:
+    """Return a feeder's nominal voltages in words: "11547.0 V and 230.9 V".
+
+    Parameters
+    ----------
+    nominal_volt : (n,)
+        Of its places, V, the busbar first.
+    form
+        How numbers are written.
+    """
+    several = dict.fromkeys(f"{volt:{form}} V" for volt in nominal_volt.tolist())
+    return " and ".join(several)
 
 
 def nominal_volts(found: Tree, edges: Sequence[Edge | LineRow], volt: float) -> list[float]:

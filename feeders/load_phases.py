@@ -83,6 +83,11 @@ class ThreePhaseSite:
         base, connected = self.base_volt[self.feeder.bus], self.feeder.connected
         return np.asarray((base * connected).sum(axis=1) / connected.sum(axis=1))
 
+    @property
+    def customer_nominal(self) -> Floats:
+        """Nominal voltage of every customer, V, (N,)."""
+        return np.asarray(self.nominal_volt[self.feeder.bus])
+
 
 def load_three_phase(path_or_name: Path | str) -> ThreePhaseSite:
     """Load a feeder in three phases.

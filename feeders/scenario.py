@@ -239,7 +239,7 @@ def simulate(site: Site, scenario: Scenario) -> Iterator[Sample]:
     """
     _check(site, scenario)
     meters = Meters(site, scenario.errors, scenario.channel, scenario.seed)
-    nominal = site.tables.meta.voltage_volt
+    nominal = site.customer_nominal[site.meters]
     past = _Past(site.meters.size, scenario)
     if past.first < 0:
         for block in truth(site, scenario, past.first, 0):
@@ -376,7 +376,7 @@ def _attacked(
     """What is reported; honest meters keep their registers to the last bit."""
     if not lies.any():
         return honest
-    nominal = site.tables.meta.voltage_volt
+    nominal = site.customer_nominal[site.meters]
     before = Reports(honest.v_volt / nominal, honest.p_kw, honest.q_kvar)
     after = apply_all(scenario.attacks, t, before, past)
     v = np.where(lies, after.v * nominal, honest.v_volt)

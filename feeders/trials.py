@@ -353,7 +353,7 @@ def judge(
     ticks: list[tuple[float, Verdict, Truth]] = []
     all_errors: list[Floats] = []
     liar_errors: list[Floats] = []
-    of_nominal = trial.site.customer_volt / trial.site.tables.meta.voltage_volt
+    of_nominal = trial.site.customer_volt / trial.site.customer_nominal
     step_ms: list[float] = []
     settled, lied = START + settling_s, False
     for frame, truth in frames(trial) if played is None else played:

@@ -44,13 +44,14 @@ def feeders_list() -> None:
 @app.command("show")
 def feeders_show(feeder: Feeder) -> None:
     """Show a feeder and its customers."""
+    from feeders.levels import told
     from feeders.load import load
 
     site = load(feeder)
     meta = site.tables.meta
     out.print(f"[bold]{escape(meta.name)}[/] {escape(meta.title)}")
     out.print(
-        f"{meta.voltage_volt:g} V phase to neutral, {len(site.spanning.buses)} buses, "
+        f"{told(site.nominal_volt, 'g')} phase to neutral, {len(site.spanning.buses)} buses, "
         + (f"{len(site.ties)} closed ties, " if site.ties.size else "")
         + f"{len(site.feeder.customers)} customers, {len(site.meter_ids)} meters, "
         f"watched every {meta.monitor.tick_s:g} s for up to {meta.monitor.max_attacked} manipulated meters"

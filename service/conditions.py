@@ -190,7 +190,7 @@ def _voltage_limit(report: FeederReport, meter: MeterReport) -> Iterable[Conditi
             AlarmKind.VOLTAGE_LIMIT, report.feeder, meter.meter, Severity.MAJOR, evidence, known=False
         )
         return
-    low, high = report.v_min_volt, report.v_max_volt
+    low, high = meter.limits(report)
     if low <= v <= high:
         return
     surely = v + half_width < low or v - half_width > high

@@ -50,6 +50,7 @@ def detail(site: Site) -> dict[str, Any]:
             "parent": [None, *(int(bus) for bus in tree.parent)],
             "ties": [(int(one), int(other)) for one, other in site.ties],
             "xy": None if xy is None else [[float(x), float(y)] for x, y in xy],
+            "v_nominal_volt": site.nominal_volt[:: site.nominal_volt.size // len(tree.buses)].tolist(),
             "customers": [
                 {
                     "customer": row.customer,

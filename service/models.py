@@ -59,6 +59,8 @@ class MeterState(BaseModel):
     attack_volt_estimated: Number = Field(description="Reported minus reconstructed, V; 0 if no suspect.")
     kind: str | None = Field(default=None, description="What the manipulation looks like, if known.")
     phase: str | None = Field(default=None, description="Phase that it measures; null if balanced.")
+    v_min_volt: Number = Field(default=None, description="Lowest voltage allowed where it is, V.")
+    v_max_volt: Number = Field(default=None, description="Highest voltage allowed where it is, V.")
 
 
 class CustomerState(BaseModel):
@@ -231,6 +233,9 @@ class Layout(BaseModel):
         default=[], description="Indices of the buses at both ends of each line that closes a loop."
     )
     xy: list[tuple[float, float] | None] | None = Field(default=None, description="Coordinates, if known.")
+    v_nominal_volt: list[float] = Field(
+        default=[], description="Nominal voltage of each bus, V: behind transformers not that of the busbar."
+    )
     customers: list[LayoutCustomer]
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import reprlib
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
@@ -112,14 +113,21 @@ class Known:
     meters
         Ids of its meters.
     nominal_volt
-        Nominal phase-to-neutral voltage, V.
+        Nominal phase-to-neutral voltage of the busbar, V.
     power_max_kw
         Largest believable magnitude of a customer's active or reactive power, kW or kvar.
+    own_volt
+        The same of the meters behind a transformer.
     """
 
     meters: frozenset[str]
     nominal_volt: float
     power_max_kw: float
+    own_volt: Mapping[str, float] = field(default_factory=dict)
+
+    def volt(self, meter: object) -> float:
+        """Return the nominal voltage of a meter, or of the busbar for anything else, V."""
+        return self.own_volt.get(meter, self.nominal_volt) if isinstance(meter, str) else self.nominal_volt
 
 
 class Raw(msgspec.Struct, gc=False):
@@ -134,11 +142,11 @@ class Raw(msgspec.Struct, gc=False):
     v_phases: list[float | None] | None = None
 
 
-def plausible(raw: Raw, known: Known) -> bool:
-    """Tell whether every number of a well-typed reading is believable."""
+def plausible(raw: Raw, known: Known, meter: str | None) -> bool:
+    """Tell whether every number of a well-typed reading of a meter (None: the busbar) is believable."""
     limit = known.power_max_kw
     return (
-        0.0 < raw.v_volt <= VOLT_FACTOR * known.nominal_volt
+        0.0 < raw.v_volt <= VOLT_FACTOR * known.volt(meter)
         and T_MIN <= raw.t <= T_MAX
         and (raw.p_kw is None or -limit <= raw.p_kw <= limit)
         and (raw.q_kvar is None or -limit <= raw.q_kvar <= limit)
@@ -191,7 +199,7 @@ class Findings:
 _GRAVITY = (BadReason.TYPE, BadReason.VALUE, BadReason.UNKNOWN_METER)
 
 
-def judge(value: Any, known: Known, *, in_batch: bool) -> Raw | Findings:
+def judge(value: Any, known: Known, meter: str | None = None, *, in_batch: bool) -> Raw | Findings:
     """Return the reading in a parsed value, or everything that is wrong with it.
 
     Parameters
@@ -200,6 +208,8 @@ def judge(value: Any, known: Known, *, in_batch: bool) -> Raw | Findings:
         Anything that JSON, CBOR or a row of columns can hold.
     known
         The feeder's limits.
+    meter
+        Whose it is, unless the reading itself names its meter; None: the busbar's.
     in_batch
         Whether the reading has to name its meter.
     """
@@ -211,8 +221,9 @@ def judge(value: Any, known: Known, *, in_batch: bool) -> Raw | Findings:
     if t is not None and not T_MIN <= t <= T_MAX:
         findings.add(BadReason.VALUE, f"t = {t:g} is no Unix time in seconds")
     v_volt = _number(value, "v_volt", findings, required=True)
-    if v_volt is not None and not 0.0 < v_volt <= VOLT_FACTOR * known.nominal_volt:
-        problem = f"v_volt = {v_volt:g} V is absurd where {known.nominal_volt:g} V is nominal"
+    nominal = known.volt(value.get("meter") if in_batch else meter)
+    if v_volt is not None and not 0.0 < v_volt <= VOLT_FACTOR * nominal:
+        problem = f"v_volt = {v_volt:g} V is absurd where {nominal:g} V is nominal"
         findings.add(BadReason.VALUE, problem)
     p_kw = _power(value, "p_kw", known, findings)
     q_kvar = _power(value, "q_kvar", known, findings)
@@ -222,15 +233,15 @@ def judge(value: Any, known: Known, *, in_batch: bool) -> Raw | Findings:
         findings.add(BadReason.TYPE, f"seq is {name_of(seq)}, not an integer")
     elif seq is not None and not 0 <= seq <= SEQ_MAX:
         findings.add(BadReason.VALUE, "seq is outside of 0 to 2^63 - 1")
-    meter = value.get("meter") if in_batch else None
-    if in_batch and not isinstance(meter, str):
-        problem = "meter is missing" if meter is None else f"meter is {name_of(meter)}, not a string"
+    named = value.get("meter") if in_batch else None
+    if in_batch and not isinstance(named, str):
+        problem = "meter is missing" if named is None else f"meter is {name_of(named)}, not a string"
         findings.add(BadReason.TYPE, problem)
-    elif in_batch and meter not in known.meters:
-        findings.add(BadReason.UNKNOWN_METER, f"the feeder has no meter `{str(meter)[:64]}`")
+    elif in_batch and named not in known.meters:
+        findings.add(BadReason.UNKNOWN_METER, f"the feeder has no meter `{str(named)[:64]}`")
     if findings.of or t is None or v_volt is None:
         return findings
-    return Raw(t, v_volt, p_kw, q_kvar, seq, meter, v_phases)
+    return Raw(t, v_volt, p_kw, q_kvar, seq, named, v_phases)
 
 
 def _phases(value: Any, known: Known, findings: Findings) -> list[float | None] | None:

@@ -89,7 +89,7 @@ def _checked(feeder: str, known: Known, recorded: Recorded, tally: Tally) -> Rea
         "seq": recorded.seq,
         "v_phases": recorded.v_phases and list(recorded.v_phases),
     }
-    found = judge(fields, known, in_batch=False)
+    found = judge(fields, known, recorded.meter, in_batch=False)
     if isinstance(found, Findings):
         tally.readings[found.reason] += 1
         return None

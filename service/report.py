@@ -8,8 +8,6 @@ strings and floats, so it can be kept, compared, sent and read from any thread.
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
 from typing import Any
@@ -17,14 +15,13 @@ from typing import Any
 import numpy as np
 
 from feeders.load import Site, volts
-from gridsec.arrays import Bools
 from gridsec.online import Cause, Decision, Estimate, Verdict
 from service.align import Tick
+from service.reasons import reason_of
 from service.voltages import attack_volts, bus_volts, std_volts
 
 BUSBAR = "substation"
 """The name under which the busbar meter is reported among the silent ones (as in its zenoh key)."""
-_SHOWN = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,13 +49,15 @@ class MeterReport:
         the half-width of the interval that holds the true voltage, the standard deviation of the normal law
         whose three-sigma interval it is.
     v2_pu_estimated
-        Reconstructed squared voltage, pu.
+        Reconstructed squared voltage, in parts of its nominal voltage squared.
     attack_volt_estimated
         Reconstructed manipulation: reported minus reconstructed voltage, V, for suspects; 0 for others.
     kind
         What the manipulation looks like, see `gridsec.online.Kind`; None where nobody can tell.
     phase
         The phase that it measures: a, b or c; None on a balanced feeder.
+    v_min_volt, v_max_volt
+        The voltage limits where it is, V: behind a transformer others than the busbar's; None: the feeder's.
     """
 
     meter: str
@@ -74,6 +73,19 @@ class MeterReport:
     attack_volt_estimated: float | None
     kind: str | None = None
     phase: str | None = None
+    v_min_volt: float | None = None
+    v_max_volt: float | None = None
+
+    def limits(self, report: FeederReport) -> tuple[float, float]:
+        """Return the lowest and the highest voltage allowed at the meter, V.
+
+        Parameters
+        ----------
+        report
+            Of its feeder.
+        """
+        low, high = self.v_min_volt, self.v_max_volt
+        return report.v_min_volt if low is None else low, report.v_max_volt if high is None else high
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +180,7 @@ class FeederReport:
         that have been silent for longer than the feeder's `silence_s`; the busbar meter appears as
         `BUSBAR`.
     v_min_volt, v_max_volt
-        The feeder's voltage limits, V.
+        The feeder's voltage limits, V, at the nominal voltage of its busbar.
     customers, inverters
         One entry per customer, and per droop inverter, in the order of the feeder's file.
     explanations
@@ -215,12 +227,11 @@ def build(site: Site, tick: Tick, max_attacked: int, estimate: Estimate, verdict
     """
     v, std = volts(site.customer_volt, estimate.v2), std_volts(site, estimate)
     at = site.meters
-    v2 = (
-        estimate.v2 * (site.customer_volt / site.tables.meta.voltage_volt) ** 2
-    )  # of nominal, behind taps too
+    v2 = estimate.v2 * (site.customer_volt / site.customer_nominal) ** 2  # of nominal, behind taps too
     numbers = np.column_stack((verdict.score, verdict.threshold, v[at], std[at], v2[at]))
     attack = attack_volts(site, tick, verdict)
     kinds = verdict.kinds or (None,) * len(site.meter_ids)
+    allowed = _limits(site)
     meters = []
     for k, (meter, reading) in enumerate(zip(site.meter_ids, tick.readings, strict=True)):
         score, threshold, v_volt, v_std, v2_pu = (finite(value) for value in numbers[k])
@@ -239,6 +250,8 @@ def build(site: Site, tick: Tick, max_attacked: int, estimate: Estimate, verdict
                 attack_volt_estimated=finite(attack[k]),
                 kind=None if kinds[k] is None else str(kinds[k]),
                 phase=_phase(site, k),
+                v_min_volt=allowed[k][0],
+                v_max_volt=allowed[k][1],
             )
         )
     one, phases = bus_volts(site, estimate.v2_bus)
@@ -247,7 +260,7 @@ def build(site: Site, tick: Tick, max_attacked: int, estimate: Estimate, verdict
         site,
         tick,
         max_attacked,
-        verdict=(verdict.decision, verdict.cause, _reason(site, tick, max_attacked, verdict)),
+        verdict=(verdict.decision, verdict.cause, reason_of(site, tick, max_attacked, verdict)),
         meters=tuple(meters),
         buses=tuple((bus, finite(v)) for bus, v in buses),
         customers=tuple(map(CustomerReport, site.feeder.customers, map(finite, v), map(finite, std))),
@@ -267,6 +280,7 @@ def blind(site: Site, tick: Tick, max_attacked: int, cause: Cause, reason: str) 
     cause, reason
         Why there is no estimate.
     """
+    allowed = _limits(site)
     meters = tuple(
         MeterReport(
             meter=meter,
@@ -281,6 +295,8 @@ def blind(site: Site, tick: Tick, max_attacked: int, cause: Cause, reason: str) 
             v2_pu_estimated=None,
             attack_volt_estimated=None,
             phase=_phase(site, k),
+            v_min_volt=allowed[k][0],
+            v_max_volt=allowed[k][1],
         )
         for k, (meter, reading) in enumerate(zip(site.meter_ids, tick.readings, strict=True))
     )
@@ -295,6 +311,15 @@ def blind(site: Site, tick: Tick, max_attacked: int, cause: Cause, reason: str) 
         inverters=_inverters(site, None, None),
         explanations=(),
     )
+
+
+def _limits(site: Site) -> list[tuple[float, float]]:
+    """Lowest and highest voltage allowed at every meter, V."""
+    limits = site.tables.meta.limits
+    return [
+        (limits.v_min_pu * volt, limits.v_max_pu * volt)
+        for volt in site.customer_nominal[site.meters].tolist()
+    ]
 
 
 def _phase(site: Site, meter: int) -> str | None:
@@ -328,65 +353,6 @@ def _explanations(site: Site, verdict: Verdict) -> tuple[ExplanationReport, ...]
         )
         for e in verdict.explanations
     )
-
-
-def _reason(site: Site, tick: Tick, max_attacked: int, verdict: Verdict) -> str:
-    """Say why, with the meters' ids, as in alarms: the monitor knows customers only."""
-    suspects = np.flatnonzero(verdict.suspects).tolist()
-    unseen = [k for k, reading in enumerate(tick.readings) if reading is None]
-    named = _meters(site, suspects)
-    if verdict.cause is Cause.RESIDUALS:
-        who = _who(site, verdict.suspects, verdict.inverters)
-        return f"Manipulated: {who}; further off than meter accuracy and load uncertainty allow."
-    if verdict.cause is Cause.AMBIGUOUS and verdict.explanations:
-        ways = [
-            f"{_who(site, e.meters, e.inverters, e.powers)} ({e.probability:.0%})"
-            for e in verdict.explanations
-        ]
-        more = f" or {len(ways) - _SHOWN} more" if len(ways) > _SHOWN else ""
-        return f"Several explanations fit: {' or else '.join(ways[:_SHOWN])}{more}."
-    if verdict.cause is Cause.TOO_MANY_SUSPECTS and suspects:
-        return (
-            f"{len(suspects)} meters disagree with the feeder ({named}), and at most {max_attacked} can be "
-            "told apart. A wrong busbar reading, switch or line in the model looks the same."
-        )
-    if verdict.cause is Cause.SILENT_METERS and unseen:
-        return f"No reading from {_meters(site, unseen)}."
-    if verdict.cause in {Cause.AMBIGUOUS, Cause.SILENT_METERS}:
-        return _in_ids(site, verdict.reason)
-    return verdict.reason
-
-
-def _meters(site: Site, which: Sequence[int]) -> str:
-    """The ids of some meters, the first few of many."""
-    rest = f" and {len(which) - _SHOWN} more" if len(which) > _SHOWN else ""
-    return ", ".join(site.meter_ids[k] for k in which[:_SHOWN]) + rest
-
-
-def _who(site: Site, meters: Bools, inverters: Bools, powers: Bools | None = None) -> str:
-    """Meters by their ids, all else by its customers, as in alarms; the first few of many."""
-    found = np.flatnonzero(meters).tolist()
-    parts = [_meters(site, found)] if found else []
-    doubted = () if powers is None else np.flatnonzero(powers)
-    for what, customers in (("inverter", site.droop.customer[inverters]), ("reported power", doubted)):
-        names = [site.feeder.customers[int(c)] for c in customers]
-        rest = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-        if names:
-            parts.append(f"the {what}{'s' if len(names) > 1 else ''} of {', '.join(names[:_SHOWN])}{rest}")
-    return " and ".join(parts) or "nobody"
-
-
-def _in_ids(site: Site, text: str) -> str:
-    """Call customers in a sentence by their meters' ids; longer names first, one may begin another.
-
-    Inverters keep their customer's name, as in alarms.
-    """
-    meter_of = {
-        site.feeder.customers[int(customer)]: meter
-        for customer, meter in zip(site.meters, site.meter_ids, strict=True)
-    }
-    names = "|".join(re.escape(name) for name in sorted(meter_of, key=len, reverse=True))
-    return re.sub(rf"(?<!\w)(?<!nverter of )(?:{names})(?!\w)", lambda found: meter_of[found[0]], text)
 
 
 def _whole(
@@ -458,6 +424,8 @@ def to_json(report: FeederReport) -> dict[str, Any]:
                 "attack_volt_estimated": m.attack_volt_estimated,
                 "kind": m.kind,
                 "phase": m.phase,
+                "v_min_volt": m.limits(report)[0],
+                "v_max_volt": m.limits(report)[1],
             }
             for m in report.meters
         ],

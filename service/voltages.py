@@ -63,7 +63,8 @@ def bus_volts(site: Site, v2_bus: Floats) -> tuple[Floats, Floats]:
     if not isinstance(site.feeder, InPhases):
         return v, np.zeros((v.size, 0))
     phases = np.where(site.feeder.tree.phases, v.reshape(-1, 3), np.nan)
-    off = np.where(np.isnan(phases), -1.0, np.abs(phases - site.feeder.base_volt))
+    nominal = site.nominal_volt.reshape(-1, 3)
+    off = np.where(np.isnan(phases), -1.0, np.abs(phases - nominal))
     return np.take_along_axis(phases, off.argmax(axis=1)[:, None], axis=1)[:, 0], phases
 
 

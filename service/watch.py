@@ -53,7 +53,9 @@ def known_of(site: Site) -> Known:
         The feeder.
     """
     meta = site.tables.meta
-    return Known(frozenset(site.meter_ids), meta.voltage_volt, POWER_MAX_FACTOR * meta.base_kva)
+    nominal = zip(site.meter_ids, site.customer_nominal[site.meters].tolist(), strict=True)
+    own = {meter: volt for meter, volt in nominal if volt != meta.voltage_volt}
+    return Known(frozenset(site.meter_ids), meta.voltage_volt, POWER_MAX_FACTOR * meta.base_kva, own)
 
 
 def align_rules(

@@ -193,7 +193,7 @@ def _single(payload: bytes, source: Source, known: Known, base: BadReading) -> D
     except (msgspec.MsgspecError, RecursionError):
         pass
     else:
-        if plausible(raw, known):
+        if plausible(raw, known, source.meter):
             return Decoded((to_reading(source.feeder, source.meter, raw),))
     try:
         value = _parse(payload)
@@ -201,7 +201,7 @@ def _single(payload: bytes, source: Source, known: Known, base: BadReading) -> D
         return _refuse(base, BadReason.SYNTAX, f"no JSON: {error}")
     if value in ([], {}):
         return _refuse(base, BadReason.EMPTY, "the reading is empty")
-    found = judge(value, known, in_batch=False)
+    found = judge(value, known, source.meter, in_batch=False)
     if isinstance(found, Raw):
         return Decoded((to_reading(source.feeder, source.meter, found),))
     return _refuse(base, found.reason, *found.problems)
@@ -213,7 +213,7 @@ def _json_batch(payload: bytes, source: Source, known: Known, base: BadReading) 
     except (msgspec.MsgspecError, RecursionError):
         pass
     else:
-        if rows and all(plausible(raw, known) and raw.meter in known.meters for raw in rows):
+        if rows and all(plausible(raw, known, raw.meter) and raw.meter in known.meters for raw in rows):
             return Decoded(tuple(to_reading(source.feeder, raw.meter, raw) for raw in rows))
     try:
         value = _parse(payload)

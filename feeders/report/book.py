@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from feeders.levels import told
 from feeders.report import raster
 from feeders.report.drawing import Drawing, svg
 from feeders.report.figure import WIDE, Figure
@@ -97,7 +98,7 @@ def _facts(site: Site) -> dict[str, str]:
         "meters": f"{site.meters.size} meters, class {spread} %",
         "inverters": f"{site.droop.tau.size} inverters, {kva:.4g} kVA",
         "peak of all loads": f"{sum(row.load_kw for row in rows):.4g} kW",
-        "nominal voltage": f"{meta.voltage_volt:.1f} V",
+        "nominal voltage": told(site.nominal_volt),
         "voltage band": f"{meta.limits.v_min_pu:g} to {meta.limits.v_max_pu:g} pu",
         "busbar": str(site.spanning.buses[0]),
         "content (SHA-256)": site.digest[:16],

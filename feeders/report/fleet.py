@@ -36,11 +36,13 @@ def droop(site: Site, found: DroopStudy) -> Section:
         The feeder, and what was found.
     """
     given, own = found.options, site.tables.meta.limits
-    limits = [
-        site.feeder.base_volt * (mine if asked is None else asked)
+    low, high = (
+        mine if asked is None else asked
         for asked, mine in ((given.v_min, own.v_min_pu), (given.v_max, own.v_max_pu))
-    ]
-    band = f"{number(limits[0], 1)} to {number(limits[1], 1)} V"
+    )
+    volt = site.feeder.base_volt
+    one = bool((site.nominal_volt == volt).all())
+    band = f"{number(low * volt, 1)} to {number(high * volt, 1)} V" if one else f"{low:g} to {high:g} pu"
     ends = given.v0_low, given.v0_high
     busbar = f"at {ends[0]:g} pu" if ends[0] == ends[1] else f"from {ends[0]:g} to {ends[1]:g} pu"
     alone = "" if ends[0] == ends[1] or single_phase(site) else ", each phase on its own"

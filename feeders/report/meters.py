@@ -6,6 +6,7 @@ import math
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from feeders.levels import told
 from feeders.report.charts import Bar, Row, rows
 from feeders.report.drawing import Drawing
 from feeders.report.figure import Figure
@@ -155,7 +156,7 @@ def _picture(site: Site, customers: pd.DataFrame, liars: int) -> Finding:
         f" (at {_extreme(customers, 'customer', 'error', smallest=True)}) to ",
         most(customers, name, "error", "V", side=Side.ABOVE),
         f" (at {_extreme(customers, 'customer', 'error')}), honest errors included. "
-        f"Nominal voltage is {number(float(site.feeder.base_volt), 1)} V.",
+        f"Nominal voltage is {told(site.nominal_volt)}.",
     )
     if not all(math.isfinite(v) for v in customers["error"]):
         return Finding(Standing.OPEN, (("No bound of the error is proved for every customer.",),))

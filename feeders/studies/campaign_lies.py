@@ -63,7 +63,7 @@ def attacks(
         told = np.array(kind.volts)
         some, signs = liars(site, case, random)
     if told.size:
-        nominal = site.tables.meta.voltage_volt
+        nominal = site.customer_nominal[site.meters[some]]
         return (Bias(some, t_on, t_off, case.size * signs * told[some] / nominal),), ()
     lie = Lie(kind.trick, case.liars, case.size)
     return (each_alone(lie, some, signs, t_on, t_off),), ()

@@ -229,7 +229,7 @@ def _lied(given: Prepared, played: _Played, honest: Scenario, case: Case) -> _Pl
     t = np.array([frame.t for frame in played.frames])
     y = np.array([frame.y for frame in played.frames])
     # Lies have sizes in parts of the nominal voltage, as in scenarios, frames in parts of each place's base.
-    of_nominal = given.site.customer_volt[given.site.meters] / given.site.tables.meta.voltage_volt
+    of_nominal = (given.site.customer_volt / given.site.customer_nominal)[given.site.meters]
     # The root of a rounded square is the number itself.
     v = np.sqrt(y) * of_nominal
     nothing = np.zeros_like(v)
@@ -395,7 +395,7 @@ def _errors(  # noqa: PLR0917  # the same
     """Errors of the voltage, % of nominal, at liars while they lie and at everybody else."""
     with np.errstate(invalid="ignore"):
         error = 100.0 * np.abs(np.sqrt(seen.v2) - np.sqrt(played.v2[begin:]))
-    error *= site.customer_volt / site.tables.meta.voltage_volt
+    error *= site.customer_volt / site.customer_nominal
     error = np.where(np.isfinite(error), error, np.inf)
     lying: Bools = np.any(lies, axis=1)
     first = int(np.argmax(lying)) if lying.any() else 0

@@ -136,8 +136,10 @@ function verdict() {
       text: `inverter of ${i.customer} ${signed(i.attack_kvar_estimated)} kvar`, on: { click: () => select(i.customer) },
     })),
     ...report.silent.map((s) => chip(s.meter, "silent", `${s.meter} silent ${isKnown(s.seconds) ? duration(s.seconds) : ""}`)));
-  const volts = report.meters.map((m) => m.v_volt_estimated).filter(isKnown);
-  const range = volts.length ? `${bare(Math.min(...volts))} – ${volt(Math.max(...volts))}` : "–";
+  const several = diagram.level === null;
+  const real = report.meters.map((m) => (several ? m.v2_pu_estimated : m.v_volt_estimated)).filter(isKnown);
+  const [low, high] = [Math.min(...real), Math.max(...real)].map((v) => (several ? Math.sqrt(v).toFixed(3) : bare(v)));
+  const range = real.length ? `${low} – ${high} ${several ? "pu" : "V"}` : "–";
   const fact = (name, value) => el("div", {}, el("dt", { text: name }), el("dd", { text: value }));
   byId("facts").replaceChildren(
     fact("Meters heard", `${report.meters.filter((m) => m.seen).length} of ${report.meters.length}`),

@@ -1,6 +1,6 @@
 // One customer: what its meter says, what the voltage is, how far that may be from each other, and a trend.
 
-import { bare, byId, clock, duration, el, isKnown, signed, status, svg, volt } from "./dom.js";
+import { bare, byId, clock, duration, el, isKnown, nominals, signed, status, svg, volt } from "./dom.js";
 
 const [W, H, LEFT, RIGHT, TOP, BOTTOM] = [420, 150, 46, 8, 10, 20];
 
@@ -63,8 +63,9 @@ function row(label, value, extra) {
 }
 
 export function showDetail(feeder, customer, { meter, inverter, v, std, own }, points) {
-  const limits = { low: feeder.v_min_volt, high: feeder.v_max_volt };
-  const nominal = feeder.v_nominal_volt;
+  const nominal = nominals(feeder).get(customer.bus);
+  const share = nominal / feeder.v_nominal_volt;
+  const limits = { low: share * feeder.v_min_volt, high: share * feeder.v_max_volt };
   const pu = (value) => (isKnown(value) ? `${(value / nominal).toFixed(4)} pu` : "");
   const now = status(meter, limits);
   byId("detail-title").textContent = customer.customer;

@@ -1,6 +1,6 @@
 // The feeder as a drawing: built once per feeder and width, coloured at every tick.
 
-import { byId, el, isKnown, signed, status, svg, volt } from "./dom.js";
+import { byId, el, isKnown, nominals, signed, status, svg, volt } from "./dom.js";
 import { hasMap, oneLine } from "./layout.js";
 import { Scale } from "./scale.js";
 
@@ -64,13 +64,15 @@ export class Diagram {
   show(feeder) {
     this.feeder = feeder;
     this.limits = { low: feeder.v_min_volt, high: feeder.v_max_volt };
+    this.nominal = nominals(feeder);
+    this.level = new Set(this.nominal.values()).size > 1 ? null : feeder.v_nominal_volt;
     this.report = null;
     this.placed = oneLine(feeder.layout);
     this.mapped = hasMap(feeder.layout);
     byId("view").hidden = !this.mapped;
     this.view = "line";
     this.cut = sharedPrefix(feeder.layout.customers.map((c) => c.customer));
-    this.scale.fit([], feeder.v_nominal_volt);
+    this.scale.fit([], this.level);
     this.rescale();
     this.look("line");
   }
@@ -236,14 +238,21 @@ export class Diagram {
     this.meters = new Map(report.meters.map((meter) => [meter.meter, meter]));
     this.volts = new Map(report.buses.map((bus) => [bus.bus, bus.v_volt]));
     this.phases = new Map(report.buses.map((bus) => [bus.bus, bus.v_phases]));
-    const all = [...this.volts.values(), ...report.meters.map((m) => m.v_volt_estimated)].filter(isKnown);
-    if (this.scale.fit(all, this.feeder.v_nominal_volt)) this.rescale();
+    const parts = [...this.volts].map(([bus, v]) => this.part(bus, v)).filter(isKnown);
+    parts.push(...report.meters.map((m) => m.v2_pu_estimated).filter(isKnown).map(Math.sqrt));
+    if (this.scale.fit(parts, this.level)) this.rescale();
     this.paint();
     this.hover(this.hovered);
   }
 
   rescale() {
-    this.scale.draw(this.limits);
+    const { v_nominal_volt: nominal } = this.feeder;
+    this.scale.draw({ low: this.limits.low / nominal, high: this.limits.high / nominal });
+  }
+
+  // A voltage by the nominal one of its bus.
+  part(bus, v) {
+    return isKnown(v) ? v / this.nominal.get(bus) : NaN;
   }
 
   voltAt(customer) {
@@ -257,7 +266,7 @@ export class Diagram {
     if (!this.report || !this.customers) return;
     const { buses } = this.feeder.layout;
     for (const { path, bus } of this.lines) {
-      const color = this.scale.color(this.volts.get(buses[bus]));
+      const color = this.scale.color(this.part(buses[bus], this.volts.get(buses[bus])));
       path.classList.toggle("unknown", color === null);
       path.style.stroke = color ?? "";
     }
@@ -268,7 +277,7 @@ export class Diagram {
       const v = this.voltAt(part.customer);
       part.group.setAttribute("data-status", now.key);
       part.shape.setAttribute("d", SHAPE[now.key]);
-      part.shape.style.fill = now.key === "silent" ? "" : (this.scale.color(v) ?? "");
+      part.shape.style.fill = now.key === "silent" ? "" : (this.scale.color(this.part(part.customer.bus, v)) ?? "");
       part.sign.textContent = SIGN[now.key] ?? "";
       const loud = now.key === "suspect";
       // Neighbours that both have something to say must not say it in the same place.

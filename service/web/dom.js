@@ -47,9 +47,15 @@ export function status(meter, limits) {
   if (meter.suspect) return { key: "suspect", text: "suspect" };
   if (!meter.seen) return { key: "silent", text: "silent" };
   const v = meter.v_volt_estimated;
-  if (known(v) && v > limits.high) return { key: "high", text: "above limit" };
-  if (known(v) && v < limits.low) return { key: "low", text: "below limit" };
+  if (known(v) && v > (meter.v_max_volt ?? limits.high)) return { key: "high", text: "above limit" };
+  if (known(v) && v < (meter.v_min_volt ?? limits.low)) return { key: "low", text: "below limit" };
   return { key: "ok", text: "honest" };
+}
+
+// Nominal voltage of every bus: another one than the busbar's behind a transformer.
+export function nominals(feeder) {
+  const { buses, v_nominal_volt: own = [] } = feeder.layout;
+  return new Map(buses.map((bus, k) => [bus, own[k] ?? feeder.v_nominal_volt]));
 }
 
 export async function getJson(url) {

@@ -1,5 +1,6 @@
 // Voltage to colour: blue is low, orange is high, the middle is the nominal voltage. The range fits the data
-// in few steps, so that colours keep their meaning while one looks; its ends are written beside it.
+// in few steps, so that colours keep their meaning while one looks; its ends are written beside it. Voltages
+// come as parts of the nominal one; that itself is null where there are several.
 
 import { bare, byId, el, svg } from "./dom.js";
 
@@ -24,8 +25,8 @@ export class Scale {
   }
 
   // Returns whether the range changed.
-  fit(volts, nominal) {
-    const largest = Math.max(0, ...volts.map((v) => Math.abs(v / nominal - 1)));
+  fit(parts, nominal) {
+    const largest = Math.max(0, ...parts.map((part) => Math.abs(part - 1)));
     const needed = STEPS.find((step) => step >= largest) ?? STEPS.at(-1);
     const keep = this.nominal === nominal && this.range >= needed && largest > 0.55 * needed && this.range <= 2 * needed;
     const range = keep ? this.range : needed;
@@ -35,9 +36,9 @@ export class Scale {
     return changed;
   }
 
-  color(v) {
-    if (!Number.isFinite(v)) return null;
-    const at = Math.min(1, Math.max(-1, (v / this.nominal - 1) / this.range)) * 2 + 2;
+  color(part) {
+    if (!Number.isFinite(part)) return null;
+    const at = Math.min(1, Math.max(-1, (part - 1) / this.range)) * 2 + 2;
     const k = Math.min(3, Math.floor(at));
     const mix = this.stops[k].map((a, i) => Math.round(a + (this.stops[k + 1][i] - a) * (at - k)));
     return `rgb(${mix.join(",")})`;
@@ -51,13 +52,15 @@ export class Scale {
       svg("rect", { width: "100%", height: 12, rx: 3, fill: "url(#ramp)" }));
     const marks = [-1, -0.5, 0, 0.5, 1].map((k) => {
       const pu = 1 + k * range;
-      const tick = el("span", { class: "tick" }, el("b", { text: `${bare(pu * nominal)} V` }),
-        el("span", { text: `${pu.toFixed(range < 0.02 || range === 0.03 || range === 0.075 ? 4 : 3)} pu` }));
+      const part = `${pu.toFixed(range < 0.02 || range === 0.03 || range === 0.075 ? 4 : 3)} pu`;
+      const tick = nominal === null
+        ? el("span", { class: "tick" }, el("b", { text: part }))
+        : el("span", { class: "tick" }, el("b", { text: `${bare(pu * nominal)} V` }), el("span", { text: part }));
       tick.style.left = `${50 + 50 * k}%`;
       return tick;
     });
     const edges = [["low", limits.low], ["high", limits.high]]
-      .map(([name, v]) => [name, (v / nominal - 1) / range])
+      .map(([name, part]) => [name, (part - 1) / range])
       .filter(([, place]) => Math.abs(place) <= 1)
       .map(([name, place]) => {
         const edge = el("span", { class: `edge ${name}`, title: `${name} limit` });

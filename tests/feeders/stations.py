@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from feeders.schema import CustomerRow, FeederMeta, FeederTables, LineRow, MonitorDefaults
+from feeders.schema import CustomerRow, FeederMeta, FeederTables, LineRow
 
 MV, LV = 20_000.0 / 3**0.5, 400.0 / 3**0.5
 
@@ -36,8 +36,8 @@ LOADS = {
 }
 
 
-def tables(**monitor: object) -> FeederTables:
-    """The feeder; keywords go to its [monitor]."""
+def tables() -> FeederTables:
+    """The feeder, balanced."""
     meta = FeederMeta(
         format=1,
         name="two-levels",
@@ -45,7 +45,6 @@ def tables(**monitor: object) -> FeederTables:
         busbar="works",
         base_kva=1000.0,
         busbar_resolution_volt=1.0,
-        monitor=replace(MonitorDefaults(), **monitor),  # type: ignore[arg-type]
     )
     customers = tuple(
         CustomerRow(

@@ -137,6 +137,8 @@ def test_json_is_plain_and_has_no_nan(site: Site) -> None:
     wanted = {
         "kind",
         "phase",
+        "v_min_volt",
+        "v_max_volt",
         "meter",
         "bus",
         "seen",

@@ -1,0 +1,86 @@
+"""Why a tick was judged as it was, in an operator's words: with the ids of meters, which monitors lack."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from feeders.load import Site
+from gridsec.arrays import Bools
+from gridsec.online import Cause, Verdict
+from service.align import Tick
+
+_SHOWN: Final = 5
+"""So many names are listed at most."""
+
+
+def reason_of(site: Site, tick: Tick, max_attacked: int, verdict: Verdict) -> str:
+    """Say why, with the meters' ids, as in alarms: the monitor knows customers only.
+
+    Parameters
+    ----------
+    site, tick
+        The feeder, and what was known.
+    max_attacked
+        The number M that the monitor was designed for.
+    verdict
+        What the monitor made of it.
+    """
+    suspects = np.flatnonzero(verdict.suspects).tolist()
+    unseen = [k for k, reading in enumerate(tick.readings) if reading is None]
+    named = _meters(site, suspects)
+    if verdict.cause is Cause.RESIDUALS:
+        who = _who(site, verdict.suspects, verdict.inverters)
+        return f"Manipulated: {who}; further off than meter accuracy and load uncertainty allow."
+    if verdict.cause is Cause.AMBIGUOUS and verdict.explanations:
+        ways = [
+            f"{_who(site, e.meters, e.inverters, e.powers)} ({e.probability:.0%})"
+            for e in verdict.explanations
+        ]
+        more = f" or {len(ways) - _SHOWN} more" if len(ways) > _SHOWN else ""
+        return f"Several explanations fit: {' or else '.join(ways[:_SHOWN])}{more}."
+    if verdict.cause is Cause.TOO_MANY_SUSPECTS and suspects:
+        return (
+            f"{len(suspects)} meters disagree with the feeder ({named}), and at most {max_attacked} can be "
+            "told apart. A wrong busbar reading, switch or line in the model looks the same."
+        )
+    if verdict.cause is Cause.SILENT_METERS and unseen:
+        return f"No reading from {_meters(site, unseen)}."
+    if verdict.cause in {Cause.AMBIGUOUS, Cause.SILENT_METERS}:
+        return _in_ids(site, verdict.reason)
+    return verdict.reason
+
+
+def _meters(site: Site, which: Sequence[int]) -> str:
+    """The ids of some meters, the first few of many."""
+    rest = f" and {len(which) - _SHOWN} more" if len(which) > _SHOWN else ""
+    return ", ".join(site.meter_ids[k] for k in which[:_SHOWN]) + rest
+
+
+def _who(site: Site, meters: Bools, inverters: Bools, powers: Bools | None = None) -> str:
+    """Meters by their ids, all else by its customers, as in alarms; the first few of many."""
+    found = np.flatnonzero(meters).tolist()
+    parts = [_meters(site, found)] if found else []
+    doubted = () if powers is None else np.flatnonzero(powers)
+    for what, customers in (("inverter", site.droop.customer[inverters]), ("reported power", doubted)):
+        names = [site.feeder.customers[int(c)] for c in customers]
+        rest = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+        if names:
+            parts.append(f"the {what}{'s' if len(names) > 1 else ''} of {', '.join(names[:_SHOWN])}{rest}")
+    return " and ".join(parts) or "nobody"
+
+
+def _in_ids(site: Site, text: str) -> str:
+    """Call customers in a sentence by their meters' ids; longer names first, one may begin another.
+
+    Inverters keep their customer's name, as in alarms.
+    """
+    meter_of = {
+        site.feeder.customers[int(customer)]: meter
+        for customer, meter in zip(site.meters, site.meter_ids, strict=True)
+    }
+    names = "|".join(re.escape(name) for name in sorted(meter_of, key=len, reverse=True))
+    return re.sub(rf"(?<!\w)(?<!nverter of )(?:{names})(?!\w)", lambda found: meter_of[found[0]], text)
