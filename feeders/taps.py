@@ -129,10 +129,15 @@ def _problems(closed: Sequence[LineRow]) -> list[str]:
 def _around(ties: Sequence[LineRow], ratio: Floats) -> list[str]:
     """Loops whose taps drive a current around without any load, which the model does not have."""
     return [
-        f"lines, line {line.line!r} closes a loop around which the taps multiply to {own[0]:.6g}; expected 1"
+        f"lines, line {line.line!r} closes a loop around which the taps multiply to {far:.6g}; expected 1"
         for line, own in zip(ties, ratio, strict=True)
-        if (np.abs(own - 1.0) > _ROUNDING).any()
+        if abs((far := _farthest(own[["abc".index(phase) for phase in line.phases]])) - 1.0) > _ROUNDING
     ]
+
+
+def _farthest(ratio: Floats) -> float:
+    """The one that is the least 1."""
+    return float(ratio[np.abs(ratio - 1.0).argmax()])
 
 
 # Ratios around a loop are products of a few numbers of the files.

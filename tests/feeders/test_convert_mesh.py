@@ -12,15 +12,20 @@ from pandapower import networks
 
 from feeders.convert import check_against_source, convert
 from feeders.convert_check import BALANCED_PU
+from feeders.estimators import design
+from feeders.lies import Lie, Trick
 from feeders.load import load
 from feeders.powerflow import PowerFlow
+from feeders.powerflow_unbalanced import power_flow
 from feeders.schema import read
+from feeders.trials import LoadError, Meters, Trial, judge
 from gridsec.errors import FeederInvalid
-from gridsec.mesh import MeshedFeeder
+from gridsec.mesh import MeshedFeeder, PhasedMesh
 from gridsec.network import bus_voltages, model_error_bound
 from tests.feeders.test_convert_check import village
 from tests.feeders.test_convert_pgm import line, written
 from tests.feeders.test_convert_pgm import load as pgm_load
+from tests.feeders.thirteen import thirteen
 
 
 def meshed_net() -> Any:
@@ -85,6 +90,42 @@ def test_a_network_of_power_grid_model_with_a_ring(tmp_path: Path) -> None:
     done = convert(written(tmp_path, tables), tmp_path / "x", meshed=True)
     assert done.check is not None
     assert done.check.largest_pu < 1e-8
+
+
+LOOPS = """new line.ring bus1=680.1.2.3 bus2=675.1.2.3 linecode=601 length=1500 units=ft
+new line.one bus1=611.3 bus2=646.3 linecode=605 length=900 units=ft
+new line.two bus1=645.3.2 bus2=671.3.2 linecode=603 length=1200 units=ft
+"""
+
+
+@pytest.mark.parametrize("lie", [None, Lie(Trick.BIAS, 5, 3.0, onset_s=10.0)], ids=["nobody", "five"])
+def test_the_ieee_13_node_feeder_with_three_loops(lie: Lie | None, tmp_path: Path) -> None:
+    """Ties of three phases, of two and of one, behind a regulator that differs in its phases."""
+    pytest.importorskip("opendssdirect", reason="the extra `convert` is not installed")
+    before, loads = thirteen().split("new load", 1)
+    (tmp_path / "thirteen.dss").write_text(f"{before}{LOOPS}new load{loads}")
+    source = str(tmp_path / "thirteen.dss")
+    with pytest.raises(FeederInvalid, match=r"form a loop.*\(converters: --meshed\)"):
+        convert(source, tmp_path / "x", root="650")
+    done = convert(source, tmp_path / "x", root="650", meshed=True)
+    assert done.check is not None
+    assert done.check.three_phase
+    assert done.check.largest_pu < 1e-7
+    site = load(tmp_path / "x")
+    assert isinstance(site.feeder, PhasedMesh)
+    assert sorted(site.feeder.phases.sum(axis=1).tolist()) == [1, 2, 3]
+    p = -site.loads.load_peak
+    _, places = power_flow(site).solve(-p * site.feeder.base_kva, -0.4 * p * site.feeder.base_kva, 2400.0)
+    exact = (places / site.base_volt) ** 2
+    v0 = np.square(2400.0 / site.feeder.base_volt)
+    off = np.abs(bus_voltages(site.feeder, p, 0.4 * p, v0) - exact)[site.feeder.bus]
+    assert (off <= model_error_bound(site.feeder, p, 0.4 * p, v0) + 1e-9).all()
+    assert off.max() < 3e-3
+    trial = Trial(site, 2, 22.0, load_error=LoadError(20.0, 7.0), meters=Meters.WHITE, lie=lie)
+    found = judge(design(trial.stated), trial, settling_s=3.0)
+    assert found.liars.size == (5 if lie else 0)
+    assert (found.delay_s <= 3.0).all()
+    assert not found.accused.any()
 
 
 def test_the_option_changes_nothing_of_a_radial_network(tmp_path: Path) -> None:
