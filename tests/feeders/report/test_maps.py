@@ -11,7 +11,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from benchmarks.mesh import baran_wu, landnetz, rural3
+from benchmarks.mesh import baran_wu, european, landnetz, rural3
 from feeders.load import Site, load, names
 from feeders.report.drawing import STEPS, Disc, Line, Text, width_of
 from feeders.report.figure import NARROW, WIDE
@@ -43,7 +43,7 @@ def test_everybody_is_on_the_sheet_and_on_a_line(feeder: Site, width: float, *, 
 
 
 @pytest.mark.parametrize("width", [WIDE, NARROW])
-@pytest.mark.parametrize("make", [baran_wu, rural3, landnetz])
+@pytest.mark.parametrize("make", [baran_wu, rural3, landnetz, european])
 def test_ties_end_on_the_lines_they_join(make: Callable[[], Site], width: float) -> None:
     site = make()
     for shown in (site, replace(site, xy=None)):

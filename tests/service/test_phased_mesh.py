@@ -1,0 +1,76 @@
+"""A meshed feeder of single-phase customers through the whole service: its check, layout, and who lies."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from benchmarks.mesh import european
+from feeders.recording import read_recording, record
+from feeders.scenario import Scenario, random_attacks, simulate
+from feeders.schema import write
+from gridsec.mesh import PhasedMesh
+from service.cli import app
+from service.describe import detail
+from service.models import FeederDetail, State
+from service.replay import Tally, replay
+from service.simulate import Pace, play
+from tests.service.running import service, until
+
+START = 1_795_212_000.0
+NAME = "ieee-european-lv"
+
+
+@pytest.fixture(scope="module")
+def scenario() -> Scenario:
+    attacks = random_attacks(european(), 3, "bias", 6, 0.03, t_on=START + 15, t_off=START + 60)
+    return Scenario(seed=6, start=START, duration_s=30.0, attacks=attacks)
+
+
+def test_the_folder_is_checked_and_shown(tmp_path: Path) -> None:
+    write(european().tables, tmp_path / NAME)
+    checked = CliRunner().invoke(app, ["feeders", "validate", str(tmp_path / NAME)])
+    assert checked.exit_code == 0
+    assert "'ring' is drawn as a tie" in " ".join(checked.output.split())
+    shown = CliRunner().invoke(app, ["feeders", "show", str(tmp_path / NAME)])
+    assert "906 buses, 1 closed ties, 55 customers" in " ".join(shown.output.split())
+
+
+def test_the_layout_is_a_tree_and_its_tie() -> None:
+    site = european()
+    assert isinstance(site.feeder, PhasedMesh)
+    found = FeederDetail.model_validate(detail(site)).layout
+    assert [{found.buses[one], found.buses[other]} for one, other in found.ties] == [{"681", "906"}]
+    assert len(found.buses) == len(found.parent) == 906
+    assert {customer.phase for customer in found.customers} == {"a", "b", "c"}
+
+
+def test_the_service_names_the_liars(scenario: Scenario, tmp_path: Path) -> None:
+    site = european()
+    write(site.tables, tmp_path / NAME)
+    with service(tmp_path, (str(tmp_path / NAME),), clock="events") as live:
+        samples = list(play(site, scenario, live.meters, Pace(float("inf"), ahead=3)))
+        until(lambda: live.state(NAME).get("t", 0.0) >= samples[-1].t - 2.0, "the end")
+        state = live.state(NAME)
+    lying = {site.meter_ids[k] for k in np.flatnonzero(samples[-1].manipulated)}
+    assert len(lying) == 6
+    assert state["verdict"] == "attacked"
+    assert {meter["meter"] for meter in state["meters"] if meter["suspect"]} == lying
+    State.model_validate(state)
+    found = np.array([bus["v_phases"] for bus in state["buses"]], dtype=float)
+    np.testing.assert_allclose(found, samples[-1].v_bus_volt.reshape(-1, 3), rtol=0, atol=2.0)
+
+
+def test_a_recording_is_replayed(scenario: Scenario, tmp_path: Path) -> None:
+    site = european()
+    recording = record(site, scenario, tmp_path / "day.parquet")
+    samples = list(simulate(site, scenario))
+    reports = [one.report for one in replay(site, read_recording(recording.path).readings(), Tally())]
+    lying = {site.meter_ids[k] for k in np.flatnonzero(samples[-1].manipulated)}
+    assert {meter.meter for meter in reports[-1].meters if meter.suspect} == lying
+    clean = [report for report in reports if report.t < START + 15]
+    assert len(clean) >= 10
+    assert not any(meter.suspect for report in clean for meter in report.meters)
