@@ -141,8 +141,10 @@ class Recording:
             table = pq.read_table(path)
         except (OSError, pa.ArrowException) as error:
             raise RecordingInvalid(f"{path}: no truth of this recording: {error}") from error
-        columns = {name: _matrix(table.column(name)) for name in (field.name for field in fields(Truth))}
-        return Truth(**columns)
+        there = {name: _matrix(table.column(name)) for name in table.column_names}
+        # Parquet has no lists without entries: of no inverter, or no meter, there is no column.
+        none = np.empty((table.num_rows, 0))
+        return Truth(**{field.name: there.get(field.name, none) for field in fields(Truth)})
 
 
 def truth_path(path: Path) -> Path:
@@ -403,8 +405,9 @@ def _truth_schema(site: Site) -> Any:
         "shift_volt": meters,
     }
     columns = [("t", pa.float64())]
-    columns += [(name, pa.list_(pa.float64(), width)) for name, width in widths.items()]
-    return pa.schema([*columns, ("manipulated", pa.list_(pa.bool_(), meters))])
+    columns += [(name, pa.list_(pa.float64(), width)) for name, width in widths.items() if width]
+    columns += [("manipulated", pa.list_(pa.bool_(), meters))] if meters else []
+    return pa.schema(columns)
 
 
 def _truth_table(chunk: list[Sample], schema: Any) -> Any:

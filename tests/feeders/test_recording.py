@@ -24,7 +24,7 @@ from feeders.recording import (
 )
 from feeders.scenario import START, Scenario, Season, by_arrival, simulate
 from feeders.variation import Variation
-from tests.feeders.villages import village
+from tests.feeders.villages import village, village_without_inverters
 
 
 def busy() -> Scenario:
@@ -177,6 +177,14 @@ def test_a_failure_leaves_no_half_file(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(OSError, match="nowhere"):
         record(village(), Scenario(), tmp_path / "nowhere" / "a.parquet")
+
+
+def test_a_feeder_without_inverters_has_no_column_of_them(tmp_path: Path) -> None:
+    site = village_without_inverters()
+    made = record(site, Scenario(seed=1, duration_s=3.0), tmp_path / "plain.parquet")
+    truth = made.truth()
+    assert truth.x_kvar.shape == (truth.t.size, 0)
+    assert truth.v_volt.shape == (truth.t.size, len(site.feeder.customers))
 
 
 def test_a_scenario_in_which_nothing_arrives(tmp_path: Path) -> None:
