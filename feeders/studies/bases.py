@@ -29,7 +29,7 @@ def nominal_volt(site: Site | ThreePhaseSite) -> Floats:
     site
         The feeder.
     """
-    return np.full(len(site.feeder.customers), site.tables.meta.voltage_volt)
+    return site.customer_nominal
 
 
 @dataclass(frozen=True, slots=True, eq=False)
