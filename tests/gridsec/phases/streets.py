@@ -7,11 +7,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from gridsec.droop import Droop
+from gridsec.mesh import PhasedMesh
+from gridsec.network import InPhases
 from gridsec.online import Frame
 from gridsec.phases import PhasedFeeder, ThreePhaseFeeder
 from gridsec.plant import Plant
 from tests.gridsec.street import BASE_KVA, BASE_VOLT, RESOLUTION, Street, make_plant
-from tests.gridsec.unbalanced import power_flow
+from tests.gridsec.unbalanced import ac_places
 
 UNEQUAL = np.array([1.0, 1.012, 0.991])
 """Busbar voltages of the phases, relative to each other."""
@@ -57,6 +59,17 @@ def coupled(
     return Plant(PhasedFeeder(tree), droop, like.meters, like.accuracy, loss_correction)
 
 
+def ringed(plant: Plant) -> Plant:
+    """The same with two closed ties: one of all phases from the busbar to the end, one of phase b."""
+    assert isinstance(plant.feeder, PhasedFeeder)
+    tree = plant.feeder.tree
+    last = tree.z.shape[0]
+    phases = np.array([[True, True, True], [False, True, False]])
+    z = tree.z[[0, 1]] * (phases[:, :, None] & phases[:, None, :]) * np.array([2.0, 0.5])[:, None, None]
+    ends = np.array([[0, last], [1, last - 1]])
+    return replace(plant, feeder=PhasedMesh(tree, ends, phases, z, np.zeros((2, 3, 3))))
+
+
 @dataclass
 class PhasedStreet(Street):
     """A street in three phases: its truth is that of nodal admittances, its busbar has three voltages."""
@@ -66,11 +79,10 @@ class PhasedStreet(Street):
     def voltages(self) -> np.ndarray:
         """|v| of every place."""
         feeder = self.plant.feeder
-        assert isinstance(feeder, PhasedFeeder)
+        assert isinstance(feeder, InPhases)
         q = self.p * self.tan
         np.add.at(q, self.plant.droop.customer, self.x)
-        v = power_flow(feeder.tree, 3.0 * self.p, 3.0 * q, (self.v0 * self.phases) ** 2)
-        return np.nan_to_num(np.abs(v).T.ravel())
+        return np.nan_to_num(np.sqrt(ac_places(feeder, self.p, q, (self.v0 * self.phases) ** 2)))
 
     def frame(self, lies: dict[int, float] | None = None, silent: tuple[int, ...] = ()) -> Frame:
         """What is known of the present; see `Street.frame`."""

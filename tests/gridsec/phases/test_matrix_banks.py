@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,9 +18,9 @@ from gridsec.network import Power, between
 from gridsec.online import Decision
 from gridsec.plant import Plant
 from gridsec.stacked import Gains
-from tests.gridsec.meshes import ac
+from tests.gridsec.phases.around import MeshedStreet
 from tests.gridsec.phases.streets import PhasedStreet, coupled
-from tests.gridsec.street import Street, make_plant
+from tests.gridsec.street import make_plant
 
 
 def loop() -> tuple[Plant, Lure]:
@@ -79,18 +79,6 @@ class TestAsymmetricLoop:
                 assert set(np.flatnonzero(verdict.suspects)) <= {liar}
                 assert tick <= 8 or verdict.decision is not Decision.CLEAN
             assert verdict.suspects[liar]
-
-
-@dataclass
-class MeshedStreet(Street):
-    """A street around loops: its truth is that of power-grid-model."""
-
-    def voltages(self) -> np.ndarray:
-        feeder = self.plant.feeder
-        assert isinstance(feeder, MeshedFeeder)
-        q = self.p * self.tan
-        np.add.at(q, self.plant.droop.customer, self.x)
-        return np.sqrt(ac(feeder, self.p, q, self.v0**2))
 
 
 @pytest.mark.parametrize("liar", [1, 4])

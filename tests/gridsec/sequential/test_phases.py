@@ -17,12 +17,14 @@ from gridsec import sequential
 from gridsec.detect import MeterAccuracy
 from gridsec.droop import Droop
 from gridsec.feeder import Feeder
-from gridsec.network import bus_voltages
+from gridsec.mesh import MeshedFeeder, PhasedMesh
+from gridsec.network import InPhases, bus_voltages
 from gridsec.online import Cause, Decision, Estimate, Frame, Verdict
 from gridsec.phases import PhasedFeeder, ThreePhaseFeeder
 from gridsec.plant import Plant
 from gridsec.sequential import LoadDoubt, SequentialDesign, SequentialOptions
 from gridsec.sequential.loads import prior
+from tests.gridsec.phases.around import MeshedStreet
 from tests.gridsec.street import BASE_KVA, Street, make_plant
 
 CUSTOMERS = 9
@@ -30,7 +32,8 @@ CUSTOMERS = 9
 
 def apart(one: Plant) -> Plant:
     """Three phases without mutual impedance, each of them the same street with customers of its own."""
-    tree, droop, count = one.feeder, one.droop, CUSTOMERS
+    net, droop, count = one.feeder, one.droop, CUSTOMERS
+    tree = net.tree if isinstance(net, MeshedFeeder) else net
     assert isinstance(tree, Feeder)
     branches, phase = tree.r.size, np.repeat(np.arange(3), count)
     whole = ThreePhaseFeeder(
@@ -64,7 +67,11 @@ def apart(one: Plant) -> Plant:
     parts = ("class_fraction", "resolution", "jitter")
     accuracy = replace(one.accuracy, **{name: three(getattr(one.accuracy, name)) for name in parts})
     assert isinstance(accuracy, MeterAccuracy)
-    return Plant(PhasedFeeder(whole), fleet, shifted(one.meters), accuracy, one.loss_correction)
+    feeder: InPhases = PhasedFeeder(whole)
+    if isinstance(net, MeshedFeeder):
+        z = ((net.r + 1j * net.x) / 3.0)[:, None, None] * np.eye(3)
+        feeder = PhasedMesh(whole, net.ends, np.ones((len(z), 3), dtype=np.bool_), z, 0.0 * z.real)
+    return Plant(feeder, fleet, shifted(one.meters), accuracy, one.loss_correction)
 
 
 def together(heard: list[Frame]) -> Frame:
@@ -86,12 +93,21 @@ def prepare(plant: Plant, phases: int, commission_s: float = 0.0) -> SequentialD
 
 
 def side_by_side(
-    lies: tuple[dict[int, float], ...], silent: tuple[tuple[int, ...], ...] = ((), (), ()), count: int = 30
+    lies: tuple[dict[int, float], ...],
+    silent: tuple[tuple[int, ...], ...] = ((), (), ()),
+    count: int = 30,
+    *,
+    meshed: bool = False,
 ) -> tuple[list[tuple[Estimate, Verdict]], tuple[Estimate, Verdict], SequentialDesign]:
     """The last answers of a balanced monitor for each phase, and of one for all three."""
     one = make_plant(np.random.default_rng(5), customers=CUSTOMERS, drop=0.03, loss_correction=0)
+    if meshed:
+        ends, z = np.array([[0, CUSTOMERS], [2, 5]]), np.array([0.01, 0.02])
+        assert isinstance(one.feeder, Feeder)
+        one = replace(one, feeder=MeshedFeeder(one.feeder, ends, z, 0.5 * z, np.zeros(2)))
     alone, whole = prepare(one, 1), prepare(apart(one), 3)
-    streets = [Street(one, np.random.default_rng([5, k])) for k in range(3)]
+    kind = MeshedStreet if meshed else Street
+    streets = [kind(one, np.random.default_rng([5, k])) for k in range(3)]
     states = [sequential.init(alone, 1000.0) for _ in streets]
     answers: list[tuple[Estimate, Verdict]] = []
     state = sequential.init(whole, 1000.0)
@@ -123,6 +139,7 @@ class TestPhasesThatDoNotTouch:
         # Lie by lie, each phase has the false-alarm rate of the balanced monitor.
         np.testing.assert_allclose(whole.sigmas, alone.sigmas, rtol=1e-12)
 
+    @pytest.mark.parametrize("meshed", [False, True])
     @pytest.mark.parametrize(
         "lies",
         [
@@ -133,9 +150,9 @@ class TestPhasesThatDoNotTouch:
         ],
     )
     def test_each_phase_gets_the_answers_of_a_balanced_monitor(
-        self, lies: tuple[dict[int, float], ...]
+        self, lies: tuple[dict[int, float], ...], *, meshed: bool
     ) -> None:
-        alone, (estimate, verdict), _ = side_by_side(lies)
+        alone, (estimate, verdict), _ = side_by_side(lies, meshed=meshed)
         assert verdict.suspects.sum() == sum(map(len, lies))
         for name in ("v2", "std", "trusted"):
             expected = np.concatenate([getattr(each, name) for each, _ in alone])
