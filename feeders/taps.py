@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,10 +21,6 @@ from feeders.schema import FeederTables, LineRow
 from feeders.topology import Tree
 from gridsec.arrays import Floats
 from gridsec.errors import FeederInvalid
-
-if TYPE_CHECKING:
-    from feeders.load import Site
-    from feeders.load_phases import ThreePhaseSite
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,14 +100,6 @@ def _factors(lines: Sequence[LineRow], found: Tree) -> tuple[Floats, Floats]:
             branch[k] = bus[above]
             bus[k + 1] = bus[above] * line.taps
     return bus, branch
-
-
-def refuse(site: Site | ThreePhaseSite) -> None:
-    """Raise `FeederInvalid` if a feeder has taps or transformers, for what knows one voltage base only."""
-    if (site.base_volt != site.feeder.base_volt).any():
-        raise FeederInvalid(
-            ["lines, columns tap and to_volt: not one voltage, and this takes feeders without taps only"]
-        )
 
 
 def _problems(closed: Sequence[LineRow]) -> list[str]:

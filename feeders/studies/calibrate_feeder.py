@@ -1,4 +1,4 @@
-"""A feeder, balanced or of three phases, as `gridsec.studies.calibrate_model` compares it with readings."""
+"""A feeder, radial, meshed or in three phases, as `gridsec.studies.calibrate_model` compares it."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ import numpy as np
 
 from feeders.load import Site, find, from_tables
 from feeders.load_phases import ThreePhaseSite, three_phase
-from feeders.taps import refuse
-from feeders.topology import Edge, tree
+from feeders.studies.bases import line_rows
 from gridsec import phases as three
-from gridsec.arrays import Bools, Floats, Ints
+from gridsec.arrays import Bools, Floats, Ints, Phasors
 from gridsec.droop import voltage_curve
 from gridsec.feeder import Feeder, bus_voltages, lindistflow
+from gridsec.mesh import MeshedFeeder, impedances
 from gridsec.phases import PHASES, ThreePhaseFeeder, lindist3flow
 from gridsec.studies.calibrate_model import Doubts, Places, Series
 from gridsec.studies.calibrate_noise import Field
+from gridsec.studies.droop_network import lines
 
 if TYPE_CHECKING:
     from feeders.schema import FeederTables
@@ -43,6 +44,7 @@ STEEP_PU: Final = 0.003
 """Half of the voltage over which the slope of an inverter's curve is taken, pu."""
 
 _STEPS: Final = 2
+_ROUNDS: Final = 4
 _CHUNK: Final = 64
 
 
@@ -55,18 +57,21 @@ class Network:
     site
         The feeder as its files say.
     feeder
-        Its tree, merged.
+        Its tree, merged; or with closed loops.
     lines : (L,)
-        The lines of each branch, indices into the tables.
+        The lines of each branch, and then each that closes a loop, indices into the tables.
+    ends : (L, 2)
+        Their buses, of a branch the one nearer to the busbar first.
     place : (Q, 2)
-        Bus of the merged tree and phase of each place.
+        Bus of the feeder and phase of each place.
     places
         What readings see of it.
     """
 
     site: Site | ThreePhaseSite
-    feeder: Feeder | ThreePhaseFeeder
+    feeder: Model
     lines: tuple[tuple[int, ...], ...]
+    ends: Ints
     place: Ints
     places: Places
 
@@ -76,17 +81,17 @@ class Network:
         return {int(customer): j for j, customer in enumerate(self.site.meters)}
 
     def weight(self, bus: int, phases: str) -> Floats:
-        """Weights (Q,) of a customer at a bus of the merged tree."""
+        """Weights (Q,) of a customer at a bus of the feeder."""
         at = self.place[:, 0] == bus
         if self.places.phase.max() > 0:
             at &= np.isin(self.place[:, 1], [PHASES.index(phase) for phase in phases])
         return np.asarray(at / at.sum())
 
     def reaches(self, bus: int, phases: str) -> bool:
-        """Whether a bus of the merged tree has these phases."""
-        if isinstance(self.feeder, Feeder):
-            return True
-        return bool(all(self.feeder.phases[bus][PHASES.index(phase)] for phase in phases))
+        """Whether a bus of the feeder has these phases."""
+        if isinstance(self.feeder, ThreePhaseFeeder):
+            return bool(all(self.feeder.phases[bus][PHASES.index(phase)] for phase in phases))
+        return True
 
 
 def site_of(path_or_name: Path | str) -> Site | ThreePhaseSite:
@@ -115,29 +120,37 @@ def network(tables: FeederTables) -> Network:
     Raises
     ------
     FeederInvalid
-        With every problem of the files.
+        With every problem of the files; if closed lines form loops in three phases.
     """
     site = _site(tables)
-    refuse(site)
-    closed = [k for k, line in enumerate(tables.lines) if line.closed]
-    rows = [tables.lines[k] for k in closed]
-    edges = [Edge(row.line, row.from_bus, row.to_bus, row.r_ohm == row.x_ohm == 0.0) for row in rows]
-    each: tuple[tuple[int, ...], ...] = tuple((closed[k],) for k in tree(tables.meta.busbar, edges).branch)
-    feeder, lines = _merged(site.tree if isinstance(site, Site) else site.feeder, each)
-    if isinstance(feeder, Feeder):
-        place = np.column_stack([np.arange(len(feeder.buses)), np.zeros(len(feeder.buses))]).astype(np.intp)
+    feeder, rows = _merged(_model(site), tuple((row,) for row in line_rows(site)))
+    if isinstance(feeder, ThreePhaseFeeder):
+        place, ends = np.argwhere(feeder.phases), _branches(feeder)
     else:
-        place = np.argwhere(feeder.phases)
-    return Network(site, feeder, lines, place, _places(site, feeder, place))
+        place = np.column_stack([np.arange(len(feeder.buses)), np.zeros(len(feeder.buses))]).astype(np.intp)
+        ends = lines(feeder)[0]
+    return Network(site, feeder, rows, ends, place, _places(site, feeder, place))
 
 
-def _merged(
-    feeder: Feeder | ThreePhaseFeeder, lines: tuple[tuple[int, ...], ...]
-) -> tuple[Feeder | ThreePhaseFeeder, tuple[tuple[int, ...], ...]]:
-    """Join lines in series without customers between them, in large feeders."""
+Model = Feeder | MeshedFeeder | ThreePhaseFeeder
+
+
+def _model(site: Site | ThreePhaseSite) -> Model:
+    """A site's feeder; `FeederInvalid` if loops are closed in three phases."""
+    if isinstance(site.feeder, MeshedFeeder):
+        return site.feeder
+    return site.tree if isinstance(site, Site) else site.feeder
+
+
+def _branches(feeder: ThreePhaseFeeder) -> Ints:
+    return np.column_stack([feeder.parent, np.arange(1, len(feeder.buses))])
+
+
+def _merged(feeder: Model, rows: tuple[tuple[int, ...], ...]) -> tuple[Model, tuple[tuple[int, ...], ...]]:
+    """Join lines in series without customers between them, in large feeders without loops."""
     count = len(feeder.buses)
-    if count <= MOST_BUSES:
-        return feeder, lines
+    if count <= MOST_BUSES or isinstance(feeder, MeshedFeeder):
+        return feeder, rows
     children = np.bincount(feeder.parent, minlength=count)
     keep = children != 1
     keep[0] = True
@@ -149,10 +162,10 @@ def _merged(
     above_of, chain = np.zeros(count, dtype=np.intp), list[tuple[int, ...]]([()] * count)
     impedances = {name: np.array(getattr(feeder, name)) for name in _impedances(feeder)}
     for k, above in enumerate(feeder.parent.tolist()):
-        chain[k + 1] = lines[k]
+        chain[k + 1] = rows[k]
         above_of[k + 1] = above
         if not keep[above]:
-            chain[k + 1] = chain[above] + lines[k]
+            chain[k + 1] = chain[above] + rows[k]
             above_of[k + 1] = above_of[above]
             for values in impedances.values():
                 values[k] += values[above - 1]
@@ -169,11 +182,15 @@ def _impedances(feeder: Feeder | ThreePhaseFeeder) -> tuple[str, ...]:
     return ("r", "x", "charging") if isinstance(feeder, Feeder) else ("z", "charging")
 
 
-def _places(site: Site | ThreePhaseSite, feeder: Feeder | ThreePhaseFeeder, place: Ints) -> Places:
+def _places(site: Site | ThreePhaseSite, feeder: Model, place: Ints) -> Places:
     bus, phase = place.T
     ids = tuple(map(str, range(bus.size)))
     weight = np.zeros((len(feeder.customers), bus.size))
-    if isinstance(feeder, Feeder):
+    if isinstance(feeder, MeshedFeeder):
+        Z = impedances(feeder, bus)
+        active, reactive = 2.0 * Z.real, 2.0 * Z.imag
+        weight[np.arange(feeder.bus.size), feeder.bus] = 1.0
+    elif isinstance(feeder, Feeder):
         flow = lindistflow(replace(feeder, bus=bus, customers=ids))
         active, reactive = 2.0 * flow.R, 2.0 * flow.X
         weight[np.arange(feeder.bus.size), feeder.bus] = 1.0
@@ -185,9 +202,26 @@ def _places(site: Site | ThreePhaseSite, feeder: Feeder | ThreePhaseFeeder, plac
         at = {(int(k), int(f)): q for q, (k, f) in enumerate(place)}
         where = [at[int(k), int(f)] for k, f in zip(feeder.at, feeder.phase, strict=True)]
         weight[feeder.of, where] = feeder.share
+    buses = site.spanning.buses if isinstance(site, Site) else site.feeder.buses
+    own = {name: k for k, name in enumerate(buses)}
+    volt = site.base_volt.reshape(len(own), -1)[[own[feeder.buses[k]] for k in bus], phase]
+    unit = site.customer_volt[site.meters]
+    return Places(active, reactive, phase, _shares(feeder, bus), weight, site.meters, volt, unit)
+
+
+def _shares(feeder: Model, bus: Ints) -> Floats | Phasors:
+    """What of each line's drop a bus has, (Q, L): all that are behind it, or what loops make of it.
+
+    A line of impedance z from i to j whose length grows is one with a source in it, so that bus k has
+    ``(Z_kj - Z_ki) / z`` of its drop.
+    """
+    if isinstance(feeder, MeshedFeeder):
+        (one, other), z = lines(feeder)[0].T, lines(feeder)[1]
+        Z = impedances(feeder, np.arange(len(feeder.buses)))[bus]
+        return np.asarray((Z[:, other] - Z[:, one]) / z)
     start = feeder.start[bus][:, None]
     behind = (feeder.start[1:] <= start) & (start < feeder.stop[1:])
-    return Places(active, reactive, phase, behind, weight, site.meters)
+    return behind.astype(np.float64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -232,7 +266,7 @@ def powers(site: Site | ThreePhaseSite, given: Frames) -> Powers:
     draws = np.broadcast_to(IDLE * model.load_peak, (T, N)).copy()
     missing = np.zeros((T, N), dtype=np.bool_)
     metered_q = np.zeros(N, dtype=np.bool_)
-    q_read, v = np.zeros((T, N)), np.full((T, N), site.feeder.base_volt)
+    q_read, v = np.zeros((T, N)), np.tile(site.customer_volt, (T, 1))
     for j, customer in zip(order, site.meters.tolist(), strict=True):
         there = np.isfinite(given.p_kw[:, j])
         if there.any():
@@ -245,7 +279,7 @@ def powers(site: Site | ThreePhaseSite, given: Frames) -> Powers:
         there = np.isfinite(given.v_volt[:, j])
         if there.any():
             v[:, customer] = np.interp(given.t, given.t[there], given.v_volt[there, j])
-    v /= site.feeder.base_volt
+    v /= site.customer_volt
     low = np.maximum(draws, 0.0)
     tan = 0.5 * (model.tan_min + model.tan_max)
     roof = model.pv_peak * _sun(draws, model.pv_peak)[:, None]
@@ -293,10 +327,10 @@ def series(net: Network, given: Frames, drawn: Powers, excluded: Collection[str]
     """
     site = net.site
     order = [given.meter_ids.index(name) for name in site.meter_ids]
-    v = given.v_volt[:, order] / site.feeder.base_volt
+    v = given.v_volt[:, order] / net.places.unit
     seen = np.isfinite(v) & ~np.isin(site.meter_ids, list(excluded))
-    busbar = given.v0_volt if isinstance(net.feeder, Feeder) else given.v0_phases
-    U = _voltages(net.feeder, drawn.p, drawn.q, (busbar / site.feeder.base_volt) ** 2)
+    busbar = given.v0_phases if isinstance(net.feeder, ThreePhaseFeeder) else given.v0_volt
+    U, drop = _voltages(net, drawn.p, drawn.q, busbar / site.feeder.base_volt)
     bus, phase = net.place.T
     return Series(
         t=given.t,
@@ -308,20 +342,39 @@ def series(net: Network, given: Frames, drawn: Powers, excluded: Collection[str]
         roof=drawn.roof,
         steep=drawn.steep,
         places=U[:, phase, bus],
-        drop=U[:, :, net.feeder.parent] - U[:, :, 1:],
+        drop=drop,
     )
 
 
-def _voltages(feeder: Feeder | ThreePhaseFeeder, p: Floats, q: Floats, v0_squared: Floats) -> Floats:
-    """Squared voltages of all buses with their losses, (T, F, b + 1), from the busbar's, (T,) or (T, 3)."""
+def _voltages(net: Network, p: Floats, q: Floats, v0: Floats) -> tuple[Floats, Floats | Phasors]:
+    """Squared voltages of all buses with their losses, (T, F, b + 1), and `Series.drop`, (T, F, L).
+
+    From the busbar's voltages (T,) or (T, 3).
+    """
+    feeder, (one, other) = net.feeder, net.ends.T
+    if isinstance(feeder, MeshedFeeder):
+        V = _phasors(feeder, p + 1j * q, v0)
+        apart = V[:, one] - V[:, other]
+        return (V.real**2 + V.imag**2)[:, None], (np.conj(V[:, one] + V[:, other]) * apart)[:, None]
     if isinstance(feeder, Feeder):
-        return bus_voltages(feeder, p, q, v0_squared, steps=_STEPS)[:, None, :]
-    parts = [slice(k, k + _CHUNK) for k in range(0, len(v0_squared), _CHUNK)]
-    # 1 pu of a phase's power is a third of the feeder's base.
-    p3, q3 = (3.0 * feeder.connections(power) for power in (p, q))
-    return np.concatenate(
-        [three.bus_voltages(feeder, p3[some], q3[some], v0_squared[some], steps=_STEPS) for some in parts]
-    )
+        U = bus_voltages(feeder, p, q, v0**2, steps=_STEPS)[:, None, :]
+    else:
+        parts = [slice(k, k + _CHUNK) for k in range(0, len(v0), _CHUNK)]
+        # 1 pu of a phase's power is a third of the feeder's base.
+        p3, q3 = (3.0 * feeder.connections(power) for power in (p, q))
+        U = np.concatenate(
+            [three.bus_voltages(feeder, p3[some], q3[some], v0[some] ** 2, steps=_STEPS) for some in parts]
+        )
+    return U, U[:, :, one] - U[:, :, other]
+
+
+def _phasors(feeder: MeshedFeeder, s: Phasors, v0: Floats) -> Phasors:
+    """Voltages of all buses, (T, b + 1): as `gridsec.mesh.bus_voltages`, which has their squares."""
+    idle = v0[:, None] * feeder.idle
+    here = V = idle[:, feeder.bus]
+    for _ in range(_ROUNDS):
+        V = here + np.conj(s / V) @ feeder.between.T
+    return np.asarray(idle + np.conj(s / V) @ feeder.transfer.T)
 
 
 def doubts(net: Network, drawn: Powers, tolerance: float, free: Collection[int], spread: float) -> Doubts:

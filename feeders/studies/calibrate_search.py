@@ -20,8 +20,7 @@ from feeders.columns import MATRIX_NAMES
 from feeders.schema import LineRow
 from feeders.studies import calibrate_feeder as model
 from gridsec.arrays import Floats, Ints
-from gridsec.feeder import Feeder
-from gridsec.phases import PHASES
+from gridsec.phases import PHASES, ThreePhaseFeeder
 from gridsec.studies.calibrate import Evidence, Fit, evidence, fit, weigh
 from gridsec.studies.calibrate_model import Regressors, Series, lengthened, regressors, steps
 from gridsec.studies.calibrate_noise import LoadErrors, Whitening, increments, learn, whitening
@@ -344,7 +343,7 @@ def _buses(net: Network, trusted: list[int]) -> list[Guess]:
 
 def _phases(net: Network, trusted: list[int]) -> list[Guess]:
     out = []
-    if not isinstance(net.feeder, Feeder):
+    if isinstance(net.feeder, ThreePhaseFeeder):
         for j in trusted:
             customer = int(net.site.meters[j])
             bus, phases = int(net.feeder.bus[customer]), net.site.tables.customers[customer].phases
@@ -384,7 +383,7 @@ def _exactly(now: Round, frames: Frames, guess: Guess) -> float:
     series = model.series(after, frames, drawn, now.state.excluded)
     # The meters of a swap have changed places; their readings are compared in the old order.
     order = [after.site.meter_ids.index(name) for name in now.net.site.meter_ids]
-    rest = series.residual(after.places)[:, order]
+    rest = series.residual(after.places)[:, order] * (after.places.unit[order] / now.net.places.unit) ** 2
     z = now.readings - now.whiten(rest[:, :, None]).ravel()
     return float(evidence(now.fit, z[:, None], np.zeros(1)).log_factor[0])
 

@@ -88,8 +88,8 @@ def lines(now: Round, tolerance: float) -> tuple[pd.DataFrame, list[tuple[str, .
     frame = pd.DataFrame(
         {
             "lines": shown,
-            "from_bus": [net.feeder.buses[k] for k in net.feeder.parent],
-            "to_bus": list(net.feeder.buses[1:]),
+            "from_bus": [net.feeder.buses[k] for k in net.ends[:, 0]],
+            "to_bus": [net.feeder.buses[k] for k in net.ends[:, 1]],
             "factor": np.where(unknown, np.nan, factor),
             "std": np.where(unknown, np.nan, std),
             "low": np.where(unknown, 0.0, factor - WIDE * std),

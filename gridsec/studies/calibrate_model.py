@@ -14,6 +14,10 @@ order
     -B_ji roof_i (1, cos, sin, ...) load that generation hides, with its daily course
 
 and for customers at other places, exactly in the linear flow, ``W'(U + dU) - W U`` with W, W' the weights.
+On closed loops a line's drop has a complex share at every place instead of being behind it or not.
+
+Behind transformers places have bases of their own, and a meter's readings are in that of its place in the
+files: a customer who is elsewhere in truth reads the volts of there. Means of phases weigh each by its base.
 
 References
 ----------
@@ -27,7 +31,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, Ints
+from gridsec.arrays import Bools, Floats, Ints, Phasors
 
 __all__ = ["Doubts", "Places", "Regressors", "Series", "regressors", "steps"]
 
@@ -42,25 +46,39 @@ class Places:
         Change of the squared voltage at a place per power injected at another, pu; the 2 is in it.
     phase : (Q,)
         Phase of each place, 0 to F - 1.
-    behind : (Q, L)
-        Whether a place is behind a branch.
+    share : (Q, L)
+        What of a line's drop a place has: 1 behind a branch of a tree and 0 elsewhere, complex in loops.
     weight : (N, Q)
         Where each customer is connected; rows add up to 1.
     meters : (p,)
         Customer of each meter.
+    volt : (Q,)
+        1 pu of each place, V.
+    unit : (p,)
+        1 pu of each meter's readings, V.
     """
 
     active: Floats
     reactive: Floats
     phase: Ints
-    behind: Bools
+    share: Floats | Phasors
     weight: Floats
     meters: Ints
+    volt: Floats
+    unit: Floats
+
+    def read(self, weight: Floats) -> Floats:
+        """From the places' squared voltages to those read by meters that are connected so, (p, Q) both.
+
+        ``(mean of a v)^2 / unit^2`` with a the bases, linear in v^2 near 1 pu.
+        """
+        own = weight * self.volt
+        return np.asarray(own * (own.sum(axis=1) / self.unit**2)[:, None])
 
     @property
     def at_meters(self) -> tuple[Floats, Floats]:
         """Sensitivities of the meters to the customers' powers, (p, N) each."""
-        W = self.weight[self.meters]
+        W = self.read(self.weight[self.meters])
         return W @ self.active @ self.weight.T, W @ self.reactive @ self.weight.T
 
     def moved(self, series: Series, change: Mapping[int, Floats]) -> Floats:
@@ -73,12 +91,15 @@ class Places:
         change
             New weights (Q,) of each customer that moves.
         """
-        W = self.weight[self.meters].copy()
-        away: Floats = np.zeros((series.t.size, W.shape[0]))
+        weight = self.weight[self.meters]
+        before = self.read(weight)
         for j, customer in enumerate(self.meters.tolist()):
             if customer in change:
-                away[:, j] = series.places @ (change[customer] - W[j])
-                W[j] = change[customer]
+                weight[j] = change[customer]
+        W = self.read(weight)
+        away: Floats = np.zeros((series.t.size, W.shape[0]))
+        moves = np.flatnonzero(np.isin(self.meters, list(change)))
+        away[:, moves] = series.places @ (W - before)[moves].T
         used = np.flatnonzero(W.any(axis=0))
         for customer, new in change.items():
             shift = new - self.weight[customer]
@@ -112,7 +133,7 @@ class Series:
     places : (T, Q)
         Squared voltages by power flow, pu.
     drop : (T, F, L)
-        Their drop along each branch, pu.
+        Their drop along each line, pu; in loops ``2 conj(V) (V_one - V_other)`` with V in its middle.
     """
 
     t: Floats
@@ -124,11 +145,11 @@ class Series:
     roof: Floats
     steep: Floats
     places: Floats
-    drop: Floats
+    drop: Floats | Phasors
 
     def residual(self, places: Places) -> Floats:
         """Readings less power flow, (T, p); 0 where there is none."""
-        model = self.places @ places.weight[places.meters].T
+        model = self.places @ places.read(places.weight[places.meters]).T
         return np.where(self.seen, self.y - model, 0.0)
 
 
@@ -230,12 +251,12 @@ def _day(t: Floats) -> list[Floats]:
 
 
 def lengthened(places: Places, series: Series) -> Floats:
-    """What the meters' squared voltages lose if a branch is longer by its own length, negative, (T, p, L)."""
-    W = places.weight[places.meters]
+    """What the meters' squared voltages lose if a line is longer by its own length, negative, (T, p, L)."""
+    W = places.read(places.weight[places.meters])
     phases = series.drop.shape[1]
-    by_phase = [W[:, places.phase == f] @ places.behind[places.phase == f] for f in range(phases)]
+    by_phase = [W[:, places.phase == f] @ places.share[places.phase == f] for f in range(phases)]
     return -sum(
-        (part[None] * series.drop[:, f, None, :] for f, part in enumerate(by_phase)),
+        ((part[None] * series.drop[:, f, None, :]).real for f, part in enumerate(by_phase)),
         np.zeros((1, 1, 1)),
     )
 

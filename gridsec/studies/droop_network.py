@@ -40,6 +40,7 @@ __all__ = [
     "Region",
     "Sensitivity",
     "currents",
+    "lines",
     "network",
     "region",
     "sensitivity",
@@ -200,14 +201,20 @@ def currents(
         return _phase_currents(feeder, np.conj(s / V), at)
     if isinstance(feeder, PhasedMesh):
         return _mesh_currents(feeder, at)
-    ends, z, charging = _lines(feeder)
+    ends, z, charging = lines(feeder)
     above, here = at[..., ends[:, 0]], at[..., ends[:, 1]]
     series, shunt = (above - here) / z, 0.5j * charging
     return np.maximum(np.abs(series + shunt * above), np.abs(series - shunt * here))[..., None]
 
 
-def _lines(feeder: Feeder | MeshedFeeder) -> tuple[Ints, Complex, Floats]:
-    """Ends, impedance and charging of every branch, and then of every tie."""
+def lines(feeder: Feeder | MeshedFeeder) -> tuple[Ints, Complex, Floats]:
+    """Ends (L, 2), impedance (L,) and charging (L,) of every branch, and then of every tie, pu.
+
+    Parameters
+    ----------
+    feeder
+        A balanced feeder.
+    """
     tree = feeder if isinstance(feeder, Feeder) else feeder.tree
     ends, z = np.column_stack([tree.parent, np.arange(1, len(tree.buses))]), tree.r + 1j * tree.x
     if isinstance(feeder, Feeder):

@@ -19,7 +19,6 @@ from feeders.powerflow import PowerFlow
 from feeders.powerflow_unbalanced import power_flow
 from feeders.scenario import START, Scenario, random_attacks, simulate, snapshots
 from feeders.schema import LineRow, examine, read, validate, write
-from feeders.studies.calibrate_feeder import network
 from feeders.studies.detectable import detectable
 from feeders.studies.redundancy import redundancy
 from feeders.trials import LoadError, Meters, Outcome, Trial, judge
@@ -228,11 +227,10 @@ def test_the_methods_of_the_papers_name_the_liar_alone(name: str) -> None:
     "study",
     [
         redundancy,
-        lambda site: network(site.tables),
         lambda site: site.tree,
         lambda site: site.balanced,
     ],
-    ids=["redundancy", "calibrate", "tree", "balanced"],
+    ids=["redundancy", "tree", "balanced"],
 )
 def test_studies_of_radial_feeders_say_so(study: Callable[[Site], object]) -> None:
     with pytest.raises(FeederInvalid, match="closed lines form loops, and this takes radial feeders only"):

@@ -17,7 +17,6 @@ from feeders.meters import Channel, MeterErrors, Meters
 from feeders.powerflow import Grid, PowerFlow
 from feeders.powerflow_unbalanced import PlacesFlow, UnbalancedPowerFlow, power_flow
 from feeders.schema import FeederTables, LineRow, from_json, to_json, validate
-from feeders.studies.calibrate_feeder import network
 from feeders.studies.detectable import detectable
 from feeders.studies.protect import Goal, protect
 from gridsec.droop import preset
@@ -212,11 +211,6 @@ def test_a_tap_at_the_head_is_another_nominal_voltage() -> None:
     mine, its = (protect(site, max_attacked=1, goal=Goal.BOUND, lie_volt=volt) for site in sites)
     assert list(mine.meters["meter"]) == list(its.meters["meter"])
     np.testing.assert_allclose([mine.before, mine.after], [its.before, its.after], rtol=1e-9)
-
-
-def test_studies_of_one_voltage_base_say_so() -> None:
-    with pytest.raises(FeederInvalid, match="without taps only"):
-        network(village().tables)
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,8 @@ def scene(seed: int) -> tuple[Feeder, Places, Series]:
     weight[np.arange(feeder.bus.size), feeder.bus] = 1.0
     start = feeder.start[:, None]
     behind = (feeder.start[1:] <= start) & (start < feeder.stop[1:])
-    places = Places(2.0 * flow.R, 2.0 * flow.X, np.zeros(buses.size, dtype=np.intp), behind, weight, meters)
+    one = np.zeros(buses.size, dtype=np.intp), behind.astype(np.float64), weight, meters
+    places = Places(2.0 * flow.R, 2.0 * flow.X, *one, np.full(buses.size, 230.0), np.full(meters.size, 230.0))
     p, q = rng.normal(0.0, 0.1, (2, T, feeder.bus.size))
     U = voltages(feeder, p, q)
     y = U[:, feeder.bus[meters]] + rng.normal(0.0, 1e-3, (T, meters.size))
@@ -61,6 +62,40 @@ def test_moves_and_swaps_are_the_flow_of_the_other_feeder(seed: int) -> None:
         before = series.places[:, feeder.bus[places.meters]]
         weights = {customer: np.eye(len(feeder.buses))[new] for customer, new in change.items()}
         np.testing.assert_allclose(places.moved(series, weights), after - before, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_who_is_elsewhere_reads_the_volts_of_there(seed: int) -> None:
+    """Places of any bases: in volts a move is the other feeder's flow, in the meter's own unit."""
+    feeder, places, series = scene(seed)
+    volt = np.random.default_rng(seed).uniform(200.0, 260.0, len(feeder.buses))
+    unit = volt[feeder.bus[places.meters]]
+    places = replace(places, volt=volt, unit=unit)
+    one = int(places.meters[0])
+    bus = feeder.bus.copy()
+    bus[one] = 3
+    after = voltages(replace(feeder, bus=bus), series.p, series.q) * volt**2
+    before = series.places * volt**2
+    there, here = bus[places.meters], feeder.bus[places.meters]
+    moved = places.moved(series, {one: np.eye(len(feeder.buses))[3]})
+    np.testing.assert_allclose(moved * unit**2, after[:, there] - before[:, here], rtol=1e-10, atol=1e-8)
+    plain = replace(places, volt=np.ones_like(volt), unit=np.ones_like(unit))
+    for own, same in zip(places.at_meters, plain.at_meters, strict=True):
+        np.testing.assert_allclose(own, same, rtol=1e-14)
+
+
+def test_a_mean_of_phases_of_different_bases() -> None:
+    """To first order in what phases differ by; unequal taps alone are no residual."""
+    _, places, _ = scene(0)
+    volt, count = np.array([230.0, 236.0, 225.0]), places.active.shape[0]
+    of_three = replace(places, volt=np.resize(volt, count), unit=np.array([volt.mean()]))
+    weight = np.zeros((1, count))
+    weight[0, :3] = 1.0 / 3.0
+    v = np.ones(count)
+    assert of_three.read(weight) @ v**2 == pytest.approx(1.0, abs=1e-14)
+    v[:3] += 0.01 * np.array([1.0, -0.5, 0.3])
+    exact = (np.mean(volt * v[:3]) / volt.mean()) ** 2
+    assert of_three.read(weight) @ v**2 == pytest.approx(exact, abs=1e-4)
 
 
 def test_a_longer_line_is_its_drop() -> None:
