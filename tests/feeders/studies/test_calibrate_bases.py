@@ -92,7 +92,7 @@ def test_planted_errors_are_found_and_nothing_else(make: Change, tmp_path: Path)
 def test_biases_are_found_and_files_that_are_right_are_left(make: Change, tmp_path: Path) -> None:
     truth = make(plain())
     half = tuple(Bias(np.array([k]), START, np.inf, np.array([b])) for k, b in ((2, 0.005), (4, -0.005)))
-    found = found_in(tmp_path, truth, truth, 3, half)
+    found = found_in(tmp_path, truth, truth, 1, half)
     assert found.proposals.empty
     rows = found.meters.set_index("customer")
     volt = dict(zip(from_tables(truth).feeder.customers, from_tables(truth).customer_volt, strict=True))
