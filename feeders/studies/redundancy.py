@@ -132,7 +132,7 @@ def redundancy(
     cases = {ALL: known(silent=())}
     if silent:
         cases[SILENT] = known(silent=silent)
-    pieces = parts(site.tree, tree_bus(site.feeder)[site.meters])
+    pieces = parts(site.spanning, tree_bus(site.feeder)[site.meters], site.ties)
     tasks = [task for case, what in cases.items() for task in _tasks(site, case, what, pieces)]
     done = worked(Journal(journal, subject), tasks, progress)
     return Redundancy(
@@ -205,7 +205,7 @@ def _meter(site: Site, case: str, what: Knowledge, j: int) -> dict[str, Any]:
 def _part(site: Site, case: str, what: Knowledge, piece: Part) -> dict[str, Any]:
     row: dict[str, Any] = {
         "case": case,
-        "bus": site.tree.buses[piece.bus],
+        "bus": site.spanning.buses[piece.bus],
         "branch": piece.branch,
         "meters": int(np.count_nonzero(~what.silent[piece.meters])),
     }

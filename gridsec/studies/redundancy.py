@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from gridsec.arrays import Bools, Ints
 from gridsec.feeder import Feeder
@@ -43,14 +45,14 @@ class Meter:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """A part of a feeder: what is fed through one bus.
+    """A part of a feeder: what is fed through one bus, and by no way around it.
 
     Attributes
     ----------
     bus
         The bus.
     branch
-        Whether it hangs on the busbar directly.
+        Whether a line leads from it to the busbar.
     meters : (k,)
         The meters there.
     """
@@ -108,7 +110,7 @@ def tree_bus(feeder: Network) -> Ints:
     return feeder.tree.at if isinstance(feeder, InPhases) else feeder.bus
 
 
-def parts(feeder: Feeder | ThreePhaseFeeder, buses: Ints) -> Sequence[Part]:
+def parts(feeder: Feeder | ThreePhaseFeeder, buses: Ints, ties: Ints) -> Sequence[Part]:
     """All parts of a feeder that differ in their meters, those nearest the busbar first.
 
     A part has all phases of its buses.
@@ -119,11 +121,24 @@ def parts(feeder: Feeder | ThreePhaseFeeder, buses: Ints) -> Sequence[Part]:
         The feeder's tree.
     buses : (p,)
         Bus of each meter.
+    ties : (t, 2)
+        Buses at both ends of the lines that close loops in it.
     """
     found: dict[tuple[int, ...], Part] = {}
+    lines = np.vstack([np.column_stack([feeder.parent, np.arange(1, len(feeder.buses))]), ties])
+    beside = lines[(lines == 0).any(axis=1)].max(axis=1)
     for bus in range(1, len(feeder.buses)):
-        start = feeder.start[buses]
-        inside = np.flatnonzero((start >= feeder.start[bus]) & (start < feeder.stop[bus]))
+        inside = np.flatnonzero(_fed_through(feeder, lines, bus)[buses])
         if inside.size:
-            found.setdefault(tuple(inside.tolist()), Part(bus, bool(feeder.parent[bus - 1] == 0), inside))
+            found.setdefault(tuple(inside.tolist()), Part(bus, bool((beside == bus).any()), inside))
     return tuple(found.values())
+
+
+def _fed_through(feeder: Feeder | ThreePhaseFeeder, lines: Ints, bus: int) -> Bools:
+    """Buses that lose the busbar with one, itself among them; on a tree all that are behind it."""
+    if len(lines) < len(feeder.buses):
+        return np.asarray((feeder.start >= feeder.start[bus]) & (feeder.start < feeder.stop[bus]))
+    left = lines[(lines != bus).all(axis=1)]
+    graph = coo_array((np.ones(len(left)), left.T), shape=(len(feeder.buses),) * 2)
+    _, piece = connected_components(graph, directed=False)
+    return np.asarray(piece != piece[0])

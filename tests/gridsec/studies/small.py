@@ -11,6 +11,7 @@ from gridsec.droop import fleet
 from gridsec.feeder import Feeder
 from gridsec.index import observable_rows, unstable_subspace
 from gridsec.lure import Lure, close_loop
+from gridsec.mesh import MeshedFeeder
 from gridsec.network import Network
 from gridsec.phases import PhasedFeeder, ThreePhaseFeeder
 from gridsec.studies.lies import Box
@@ -19,10 +20,11 @@ from gridsec.studies.patterns import unknown_pair, unknown_voltages
 TOL = 1e-9
 
 
-def tree(seed: int, *, phased: bool = False) -> tuple[Network, Lure, Ints, Ints]:
+def tree(seed: int, *, phased: bool = False, ties: int = 0) -> tuple[Network, Lure, Ints, Ints]:
     """A small feeder: 7 customers, 5 of them with meters, 2 inverters, 1 or 2 loads that nobody knows.
 
-    In three phases each customer has one of them, and mutual impedances are a good part of the others.
+    In three phases each customer has one of them, and mutual impedances are a good part of the others. With
+    ties, closed loops.
     """
     rng = np.random.default_rng(seed)
     branches = 7
@@ -42,6 +44,12 @@ def tree(seed: int, *, phased: bool = False) -> tuple[Network, Lure, Ints, Ints]
         assert isinstance(feeder, Feeder)
         phase = np.random.default_rng([seed, 3]).integers(0, 3, 7)
         feeder = in_phases(feeder, phase, mutual=0.4)
+    if ties:
+        assert isinstance(feeder, Feeder)
+        other = np.random.default_rng([seed, 4])
+        ends = np.array([other.choice(branches + 1, 2, replace=False) for _ in range(ties)])
+        r, x = other.uniform(0.01, 0.05, (2, ties))
+        feeder = MeshedFeeder(feeder, ends, r, x, np.zeros(ties))
     meters = np.sort(rng.choice(7, 5, replace=False))
     own = np.sort(rng.choice(7, 2, replace=False))
     droop = fleet(own, "ieee1547-b", np.array([5.0, 9.0]), 100.0, tau=np.array([2.0, 3.1]))
@@ -69,8 +77,8 @@ def in_phases(feeder: Feeder, phase: Ints, *, mutual: float) -> PhasedFeeder:
     )
 
 
-def system(seed: int, *, busbar: bool = False, phased: bool = False) -> tuple[Floats, Floats]:
-    feeder, lure, _, unknown = tree(seed, phased=phased)
+def system(seed: int, *, busbar: bool = False, phased: bool = False, ties: int = 0) -> tuple[Floats, Floats]:
+    feeder, lure, _, unknown = tree(seed, phased=phased, ties=ties)
     W = unknown_voltages(feeder, unknown, busbar=busbar, tol=TOL)
     return unknown_pair(lure, lure.slope, W)
 

@@ -8,6 +8,7 @@ import pytest
 from gridsec.arrays import Floats
 from gridsec.feeder import Feeder
 from gridsec.index import redundant_detectable, redundant_observable
+from gridsec.mesh import MeshedFeeder
 from gridsec.studies.patterns import Patterns, fewest_meters, patterns, unknown_pair, unknown_voltages
 from gridsec.studies.redundancy import meter_redundancy, part_redundancy, parts, tree_bus
 from tests.gridsec.studies.small import TOL, brute, system, tree
@@ -16,6 +17,8 @@ from tests.gridsec.studies.small import TOL, brute, system, tree
 def given(A: Floats, C: Floats, *, persistent: bool) -> Patterns:
     return patterns(A, C, persistent=persistent, tol=TOL)
 
+
+NONE = np.zeros((0, 2), dtype=np.intp)
 
 FEEDERS = pytest.mark.parametrize(
     ("seed", "phased"),
@@ -54,10 +57,42 @@ def test_parts_and_silent_meters_equal_brute_force(seed: int, persistent: bool, 
     found = given(A, C, persistent=persistent)
     silent = np.arange(len(C)) == seed % len(C)
     live = np.flatnonzero(~silent).tolist()
-    for part in parts(whole, tree_bus(feeder)[meters]):
+    for part in parts(whole, tree_bus(feeder)[meters], NONE):
         inside = [j for j in part.meters.tolist() if not silent[j]]
         counted = part_redundancy(found, part, silent).count
         assert counted == brute(A, C, inside, live, persistent=persistent)
+
+
+def cut_off(mesh: MeshedFeeder, bus: int) -> set[int]:
+    """Buses that a walk from the busbar does not reach around one."""
+    lines = [*enumerate(mesh.tree.parent.tolist(), 1), *map(tuple, mesh.ends.tolist())]
+    reached, grows = {0}, True
+    while grows:
+        more = {b for one, other in lines for a, b in ((one, other), (other, one)) if a in reached} - {bus}
+        grows = not more <= reached
+        reached |= more
+    return set(range(len(mesh.buses))) - reached
+
+
+@pytest.mark.parametrize("persistent", [True, False])
+@pytest.mark.parametrize("seed", range(8))
+def test_parts_of_a_mesh_are_fed_through_one_bus_and_equal_brute_force(seed: int, persistent: bool) -> None:
+    mesh, _, meters, _ = tree(seed, ties=1 + seed % 2)
+    assert isinstance(mesh, MeshedFeeder)
+    A, C = system(seed, ties=1 + seed % 2)
+    found, everybody = given(A, C, persistent=persistent), list(range(len(C)))
+    at = mesh.bus[meters].tolist()
+    inside = [[j for j in everybody if at[j] in cut_off(mesh, bus)] for bus in range(1, len(mesh.buses))]
+    pieces = parts(mesh.tree, mesh.bus[meters], mesh.ends)
+    assert sorted(part.meters.tolist() for part in pieces) == sorted(
+        map(list, {tuple(k) for k in inside if k})
+    )
+    for part in pieces:
+        assert part.meters.tolist() == inside[part.bus - 1]
+        one = {0, part.bus}
+        assert part.branch == any({a, b} == one for a, b in [*enumerate(mesh.tree.parent, 1), *mesh.ends])
+        counted = part_redundancy(found, part, np.zeros(len(C), dtype=np.bool_)).count
+        assert counted == brute(A, C, part.meters.tolist(), everybody, persistent=persistent)
 
 
 @FEEDERS
