@@ -22,6 +22,7 @@ from feeders.powerflow_unbalanced import power_flow
 from feeders.schema import FeederTables, LineRow
 from feeders.trials import LoadError, Trial, judge
 from gridsec.arrays import Floats
+from gridsec.mesh import Meshed, sensitivities
 from gridsec.network import bus_voltages, linear, model_error_bound
 
 LOADS = (0.25, 0.5, 1.0)
@@ -100,24 +101,25 @@ def errors(site: Site, part: float) -> str:
 
 
 def sensitivity(site: Site, part: float) -> str:
-    """One row: how far R and X are from differences of the AC power flow, in parts of the whole matrix.
+    """One row: how far R and X are from differences of the AC power flow, in parts of the largest entry.
 
-    Without load, and at a part of the peaks; the largest entry, and the square root of the sum of squares.
+    At a part of the peaks: those of the linear power flow, and then those of that operating point.
     """
     feeder, flow, v0 = site.feeder, power_flow(site), site.feeder.base_volt
+    assert isinstance(feeder, Meshed)
     p_kw = part * site.loads.load_peak * feeder.base_kva
-    model, there = linear(feeder), np.arange(p_kw.size)
+    p, there = -p_kw / feeder.base_kva, np.arange(p_kw.size)
+    models = linear(feeder), sensitivities(feeder, p, 0.33 * p, 1.0)
     cells = []
-    for power, matrix in ((0, model.R), (1, model.X)):
+    for power, name in enumerate("RX"):
         moved = np.zeros((2, p_kw.size, 2, p_kw.size))
         moved[0, there, power, there], moved[1, there, power, there] = STEP_KW, -STEP_KW
         loads = (np.stack([p_kw, 0.33 * p_kw]) + moved).reshape(-1, 2, p_kw.size)
         v = flow.solve_batch(loads[:, 0], loads[:, 1], np.full(len(loads), v0))[0] / v0
         down, up = (v**2).reshape(2, p_kw.size, -1)
-        slope = (up - down).T * feeder.base_kva / (2.0 * STEP_KW)
-        off, whole = slope - 2.0 * matrix, 2.0 * np.abs(matrix).max()
-        cells += [np.abs(off).max() / whole, np.linalg.norm(off) / np.linalg.norm(2.0 * matrix)]
-    return f"| {feeder.name} | {part:g} | " + " | ".join(f"{100 * value:.2g} %" for value in cells)
+        slope = (up - down).T * feeder.base_kva / (4.0 * STEP_KW)
+        cells.append([np.abs(getattr(model, name) - slope).max() / np.abs(slope).max() for model in models])
+    return f"| {feeder.name} | {part:g} | " + " | ".join(f"{100 * v:.2g} %" for v in np.ravel(cells, "F"))
 
 
 def named(site: Site, trick: Trick, percent: float) -> str:

@@ -5,7 +5,7 @@ inverse of their admittances, so that `bus_voltages`, `model_error_bound` and `i
 """
 
 from gridsec.mesh.balanced import MeshedFeeder, admittance, impedances
-from gridsec.mesh.flow import Meshed, bus_voltages, interval_bounds, model_error_bound
+from gridsec.mesh.flow import Meshed, bus_voltages, interval_bounds, model_error_bound, sensitivities
 from gridsec.mesh.phased import PhasedMesh
 
 __all__ = [
@@ -17,4 +17,5 @@ __all__ = [
     "impedances",
     "interval_bounds",
     "model_error_bound",
+    "sensitivities",
 ]

@@ -16,7 +16,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gridsec.arrays import Floats, Phasors
+from gridsec.arrays import Floats, Phasors, frozen
+from gridsec.feeder import LinDistFlow
 from gridsec.intervals import Sweeps, bounds
 from gridsec.mesh.balanced import MeshedFeeder
 from gridsec.mesh.phased import PhasedMesh
@@ -62,6 +63,51 @@ def bus_voltages(
         V = here + np.conj(s / V) @ feeder.between.T
     V = idle + np.conj(s / V) @ feeder.transfer.T
     return np.asarray(V.real**2 + V.imag**2)
+
+
+def sensitivities(
+    feeder: Meshed, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 4
+) -> LinDistFlow:
+    """Derivatives of squared voltages at an operating point, halved: R and X where there is load.
+
+    A power that changes by ds at one customer changes what all draw, because their powers are constant. The
+    differential of the fixed point,
+
+        dV + Z diag(conj(s / V^2)) conj(dV) = Z conj(ds / V),
+
+    is a real linear system for real and imaginary parts of dV at the customers, solved for all of them at
+    once; Re(conj(V) dV) is half the derivative of ``|V|^2``. Without load and charging it is R and X. O(N^3).
+
+    Parameters
+    ----------
+    feeder
+        The feeder.
+    p, q : (N,)
+        Net active and reactive injection of each customer at the operating point, pu.
+    v0_squared
+        As in `bus_voltages`.
+    steps
+        Steps to the voltages of the operating point, as in `bus_voltages`.
+
+    Returns
+    -------
+    LinDistFlow
+        The matrices; ``v^2`` then changes by ``2 R dp + 2 X dq``.
+    """
+    s, idle, here = _start(feeder, p, q, v0_squared)
+    V = here
+    for _ in range(steps + 1):
+        V = here + feeder.between @ np.conj(s / V)
+    turned, alone = feeder.between * np.conj(s / V**2), np.eye(s.size)
+    own: Phasors = np.concatenate([np.diag(unit / np.conj(V)) for unit in (1.0, -1j)], axis=1)
+    system = np.block([[alone + turned.real, turned.imag], [turned.imag, alone - turned.real]])
+    driven = feeder.between @ own
+    moved = np.linalg.solve(system, np.concatenate([driven.real, driven.imag]))
+    change = moved[: s.size] + 1j * moved[s.size :]
+    currents = own - np.conj((s / V**2)[:, None] * change)
+    volts = idle + feeder.transfer @ np.conj(s / V)
+    R, X = np.split((np.conj(volts)[:, None] * (feeder.transfer @ currents)).real, 2, axis=1)
+    return LinDistFlow(*(frozen(each) for each in (R[feeder.bus], X[feeder.bus], R, X)))
 
 
 def model_error_bound(feeder: Meshed, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:

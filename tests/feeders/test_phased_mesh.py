@@ -213,9 +213,10 @@ def test_the_european_feeder_with_a_ring() -> None:
     radial = load("ieee-european-lv").feeder
     alone = np.sqrt(bus_voltages(radial, -peak, -0.33 * peak, 1.0)[feeder.bus])
     assert np.abs(alone - truth / feeder.base_volt).max() > 5e-3
-    for part, most in ((0.0, 1e-6), (0.25, 0.02)):
-        cells = sensitivity(site, part).split("|")[3:]
-        assert all(float(cell.strip(" %")) / 100.0 < most for cell in cells)
+    for part, most in ((0.0, 1e-6), (0.25, 0.02), (1.0, 0.1)):
+        *linear, r, x = (float(cell.strip(" %")) / 100.0 for cell in sensitivity(site, part).split("|")[3:])
+        assert max(linear) < most
+        assert max(r, x) < 1e-4
 
 
 @pytest.mark.parametrize("make", [european, ring])

@@ -206,6 +206,30 @@ def test_customers_hang_on_the_phase_of_the_busbar_that_they_have() -> None:
     np.testing.assert_array_equal(one_busbar(feeder, feeder.bus, feeder.bus), same)
 
 
+@pytest.mark.parametrize("charging", [0.0, 0.02])
+@given(seed=seeds)
+@settings(max_examples=8, deadline=None)
+def test_sensitivities_are_the_derivatives_under_load(charging: float, seed: int) -> None:
+    feeder = random_phased_mesh(seed, charging=charging)
+    p, q = loads(feeder, seed, 0.01)
+    v0 = np.array([1.02, 1.0, 0.97])
+    found = mesh.sensitivities(feeder, p, q, v0, steps=20)
+    step = 1e-3
+    for k in range(feeder.bus.size):
+        unit = step * (np.arange(p.size) == k)
+        for column, up, down in (
+            (found.R_bus[:, k], (p + unit, q), (p - unit, q)),
+            (found.X_bus[:, k], (p, q + unit), (p, q - unit)),
+        ):
+            above, below = (ac_places(feeder, *each, v0) for each in (up, down))
+            slope, there = (above - below) / (4.0 * step), ~np.isnan(above)
+            np.testing.assert_allclose(slope[there], column[there], rtol=0, atol=1e-6)
+    none = mesh.sensitivities(feeder, 0.0 * p, 0.0 * q, 1.0)
+    if not charging:
+        np.testing.assert_allclose(none.R_bus, feeder.R, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(none.X_bus, feeder.X, rtol=0, atol=1e-12)
+
+
 def test_beyond_what_the_feeder_carries_nothing_is_promised() -> None:
     feeder = random_phased_mesh(11)
     p, q = np.full((2, feeder.bus.size), -50.0)
