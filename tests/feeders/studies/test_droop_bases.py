@@ -80,7 +80,7 @@ def test_the_verdict_is_that_of_the_simulation_in_volts(kind: str) -> None:
         assert bool(np.ptp(volt) > 1.0) is (kind in KINDS[:2])
         subject = Subject.of(site)
         updates = [
-            Update(float(rng.choice([0.5, 1.0, 3.0, 60.0])), int(rng.choice([0, 2]))) for _ in range(20)
+            Update(float(rng.choice([0.5, 1.0, 3.0, 60.0])), int(rng.choice([0, 2]))) for _ in range(15)
         ]
         loads = [
             point(site, rng.uniform(0, 1), rng.uniform(0, 1), float(rng.uniform(0.98, 1.02))) for _ in updates
@@ -94,16 +94,16 @@ def test_the_verdict_is_that_of_the_simulation_in_volts(kind: str) -> None:
                 moves_on = alone[0] > 1e-5
             key = verdict, bool(moves_on)
             told[key] = told.get(key, 0) + 1
-    assert sum(told.values()) == 40
+    assert sum(told.values()) == 30
     assert told.get((Verdict.STABLE, True), 0) == told.get((Verdict.UNSTABLE, False), 0) == 0
-    assert min(told[Verdict.STABLE, False], told[Verdict.UNSTABLE, True]) >= 8
+    assert min(told[Verdict.STABLE, False], told[Verdict.UNSTABLE, True]) >= 5
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_curves_and_limits_are_those_of_the_nominal_voltage(kind: str) -> None:
     """Whether a band is kept, and what is hosted, by a fleet whose curves are simulated in volts."""
     verdicts = set()
-    for seed in range(3):
+    for seed in range(2):
         rng = np.random.default_rng([seed, 2])
         site = changed(random_site(seed, phased="phases" in kind), kind, rng)
         subject, loads = Subject.of(site), box(site, load_high=0.5, pv_high=0.3)
@@ -113,7 +113,7 @@ def test_curves_and_limits_are_those_of_the_nominal_voltage(kind: str) -> None:
         volts = [rest_volts(loop, loads, u) for u in (np.zeros(own.size), np.ones(own.size))]
         volts += [rest_volts(loop, loads, rng.uniform(0.0, 1.0, own.size)) for _ in range(10)]
         low, high = min(v.min() for v in volts), max(v.max() for v in volts)
-        for limits in ((0.9, 1.1), (0.97 * low / 230.0, 1.03 * high / 230.0), (0.98, high / 230.0 - 0.001)):
+        for limits in ((0.9, 1.1), (0.93 * low / 230.0, 1.07 * high / 230.0), (0.98, high / 230.0 - 0.001)):
             found = safety(subject, fleet, loads, limits)
             verdicts.add(found.rest)
             assert found.low_rest_volt <= low + 1e-4
@@ -225,32 +225,33 @@ def test_volts_of_a_simulation_are_those_of_the_power_flow() -> None:
     assert row["worst_customer"] == site.feeder.customers[int(np.argmax(np.abs(still - 230.0)))]
 
 
-def ring(ties: tuple[LineRow, ...]) -> Site:
+def test_two_lines_in_parallel_are_one_of_half_the_impedance() -> None:
+    """Every line closes a loop with its twin, behind a tap; each carries half, and may."""
     tables = village_tables()
-    lines = tuple(replace(line, rating_a=100.0) for line in tables.lines[:-1])
-    meta = replace(tables.meta, meshed=bool(ties), accept=("impedance",))
-    return from_tables(replace(tables, meta=meta, lines=(*lines, *ties)))
-
-
-def test_a_loop_that_carries_nothing_is_none() -> None:
-    """Closed by a line of a megohm, a feeder is as it was; by one of the usual kind it is not."""
-    options = replace(OPTIONS, draws=0, hosting_presets=("",))
-    radial = droop(ring(()), options)
-    thin = droop(ring((LineRow("tie", "n3", "n6", 1e6, 1e6),)), options)
-    closed = droop(ring((LineRow("tie", "n3", "n6", 0.02, 0.01),)), options)
-    assert (thin.verdict, thin.rest, thin.always) == (radial.verdict, radial.rest, radial.always)
-    for name in ("stability", "inverters", "band", "customers", "steps", "hosting", "presets"):
-        pd.testing.assert_frame_equal(thin.tables[name], radial.tables[name], rtol=1e-4, atol=1e-4)
-        assert not closed.tables[name].equals(radial.tables[name])
-    assert len(presets_of([ring((LineRow("tie", "n3", "n6", 0.02, 0.01),))], options)) == 1
+    lines = [replace(row, rating_a=100.0, tap=0.97 if row.line == "l1" else 1.0) for row in tables.lines[:-1]]
+    again = [replace(row, line=f"{row.line} again") for row in lines]
+    one = [
+        replace(row, r_ohm=0.5 * row.r_ohm, x_ohm=0.5 * row.x_ohm, b_us=2.0 * row.b_us, rating_a=200.0)
+        for row in lines
+    ]
+    meta = replace(tables.meta, meshed=True)
+    twice = from_tables(replace(tables, meta=meta, lines=(*lines, *again)))
+    once = from_tables(replace(tables, lines=tuple(one)))
+    assert len(twice.ties) == 5
+    options = replace(OPTIONS, draws=0)
+    found, other = droop(twice, options), droop(once, options)
+    assert (found.verdict, found.rest, found.always) == (other.verdict, other.rest, other.always)
+    for name in (*SAME[:-1], "steps"):
+        pd.testing.assert_frame_equal(found.tables[name], other.tables[name], rtol=1e-5, atol=1e-5)
+    assert presets_of([twice], options)["verdict"].tolist() == ["stable"]
 
 
 def test_currents_of_a_loop_are_those_of_the_power_flow() -> None:
     """And ratings in amperes: what flows over a line is what its ends differ by, over its impedance."""
-    tie = LineRow("tie", "n6", "n3", 0.02, 0.01, b_us=400.0, rating_a=30.0)
-    site = ring((tie,))
-    lines = tuple(replace(row, tap=0.95) if row.line == "l1" else row for row in site.tables.lines)
-    site = from_tables(replace(site.tables, lines=lines))
+    tables = village_tables()
+    rated = (replace(row, rating_a=100.0, tap=0.95 if row.line == "l1" else 1.0) for row in tables.lines[:-1])
+    lines = (*rated, LineRow("tie", "n6", "n3", 0.02, 0.01, b_us=400.0, rating_a=30.0))
+    site = from_tables(replace(tables, meta=replace(tables.meta, meshed=True), lines=lines))
     net, count = Subject.of(site).net, len(site.feeder.customers)
     p, q = np.random.default_rng(0).uniform(-0.1, 0.1, (2, count))
     amps = np.array(
