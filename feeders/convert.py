@@ -21,6 +21,7 @@ from typing import Any
 from feeders import convert_simbench
 from feeders.convert_changes import CHANGES_FILE, Change, changes_csv, sentences
 from feeders.convert_check import SourceCheck, compare
+from feeders.convert_levels import EVERYTHING, Extent
 from feeders.convert_network import Converted, feeder_of
 from feeders.convert_opendss import read_opendss
 from feeders.convert_pandapower import Fleet, from_pandapower
@@ -156,6 +157,7 @@ def convert(
     droop: str | None = None,
     opened: Sequence[str] = (),
     meshed: bool = False,
+    one_voltage: bool = False,
 ) -> Conversion:
     """Convert a source into a feeder's folder (or the profile library) with its SOURCE.md.
 
@@ -175,6 +177,8 @@ def convert(
         Lines to take as open, so that a mesh becomes radial.
     meshed
         Whether loops stay closed, as `meshed = true` in feeder.toml.
+    one_voltage
+        Whether it ends where another nominal voltage begins: a transformer to that is then a customer.
 
     Raises
     ------
@@ -191,7 +195,8 @@ def convert(
     chosen = name or (
         source if recipe is not None else re.sub(r"[^A-Za-z0-9_-]+", "-", folder.resolve().name)
     )
-    converted, package = _converted(source, chosen[:64], root=root, droop=droop, opened=opened, meshed=meshed)
+    extent = Extent(one_voltage, meshed)
+    converted, package = _converted(source, chosen[:64], root=root, droop=droop, opened=opened, extent=extent)
     problems = validate(converted.tables)
     if problems:
         raise FeederInvalid(
@@ -203,7 +208,7 @@ def convert(
     done = _checked(converted, folder)
     (folder / CHANGES_FILE).write_text(changes_csv(done.changes), encoding="utf-8", newline="\n")
     target = f"data/feeders/{chosen}" if recipe else str(out)
-    options = [*_options(root, name, droop, opened), *(["--meshed"] if meshed else [])]
+    options = [*_options(root, name, droop, opened), *_flags(extent)]
     text = feeder_source(
         converted.tables,
         about=recipe.about if recipe else "A converted network.",
@@ -218,7 +223,12 @@ def convert(
 
 
 def check_against_source(
-    source: str, folder: Path | str, *, root: str | None = None, opened: Sequence[str] = ()
+    source: str,
+    folder: Path | str,
+    *,
+    root: str | None = None,
+    opened: Sequence[str] = (),
+    one_voltage: bool = False,
 ) -> SourceCheck:
     """Compare a folder's AC power flow with that of the source it was made from, at the source's loads.
 
@@ -228,7 +238,7 @@ def check_against_source(
         As `convert` takes it.
     folder
         The feeder.
-    root, opened
+    root, opened, one_voltage
         As `convert` was given them.
 
     Raises
@@ -238,10 +248,12 @@ def check_against_source(
     PowerFlowDiverged
         If the feeder's does.
     """
-    converted, _ = _converted(source, "check", root=root, opened=opened)
+    tables = read(folder)
+    extent = Extent(one_voltage, tables.meta.meshed)
+    converted, _ = _converted(source, "check", root=root, opened=opened, extent=extent)
     if converted.state is None:
         raise GridsecError(converted.unchecked)
-    return compare(converted.state, read(folder))
+    return compare(converted.state, tables)
 
 
 def _checked(converted: Converted, folder: Path) -> Conversion:
@@ -261,18 +273,18 @@ def _converted(
     root: str | None,
     opened: Sequence[str] = (),
     droop: str | None = None,
-    meshed: bool = False,
+    extent: Extent = EVERYTHING,
 ) -> tuple[Converted, str]:
     """Return a source as a feeder, and the package that holds its data or reads its file."""
-    found, package = _read(source, name, root=root, opened=opened, droop=droop)
-    if not meshed:
+    found, package = _read(source, name, root=root, opened=opened, droop=droop, extent=extent)
+    if not extent.meshed:
         return found, package
     tables = replace(found.tables, meta=replace(found.tables.meta, meshed=True))
     return replace(found, tables=tables), package
 
 
 def _read(
-    source: str, name: str, *, root: str | None, opened: Sequence[str], droop: str | None
+    source: str, name: str, *, root: str | None, opened: Sequence[str], droop: str | None, extent: Extent
 ) -> tuple[Converted, str]:
     recipe = RECIPES.get(source)
     origin = recipe.source if recipe else source
@@ -281,10 +293,11 @@ def _read(
         return Converted(read(path), (), None, "it was a feeder's folder already"), "gridsec"
     kind = _kind(path) if path.is_file() else ""
     if kind == OPENDSS:
-        found = feeder_of(read_opendss(path), name, root=root, opened=opened, droop=droop)
-        return found, "opendssdirect.py"
+        network, package = read_opendss(path), "opendssdirect.py"
+        return feeder_of(network, name, root=root, opened=opened, droop=droop, extent=extent), package
     if kind == PGM:
-        return feeder_of(read_pgm(path), name, root=root, opened=opened, droop=droop), "power-grid-model"
+        network, package = read_pgm(path), "power-grid-model"
+        return feeder_of(network, name, root=root, opened=opened, droop=droop, extent=extent), package
     net, package = _open(origin)
     mended = (recipe.mend(net),) if recipe and recipe.mend else ()
     found = from_pandapower(
@@ -294,6 +307,7 @@ def _read(
         root=root or (recipe.root if recipe else None),
         opened=opened,
         droop=droop,
+        extent=extent,
         fleet=recipe.fleet if recipe else None,
         max_attacked=recipe.max_attacked if recipe else 1,
     )
@@ -332,6 +346,11 @@ def _options(root: str | None, name: str | None, droop: str | None, opened: Sequ
     """Return the options of the command line that were given."""
     given = ((f"--root {root!r}", root), (f"--name {name}", name), (f"--droop {droop}", droop))
     return [text for text, value in given if value] + [f"--open {line!r}" for line in opened]
+
+
+def _flags(extent: Extent) -> list[str]:
+    given = (("--meshed", extent.meshed), ("--one-voltage", extent.one_voltage))
+    return [text for text, value in given if value]
 
 
 def _seeded(make: Callable[[], Any]) -> Any:

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
 from feeders.convert_changes import WHOLE, Change
-from feeders.convert_customers import HOUSEHOLD_KW, droop_preset, reactive, rounded, usual_profile
+from feeders.convert_customers import (
+    HOUSEHOLD_KW,
+    LEAST_POWER_FACTOR,
+    droop_preset,
+    reactive,
+    rounded,
+    usual_profile,
+)
 from feeders.schema import CustomerRow
 from gridsec.arrays import Phasors
 
@@ -49,6 +56,8 @@ class Draw:
         It is one connection of all three phases.
     rating_kva
         Rating of a generator's inverter; None: no generator.
+    idle
+        It is what a transformer takes without load, which no customer pays for and no meter reads.
     """
 
     name: str
@@ -56,6 +65,7 @@ class Draw:
     power_kva: Phasors
     even: bool = True
     rating_kva: float | None = None
+    idle: bool = False
 
 
 def is_even(power: Phasors) -> bool:
@@ -66,7 +76,7 @@ def is_even(power: Phasors) -> bool:
 
 def customers_of(
     draws: Iterable[Draw],
-    volt: float,
+    nominal: Mapping[str, float],
     droop: str | None,
     changes: list[Change],
     taken: Collection[str] = (),
@@ -77,8 +87,8 @@ def customers_of(
     ----------
     draws
         Loads and generators.
-    volt
-        Nominal voltage, V.
+    nominal
+        Nominal voltages of the buses, V.
     droop
         Preset of the generators' inverters; None: by their size.
     changes
@@ -88,7 +98,8 @@ def customers_of(
     """
     rows: list[CustomerRow] = []
     power: dict[str, complex] = {}
-    for draw in sorted(draws, key=lambda each: each.rating_kva is not None):
+    own = (draw for draw in draws if not draw.idle)
+    for draw in sorted(own, key=lambda each: each.rating_kva is not None):
         connections = _connections(draw)
         if not connections:
             what = "load" if draw.rating_kva is None else "generator"
@@ -98,7 +109,7 @@ def customers_of(
             row = CustomerRow(_unique(draw, phases, {*taken, *power}), draw.bus, 0.0, phases=phases)
             power[row.customer] = kva
             if draw.rating_kva is None:
-                rows.append(_load(row, kva, len(rows), volt, changes))
+                rows.append(_load(row, kva, len(rows), nominal[draw.bus], changes))
                 continue
             share = draw.rating_kva if phases == "abc" else draw.rating_kva / len(connections)
             row = replace(row, pv_kw=rounded(max(-kva.real, 0.0)), pv_profile=f"PV{len(rows) % 8 + 1}")
@@ -110,6 +121,33 @@ def customers_of(
                     )
                 )
             rows.append(row)
+    return rows, power
+
+
+def idle_customers(
+    draws: Iterable[Draw], taken: Collection[str]
+) -> tuple[list[CustomerRow], dict[str, complex]]:
+    """Return what transformers take without load as customers without meters, and their powers, kVA.
+
+    Parameters
+    ----------
+    draws
+        Of which those are taken that are idle.
+    taken
+        Names that customers have.
+    """
+    rows: list[CustomerRow] = []
+    power: dict[str, complex] = {}
+    for draw in draws:
+        for phases, kva in _connections(draw) if draw.idle else ():
+            row = CustomerRow(_unique(draw, phases, {*taken, *power}), draw.bus, rounded(max(kva.real, 0.0)))
+            factor = max(kva.real / abs(kva), LEAST_POWER_FACTOR)
+            # What the power factor does not say: all of it where no active power is drawn.
+            beside = abs(kva.imag) - row.load_kw * math.tan(math.acos(factor))
+            row = replace(row, phases=phases, q_floor_kvar=rounded(max(beside, 0.0)))
+            one = rounded(factor)
+            rows.append(replace(row, power_factor=one, power_factor_min=one, power_factor_max=one))
+            power[row.customer] = kva
     return rows, power
 
 

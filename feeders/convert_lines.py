@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -189,20 +189,28 @@ def open_end(row: LineRow, bus: str, volt: float) -> LineRow | None:
     return replace(row, line=name, from_bus=bus, to_bus=f"{bus} {name}", closed=True)
 
 
-def turned(row: LineRow) -> LineRow:
+def turned(row: LineRow, nominal: Mapping[str, float]) -> LineRow:
     """Return a line given from its other end; a tap t becomes 1/t, with the impedance on its other side.
 
     Parameters
     ----------
     row
         The line.
+    nominal
+        Nominal voltages of the buses, V; looked at only if the line leads to another one.
     """
     away = replace(row, from_bus=row.to_bus, to_bus=row.from_bus)
-    if set(row.taps) == {1.0}:
+    level = 1.0
+    if row.to_volt is not None:
+        level = nominal[row.from_bus] / row.to_volt
+        limit = None if row.rating_a is None else rounded(row.rating_a / level)
+        away = replace(away, to_volt=nominal[row.from_bus], rating_a=limit)
+    elif set(row.taps) == {1.0}:
         return away
     if row.tap_a is None and row.tap_b is None and row.tap_c is None:
-        factor = dict.fromkeys(SERIES_NAMES, row.tap**2) | dict.fromkeys(SHUNT_NAMES, row.tap**-2)
-        factor |= dict.fromkeys(("r_ohm", "x_ohm", "r0_ohm", "x0_ohm"), row.tap**2) | {"b_us": row.tap**-2}
+        up, down = (level * row.tap) ** 2, (level * row.tap) ** -2
+        factor = dict.fromkeys(SERIES_NAMES, up) | dict.fromkeys(SHUNT_NAMES, down)
+        factor |= dict.fromkeys(("r_ohm", "x_ohm", "r0_ohm", "x0_ohm"), up) | {"b_us": down}
         values = {name: (getattr(row, name), by) for name, by in factor.items()}
         cells: dict[str, Any] = {
             name: rounded(value * by) for name, (value, by) in values.items() if value is not None
@@ -210,7 +218,7 @@ def turned(row: LineRow) -> LineRow:
         return replace(away, tap=rounded(1.0 / row.tap), **cells)
     phases = phases_of(row)
     here = np.ix_(phases, phases)
-    side = np.outer(row.taps, row.taps)[here]
+    side = level**2 * np.outer(row.taps, row.taps)[here]
     scaled = line_row(
         row.line,
         (row.to_bus, row.from_bus),
@@ -219,7 +227,7 @@ def turned(row: LineRow) -> LineRow:
         shunt=1e-6 * shunt_of(row)[here] / side,
         changes=[],
     )
-    scaled = replace(scaled, closed=row.closed, rating_a=row.rating_a)
+    scaled = replace(scaled, closed=row.closed, rating_a=away.rating_a, to_volt=away.to_volt)
     return with_taps(scaled, 1.0 / np.array(row.taps))
 
 
@@ -246,7 +254,9 @@ def phases_of(row: LineRow) -> Ints:
     return np.array(["abc".index(phase) for phase in sorted(row.phases)], dtype=np.intp)
 
 
-def merged(lines: Sequence[LineRow], busbar: str, changes: list[Change]) -> list[LineRow]:
+def merged(
+    lines: Sequence[LineRow], busbar: str, changes: list[Change], nominal: Mapping[str, float]
+) -> list[LineRow]:
     """Return the lines with those in parallel as one, and those that switches short-circuit open.
 
     Parameters
@@ -257,6 +267,8 @@ def merged(lines: Sequence[LineRow], busbar: str, changes: list[Change]) -> list
         Its busbar.
     changes
         Takes what was joined.
+    nominal
+        Nominal voltages of the buses, V.
     """
     above: dict[str, str] = {busbar: busbar}
 
@@ -291,7 +303,9 @@ def merged(lines: Sequence[LineRow], busbar: str, changes: list[Change]) -> list
                 )
         elif len(members) > 1:
             start = fused(rows[members[0]].from_bus)
-            alike = [rows[k] if fused(rows[k].from_bus) == start else turned(rows[k]) for k in members]
+            alike = [
+                rows[k] if fused(rows[k].from_bus) == start else turned(rows[k], nominal) for k in members
+            ]
             rows[members[0]] = _parallel(alike, changes)
             gone.update(members[1:])
     return [row for k, row in enumerate(rows) if k not in gone]
@@ -302,7 +316,8 @@ def _parallel(rows: list[LineRow], changes: list[Change]) -> LineRow:
     names = " + ".join(row.line for row in rows)
     first = rows[0]
     alike = len({row.phases for row in rows}) == 1
-    if not alike or any((row.in_phases and len(row.phases) > 1) or row.tap != 1.0 for row in rows):
+    tapped = len({row.taps for row in rows}) > 1
+    if not alike or any((row.in_phases and len(row.phases) > 1) or tapped for row in rows):
         return _side_by_side(rows, names, changes)
     changes.append(Change(f"lines {names}", WHOLE, "changed", f"in parallel; one line {first.line}"))
     positive = [complex(row.r_ohm, row.x_ohm) for row in rows]
@@ -353,4 +368,5 @@ def _side_by_side(rows: list[LineRow], names: str, changes: list[Change]) -> Lin
         changes=changes,
     )
     limit = min((row.rating_a for row in rows if row.rating_a is not None), default=None)
-    return with_taps(replace(joined, rating_a=limit, to_x=first.to_x, to_y=first.to_y), taps)
+    joined = replace(joined, rating_a=limit, to_x=first.to_x, to_y=first.to_y, to_volt=first.to_volt)
+    return with_taps(joined, taps)

@@ -7,7 +7,6 @@ customers that draw what flows into them.
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -17,31 +16,13 @@ from feeders.columns import SUSPICIONS
 from feeders.convert_changes import WHOLE, BusbarUnclear, Change
 from feeders.convert_check import SourceState
 from feeders.convert_customers import USUAL_POWER_FACTOR, base_kva, with_meters
-from feeders.convert_draws import Draw, customers_of, is_even
+from feeders.convert_draws import Draw, customers_of, idle_customers, is_even
+from feeders.convert_graph import Coupling, above_busbar, as_rows, fused_with, reached
+from feeders.convert_levels import EVERYTHING, Extent, levels_of, transformed
 from feeders.convert_lines import balanced_charging, merged, turned
 from feeders.schema import FeederMeta, FeederTables, LineRow, LoadDefaults, validate
 from gridsec.arrays import Phasors
 from gridsec.errors import FeederInvalid, GridsecError
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Coupling:
-    """A transformer, or anything else that joins buses and is no line.
-
-    Attributes
-    ----------
-    name, buses
-        Its name, with its kind, and the buses it joins.
-    power_kva
-        What flows into it from each of them, by phase, kVA.
-    line
-        The line with a tap that it is between buses of one nominal voltage; None: it is none.
-    """
-
-    name: str
-    buses: tuple[str, ...]
-    power_kva: tuple[Phasors, ...]
-    line: LineRow | None = None
 
 
 @dataclass(slots=True)
@@ -142,6 +123,7 @@ def feeder_of(
     root: str | None = None,
     opened: Sequence[str] = (),
     droop: str | None = None,
+    extent: Extent = EVERYTHING,
 ) -> Converted:
     """Return the feeder below a bus of a network.
 
@@ -157,16 +139,19 @@ def feeder_of(
         Lines to take as open, so that the feeder is radial.
     droop
         Preset of the generators' inverters; None: by their size.
+    extent
+        How far down it goes.
 
     Raises
     ------
     FeederInvalid
         With every reason why there is no feeder.
     """
-    part = below(network, root, opened)
+    part = below(network, root, opened, extent)
     volt = network.nominal[part.busbar]
-    rows, power = customers_of(part.draws, volt, droop, part.changes)
-    rows = with_meters(rows)
+    rows, power = customers_of(part.draws, network.nominal, droop, part.changes)
+    idle, taken = idle_customers(part.draws, power)
+    rows, power = [*with_meters(rows), *idle], power | taken
     lines = part.lines
     if all(row.phases == "abc" for row in rows):
         lines = balanced_charging(lines, part.changes)
@@ -184,12 +169,12 @@ def feeder_of(
     return finished(network, part, tables, power)
 
 
-def below(network: Network, root: str | None, opened: Sequence[str]) -> Part:
+def below(network: Network, root: str | None, opened: Sequence[str], extent: Extent = EVERYTHING) -> Part:
     """Cut the part below a bus out of a network.
 
     Parameters
     ----------
-    network, root, opened
+    network, root, opened, extent
         As `feeder_of` takes them.
 
     Raises
@@ -202,23 +187,17 @@ def below(network: Network, root: str | None, opened: Sequence[str]) -> Part:
     changes = list(network.changes)
     rows = _opened(network.lines, opened, changes)
     busbar = _busbar(network, rows, root)
-    network, rows = _regulated(network, rows, busbar, changes)
-    inside = _reached(busbar, rows)
+    network, rows = transformed(network, rows, busbar, extent, changes)
+    inside = reached(busbar, rows)
     problems = _infeeds(network, rows, busbar, inside)
-    volt = network.nominal[busbar]
-    problems += [
-        f"bus {bus!r} has a nominal voltage of {network.nominal[bus]:.6g} V and the busbar {busbar!r} of "
-        f"{volt:.6g} V, though lines join them; expected one voltage"
-        for bus in inside
-        if abs(network.nominal.get(bus, volt) - volt) > 1e-6 * volt
-    ]
+    kept = _kept(network, rows, inside, changes)
+    problems += levels_of(kept, network.nominal)
     if problems:
         raise FeederInvalid(problems)
-    kept = _kept(network, rows, inside, changes)
     draws = [draw for draw in network.draws if draw.bus in inside]
     draws += _behind(network, rows, inside, changes)
     changes.extend(change for bus, change in network.of_bus if bus in inside)
-    return Part(busbar, inside, merged(kept, busbar, changes), draws, changes)
+    return Part(busbar, inside, merged(kept, busbar, changes, network.nominal), draws, changes)
 
 
 def finished(network: Network, part: Part, tables: FeederTables, power: Mapping[str, complex]) -> Converted:
@@ -279,35 +258,6 @@ def _opened(lines: Iterable[LineRow], opened: Sequence[str], changes: list[Chang
     return [replace(row, closed=False) if row.line in opened else row for row in rows]
 
 
-def _fused(bus: str, rows: Iterable[LineRow]) -> dict[str, int]:
-    """Return the buses that closed switches make one with a bus."""
-    return _reached(bus, (row for row in rows if row.r_ohm == row.x_ohm == 0.0))
-
-
-def _reached(start: str, rows: Iterable[LineRow], without: Collection[str] = ()) -> dict[str, int]:
-    """Return the buses that closed lines connect, with how many lines away; nothing passes `without`."""
-    near: dict[str, list[str]] = defaultdict(list)
-    for row in rows:
-        if row.closed:
-            near[row.from_bus].append(row.to_bus)
-            near[row.to_bus].append(row.from_bus)
-    level = {start: 0}
-    order = [start]
-    for bus in order:
-        for other in near[bus]:
-            if other not in level and bus not in without:
-                level[other] = level[bus] + 1
-                order.append(other)
-    return level
-
-
-def _as_rows(couplings: Iterable[Coupling]) -> list[LineRow]:
-    """Couplings as lines, where only what is connected matters."""
-    return [
-        LineRow(each.name, each.buses[0], other, 0.0, 0.0) for each in couplings for other in each.buses[1:]
-    ]
-
-
 def _busbar(network: Network, rows: list[LineRow], root: str | None) -> str:
     """Return the bus asked for, or the first from the source on that has lines."""
     if root is not None:
@@ -349,7 +299,7 @@ def one_busbar(buses: Collection[str], rows: Iterable[LineRow]) -> bool:
     rows
         The network's lines.
     """
-    return bool(buses) and _fused(min(buses), rows).keys() >= set(buses)
+    return bool(buses) and fused_with(min(buses), rows).keys() >= set(buses)
 
 
 def _way_down(network: Network, rows: list[LineRow]) -> list[str]:
@@ -371,39 +321,18 @@ def _beyond(network: Network, way: list[str]) -> set[str]:
     return {bus for each in network.couplings if way[-1] in each.buses for bus in each.buses} - set(way)
 
 
-def _regulated(
-    network: Network, rows: list[LineRow], busbar: str, changes: list[Change]
-) -> tuple[Network, list[LineRow]]:
-    """Take transformers below the busbar as the lines with taps that they are, where they are such."""
-    fused = _fused(busbar, rows)
-    everything = [*rows, *_as_rows(network.couplings)]
-    above = {bus for source in network.sources for bus in _reached(source, everything, without=fused)}
-    left, lines = [], []
-    for each in network.couplings:
-        volts = [network.nominal[bus] for bus in each.buses]
-        one_level = max(volts) - min(volts) <= 1e-6 * max(volts)
-        if each.line is None or not one_level or not above.isdisjoint(set(each.buses) - fused.keys()):
-            left.append(each)
-            continue
-        lines.append(each.line)
-        ratios = " ".join(f"{tap:.6g}" for tap in dict.fromkeys(each.line.taps))
-        effect = f"a line with the fixed ratio {ratios} that the source's power flow left it at"
-        changes.append(Change(each.name, "tap", "changed", effect))
-    return replace(network, couplings=left), [*rows, *lines]
-
-
 def _infeeds(network: Network, rows: list[LineRow], busbar: str, inside: Mapping[str, int]) -> list[str]:
     """Return what else feeds the feeder besides its busbar."""
     problems = []
-    everything = [*rows, *_as_rows(network.couplings)]
-    fused = _fused(busbar, rows)
+    everything = [*rows, *as_rows(network.couplings)]
+    fused = fused_with(busbar, rows)
     for source in network.sources:
         if source in inside and source != busbar:
             problems.append(
                 f"bus {source!r} has another voltage source; the feeder is fed by its busbar {busbar!r} alone"
             )
         elif source != busbar:
-            above = _reached(source, everything, without=fused)
+            above = reached(source, everything, without=fused)
             ways = [bus for bus in inside if bus not in fused and bus in above]
             if ways:
                 problems.append(
@@ -422,7 +351,8 @@ def _kept(
     for row in rows:
         a, b = row.from_bus in inside, row.to_bus in inside
         if a and b:
-            away = turned(row) if inside[row.to_bus] < inside[row.from_bus] else row
+            back = inside[row.to_bus] < inside[row.from_bus]
+            away = turned(row, network.nominal) if back else row
             place = network.xy.get(away.to_bus)
             kept.append(replace(away, to_x=place[0], to_y=place[1]) if place else away)
         elif a or b:
@@ -450,9 +380,8 @@ def _behind(
     network: Network, rows: list[LineRow], inside: Mapping[str, int], changes: list[Change]
 ) -> list[Draw]:
     """Couplings below the busbar, as what flows into them."""
-    fused = _fused(next(iter(inside)), rows)
-    everything = [*rows, *_as_rows(network.couplings)]
-    above = {bus for source in network.sources for bus in _reached(source, everything, without=fused)}
+    everything = [*rows, *as_rows(network.couplings)]
+    above = above_busbar(next(iter(inside)), network.sources, rows, network.couplings)
     draws = []
     for each in network.couplings:
         ends = [k for k, bus in enumerate(each.buses) if bus in inside]
@@ -462,7 +391,7 @@ def _behind(
             bus
             for end in each.buses
             if end not in inside
-            for bus in _reached(
+            for bus in reached(
                 end, [row for row in everything if not {row.from_bus, row.to_bus} & inside.keys()]
             )
         }
@@ -475,12 +404,13 @@ def _behind(
             name = each.name if len(ends) == 1 else f"{each.name} {each.buses[k]}"
             draws.append(Draw(name, each.buses[k], power, even=is_even(power)))
         total = sum((each.power_kva[k].sum() for k in ends), start=0j)
+        what = f"{_buses(len(far))} became a customer that draws" if far else "in a loop; customers draw"
         changes.append(
             Change(
                 each.name,
                 "load side",
                 "changed",
-                f"{_buses(len(far))} became a customer that draws what flows there, "
+                f"{what} what flows there, "
                 f"{total.real:.4g} kW and {total.imag:.4g} kvar; exact at these loads only",
             )
         )

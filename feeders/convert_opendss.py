@@ -19,8 +19,9 @@ import numpy as np
 
 from feeders.convert_changes import WHOLE, Change
 from feeders.convert_draws import Draw, is_even
+from feeders.convert_graph import Coupling
 from feeders.convert_lines import capacitor, line_row, open_end, with_taps
-from feeders.convert_network import Coupling, Network
+from feeders.convert_network import Network
 from feeders.schema import LineRow
 from gridsec.arrays import Floats, Phasors
 from gridsec.errors import FeederInvalid, GridsecError

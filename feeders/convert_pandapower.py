@@ -23,7 +23,8 @@ from feeders.convert_customers import (
     usual_profile,
     with_meters,
 )
-from feeders.convert_draws import ONLY_REACTIVE, SWITCHED_OFF, customers_of
+from feeders.convert_draws import ONLY_REACTIVE, SWITCHED_OFF, customers_of, idle_customers
+from feeders.convert_levels import EVERYTHING, Extent
 from feeders.convert_network import Converted, Network, below, below_source, finished, one_busbar
 from feeders.convert_pandapower_net import ids, network_of
 from feeders.profiles import envelopes
@@ -83,6 +84,7 @@ def from_pandapower(
     root: str | None = None,
     opened: Sequence[str] = (),
     droop: str | None = None,
+    extent: Extent = EVERYTHING,
     fleet: Fleet | None = None,
     max_attacked: int = 1,
 ) -> Converted:
@@ -101,6 +103,8 @@ def from_pandapower(
         Lines to take as open, so that the feeder is radial.
     droop
         Preset of the inverters in the source (static generators); None: vde4105 or vde4105-small by size.
+    extent
+        How far down it goes.
     fleet
         Synthetic inverters to add.
     max_attacked
@@ -115,14 +119,16 @@ def from_pandapower(
     """
     network = network_of(net)
     names = ids(net.bus, "bus")
-    part = below(network, _root(net, network, names, root), opened)
+    part = below(network, _root(net, network, names, root), opened, extent)
     source = _Source(net, names, {i for i, bus in names.items() if bus in part.inside}, part.changes)
     customers = _customers(source, droop)
     volt = network.nominal[part.busbar]
-    more, drawn = customers_of(part.draws, volt, droop, part.changes, set(source.power))
+    more, drawn = customers_of(part.draws, network.nominal, droop, part.changes, set(source.power))
     customers = with_meters([*customers, *more])
     if fleet is not None:
         customers = _with_fleet(customers, fleet, part.changes)
+    idle, taken = idle_customers(part.draws, {row.customer for row in customers})
+    customers += idle
     load = sum(row.load_kw for row in customers)
     meta = FeederMeta(
         format=1,
@@ -136,7 +142,7 @@ def from_pandapower(
         monitor=MonitorDefaults(max_attacked=max_attacked),
     )
     tables = FeederTables(meta, tuple(part.lines), tuple(customers))
-    return finished(network, part, tables, {**source.power, **drawn})
+    return finished(network, part, tables, source.power | drawn | taken)
 
 
 def _root(net: Any, network: Network, names: dict[int, str], wanted: str | None) -> str:

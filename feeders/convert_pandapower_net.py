@@ -18,7 +18,8 @@ from feeders.convert_changes import WHOLE, Change
 from feeders.convert_customers import rounded
 from feeders.convert_draws import Draw
 from feeders.convert_lines import ALL, by_sequence, capacitor, charging_cells, open_end
-from feeders.convert_network import Coupling, Network
+from feeders.convert_network import Network
+from feeders.convert_two_ports import TwoPort, coupling_of
 from feeders.schema import LineRow
 from gridsec.arrays import Phasors
 from gridsec.errors import FeederInvalid
@@ -325,6 +326,7 @@ def _flow(solved: Any, table: str, index: int, side: str) -> Phasors:
 
 
 def _transformers(net: Any, solved: Any, buses: dict[int, str], network: Network) -> None:
+    ports = _two_ports(net)
     for table, sides in SIDES.items():
         names = ids(net[table], table)
         opened = _opened(net, "t" if table == "trafo" else "t3")
@@ -335,13 +337,60 @@ def _transformers(net: Any, solved: Any, buses: dict[int, str], network: Network
             if not row.in_service or len(ends) < 2:
                 network.changes.append(Change(label, WHOLE, "left out", "switched off in the source"))
                 continue
-            network.couplings.append(
-                Coupling(
-                    label,
-                    tuple(buses[bus] for _, bus in ends),
-                    tuple(_known_flow(solved, table, int(i), side) for side, _ in ends),
-                )
-            )
+            joined = tuple(buses[bus] for _, bus in ends)
+            flows = tuple(_known_flow(solved, table, int(i), side) for side, _ in ends)
+            port, limit = (ports.get(int(i)), _rating(row)) if table == "trafo" else (None, math.nan)
+            made = coupling_of(label, joined, flows, port=port, rating_a=limit, network=network)
+            network.couplings.append(made)
+
+
+def _rating(row: Any) -> float:
+    """Rated current of a transformer's lower side, A."""
+    return float(row.sn_mva) * float(row.parallel) * 1e3 / (math.sqrt(3.0) * float(row.vn_lv_kv))
+
+
+def _two_ports(net: Any) -> dict[int, TwoPort]:
+    """Every transformer of two windings alone: between a source and nothing, and between a source and a load.
+
+    A net without a balanced power flow has none, and neither has one whose tables pandapower does not take.
+    """
+    import pandapower
+
+    own = net.trafo[net.trafo.in_service.astype(bool)]
+    if unbalanced(net) or not len(own):
+        return {}
+    bench = pandapower.create_empty_network(f_hz=float(net.f_hz), sn_mva=float(net.sn_mva))
+    for k, ends in enumerate(zip(own.hv_bus, own.lv_bus, strict=True)):
+        for end in ends:
+            pandapower.create_bus(bench, float(net.bus.at[end, "vn_kv"]))
+        pandapower.create_ext_grid(bench, 2 * k)
+        pandapower.create_shunt(bench, 2 * k + 1, 0.0, float(own.sn_mva.iloc[k]), in_service=False)
+    bench.trafo = own.assign(hv_bus=2 * np.arange(len(own)), lv_bus=2 * np.arange(len(own)) + 1)
+    if "trafo_characteristic_table" in net:
+        bench.trafo_characteristic_table = net.trafo_characteristic_table
+    try:
+        found = [_alone(bench, loaded=loaded) for loaded in (False, True)]
+    except Exception:  # noqa: BLE001  # whatever the foreign solver raises on foreign tables
+        return {}
+    return {
+        int(i): TwoPort.measured(idle[:2], loaded) for i, idle, loaded in zip(own.index, *found, strict=True)
+    }
+
+
+def _alone(bench: Any, *, loaded: bool) -> list[tuple[complex, complex, complex]]:
+    """Voltages at both ends of each transformer, V, and the current out of it, A."""
+    import pandapower
+
+    bench.shunt["in_service"] = loaded
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        pandapower.runpp(bench, numba=False, init="dc", calculate_voltage_angles=True, tolerance_mva=1e-11)
+    rated = bench.bus.vn_kv.to_numpy() * 1e3 / math.sqrt(3.0)
+    angle = np.deg2rad(bench.res_bus.va_degree.to_numpy())
+    v = (rated * bench.res_bus.vm_pu.to_numpy() * np.exp(1j * angle)).reshape(-1, 2)
+    power = 1e6 * (bench.res_trafo.p_lv_mw + 1j * bench.res_trafo.q_lv_mvar).to_numpy()
+    current = -np.conj(power / 3.0 / v[:, 1])
+    return [(complex(a), complex(b), complex(i)) for (a, b), i in zip(v, current, strict=True)]
 
 
 def _known_flow(solved: Any, table: str, index: int, side: str) -> Phasors:

@@ -16,8 +16,9 @@ from power_grid_model.validation import validate_input_data
 from feeders.convert_changes import WHOLE, Change
 from feeders.convert_customers import rounded
 from feeders.convert_draws import SWITCHED_OFF, Draw
+from feeders.convert_graph import Coupling
 from feeders.convert_lines import ALL, by_sequence, capacitor, charging_cells, line_row, open_end
-from feeders.convert_network import Coupling, Network
+from feeders.convert_network import Network
 from feeders.records import some
 from feeders.schema import LineRow
 from gridsec.arrays import Floats, Phasors

@@ -6,6 +6,7 @@ stated on the way from the busbar; a line that closes a loop must find it at bot
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Final
 
@@ -47,18 +48,28 @@ def nominal_volts(found: Tree, edges: Sequence[Edge | LineRow], volt: float) -> 
     volt
         That of the busbar, V.
     """
-    nominal = [volt]
-    for k, above in zip(found.branch, found.parent, strict=True):
-        line = edges[k]
-        changes = line.to_volt is not None and found.group[line.from_bus] == above
-        nominal.append(line.to_volt if changes and line.to_volt is not None else nominal[above])
-    return nominal
+    near: dict[int, list[tuple[int, float | None]]] = defaultdict(list)
+    for line in edges:
+        if line.from_bus in found.group:
+            here, there = found.group[line.from_bus], found.group[line.to_bus]
+            near[here].append((there, line.to_volt))
+            if line.to_volt is None:
+                near[there].append((here, None))
+    nominal, order = {0: volt}, [0]
+    for bus in order:
+        for other, changed in near[bus]:
+            if other not in nominal:
+                nominal[other] = nominal[bus] if changed is None else changed
+                order.append(other)
+    for k, above in enumerate(found.parent):  # only what `problems` tells is not known by now
+        nominal.setdefault(k + 1, nominal[above])
+    return [nominal[k] for k in range(len(found.buses))]
 
 
 def problems(found: Tree, edges: Sequence[Edge | LineRow], volt: float) -> Iterator[tuple[int, str]]:
     """Yield every line whose `to_volt` cannot be, with what is wrong; arguments as of `nominal_volts`."""
     nominal = nominal_volts(found, edges, volt)
-    above, ties = dict(zip(found.branch, found.parent, strict=True)), set(found.ties)
+    above = dict(zip(found.branch, found.parent, strict=True))
     for k, line in enumerate(edges):
         if line.from_bus not in found.group:
             continue
@@ -66,9 +77,11 @@ def problems(found: Tree, edges: Sequence[Edge | LineRow], volt: float) -> Itera
         told = nominal[here] if line.to_volt is None else line.to_volt
         if here == there and not same_level(told, nominal[here]):
             yield k, f"{told:g} on a line without impedance; expected the transformer's r_ohm and x_ohm"
-        elif line.to_volt is not None and above.get(k) == there:
+        elif same_level(told, nominal[there]):
+            continue
+        elif above.get(k) == there:
             yield k, f"{told:g}, but {line.to_bus!r} is on the side of the busbar; {_TURN}"
-        elif k in ties and not same_level(told, nominal[there]):
+        else:
             yield k, f"{told:g} V at {line.to_bus!r}, {nominal[there]:g} V around the loop; expected the same"
 
 

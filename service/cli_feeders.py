@@ -165,6 +165,10 @@ def convert(
         list[str] | None, typer.Option("--open", help="A line to take as open; may be repeated.")
     ] = None,
     meshed: Annotated[bool, typer.Option("--meshed", help="Keep loops closed.")] = False,
+    one_voltage: Annotated[
+        bool,
+        typer.Option("--one-voltage", help="End at transformers to another voltage: each is a customer."),
+    ] = False,
 ) -> None:
     """Convert another tool's network into a feeder's folder, and check it by AC power flow against that tool.
 
@@ -172,7 +176,16 @@ def convert(
     """
     from feeders.convert import convert as run
 
-    done = run(source, folder, root=root, name=name, droop=droop, opened=opened or (), meshed=meshed)
+    done = run(
+        source,
+        folder,
+        root=root,
+        name=name,
+        droop=droop,
+        opened=opened or (),
+        meshed=meshed,
+        one_voltage=one_voltage,
+    )
     _show_changes(done)
     out.print(f"[green]{escape(str(folder))} written[/]")
     show_check(done)

@@ -14,6 +14,7 @@ from pandapower import networks
 from feeders.convert import check_against_source, convert
 from feeders.convert_changes import Change, changes_csv, sentences
 from feeders.convert_check import BALANCED_PU, UNBALANCED_PU, SourceCheck, compare
+from feeders.convert_levels import Extent
 from feeders.convert_network import feeder_of
 from feeders.convert_pandapower import from_pandapower
 from feeders.convert_pgm import read_pgm
@@ -65,7 +66,7 @@ def village(*, closed: bool = False) -> Any:
 
 
 def test_transformer_capacitor_and_open_cable_are_carried_over() -> None:
-    converted = from_pandapower(village(), "village", root="root")
+    converted = from_pandapower(village(), "village", root="root", extent=Extent(one_voltage=True))
     assert converted.state is not None
     check = compare(converted.state, converted.tables)
     assert check.largest_pu < BALANCED_PU
@@ -206,6 +207,9 @@ def test_a_source_without_solution_is_converted_and_not_checked(tmp_path: Path) 
     done = convert(str(path), tmp_path / "x", root="root")
     assert done.check is None
     assert "own power flow fails" in done.unchecked
+    said = "\n".join(done.notes)
+    assert "no-load current of transformer T1; without the source's power flow not known" in said
+    done = convert(str(path), tmp_path / "y", root="root", one_voltage=True)
     assert "load side of transformer T1; 2 buses; what flows there is not known" in "\n".join(done.notes)
     with pytest.raises(GridsecError, match="own power flow fails"):
         check_against_source(str(path), tmp_path / "x", root="root")
