@@ -157,7 +157,6 @@ def campaign(
         "rows": ROWS,
         "digest": site.digest,
         "plan": plan.subject,
-        "versions": used,
     }
     kept = Journal(journal, subject)
     todo = [scene for scene in range(plan.scenes) if _key(scene) not in kept]

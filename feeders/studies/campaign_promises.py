@@ -13,7 +13,7 @@ from feeders.lies import Trick
 from feeders.load import from_tables
 from feeders.schema import FeederTables
 from feeders.studies.campaign_plan import Kind, Promise
-from feeders.studies.campaign_run import Here, Runner, versions
+from feeders.studies.campaign_run import Here, Runner
 from feeders.studies.detectable import Detectable, monitor_rule
 from feeders.studies.journal import Journal, Progress
 from feeders.studies.operating import SHARE, volts_of_lie
@@ -129,7 +129,6 @@ def rehearse_everywhere(
         "trials": [trials, piece],
         "seed": seed,
         "share": share,
-        "versions": versions(),
     }
     kept = Journal(journal, subject)
     sizes = [min(piece, trials - begin) for begin in range(0, trials, piece)]

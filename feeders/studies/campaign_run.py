@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import platform
 import signal
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Sequence
@@ -16,12 +15,12 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.metadata import version
 from threading import Thread
 from typing import Any, Final, Protocol
 
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]  # has no stubs
 
+from feeders.studies.journal import versions
 from gridsec.errors import GridsecError
 
 __all__ = ["ClusterUnusable", "Dask", "Here", "Processes", "Runner", "WorkerLost", "agree", "versions"]
@@ -46,12 +45,6 @@ class Runner(Protocol):
 
     def run(self, work: Work, pieces: Sequence[int]) -> Made:
         """Work on all pieces; yield each with its result when it is done."""
-
-
-def versions() -> dict[str, str]:
-    """Versions of everything that numbers depend on."""
-    found = {name: version(name) for name in ("gridsec", "numpy", "scipy", "power-grid-model")}
-    return {"python": platform.python_version(), **found}
 
 
 @dataclass(frozen=True, slots=True)

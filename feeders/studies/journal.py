@@ -1,26 +1,34 @@
 """What a long study has done so far, in a file: interrupted at half, it goes on where it was.
 
-JSON lines: first what is studied, then one line for each piece of work that is done. A line that was cut off
-while it was written is done again.
+JSON lines: first what is studied and with which versions, then one line for each piece of work that is done. A
+line that was cut off while it was written is done again.
 """
 
 from __future__ import annotations
 
 import json
+import platform
 from collections.abc import Callable, Iterable, Mapping
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from gridsec.errors import GridsecError
 
-__all__ = ["Journal", "OtherStudy", "Progress", "worked"]
+__all__ = ["Journal", "OtherStudy", "Progress", "versions", "worked"]
 
 Progress = Callable[[int, int], None]
 """Told how many pieces of work are done, and of how many."""
 
 
 class OtherStudy(GridsecError):
-    """A journal belongs to another study, another feeder or other arguments, or is no journal."""
+    """A journal belongs to another study, feeder, version or to other arguments, or is no journal."""
+
+
+def versions() -> dict[str, str]:
+    """Versions of everything that numbers depend on."""
+    found = {name: version(name) for name in ("gridsec", "numpy", "scipy", "power-grid-model")}
+    return {"python": platform.python_version(), **found}
 
 
 class Journal:
@@ -44,13 +52,13 @@ class Journal:
         self._done: dict[str, Any] = {}
         if path is None:
             return
-        head = json.dumps(subject, sort_keys=True)
+        head = json.dumps({**subject, "versions": versions()}, sort_keys=True)
         if not path.exists() or not path.stat().st_size:
             path.write_text(head + "\n", encoding="utf-8")
             return
         lines = path.read_text(encoding="utf-8", errors="replace").split("\n")
         if lines[0] != head:
-            raise OtherStudy(f"{path}: not the journal of this study; it begins with {lines[0][:200]!r}")
+            raise OtherStudy(f"{path}: {_other(lines[0], head)}")
         try:
             self._done = dict(json.loads(line) for line in lines[1:-1])
         except (ValueError, TypeError) as error:
@@ -91,6 +99,18 @@ class Journal:
         if self._path is not None:
             with self._path.open("a", encoding="utf-8") as file:
                 file.write(json.dumps([key, value]) + "\n")
+
+
+def _other(found: str, expected: str) -> str:
+    """In what a journal's first line is not the one expected."""
+    try:
+        theirs, ours = json.loads(found), json.loads(expected)
+        if {**theirs, "versions": ours["versions"]} == ours:
+            made = ", ".join(f"{name} {each}" for name, each in theirs.get("versions", {}).items())
+            return f"written with other versions ({made or 'which, it does not say'}); begin a new journal"
+    except (ValueError, TypeError, AttributeError):
+        pass
+    return f"not the journal of this study; it begins with {found[:200]!r}"
 
 
 def worked(

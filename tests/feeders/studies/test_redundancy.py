@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -62,9 +63,28 @@ def test_an_interrupted_study_goes_on_and_does_nothing_twice(tmp_path: Path) -> 
 def test_the_journal_of_another_study_is_refused(tmp_path: Path) -> None:
     journal = tmp_path / "journal.jsonl"
     Journal(journal, {"study": "another"})
+    before = journal.read_text(encoding="utf-8")
     with pytest.raises(OtherStudy, match="not the journal of this study"):
         redundancy(RURAL, journal=journal)
-    assert journal.read_text(encoding="utf-8") == '{"study": "another"}\n'
+    assert journal.read_text(encoding="utf-8") == before
+
+
+def test_the_journal_of_another_version_is_refused(tmp_path: Path) -> None:
+    journal = tmp_path / "journal.jsonl"
+    Journal(journal, {"study": "any"})
+    head = json.loads(journal.read_text(encoding="utf-8"))
+    for changed, told in (
+        ({"versions": head["versions"] | {"numpy": "1.0"}}, r"written with other versions \(.*numpy 1\.0"),
+        ({"versions": {}}, "which, it does not say"),
+        ({"study": "another", "versions": {}}, "not the journal of this study"),
+    ):
+        journal.write_text(json.dumps(head | changed, sort_keys=True) + "\n", encoding="utf-8")
+        with pytest.raises(OtherStudy, match=told):
+            Journal(journal, {"study": "any"})
+    for first in ("[1]", "no journal", '{"study": "any"}'):
+        journal.write_text(first + "\n", encoding="utf-8")
+        with pytest.raises(OtherStudy):
+            Journal(journal, {"study": "any"})
 
 
 def test_unknown_names_are_refused() -> None:
