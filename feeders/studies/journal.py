@@ -1,7 +1,7 @@
 """What a long study has done so far, in a file: interrupted at half, it goes on where it was.
 
-JSON lines: first what is studied and with which versions, then one line for each piece of work that is done. A
-line that was cut off while it was written is done again.
+JSON lines: first what is studied and with which versions, then one line for each piece of work that is done.
+A line that was cut off while it was written is done again.
 """
 
 from __future__ import annotations
