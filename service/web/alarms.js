@@ -1,6 +1,6 @@
 // The alarm list: loaded once, then kept right by the event stream; answers go back with a name.
 
-import { byId, clock, duration, el, getJson, isKnown, signed, volt } from "./dom.js";
+import { byId, clock, duration, el, getJson, isKnown, settle, signed, volt } from "./dom.js";
 
 const API = "/api/v1/alarms";
 const KIND = {
@@ -15,6 +15,7 @@ const PAGE = 50;
 export class Alarms {
   constructor({ onPick, onLink }) {
     this.alarms = new Map();
+    this.items = new Map();
     this.onPick = onPick;
     this.onLink = onLink;
     this.feeder = null;
@@ -101,8 +102,15 @@ export class Alarms {
     byId("alarm-none").hidden = list.length > 0;
     byId("alarm-more").hidden = !this.next;
     const focused = document.activeElement?.closest?.("[data-alarm]")?.dataset.alarm;
-    byId("alarm-list").replaceChildren(...list.map((alarm) => this.item(alarm)));
-    if (focused) byId("alarm-list").querySelector(`[data-alarm="${CSS.escape(focused)}"] button`)?.focus();
+    // What has not changed stays where it is: nobody's click may fall between two copies of a button.
+    const before = this.items;
+    this.items = new Map(list.map((alarm) => {
+      const said = JSON.stringify(alarm);
+      const old = before.get(alarm.id);
+      return [alarm.id, old?.said === said ? old : { said, node: this.item(alarm) }];
+    }));
+    settle(byId("alarm-list"), [...this.items.values()].map(({ node }) => node));
+    if (focused && !byId("alarm-list").contains(document.activeElement)) byId("alarm-list").querySelector(`[data-alarm="${CSS.escape(focused)}"] button`)?.focus();
   }
 
   item(alarm) {

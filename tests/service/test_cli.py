@@ -101,10 +101,14 @@ def serving(folder: Path, *options: str) -> Iterator[tuple[subprocess.Popen[str]
                 pipe.close()
 
 
+# An open stream would keep a service that waits for it forever; a busy machine takes some seconds.
+SOON_S = 15.0
+
+
 def ended(child: subprocess.Popen[str]) -> float:
     """Wait for the end; return how long it took, s."""
     begin = time.monotonic()
-    child.wait(timeout=10.0)
+    child.wait(timeout=30.0)
     return time.monotonic() - begin
 
 
@@ -294,7 +298,7 @@ def test_a_signal_ends_the_service_in_time_even_with_a_stream_open(number: int, 
         ):
             assert stream.status_code == 200
             child.send_signal(number)
-            assert ended(child) < 3.0
+            assert ended(child) < SOON_S
         assert child.returncode == 0
         assert "Traceback" not in (tmp_path / "log").read_text()
 
@@ -303,7 +307,7 @@ def test_the_service_of_a_starter_that_has_gone_ends(tmp_path: Path) -> None:
     with serving(tmp_path, "--until-eof") as (child, _url, _zenoh):
         assert child.stdin is not None
         child.stdin.close()
-        assert ended(child) < 3.0
+        assert ended(child) < SOON_S
         assert child.returncode == 0
 
 

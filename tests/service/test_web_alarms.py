@@ -105,6 +105,21 @@ def test_the_second_operator_hears_who_was_first(site: Site) -> None:
     expect(two.locator("#ack-error")).to_contain_text("already been acknowledged by Ada")
 
 
+def test_what_has_not_changed_stays_where_it_is(site: Site) -> None:
+    """Else a click whose halves fall on two copies of a button is none."""
+    site.tick(T0, 4, lies={"H3": 9.0})
+    page = site.open()
+    button = page.locator("button.ack")
+    button.focus()
+    button.evaluate("(node) => { node.dataset.mine = 'yes'; }")
+    site.tick(T0 + 4, 4, lies={"H3": 9.0, "H5": 9.0})
+    expect(page.locator(".alarm")).to_have_count(2)
+    expect(page.locator(".alarm").first).to_contain_text("H5")
+    kept = page.locator('[data-mine="yes"]')
+    expect(kept).to_have_count(1)
+    expect(kept).to_be_focused()
+
+
 def test_filters(site: Site, village: type) -> None:
     town = village("town", 4)
     site.service.villages["town"] = town
