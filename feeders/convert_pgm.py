@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from power_grid_model import CalculationMethod, PowerGridModel
+from power_grid_model import (
+    CalculationMethod,
+    ComponentType,
+    DatasetType,
+    PowerGridModel,
+    WindingType,
+    initialize_array,
+)
 from power_grid_model.utils import json_deserialize  # type: ignore[attr-defined]  # documented, but not re-exported
 from power_grid_model.validation import validate_input_data
 
@@ -19,6 +26,8 @@ from feeders.convert_draws import SWITCHED_OFF, Draw
 from feeders.convert_graph import Coupling
 from feeders.convert_lines import ALL, by_sequence, capacitor, charging_cells, line_row, open_end
 from feeders.convert_network import Network
+from feeders.convert_two_ports import TwoPort, coupling_of
+from feeders.levels import same_level
 from feeders.records import some
 from feeders.schema import LineRow
 from gridsec.arrays import Floats, Phasors
@@ -43,6 +52,9 @@ CARRIED: Final = {
 STATUS: Final = ("status", "from_status", "to_status", "status_1", "status_2", "status_3")
 TOLERANCES: Final = (1e-11, 1e-9, 1e-7)
 """Largest voltage corrections of the last Newton step, pu; links, almost short circuits, limit them."""
+STIFF_VA: Final = 1e20
+"""Short-circuit power of a source in front of one transformer."""
+
 TURN: Final = np.exp(-2j * np.pi / 3.0 * np.arange(3))
 
 Tables = dict[str, Any]
@@ -90,7 +102,7 @@ def read_pgm(path: Path) -> Network:
     network.sources = [str(row["node"]) for row in _rows(tables, "source") if row["status"]]
     _lines(tables, network)
     _asymmetric_lines(tables, network)
-    _couplings(tables, solved, network)
+    _couplings(tables, solved, network, symmetric=symmetric)
     _draws(tables, network)
     _shunts(tables, solved, network)
     _rest(tables, network)
@@ -232,11 +244,12 @@ def _capacitances(row: Any) -> Floats:
     return np.asarray(OMEGA * c)
 
 
-def _couplings(tables: Tables, solved: Tables, network: Network) -> None:
+def _couplings(tables: Tables, solved: Tables, network: Network, *, symmetric: bool) -> None:
+    ports = _two_ports(tables, symmetric)
     for kind, sides in COUPLINGS.items():
         for row, flow in zip(_rows(tables, kind), _rows(solved, kind), strict=True):
             label = f"{kind} {row['id']}"
-            if kind == "generic_branch" and _plain(row):
+            if kind == "generic_branch" and _plain(row, network.nominal):
                 network.lines.append(_plain_line(row, label))
                 continue
             on = [bool(row[name]) for name in STATUS[1:3] if name in row.dtype.names] or [
@@ -246,23 +259,86 @@ def _couplings(tables: Tables, solved: Tables, network: Network) -> None:
             if len(joined) < 2:
                 network.changes.append(Change(label, WHOLE, "left out", "switched off in the source"))
                 continue
-            network.couplings.append(
-                Coupling(
-                    label,
-                    tuple(str(row[sides[k][0]]) for k in joined),
-                    tuple(_by_phase(flow[sides[k][1]], flow[sides[k][2]]) for k in joined),
-                    _plain_line(row, label) if kind == "generic_branch" and _regulator(row) else None,
-                )
-            )
+            ends = tuple(str(row[sides[k][0]]) for k in joined)
+            flows = tuple(_by_phase(flow[sides[k][1]], flow[sides[k][2]]) for k in joined)
+            made = Coupling(label, ends, flows)
+            if kind == "generic_branch" and _regulator(row):
+                made = Coupling(label, ends, flows, _plain_line(row, label))
+            elif kind == "transformer":
+                limit = float(row["sn"]) / (3.0**0.5 * float(row["u2"]))
+                port = ports.get(int(row["id"]))
+                made = coupling_of(label, ends, flows, port=port, rating_a=limit, network=network)
+            if made.line is not None and not symmetric:
+                passing = replace(made.line, r0_ohm=made.line.r_ohm, x0_ohm=made.line.x_ohm)
+                made = replace(made, line=passing)
+            network.couplings.append(made)
 
 
-def _plain(row: Any) -> bool:
+def _two_ports(tables: Tables, symmetric: bool) -> dict[int, TwoPort]:
+    """Every transformer alone: between a source and nothing, and between a source and a load.
+
+    In three phases only those that turn no phase and pass the zero sequence as the positive one, with both
+    neutrals solidly grounded.
+    """
+    rows = [row for row in _rows(tables, "transformer") if _closed(row) and (symmetric or _passing(row))]
+    if not rows:
+        return {}
+    rated = {int(row["id"]): float(row["u_rated"]) for row in tables["node"]}
+    count = len(rows)
+    node = initialize_array(DatasetType.input, ComponentType.node, 2 * count)
+    node["id"] = np.arange(2 * count)
+    node["u_rated"] = [rated[int(row[end])] for row in rows for end in ("from_node", "to_node")]
+    transformer = initialize_array(DatasetType.input, ComponentType.transformer, count)
+    for name in set(transformer.dtype.names or ()) & set(rows[0].dtype.names):
+        transformer[name] = [row[name] for row in rows]
+    transformer["from_node"], transformer["to_node"] = 2 * np.arange(count), 2 * np.arange(count) + 1
+    source = initialize_array(DatasetType.input, ComponentType.source, count)
+    load = initialize_array(DatasetType.input, ComponentType.sym_load, count)
+    for table, first, at in ((transformer, 2, 0), (source, 3, 0), (load, 4, 1)):
+        table["id"] = first * count + np.arange(count)
+        if table is not transformer:
+            table["node"], table["status"] = 2 * np.arange(count) + at, 1
+    source["u_ref"], source["sk"] = 1.0, STIFF_VA
+    load["type"], load["q_specified"] = 1, 0.0
+    bench = {
+        ComponentType.node: node,
+        ComponentType.transformer: transformer,
+        ComponentType.source: source,
+        ComponentType.sym_load: load,
+    }
+    found = []
+    for share in (0.0, 1.0):
+        load["p_specified"] = share * transformer["sn"]
+        solved = PowerGridModel(bench).calculate_power_flow(
+            symmetric=True, error_tolerance=TOLERANCES[0], calculation_method=CalculationMethod.linear
+        )
+        nodes = solved[ComponentType.node]
+        v = (nodes["u_pu"] * np.exp(1j * nodes["u_angle"]) * node["u_rated"] / 3.0**0.5).reshape(-1, 2)
+        power = solved[ComponentType.sym_load]
+        current = np.conj((power["p"] + 1j * power["q"]) / 3.0 / v[:, 1])
+        found.append([(complex(a), complex(b), complex(i)) for (a, b), i in zip(v, current, strict=True)])
+    return {
+        int(row["id"]): TwoPort.measured(idle[:2], loaded)
+        for row, idle, loaded in zip(rows, *found, strict=True)
+    }
+
+
+def _passing(row: Any) -> bool:
+    grounding = [row[f"{part}_grounding_{end}"] for part in "rx" for end in ("from", "to")]
+    neutrals = row["winding_from"] == row["winding_to"] == WindingType.wye_n
+    return bool(neutrals and row["clock"] % 12 == 0 and not np.nan_to_num(grounding).any())
+
+
+def _plain(row: Any, nominal: Mapping[str, float]) -> bool:
+    if not same_level(nominal[str(row["from_node"])], nominal[str(row["to_node"])]):
+        return False
     neutral = all(np.isnan(row[name]) or row[name] == value for name, value in (("k", 1.0), ("theta", 0.0)))
     return bool(neutral and not row["g1"] > 0)
 
 
 def _regulator(row: Any) -> bool:
-    return bool(not row["theta"] and not row["g1"] > 0 and min(row["r1"], row["x1"]) >= 0)
+    passive = not row["g1"] > 0 and not row["b1"] < 0 and min(row["r1"], row["x1"]) >= 0
+    return bool(not row["theta"] and passive)
 
 
 def _plain_line(row: Any, label: str) -> LineRow:
