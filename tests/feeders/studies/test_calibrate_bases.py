@@ -64,6 +64,12 @@ def headed(tables: FeederTables) -> FeederTables:
     return replace(ring, lines=lines)
 
 
+def stepped(tables: FeederTables) -> FeederTables:
+    """The first line is a transformer from 6.35 kV, 2 % above its nominal ratio; so is the village."""
+    lines = tuple(replace(row, to_volt=230.0, tap=0.98) if row.line == "l1" else row for row in tables.lines)
+    return replace(tables, meta=replace(tables.meta, voltage_volt=6350.0), lines=lines)
+
+
 def found_in(
     folder: Path, truth: FeederTables, files: FeederTables, seed: int, lies: tuple[Attack, ...] = ()
 ) -> Calibrate:
@@ -88,7 +94,7 @@ def test_planted_errors_are_found_and_nothing_else(make: Change, tmp_path: Path)
     assert found.meters["bias_percent"].abs().max() < 1.5
 
 
-@pytest.mark.parametrize("make", [tapped, headed])
+@pytest.mark.parametrize("make", [tapped, headed, stepped])
 def test_biases_are_found_and_files_that_are_right_are_left(make: Change, tmp_path: Path) -> None:
     truth = make(plain())
     half = tuple(Bias(np.array([k]), START, np.inf, np.array([b])) for k, b in ((2, 0.005), (4, -0.005)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -192,9 +193,18 @@ def in_phases(tables: FeederTables) -> FeederTables:
     return replace(tables, lines=lines, customers=tuple(customers))
 
 
-@pytest.mark.parametrize("phased", [False, True], ids=["balanced", "phases"])
-def test_a_tap_at_the_head_is_another_voltage_of_the_busbar(phased: bool) -> None:
-    tapped, plain = (in_phases(t) if phased else t for t in (headed(0.96), headed(1.0)))
+def stepped(tables: FeederTables) -> FeederTables:
+    """The first line is a transformer from 6.35 kV; the nominal voltage behind it is that of before."""
+    lines = (replace(tables.lines[0], to_volt=tables.meta.voltage_volt), *tables.lines[1:])
+    return replace(tables, meta=replace(tables.meta, voltage_volt=6350.0), lines=lines)
+
+
+@pytest.mark.parametrize("change", [lambda tables: tables, in_phases, stepped])
+def test_a_tap_at_the_head_is_another_voltage_of_the_busbar(
+    change: Callable[[FeederTables], FeederTables],
+) -> None:
+    tapped = change(headed(0.96))
+    plain = headed(1.0) if change is stepped else change(headed(1.0))
     raised = replace(OPTIONS, v0_low=OPTIONS.v0_low / 0.96, v0_high=OPTIONS.v0_high / 0.96)
     one, other = droop(from_tables(tapped), OPTIONS), droop(from_tables(plain), raised)
     assert (one.verdict, one.rest, one.always) == (other.verdict, other.rest, other.always)
