@@ -100,7 +100,8 @@ def _told(each: Coupling, line: LineRow) -> Change:
 
 def _leads_on(network: Network, rows: Iterable[LineRow], each: Coupling, busbar: str) -> bool:
     """Whether lines begin behind a transformer: without any, its customers are one load at its terminals."""
-    others = [*rows, *as_rows(other for other in network.couplings if other is not each)]
+    beside = set(each.buses)
+    others = [*rows, *as_rows(other for other in network.couplings if set(other.buses) != beside)]
     ways = [reached(bus, others) for bus in each.buses]
     behind = next((way for way in ways if busbar not in way), None)
     if behind is None:  # it closes a loop

@@ -303,8 +303,8 @@ def _take(dss: Any, each: _Element, network: Network, problems: list[str]) -> No
     elif each.kind == "capacitor":
         problems.append(f"{label} is in series between {each.buses[0]} and {each.buses[1]}; expected a shunt")
     elif each.kind in COUPLINGS:
-        line = _regulator(dss, each, network)
-        network.couplings.append(Coupling(label, each.buses, each.power_kva, line))
+        line, idle = _regulator(dss, each, network)
+        network.couplings.append(Coupling(label, each.buses, each.power_kva, line, idle))
     elif each.kind in LOADS | GENERATORS:
         _draw(dss, each, network)
     elif each.kind in CONTROLS:
@@ -315,17 +315,17 @@ def _take(dss: Any, each: _Element, network: Network, problems: list[str]) -> No
         network.of_bus.append((each.buses[0], change))
 
 
-def _regulator(dss: Any, each: _Element, network: Network) -> LineRow | None:
+def _regulator(dss: Any, each: _Element, network: Network) -> tuple[LineRow | None, Draw | None]:
     """A transformer that is a line with a tap: two ends of the same phases, each phase apart, none turned.
 
     With the admittance y behind a ratio t its admittances are ``y / t^2``, ``-y / t`` and, at the far end, y
-    beside what flows into it without load.
+    beside what flows into it without load, which is a draw there.
     """
     ends = [sorted((node, k) for k, node in enumerate(nodes) if node > 0) for nodes in each.nodes]
     nodes = [node for node, _ in ends[0]]
     alike = each.kind == "transformer" and len(ends) == 2 and nodes == [node for node, _ in ends[-1]]
     if not (alike and each.closed and nodes and len(set(nodes)) == len(nodes) and nodes[-1] <= PHASES):
-        return None
+        return None, None
     whole, count = _yprim(dss, each), len(nodes)
     order = [k for _, k in ends[0]] + [len(each.nodes[0]) + k for _, k in ends[1]]
     blocks = whole[np.ix_(order, order)].reshape(2, count, 2, count)
@@ -334,7 +334,7 @@ def _regulator(dss: Any, each: _Element, network: Network) -> LineRow | None:
         np.abs(blocks[i, :, j] - np.diag(np.diagonal(blocks[i, :, j]))).max() for i in (0, 1) for j in (0, 1)
     )
     if crossed > APART * np.abs(whole).max() or not near.all() or not across.all():
-        return None
+        return None, None
     ratio = -across / near
     series = -1.0 / (ratio * across)
     if (
@@ -342,13 +342,8 @@ def _regulator(dss: Any, each: _Element, network: Network) -> LineRow | None:
         or ratio.real.min() <= 0
         or min(series.real.min(), series.imag.min()) < 0
     ):
-        return None
-    idle = np.abs(far - 1.0 / series).sum() * network.nominal[each.buses[1]] ** 2 / 1000.0
+        return None, None
     label = f"{each.kind} {each.name}"
-    if idle > NO_LOAD * float(dss.Properties.Value("kva")):
-        network.of_bus.append(
-            (each.buses[1], Change(label, "no-load current", "left out", f"{idle:.3g} kVA"))
-        )
     phases = np.array(nodes) - 1
     row = line_row(
         f"{each.kind}.{each.name}",
@@ -359,8 +354,14 @@ def _regulator(dss: Any, each: _Element, network: Network) -> LineRow | None:
         changes=[],
     )
     taps = np.ones(PHASES)
-    taps[phases] = ratio.real
-    return with_taps(row, taps)
+    here, there = (network.nominal[bus] for bus in each.buses)
+    taps[phases] = ratio.real * there / here
+    idle = np.zeros(PHASES, dtype=np.complex128)
+    v = network.volts[each.buses[1]][phases] if network.volts else np.full(count, np.nan)
+    idle[phases] = np.abs(v) ** 2 * np.conj(far - 1.0 / series) / 1e3
+    takes = np.abs(idle).sum() > NO_LOAD * float(dss.Properties.Value("kva"))  # False for NaN
+    draw = Draw(f"{label} no-load", each.buses[1], idle, even=is_even(idle), idle=True) if takes else None
+    return with_taps(row, taps), draw
 
 
 def _is_shunt(each: _Element) -> bool:
