@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -14,6 +16,7 @@ from service.foreign import converted
 from service.tables import write_tables
 
 if TYPE_CHECKING:
+    from feeders.load import Site
     from feeders.studies.droop import DroopOptions, DroopStudy
 
 TITLES = {
@@ -29,69 +32,75 @@ TITLES = {
 """Tables that are printed; all are written with --out."""
 
 
+Preset = Annotated[
+    str | None, typer.Option(help="Equip customers with this preset. [default: the feeder's inverters]")
+]
+Equipped = Annotated[str, typer.Option(help="Whom presets equip: pv (with generation) or all.")]
+Interval = Annotated[
+    float, typer.Option(help="Sampling interval of inverters, s; 0: continuous filters.", min=0.0)
+]
+Dead = Annotated[int, typer.Option(help="Their dead time, whole intervals.", min=0)]
+Busbar = Annotated[tuple[float, float], typer.Option(help="Limits of the busbar's voltage, pu.")]
+Allowed = Annotated[
+    tuple[float, float] | None,
+    typer.Option(help="Allowed voltages, parts of the nominal one. [default: as in the file]"),
+]
+LoadHigh = Annotated[float, typer.Option(help="Largest load, share of the peak.", min=0.0)]
+PvHigh = Annotated[float, typer.Option(help="Largest generation, share of the peak.", min=0.0)]
+Compare = Annotated[
+    list[str] | None, typer.Option(help="A preset to compare; may be repeated. [default: all]")
+]
+Also = Annotated[list[str] | None, typer.Option(help="Compare presets on this feeder too; may be repeated.")]
+TauFactor = Annotated[
+    list[float] | None, typer.Option(help="Factor on all time constants to compare; may be repeated.")
+]
+Hosting = Annotated[bool, typer.Option("--hosting", help="Look for hosting capacities.")]
+HostingPreset = Annotated[
+    list[str] | None,
+    typer.Option(help="Preset of new inverters, or none; may be repeated. [default: none, ieee1547-b]"),
+]
+HostingLoad = Annotated[float, typer.Option(help="Share of their peak that loads draw meanwhile.", min=0.0)]
+HostingAt = Annotated[
+    list[str] | None,
+    typer.Option(help="A customer who gets the generation; may be repeated. [default: as it is]"),
+]
+UnitKw = Annotated[float, typer.Option(help="Generation that comes at random places, kW.")]
+Draws = Annotated[int, typer.Option(help="Random orders of places.", min=0)]
+Seed = Annotated[int, typer.Option(help="Chooses what is random.", min=0)]
+
+
 def droop(
     feeder: Studied = "simbench-lv-rural1",
     *,
-    preset: Annotated[
-        str | None, typer.Option(help="Equip customers with this preset. [default: the feeder's inverters]")
-    ] = None,
-    who: Annotated[str, typer.Option(help="Whom presets equip: pv (with generation) or all.")] = "pv",
-    interval: Annotated[
-        float, typer.Option(help="Sampling interval of inverters, s; 0: continuous filters.", min=0.0)
-    ] = 1.0,
-    dead: Annotated[int, typer.Option(help="Their dead time, whole intervals.", min=0)] = 0,
-    busbar: Annotated[tuple[float, float], typer.Option(help="Limits of the busbar's voltage, pu.")] = (
-        1.0,
-        1.0,
-    ),
-    band: Annotated[
-        tuple[float, float] | None, typer.Option(help="Allowed voltages, pu. [default: as in the file]")
-    ] = None,
-    load_high: Annotated[float, typer.Option(help="Largest load, share of the peak.", min=0.0)] = 1.0,
-    pv_high: Annotated[float, typer.Option(help="Largest generation, share of the peak.", min=0.0)] = 1.0,
-    compare: Annotated[
-        list[str] | None, typer.Option(help="A preset to compare; may be repeated. [default: all]")
-    ] = None,
-    also: Annotated[
-        list[str] | None, typer.Option(help="Compare presets on this feeder too; may be repeated.")
-    ] = None,
-    tau_factor: Annotated[
-        list[float] | None, typer.Option(help="Factor on all time constants to compare; may be repeated.")
-    ] = None,
-    hosting: Annotated[bool, typer.Option("--hosting", help="Look for hosting capacities.")] = False,
-    hosting_preset: Annotated[
-        list[str] | None,
-        typer.Option(help="Preset of new inverters, or none; may be repeated. [default: none, ieee1547-b]"),
-    ] = None,
-    hosting_load: Annotated[
-        float, typer.Option(help="Share of their peak that loads draw meanwhile.", min=0.0)
-    ] = 0.1,
-    at: Annotated[
-        list[str] | None,
-        typer.Option(help="A customer who gets the generation; may be repeated. [default: as it is]"),
-    ] = None,
-    unit_kw: Annotated[float, typer.Option(help="Generation that comes at random places, kW.")] = 5.0,
-    draws: Annotated[int, typer.Option(help="Random orders of places.", min=0)] = 30,
-    seed: Annotated[int, typer.Option(help="Chooses what is random.", min=0)] = 0,
+    preset: Preset = None,
+    who: Equipped = "pv",
+    interval: Interval = 1.0,
+    dead: Dead = 0,
+    busbar: Busbar = (1.0, 1.0),
+    band: Allowed = None,
+    load_high: LoadHigh = 1.0,
+    pv_high: PvHigh = 1.0,
+    compare: Compare = None,
+    also: Also = None,
+    tau_factor: TauFactor = None,
+    hosting: Hosting = False,
+    hosting_preset: HostingPreset = None,
+    hosting_load: HostingLoad = 0.1,
+    at: HostingAt = None,
+    unit_kw: UnitKw = 5.0,
+    draws: Draws = 30,
+    seed: Seed = 0,
     journal: Journal = None,
     out: Out = None,
 ) -> None:
     """Is the volt/VAR fleet stable, with what margins; does it keep the band; how much more is hosted."""
-    import pandas as pd
-
     from feeders.load import load
-    from feeders.studies.droop import DroopOptions, presets_of
-    from feeders.studies.droop import droop as study
+    from feeders.studies.droop import DroopOptions
     from feeders.studies.droop_fleets import Who
-    from gridsec.droop import PRESETS
 
-    _see(who, tuple(Who), "--who")
-    for option, names in (("--preset", [preset or PRESETS[0]]), ("--compare", compare or [])):
-        for name in names:
-            _see(name, PRESETS, option)
     fleets = hosting_preset or ["none", "ieee1547-b"]
-    for name in fleets:
-        _see(name, ("none", *PRESETS), "--hosting-preset")
+    _see([who], tuple(Who), "--who")
+    _see_presets(preset, compare, fleets)
     usual = DroopOptions()
     options = DroopOptions(
         preset=preset,
@@ -114,19 +123,41 @@ def droop(
         draws=draws,
     )
     site, others = load(converted(feeder, out)), [load(converted(name, None)) for name in also or ()]
+    found = _studied(site, others, options, seed, journal)
+    _tell(found, options)
+    write_tables(out, found.tables)
+
+
+def _studied(
+    site: Site, others: Sequence[Site], options: DroopOptions, seed: int, journal: Path | None
+) -> DroopStudy:
+    """The study, with the presets on other feeders below its own."""
+    import pandas as pd
+
+    from feeders.studies.droop import droop as study
+    from feeders.studies.droop import presets_of
+
     with bar("fleets, steps and loads") as tell, said():
         found = study(site, options, seed=seed, journal=journal, progress=tell)
         if others:
             found.tables["presets"] = pd.concat(
                 [found.tables["presets"], presets_of(others, options, seed=seed)], ignore_index=True
             )
-    _tell(found, options)
-    write_tables(out, found.tables)
+    return found
 
 
-def _see(name: str, known: tuple[str, ...], option: str) -> None:
-    if name not in known:
-        raise typer.BadParameter(f"{name!r}: expected one of {', '.join(known)}", param_hint=option)
+def _see_presets(preset: str | None, compare: Sequence[str] | None, hosting: Sequence[str]) -> None:
+    from gridsec.droop import PRESETS
+
+    _see([preset] if preset else [], PRESETS, "--preset")
+    _see(compare or [], PRESETS, "--compare")
+    _see(hosting, ("none", *PRESETS), "--hosting-preset")
+
+
+def _see(names: Sequence[str], known: tuple[str, ...], option: str) -> None:
+    for name in names:
+        if name not in known:
+            raise typer.BadParameter(f"{name!r}: expected one of {', '.join(known)}", param_hint=option)
 
 
 def _tell(found: DroopStudy, options: DroopOptions) -> None:

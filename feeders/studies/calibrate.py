@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -153,7 +153,7 @@ def calibrate(
     Parameters
     ----------
     site
-        The feeder, balanced or of three phases.
+        The feeder, balanced (with loops or without) or of three phases.
     readings
         A recording, a table with its columns, or a Parquet or CSV file.
     risk
@@ -175,41 +175,24 @@ def calibrate(
         If the readings are another feeder's, name unknown meters, lack the busbar, or are too few.
     ValueError
         If there is no such meter, or a number is out of range.
+    FeederInvalid
+        If closed lines form loops in three phases.
     OtherStudy
         If the journal is another study's.
     """
-    if not 0.0 < risk < 1.0:
-        raise ValueError(f"risk is {risk}; it must be between 0 and 1")
-    if not 0.0 < tolerance < LENGTH_SPREAD:
-        raise ValueError(f"tolerance is {tolerance}; it must be between 0 and {LENGTH_SPREAD}")
-    unknown = sorted(set(exclude) - set(site.meter_ids))
-    if unknown:
-        raise ValueError(f"{site.feeder.name} has no meter {', '.join(unknown)}")
+    _check(site, risk, tolerance, exclude)
     given = frames(site, readings)
     kept = Journal(
         journal, _subject(site, given, risk, tolerance) | {"exclude": sorted(exclude), "kinds": sorted(kinds)}
     )
-    state, found = State(site.tables, tuple(exclude)), list[dict[str, Any]]()
-    for step in range(MOST_ERRORS + 1):
-        now = prepare(state, given, tolerance=tolerance, errors=True)
-        said: list[Verdict] = []
 
-        def work(now: Round = now, said: list[Verdict] = said) -> dict[str, Any] | None:
-            said.append(compare(now, given, risk, progress or _quiet, kinds))
-            return _best(now, said[0], risk)
+    def weighed(now: Round) -> Verdict:
+        return compare(now, given, risk, progress or _quiet, kinds)
 
-        row = kept.get(f"error {step}", work)
-        if row is None or step == MOST_ERRORS:
-            break
-        wrong = _read(row["correction"])
-        if wrong.kind is Kind.METER:
-            # What its readings may have been taken for until now is forgotten: all begins again without it.
-            state = State(site.tables, (*state.excluded, *wrong.names))
-            found = [each for each in found if each["correction"]["kind"] == Kind.METER]
-        else:
-            state = state.after(wrong)
-        found.append(row)
-    verdict = said[0] if said else compare(now, given, risk, progress or _quiet, kinds)
+    def fitted(state: State) -> Round:
+        return prepare(state, given, tolerance=tolerance, errors=True)
+
+    now, verdict, found = _searched(State(site.tables, tuple(exclude)), fitted, weighed, risk, kept)
     lines, ids = calibrate_tables.lines(now, tolerance)
     wrongs = [_read(row["correction"]) for row in found]
     rows, sure = calibrate_tables.final(found, wrongs, lines, ids)
@@ -227,6 +210,47 @@ def calibrate(
         proposals=rows,
         corrections=sure,
     )
+
+
+def _check(site: Site | ThreePhaseSite, risk: float, tolerance: float, exclude: Sequence[str]) -> None:
+    if not 0.0 < risk < 1.0:
+        raise ValueError(f"risk is {risk}; it must be between 0 and 1")
+    if not 0.0 < tolerance < LENGTH_SPREAD:
+        raise ValueError(f"tolerance is {tolerance}; it must be between 0 and {LENGTH_SPREAD}")
+    unknown = sorted(set(exclude) - set(site.meter_ids))
+    if unknown:
+        raise ValueError(f"{site.feeder.name} has no meter {', '.join(unknown)}")
+
+
+def _searched(
+    files: State,
+    fitted: Callable[[State], Round],
+    weighed: Callable[[Round], Verdict],
+    risk: float,
+    kept: Journal,
+) -> tuple[Round, Verdict, list[dict[str, Any]]]:
+    """One error after the other, until the readings speak for none; with the last round and what it said."""
+    state, found = files, list[dict[str, Any]]()
+    for step in range(MOST_ERRORS + 1):
+        now = fitted(state)
+        said: list[Verdict] = []
+
+        def work(now: Round = now, said: list[Verdict] = said) -> dict[str, Any] | None:
+            said.append(weighed(now))
+            return _best(now, said[0], risk)
+
+        row = kept.get(f"error {step}", work)
+        if row is None or step == MOST_ERRORS:
+            break
+        wrong = _read(row["correction"])
+        if wrong.kind is Kind.METER:
+            # What its readings may have been taken for until now is forgotten: all begins again without it.
+            state = State(files.tables, (*state.excluded, *wrong.names))
+            found = [each for each in found if each["correction"]["kind"] == Kind.METER]
+        else:
+            state = state.after(wrong)
+        found.append(row)
+    return now, said[0] if said else weighed(now), found
 
 
 def _quiet(done: int, total: int) -> None:
