@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from feeders.load import Site, find, from_tables
-from feeders.load_phases import ThreePhaseSite, three_phase
+from feeders.load_phases import ThreePhaseSite, spanned
 from feeders.studies.bases import line_rows
 from gridsec import phases as three
 from gridsec.arrays import Bools, Floats, Ints, Phasors
 from gridsec.droop import voltage_curve
+from gridsec.errors import FeederInvalid
 from gridsec.feeder import Feeder, bus_voltages, lindistflow
 from gridsec.mesh import MeshedFeeder, impedances
 from gridsec.phases import PHASES, ThreePhaseFeeder, lindist3flow
@@ -100,13 +101,23 @@ def site_of(path_or_name: Path | str) -> Site | ThreePhaseSite:
     Parameters
     ----------
     path_or_name
-        As in `feeders.load.load`, which says what it raises.
+        As in `feeders.load.load`, which says what it raises; closed loops in three phases are invalid, too.
     """
     return _site(find(path_or_name))
 
 
 def _site(tables: FeederTables) -> Site | ThreePhaseSite:
-    return three_phase(tables) if tables.in_phases else from_tables(tables)
+    if not tables.in_phases:
+        return from_tables(tables)
+    site, ties = spanned(tables)
+    if ties.ends.size:
+        raise FeederInvalid(
+            [
+                "lines: closed lines form loops, and in three phases calibration takes radial feeders only: "
+                "in a loop a longer line changes all phases everywhere, which it has no model of"
+            ]
+        )
+    return site
 
 
 def network(tables: FeederTables) -> Network:
@@ -136,7 +147,7 @@ Model = Feeder | MeshedFeeder | ThreePhaseFeeder
 
 
 def _model(site: Site | ThreePhaseSite) -> Model:
-    """A site's feeder; `FeederInvalid` if loops are closed in three phases."""
+    """A site's feeder, which in three phases is a tree."""
     if isinstance(site.feeder, MeshedFeeder):
         return site.feeder
     return site.tree if isinstance(site, Site) else site.feeder
