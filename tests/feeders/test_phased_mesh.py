@@ -357,5 +357,5 @@ def test_studies_take_lines_in_parallel_as_one() -> None:
     ids=["calibrate", "tree", "balanced"],
 )
 def test_what_takes_radial_feeders_says_so(study: Callable[[Site], object]) -> None:
-    with pytest.raises(FeederInvalid, match="closed lines form loops, and .*takes radial feeders only"):
+    with pytest.raises(FeederInvalid, match=r"closed lines form loops, and .*takes radial feeders only"):
         study(ring())
