@@ -156,7 +156,7 @@ def _picture(site: Site, customers: pd.DataFrame, liars: int) -> Finding:
         f" (at {_extreme(customers, 'customer', 'error', smallest=True)}) to ",
         most(customers, name, "error", "V", side=Side.ABOVE),
         f" (at {_extreme(customers, 'customer', 'error')}), honest errors included. "
-        f"Nominal voltage is {told(site.nominal_volt)}.",
+        f"Nominal voltage is {told(site.nominal_volt)}{_percent(site)}.",
     )
     if not all(math.isfinite(v) for v in customers["error"]):
         return Finding(Standing.OPEN, (("No bound of the error is proved for every customer.",),))
@@ -166,6 +166,12 @@ def _picture(site: Site, customers: pd.DataFrame, liars: int) -> Finding:
         " apart can fit to the same readings.",
     )
     return Finding(Standing.PROVED, (lead, whoever))
+
+
+def _percent(site: Site) -> str:
+    """Where there are several, what 1 % of each is: volts of different levels do not compare."""
+    levels = dict.fromkeys(site.nominal_volt.tolist())
+    return f"; 1 % is {' and '.join(f'{0.01 * volt:.1f} V' for volt in levels)}" if len(levels) > 1 else ""
 
 
 def _extreme(table: pd.DataFrame, who: str, column: str, *, smallest: bool = False) -> str:

@@ -15,9 +15,12 @@ from playwright.sync_api import Page, expect
 
 from benchmarks.mesh import baran_wu
 from feeders.load import Site as FeederSite
-from feeders.load import load, names
-from gridsec.online import Cause
+from feeders.load import from_tables, load, names
+from gridsec.online import Cause, Decision
+from service.align import Tick
 from service.describe import detail
+from service.report import blind
+from tests.feeders import stations
 from tests.service.asking import T0
 from tests.service.looking import DESKTOP, PHONE, Site, customer
 
@@ -328,6 +331,42 @@ def test_closed_ties_are_drawn_in_both_views(site_of: Callable[..., Site], villa
     apart = np.abs(xy[:, 0] - xy[:, 1])
     size = np.array(drawn.evaluate_all("all => all.map(e => e.getBBox()).map(b => [b.width, b.height])"))
     np.testing.assert_allclose(size / size.max(), apart / apart.max(), atol=1e-3)
+
+
+def test_two_nominal_voltages_have_one_scale(site_of: Callable[..., Site], village: type) -> None:
+    """The same part of 20 kV and of 0.4 kV has the same colour, and each is beyond its own limit."""
+    two = from_tables(stations.tables())
+    parts = {"dairy": 0.96, "a1-east": 0.96, "quarry": 1.12, "b1-east": 1.12, "b2-west": 0.88}
+    nothing = [None] * two.meters.size
+    report = blind(two, Tick(T0, tuple(nothing), None, ()), 1, Cause.AGREEMENT, "made up")
+    nominal = two.customer_nominal[two.meters]
+    meters = tuple(
+        replace(
+            meter,
+            seen=True,
+            v_volt_reported=float(volt * parts.get(meter.meter, 1.0)),
+            v_volt_estimated=float(volt * parts.get(meter.meter, 1.0)),
+            v_volt_std=0.1,
+            v2_pu_estimated=parts.get(meter.meter, 1.0) ** 2,
+        )
+        for meter, volt in zip(report.meters, nominal, strict=True)
+    )
+    buses = tuple((bus, float(volt)) for bus, volt in zip(two.feeder.buses, two.nominal_volt, strict=True))
+    site = site_of(real(village, two))
+    site.service.tick(replace(report, verdict=Decision.CLEAN, meters=meters, bus_v_volt=buses))
+    page = site.open(reduced_motion="reduce")
+    expect(page.locator("#decision")).to_have_text("CLEAN")
+    assert fill_of(page, "dairy") == fill_of(page, "a1-east")
+    wanted = {"quarry": "high", "b1-east": "high", "b2-west": "low", "dairy": "ok", "a1-east": "ok"}
+    for name, status in wanted.items():
+        expect(customer(page, name)).to_have_attribute("data-status", status)
+    assert page.locator("#scale .tick b").all_text_contents()[2] == "1.000 pu"
+    expect(page.locator("#facts")).to_contain_text("0.880 – 1.120 pu")
+    customer(page, "quarry").click()
+    expect(page.locator("#detail")).to_contain_text("1.1200 pu")
+    customer(page, "b2-west").click()
+    expect(page.locator("#detail")).to_contain_text("203.23 V")
+    expect(page.locator("#detail")).to_contain_text("0.8800 pu")
 
 
 def test_a_link_leads_to_its_feeder(site_of: Callable[..., Site], village: type) -> None:
