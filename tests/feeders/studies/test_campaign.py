@@ -20,7 +20,7 @@ from scipy.stats import beta
 
 from feeders.estimators import design
 from feeders.lies import Trick
-from feeders.load import load
+from feeders.load import Site, from_tables, load
 from feeders.profiles import Season
 from feeders.studies.campaign import Campaign, NothingPlayed, campaign
 from feeders.studies.campaign_lies import attacks, liars
@@ -40,6 +40,7 @@ from feeders.studies.journal import OtherStudy
 from feeders.trials import LoadError, frames, judge
 from feeders.variation import Variation
 from gridsec.feeder import lindistflow
+from tests.feeders import stations
 from tests.feeders.studies.campaigns import PLAN, SITE
 from tests.feeders.test_taps import village
 
@@ -100,10 +101,10 @@ def test_lies_are_as_large_as_they_are_said_to_be(here: Campaign) -> None:
     assert told.loc[["inverter"], "lie_volt"].isna().all()
 
 
-def test_lies_behind_taps_are_those_of_the_full_play() -> None:
+@pytest.mark.parametrize("site", [village(), from_tables(stations.tables())], ids=["taps", "stations"])
+def test_lies_behind_taps_are_those_of_the_full_play(site: Site) -> None:
     """In volts, whether a lie is put upon the scene or the scene is played anew with it."""
-    site = village()
-    p, nominal = site.meters.size, site.tables.meta.voltage_volt
+    p, nominal = site.meters.size, site.customer_nominal[site.meters]
     kinds = (
         Kind("bias", Trick.BIAS, (4.0,)),
         Kind("told", Trick.BIAS, (1.0,), (7.0,) * p),
@@ -123,8 +124,10 @@ def test_lies_behind_taps_are_those_of_the_full_play() -> None:
         expected = {site.meter_ids[k]: shift[k] for k in np.flatnonzero(shift)}
         assert each.to_dict() == pytest.approx(expected, rel=1e-9)
         if case.kind != "story":
-            assert each.to_numpy() == pytest.approx({"bias": 0.04 * nominal, "told": 7.0}[case.kind])
-        behind |= {case.kind for k in np.flatnonzero(shift) if base[k] != nominal}
+            some = [site.meter_ids.index(who) for who in each.index]
+            sizes = {"bias": 0.04 * nominal[some], "told": np.full(len(some), 7.0)}
+            assert each.to_numpy() == pytest.approx(sizes[case.kind])
+        behind |= {case.kind for k in np.flatnonzero(shift) if base[k] != nominal[k]}
     assert behind == {"bias", "told", "story"}
 
 
