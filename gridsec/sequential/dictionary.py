@@ -103,7 +103,7 @@ class Powers:
         """What has been loosened, indices into the dictionary."""
         return tuple(self.index[self.accused].tolist())
 
-    def best(self, judged: Judged, penalty: float, than: float, innocent: int | None) -> list[Step]:
+    def best(self, judged: Judged, penalty: float, than: float, innocent: Ints) -> list[Step]:
         """Loosening a direction, alone or with its meter dropped as well; nothing unless it gains more.
 
         Parameters
@@ -114,13 +114,12 @@ class Powers:
             What an accusation must gain at least.
         than
             What something else would gain.
-        innocent
-            A meter that is not dropped.
+        innocent : (k,)
+            Meters that are not dropped.
         """
         alone = self._alone(judged.weights) - penalty * self.dictionary.charges(self.index, self.now.trusted)
         both = self._with_meter(judged.weights) - penalty * (1.0 + OF_A_LIAR)
-        if innocent is not None:
-            both[self.meter == innocent] = -np.inf
+        both[np.isin(self.meter, innocent)] = -np.inf
         alone[self.accused] = both[self.accused] = -np.inf
         k, pair = int(np.argmax(alone)), int(np.argmax(both))
         if max(alone[k], both[pair]) <= than:

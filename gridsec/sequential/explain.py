@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats
+from gridsec.arrays import Bools, Floats, Ints
 from gridsec.sequential import search
 from gridsec.sequential.commission import Learned
 from gridsec.sequential.conditional import Fit, Judged, Prior, admit, drop, fit, judge, misfit
@@ -59,6 +59,8 @@ class View:
 _FEW = 32
 # With no more suspects than this, whether each of them could be honest is looked into by a search.
 _CLOSE = 8
+# Correlation from which on two meters are moved by the same loads.
+_TOGETHER = 0.5
 # A fit is made anew when that part of its meters changed, or after so many changes (rounding).
 _ANEW = 6
 _MOST_CHANGES = 400
@@ -261,6 +263,8 @@ class Search:
                 close = self._descend(all_, nobody, self.book, pairs=True, fresh=True)
                 free = likelier(free, Found(close))
         best = found.best
+        for other in self._turned(best):
+            free = likelier(free, Found(other))
         if free is not None:
             better = free.best.cost < best.cost and self._total(free.best) < self._total(best)
             first, second = (free, found) if better else (found, free)
@@ -273,12 +277,10 @@ class Search:
         fresh = self.here.enough & ~best.trusted & ~self.trust.named
         if np.count_nonzero(fresh) > _CLOSE:
             return []
-        out, keep = [], self.keep & self.trust.named
-        # Nobody is named by this: whatever makes an explanation cheaper is worth trying.
-        fair = float(np.sqrt(search.price(fresh.size, 1)))
-        limits = replace(self.here.limits, sigmas=min(self.here.limits.sigmas, fair))
+        out, keep, limits = [], self.keep & self.trust.named, self._fair()
         for j in np.flatnonzero(fresh).tolist():
-            other = self._descend(best.fit, keep, _doubtful(self.book), innocent=j, pairs=True, limits=limits)
+            book, one = _doubtful(self.book), np.array([j])
+            other = self._descend(best.fit, keep, book, innocent=one, pairs=True, limits=limits)
             few = np.count_nonzero(self.here.enough & ~other.trusted) <= self.design.most
             honest = self.scales[self.s].limits.of(other.judged.std)[j]
             if few and abs(other.judged.offset[j]) <= honest:
@@ -286,6 +288,47 @@ class Search:
                 cost, loosened = best.charge + other.cost, best.loosened + other.loosened
                 out.append(Explanation(other.trusted, loosened, charge, cost))
         return out
+
+    def _turned(self, best: Solution) -> list[Solution]:
+        """Explanations in which those who are accused of the same are honest, and who contradicts them lies.
+
+        Where many of a street, or of a phase, tell the same small lie, the word of many stands against that
+        of many, and no single meter that changes sides makes either explanation better.
+        """
+        here, prior, loose, out = self.here, self.scales.prior, best.fit.loose, []
+        within, most, fair = 2.0 * np.log(self.design.options.like), self.design.most, self._fair()
+        for group in self._agreeing(best):
+            among = np.zeros_like(best.trusted)
+            among[group] = True
+            judged = judge(fit(prior, here.noise, among, loose), here.m)
+            # What these leave unexplained among themselves, all others can only add to.
+            if judged.misfit > best.cost - best.charge + within:
+                continue
+            start = here.enough & (among | (np.abs(judged.offset) <= fair.of(judged.std)))
+            if np.count_nonzero(here.enough & ~start) > most:
+                continue
+            now = fit(prior, here.noise, start, loose)
+            other = self._descend(now, np.zeros_like(among), innocent=group, limits=fair, fresh=True)
+            if np.count_nonzero(here.enough & ~other.trusted) <= most:
+                charge, cost = best.charge + other.charge, best.charge + other.cost
+                out.append(replace(other, loosened=best.loosened, charge=charge, cost=cost))
+        return out
+
+    def _agreeing(self, best: Solution) -> list[Ints]:
+        """Accused meters of one kind: they read too high, or too low, where the same loads move them."""
+        prior, accused = self.scales.prior, self.here.enough & ~best.trusted
+        out = []
+        for sign in (accused & (best.judged.offset > 0.0), accused & (best.judged.offset < 0.0)):
+            at = np.flatnonzero(sign)
+            between = prior.of_meters[np.ix_(prior.meters[at], at)]
+            std = np.sqrt(between.diagonal())
+            out += [at[group] for group in _linked(between >= _TOGETHER * np.multiply.outer(std, std))]
+        return [group for group in out if group.size > 1]
+
+    def _fair(self) -> Limits:
+        """Limits by which nobody is named: whatever makes an explanation cheaper is worth trying."""
+        fair = float(np.sqrt(search.price(self.keep.size, 1)))
+        return replace(self.here.limits, sigmas=min(self.here.limits.sigmas, fair))
 
     def _compared(self, best: Solution, rivals: tuple[Explanation, ...]) -> tuple[Explanation, ...]:
         """Rivals, each at what it costs on the scale that speaks most against it.
@@ -345,7 +388,7 @@ class Search:
         keep: Bools,
         book: Dictionary | None = None,
         *,
-        innocent: int | None = None,
+        innocent: Ints = search.NOBODY,
         pairs: bool = False,
         limits: Limits | None = None,
         fresh: bool = False,
@@ -394,6 +437,19 @@ class Search:
     def _believe(self, best: Explanation) -> Trust:
         accused = (*self.accused, *((k, self.s) for k in best.loosened))
         return believe(self.trust, self._trusted(best), self.s, accused)
+
+
+def _linked(link: Bools) -> list[Ints]:
+    """Connected parts of a graph of few nodes, each of which is linked to itself."""
+    out, left = [], np.ones(len(link), dtype=np.bool_)
+    while left.any():
+        part, more = link[left.argmax()], True
+        while more:
+            reached = link[part].any(axis=0)
+            more, part = bool((reached & ~part).any()), reached
+        out.append(np.flatnonzero(part))
+        left &= ~part
+    return out
 
 
 def _doubtful(book: Dictionary) -> Dictionary:

@@ -29,7 +29,7 @@ from functools import cache, partial
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, Ints
+from gridsec.arrays import Bools, Floats, Ints, frozen_ints
 from gridsec.sequential.conditional import Fit, Judged, Move, Prior, admit, drop, follow, judge, solved
 from gridsec.sequential.dictionary import Dictionary, Powers, Step
 
@@ -147,6 +147,8 @@ def likelier(one: Found | None, other: Found) -> Found:
     return Found(first.best, (*first.others, second.best.bare(), *second.others))
 
 
+# No meters.
+NOBODY = frozen_ints(np.zeros(0, dtype=np.intp))
 _MOVES_PER_METER = 4
 # Weights below this are zero to the fit, and well above where Cholesky would notice.
 _FEATHER = 1e-6
@@ -160,7 +162,7 @@ def descend(
     *,
     keep: Bools,
     dictionary: Dictionary | None = None,
-    innocent: int | None = None,
+    innocent: Ints = NOBODY,
     pairs: bool = False,
     fresh: bool = False,
 ) -> Solution:
@@ -180,8 +182,8 @@ def descend(
         Meters that must not be admitted.
     dictionary
         Directions that may be loosened; none by default.
-    innocent
-        A meter that must be believed.
+    innocent : (k,)
+        Meters that must be believed.
     pairs
         Whether two meters may be dropped at once. Two that tell the same story vouch for each other, so that
         dropping either of them gains little; O(p^2) per move.
@@ -190,8 +192,8 @@ def descend(
     """
     now = start if fresh else start.copy()
     barred = ~live | keep
-    if innocent is not None and not now.trusted[innocent]:
-        admit(now, innocent)
+    for j in innocent[~now.trusted[innocent]].tolist():
+        admit(now, j)
     for j in np.flatnonzero(now.trusted & ~live):
         drop(now, int(j))
     judged = judge(now, m)
@@ -240,7 +242,7 @@ class _Place:
     judged: Judged
     limits: Limits
     barred: Bools
-    innocent: int | None
+    innocent: Ints
     pairs: bool
     powers: Powers | None
 
@@ -250,8 +252,7 @@ def _best(here: _Place) -> list[Step]:
     now, judged, powers = here.fit, here.judged, here.powers
     excess = np.abs(judged.offset) / here.limits.of(judged.std)
     inside = np.where(now.trusted, excess, -np.inf)
-    if here.innocent is not None:
-        inside[here.innocent] = -np.inf
+    inside[here.innocent] = -np.inf
     worst = int(np.argmax(inside))
     drops = bool(inside[worst] > 1.0)
     steps: list[Step] = [partial(_drop, now, worst, powers)] if drops else []
@@ -283,8 +284,7 @@ def _pair(here: _Place, than: float) -> tuple[tuple[int, ...], float]:
     """
     now, weights = here.fit, here.judged.weights
     free = now.trusted.copy()
-    if here.innocent is not None:
-        free[here.innocent] = False
+    free[here.innocent] = False
     at = np.flatnonzero(free)
     if at.size > _PAIRED:
         at = np.sort(at[np.argsort(-(weights[at] ** 2) / now.Q[at, at])[:_PAIRED]])
