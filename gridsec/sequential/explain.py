@@ -277,7 +277,10 @@ class Search:
         fresh = self.here.enough & ~best.trusted & ~self.trust.named
         if np.count_nonzero(fresh) > _CLOSE:
             return []
-        out, keep, limits = [], self.keep & self.trust.named, self._fair()
+        out, keep = [], self.keep & self.trust.named
+        # Nobody is named by this: whatever makes an explanation cheaper is worth trying.
+        fair = float(np.sqrt(search.price(fresh.size, 1)))
+        limits = replace(self.here.limits, sigmas=min(self.here.limits.sigmas, fair))
         for j in np.flatnonzero(fresh).tolist():
             book, one = _doubtful(self.book), np.array([j])
             other = self._descend(best.fit, keep, book, innocent=one, pairs=True, limits=limits)
@@ -296,23 +299,33 @@ class Search:
         of many, and no single meter that changes sides makes either explanation better.
         """
         here, prior, loose, out = self.here, self.scales.prior, best.fit.loose, []
-        within, most, fair = 2.0 * np.log(self.design.options.like), self.design.most, self._fair()
+        within, most = 2.0 * np.log(self.design.options.like), self.design.most
         for group in self._agreeing(best):
+            if np.count_nonzero(self._contradict(group[group.size // 2])) > most:
+                continue
             among = np.zeros_like(best.trusted)
             among[group] = True
             judged = judge(fit(prior, here.noise, among, loose), here.m)
             # What these leave unexplained among themselves, all others can only add to.
             if judged.misfit > best.cost - best.charge + within:
                 continue
-            start = here.enough & (among | (np.abs(judged.offset) <= fair.of(judged.std)))
+            start = here.enough & (among | (np.abs(judged.offset) <= here.limits.of(judged.std)))
             if np.count_nonzero(here.enough & ~start) > most:
                 continue
             now = fit(prior, here.noise, start, loose)
-            other = self._descend(now, np.zeros_like(among), innocent=group, limits=fair, fresh=True)
+            other = self._descend(now, np.zeros_like(among), innocent=group, fresh=True)
             if np.count_nonzero(here.enough & ~other.trusted) <= most:
                 charge, cost = best.charge + other.charge, best.charge + other.cost
                 out.append(replace(other, loosened=best.loosened, charge=charge, cost=cost))
         return out
+
+    def _contradict(self, j: int) -> Bools:
+        """Meters that cannot be honest if meter j is, as far as the two of them alone can tell, (p,)."""
+        here, prior = self.here, self.scales.prior
+        column = prior.of_meters[prior.meters, j]
+        own = prior.variance[prior.meters] + here.noise
+        apart = np.maximum(own + own[j] - 2.0 * column, 0.0)
+        return np.asarray(here.enough & (np.abs(here.m - here.m[j]) > here.limits.of(np.sqrt(apart))))
 
     def _agreeing(self, best: Solution) -> list[Ints]:
         """Accused meters of one kind: they read too high, or too low, where the same loads move them."""
@@ -324,11 +337,6 @@ class Search:
             std = np.sqrt(between.diagonal())
             out += [at[group] for group in _linked(between >= _TOGETHER * np.multiply.outer(std, std))]
         return [group for group in out if group.size > 1]
-
-    def _fair(self) -> Limits:
-        """Limits by which nobody is named: whatever makes an explanation cheaper is worth trying."""
-        fair = float(np.sqrt(search.price(self.keep.size, 1)))
-        return replace(self.here.limits, sigmas=min(self.here.limits.sigmas, fair))
 
     def _compared(self, best: Solution, rivals: tuple[Explanation, ...]) -> tuple[Explanation, ...]:
         """Rivals, each at what it costs on the scale that speaks most against it.

@@ -1,0 +1,106 @@
+"""Explanations of one scale, against all sets of liars there are."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.sparse.csgraph import connected_components
+
+from gridsec import sequential
+from gridsec.arrays import Bools, Floats
+from gridsec.detect import MeterAccuracy
+from gridsec.droop import fleet
+from gridsec.feeder import Feeder
+from gridsec.plant import Plant
+from gridsec.sequential import LoadDoubt, SequentialDesign
+from gridsec.sequential.explain import Scales, Search, _linked, adapt, view_of
+from gridsec.sequential.search import Found, price
+from gridsec.sequential.windows import push
+
+NEAR, FAR = 30, 15  # customers close to the busbar, and at the end of a long cable
+JITTER = 0.001
+
+
+def two_streets() -> SequentialDesign:
+    """One short street, and one at the end of a long cable; loads known to 0.6 kW."""
+    count = NEAR + FAR
+    k = np.arange(count)
+    r = np.where(k == NEAR, 0.4, 0.001)  # the long cable the errors of the loads move all behind it by 0.7 %
+    feeder = Feeder(
+        name="two streets",
+        parent=np.where(k == NEAR, 0, k),
+        r=r,
+        x=0.4 * r,
+        bus=k + 1,
+        customers=tuple(f"c{i}" for i in k),
+        buses=tuple(f"b{i}" for i in range(count + 1)),
+        base_volt=230.0,
+        base_kva=100.0,
+        charging=np.zeros(count),
+    )
+    accuracy = MeterAccuracy(np.zeros(count), np.zeros(count), np.full(count, JITTER), 0.0, 0.0, 2e-4)
+    none = np.zeros(0)
+    plant = Plant(feeder, fleet(none.astype(np.intp), [], none, 100.0), k, accuracy, 1)
+    doubt = LoadDoubt(np.full(count, 0.006), np.full(count, 0.002), 600.0)
+    return sequential.design(plant, doubt=doubt, step_s=1.0)
+
+
+def search(design: SequentialDesign, m: Floats) -> Found:
+    """What the first scale finds when everybody was believed until now."""
+    state, everybody = sequential.init(design, 0.0), np.ones(m.size, dtype=np.bool_)
+    window = push(state.window, design.lengths, m, everybody)
+    scales = Scales(design, design.prior, window, state.learned, np.zeros(m.size))
+    now = adapt(None, design.prior, scales[0].noise, everybody, None)
+    view = view_of(design, scales[0], now)
+    found, _ = Search(design, scales, design.book, state.fits, state.trust, 0)(now, view)
+    return found
+
+
+def cost(design: SequentialDesign, m: Floats, liars: Bools) -> float:
+    """J by definition."""
+    at = np.flatnonzero(~liars)
+    whole = design.prior.between[np.ix_(at, at)] + np.diag(design.white[at])
+    return float(m[at] @ np.linalg.solve(whole, m[at])) + price(m.size, int(liars.sum()))
+
+
+def draw(design: SequentialDesign, seed: int, size: float) -> tuple[Floats, Bools]:
+    """Residuals of one tick in which 7 of 15 far meters lie alike, and 6 near ones; and who they are."""
+    rng = np.random.default_rng([5, seed])
+    count = NEAR + FAR
+    w = rng.multivariate_normal(np.zeros(count), design.prior.between + 1e-18 * np.eye(count))
+    lies = np.zeros(count)
+    lies[rng.choice(NEAR, 6, replace=False)] = size * rng.choice([-1.0, 1.0], 6)
+    lies[NEAR + rng.choice(FAR, 7, replace=False)] = -size
+    m = w + np.sqrt(design.white) * rng.normal(size=count) + lies
+    return np.asarray(m), lies != 0.0
+
+
+@pytest.mark.parametrize("size", [0.018, 0.022])
+def test_where_the_word_of_many_stands_against_that_of_many_nobody_is_sure(size: float) -> None:
+    """Seven of fifteen tell the same lie: what they say is as likely as what the others say, or not."""
+    design, both_told = two_streets(), 0
+    for seed in range(60):
+        m, liars = draw(design, seed, size)
+        turned = np.where(np.arange(m.size) < NEAR, liars, ~liars)
+        found = search(design, m)
+        within = found.best.cost + 2.0 * np.log(design.options.like)
+        sides = cost(design, m, liars), cost(design, m, turned)
+        assert found.best.cost <= min(sides) + 0.1
+        if max(sides) < within - 0.5:
+            both_told += 1
+            near = [~each.trusted for each in (found.best, *found.others) if each.cost <= within]
+            assert not np.logical_and.reduce(near)[NEAR:].any()
+    assert both_told > 20
+
+
+def test_linked_are_connected_components() -> None:
+    rng = np.random.default_rng(6)
+    for size in (0, 1, 2, 7, 20):
+        link = rng.random((size, size)) < 1.2 / max(size, 1)
+        link |= link.T | np.eye(size, dtype=bool)
+        _, label = connected_components(link) if size else (0, np.zeros(0))
+        parts = _linked(link)
+        assert sorted(np.concatenate([*parts, np.zeros(0, dtype=int)]).tolist()) == list(range(size))
+        assert {frozenset(part.tolist()) for part in parts} == {
+            frozenset(np.flatnonzero(label == k).tolist()) for k in set(label.tolist())
+        }
