@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Final
 from feeders.convert_changes import WHOLE, Change
 from feeders.convert_draws import Draw
 from feeders.convert_graph import Coupling, above_busbar, as_rows, fused_with, reached
+from feeders.convert_lines import VOLT_DIGITS
 from feeders.levels import same_level
 from feeders.schema import LineRow
 
@@ -76,7 +77,7 @@ def transformed(
             left.append(each)
             continue
         here, there = (network.nominal[bus] for bus in each.buses)
-        line = each.line if same_level(here, there) else replace(each.line, to_volt=there)
+        line = each.line if same_level(here, there) else replace(each.line, to_volt=round(there, VOLT_DIGITS))
         if line.to_volt is not None:
             wanted = not extent.one_voltage and _leads_on(network, rows, each, busbar)
             turn = cmath.exp(1j * math.radians(each.turn))

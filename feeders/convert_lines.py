@@ -16,6 +16,9 @@ from feeders.matrices import SERIES_NAMES, SHUNT_NAMES, cells_of, columns_of, pa
 from feeders.schema import LineRow
 from gridsec.arrays import Floats, Ints, Phasors
 
+VOLT_DIGITS: Final = 6
+"""Decimals of nominal voltages."""
+
 CYCLIC: Final = 1e-7
 """Deviation from cyclic symmetry, as a share of the largest impedance, below which a line is symmetric."""
 
@@ -204,7 +207,7 @@ def turned(row: LineRow, nominal: Mapping[str, float]) -> LineRow:
     if row.to_volt is not None:
         level = nominal[row.from_bus] / row.to_volt
         limit = None if row.rating_a is None else rounded(row.rating_a / level)
-        away = replace(away, to_volt=nominal[row.from_bus], rating_a=limit)
+        away = replace(away, to_volt=round(nominal[row.from_bus], VOLT_DIGITS), rating_a=limit)
     elif set(row.taps) == {1.0}:
         return away
     if row.tap_a is None and row.tap_b is None and row.tap_c is None:

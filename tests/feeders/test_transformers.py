@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import pandapower
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from feeders.inverters import ClosedLoop, Loads
 from feeders.load import Site, Snapshot, from_tables, to_frame, volts
@@ -220,6 +222,48 @@ def test_a_loop_through_two_transformers() -> None:
         from_tables(meshed(to_volt=220.0))
     with pytest.raises(FeederInvalid, match=r"at 's2', .* V around the loop"):
         from_tables(meshed(to_volt=None))
+
+
+def test_a_loop_in_which_a_transformer_leads_back_up() -> None:
+    """The tree depends on the order of the lines; what a bus's nominal voltage is does not."""
+    made = meshed()
+    order = ("M1", "T1", "T2", "A1", "A2", "B1", "B2", "T3", "M3", "M2")
+    lines = {row.line: row for row in made.lines}
+    through = LineRow("C", "s1", "s2", 0.01, 0.004)
+    rows = (*(lines[name] for name in order[:-1]), replace(through, to_bus="a2", from_bus="s2"), lines["M2"])
+    tables = replace(made, lines=tuple(replace(row, tap=1.0) for row in rows))
+    site = from_tables(tables)
+    buses = site.feeder.buses
+    assert buses[site.spanning.parent[buses.index("m3") - 1]] == "s2"
+    nominal = np.array([NOMINAL[bus] for bus in buses])
+    np.testing.assert_array_equal(site.nominal_volt, nominal)
+    _, v = PowerFlow(site).solve(P_KW, Q_KVAR, MV)
+    np.testing.assert_allclose(
+        _meshed_volts(site, -P_KW / 1000.0, -Q_KVAR / 1000.0) / nominal, v / nominal, rtol=0, atol=1e-6
+    )
+
+
+@given(volt=st.floats(60.0, 5000.0))
+@settings(max_examples=20, deadline=None)
+def test_a_level_of_any_voltage_is_the_same_in_per_unit(volt: float) -> None:
+    """Behind a transformer to another voltage, ``z`` grown with its square: nothing in per unit changes."""
+    made, ratio = stations.tables(), (volt / LV) ** 2
+    low = [row for row in made.lines if row.line not in ("M1", "M2", "M3")]
+    other = {
+        row.line: {
+            "r_ohm": row.r_ohm * ratio,
+            "x_ohm": row.x_ohm * ratio,
+            "to_volt": None if row.to_volt is None else volt,
+        }
+        for row in low
+    }
+    meta = replace(made.meta, accept=("voltage", "impedance"))
+    one, two = from_tables(made), from_tables(replace(changed(**other), meta=meta))
+    for name in ("r", "x", "charging"):
+        np.testing.assert_allclose(getattr(two.balanced, name), getattr(one.balanced, name), rtol=1e-12)
+    _, here = PowerFlow(one).solve(P_KW, Q_KVAR, MV)
+    _, there = PowerFlow(two).solve(P_KW, Q_KVAR, MV)
+    np.testing.assert_allclose(there / two.nominal_volt, here / one.nominal_volt, rtol=0, atol=1e-9)
 
 
 def _meshed_volts(site: Site, p: Floats, q: Floats) -> Floats:
