@@ -24,6 +24,9 @@ from gridsec.arrays import Phasors
 NO_POWER: Final = 1e-9
 """Share of a load's power that is a solver's last digits."""
 
+UNSURE: Final = 0.5
+"""Part by which a transformer's no-load power is not known: without a reading a customer is taken at half."""
+
 SWITCHED_OFF: Final = (
     "in service",
     "changed",
@@ -146,7 +149,9 @@ def idle_customers(
             beside = abs(kva.imag) - row.load_kw * math.tan(math.acos(factor))
             row = replace(row, phases=phases, q_floor_kvar=rounded(max(beside, 0.0)))
             one = rounded(factor)
-            rows.append(replace(row, power_factor=one, power_factor_min=one, power_factor_max=one))
+            row = replace(row, power_factor=one, power_factor_min=one, power_factor_max=one)
+            std = [rounded(UNSURE * abs(part)) for part in (kva.real, kva.imag)]
+            rows.append(replace(row, p_std_kw=std[0], q_std_kvar=std[1]))
             power[row.customer] = kva
     return rows, power
 

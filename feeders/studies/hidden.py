@@ -80,7 +80,8 @@ def knowledge(
     site
         The feeder.
     unknown
-        Customers whose active and reactive powers nobody knows; by default those without a meter.
+        Customers whose active and reactive powers nobody knows; by default those without a meter, unless the
+        file says how well they are known (`p_std_kw` and `q_std_kvar`), as of a transformer without load.
     silent
         Meters that are missing. Nobody knows the powers of their customers either.
     busbar_known
@@ -96,7 +97,8 @@ def knowledge(
     gone = meter_mask(site, silent)
     metered = np.zeros(site.feeder.bus.size, dtype=np.bool_)
     metered[site.meters] = True
-    open_ = ~metered
+    told = [row.p_std_kw is not None and row.q_std_kvar is not None for row in site.tables.customers]
+    open_ = ~metered & ~np.array(told, dtype=np.bool_)
     if unknown is not None:
         open_ = np.zeros(metered.size, dtype=np.bool_)
         open_[customer_indices(site, unknown)] = True

@@ -13,6 +13,7 @@ from feeders.convert import check_against_source, convert
 from feeders.convert_check import BALANCED_PU, UNBALANCED_PU
 from feeders.load import from_tables
 from feeders.schema import FeederTables, read
+from feeders.studies.hidden import Curves, knowledge
 from gridsec.errors import FeederInvalid
 from tests.feeders.test_convert_pgm import line, load, transformer, written
 
@@ -55,6 +56,8 @@ def test_a_station_with_everything(tap: int, tmp_path: Path) -> None:
     idle = [row for row in tables.customers if row.customer.endswith("no-load")]
     assert len(idle) == 2
     assert not any(row.meter for row in idle)
+    known = knowledge(from_tables(tables), unknown=None, silent=(), busbar_known=True, curves=Curves.DEADBAND)
+    assert known.unknown == ()
     assert all(row.meter for row in tables.customers if row not in idle)
     iron = 1.3 * (net.res_bus.vm_pu[1] * 20.0 / 20.8) ** 2 if net.converged else 1.3
     assert idle[0].load_kw == pytest.approx(iron, rel=0.2)
