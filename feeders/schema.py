@@ -15,6 +15,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from feeders import check, raw
 from feeders.columns import (
     CUSTOMER_COLUMNS,
@@ -266,7 +268,7 @@ def to_json(tables: FeederTables) -> dict[str, Any]:
     meta["accept"] = list(tables.meta.accept)
     meta["busbar_xy"] = None if tables.meta.busbar_xy is None else list(tables.meta.busbar_xy)
     return {
-        "feeder": meta,
+        "feeder": _plain(meta),
         "lines": [_ordered(asdict(row), LINE_COLUMNS) for row in tables.lines],
         "customers": [_ordered(asdict(row), CUSTOMER_COLUMNS) for row in tables.customers],
     }
@@ -295,7 +297,16 @@ def _tables(examination: Examination) -> FeederTables:
 def _ordered(row: dict[str, Any], columns: tuple[Column, ...]) -> dict[str, Any]:
     given = (column.name for column in columns)
     seldom = {*PHASE_NAMES, "to_volt"}
-    return {name: row[name] for name in given if row[name] is not None or name not in seldom}
+    return {name: _plain(row[name]) for name in given if row[name] is not None or name not in seldom}
+
+
+def _plain(value: Any) -> Any:
+    """The same with numbers of NumPy as those of Python: the former print their type."""
+    if isinstance(value, dict):
+        return {name: _plain(each) for name, each in value.items()}
+    if isinstance(value, list):
+        return [_plain(each) for each in value]
+    return value.item() if isinstance(value, np.generic) else value
 
 
 # --- from cells to typed rows -------------------------------------------------------------------

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import networkx as nx
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -182,6 +183,23 @@ def test_valid_tables_round_trip_through_files(
     write(tables, folder)
     assert examine(folder).problems == ()
     assert read(folder) == tables
+
+
+def test_numbers_of_numpy_are_written_as_numbers(tmp_path: Path) -> None:
+    """As tables have them that a program makes."""
+    tables = read(next(path for path in GOOD if path.is_dir()))
+    line = replace(tables.lines[0], r_ohm=np.float64(0.1234), closed=np.bool_(True))
+    made = replace(
+        tables,
+        meta=replace(
+            tables.meta, voltage_volt=np.float64(230.5), busbar_xy=(np.float64(1.0), np.float64(2.5))
+        ),
+        lines=(line, *tables.lines[1:]),
+    )
+    write(made, tmp_path)
+    again = read(tmp_path)
+    assert again == made
+    assert type(again.lines[0].r_ohm) is float
 
 
 def test_rows_and_columns_name_the_same_things() -> None:
