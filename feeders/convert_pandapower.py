@@ -24,6 +24,7 @@ from feeders.convert_customers import (
     with_meters,
 )
 from feeders.convert_draws import ONLY_REACTIVE, SWITCHED_OFF, customers_of, idle_customers
+from feeders.convert_graph import as_rows, reached
 from feeders.convert_levels import EVERYTHING, Extent
 from feeders.convert_network import Converted, Network, below, below_source, finished, one_busbar
 from feeders.convert_pandapower_net import ids, network_of
@@ -160,6 +161,13 @@ def _root(net: Any, network: Network, names: dict[int, str], wanted: str | None)
         return names[sides[0]]
     found = below_source(network)
     if found is None:
+        # Stations further down are part of the feeder.
+        everything = [*network.lines, *as_rows(network.couplings)]
+        lower = {names[bus] for bus in sides}
+        first = {bus for source in network.sources for bus in reached(source, everything, without=lower)}
+        sides = [bus for bus in sides if names[bus] in first] or sides
+        if one_busbar([names[bus] for bus in sides], network.lines):
+            return names[sides[0]]
         candidates = ", ".join(str(net.bus.at[bus, "name"]) for bus in sides) or "none"
         raise BusbarUnclear(f"the busbar is not clear, candidates: {candidates}; name it with root")
     return found

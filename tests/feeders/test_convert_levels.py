@@ -28,12 +28,12 @@ def stations(tables: FeederTables) -> dict[str, float]:
         ("pandapower:example_multivoltage", "Bus MV0", 20, 230.94),
         ("pandapower:create_cigre_network_mv", "Bus 0", 15, 11547.0),
         ("pandapower:mv_oberrhein", "58", 70, 11547.0),
-        pytest.param(
-            "simbench:1-MVLV-rural-1.108-0-sw", "MV1.101 busbar1.1", 0, 230.94, marks=pytest.mark.slow
-        ),
+        pytest.param("simbench:1-MVLV-rural-1.108-0-sw", None, 0, 230.94, marks=pytest.mark.slow),
     ],
 )
-def test_pandapowers_networks(source: str, root: str, buses: int, behind: float, tmp_path: Path) -> None:
+def test_pandapowers_networks(
+    source: str, root: str | None, buses: int, behind: float, tmp_path: Path
+) -> None:
     done = convert(source, tmp_path / "x", root=root)
     assert done.check is not None
     assert done.check.largest_pu < 1e-8 < BALANCED_PU
