@@ -120,6 +120,8 @@ class SequentialState:
         What is known of them.
     model_error : (p,)
         What the model may be off at each meter, squared pu.
+    swing
+        By how much powers changed a squared voltage at most when that was bounded, pu.
     kinds
         The past, and what the named meters' manipulations look like.
     last
@@ -140,6 +142,7 @@ class SequentialState:
     learning: Learning | None
     learned: Learned
     model_error: Floats
+    swing: float
     kinds: Kinds
     last: tuple[Estimate, Verdict] | None
 
@@ -196,6 +199,7 @@ def init(
         learning=known.learning,
         learned=known.learned,
         model_error=np.zeros(p),
+        swing=0.0,
         kinds=no_kinds(p),
         last=None,
     )

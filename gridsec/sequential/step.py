@@ -72,8 +72,10 @@ def step(
     q, v2_bus = _voltages(design, frame, heard, x)
     residual = heard.y - v2_bus[at] - state.learned.bias
     window = push(_remembered(design, state, heard.busbar), design.lengths, residual, heard.live)
-    if state.ticks % _STALE == 0:
-        state = replace(state, model_error=_model_error(design, frame.p, q, heard.v0_squared))
+    swing = _swing(design, v2_bus, heard.v0_squared)
+    if state.ticks % _STALE == 0 or swing > max(_GROWN * state.swing, _CALM):
+        error = _model_error(design, frame.p, q, heard.v0_squared)
+        state = replace(state, model_error=error, swing=swing)
     since = frame.t if state.x is None else state.since
     transient = _transient(design, frame.t - since)
     model = state.model_error + transient
@@ -155,6 +157,11 @@ def _voltages(design: SequentialDesign, frame: Frame, heard: _Heard, x: Floats) 
     return q, np.where(np.isnan(v2_bus), by_place(plant.feeder, heard.v0_squared), v2_bus)
 
 
+def _swing(design: SequentialDesign, v2_bus: Floats, v0_squared: Floats | float) -> float:
+    """By how much the powers change a squared voltage at most."""
+    return float(np.abs(v2_bus - by_place(design.plant.feeder, v0_squared)).max())
+
+
 def _distrust(trust: Trust, copies: Bools) -> Trust:
     """Meters that repeat themselves are named, whatever the others say."""
     if not copies.any():
@@ -214,8 +221,9 @@ def _known(design: SequentialDesign, doubts: Doubts) -> Bools:
 _WIDER = 2.0
 # Ticks without a frame after which there was a pause.
 _PAUSE = 60.0
-# The model's error is bounded anew every so many ticks.
-_STALE = 16
+# The model's error is bounded anew every so many ticks, and where powers change a voltage by so much more than
+# when it was bounded, squared pu: it grows with the cube of that.
+_STALE, _GROWN, _CALM = 16, 1.1, 0.01
 
 
 def _powers(design: SequentialDesign, frame: Frame) -> Frame:

@@ -101,6 +101,23 @@ class TestNumbersThatAreNone:
             assert (state.doubts.prior.variance[1:] > made.prior.variance[1:]).all()
 
 
+@pytest.mark.parametrize(("factor", "before"), [(4.0, 30), (30.0, 21)])
+def test_the_models_error_is_that_of_the_loads_there_are(factor: float, before: int) -> None:
+    """At whatever tick they come: until it is known, honest meters would be judged by that of calm hours."""
+    rng = np.random.default_rng(3)
+    plant = make_plant(rng, customers=12, drop=0.03)
+    plain, street = prepare(plant), Street(plant, rng)
+    most = np.full(12, 1e3)
+    design = replace(plain, most_p=most, most_q=most)
+    state, _ = watch(street, design, before)
+    frame = street.frame()
+    frame = replace(frame, t=state.t + 1.0, p=factor * frame.p)
+    after, _, _ = sequential.step(design, state, frame)
+    first, _, _ = sequential.step(design, sequential.init(design, state.t), frame)
+    assert (first.model_error > 4.0 * state.model_error).any()
+    np.testing.assert_allclose(after.model_error, first.model_error, rtol=0.1)
+
+
 class TestLiarsWhoComeAndGo:
     """Nobody else is ever named, and who lies is not better off for being silent or honest in between."""
 
