@@ -221,8 +221,8 @@ def _known(design: SequentialDesign, doubts: Doubts) -> Bools:
 _WIDER = 2.0
 # Ticks without a frame after which there was a pause.
 _PAUSE = 60.0
-# The model's error is bounded anew every so many ticks, and where powers change a voltage by so much more than
-# when it was bounded, squared pu: it grows with the cube of that.
+# The model's error is bounded anew every so many ticks, and where powers change a voltage by so many times
+# what they did then, and by so much, squared pu: it grows with the cube of that.
 _STALE, _GROWN, _CALM = 16, 1.1, 0.01
 
 
