@@ -61,6 +61,10 @@ _FEW = 32
 _CLOSE = 8
 # Correlation from which on two meters are moved by the same loads.
 _TOGETHER = 0.5
+# Groups are believed one after the other at most so many times; a start may accuse this many times the most.
+_TURNS, _MUCH = 6, 1.5
+# Those no worse than the likeliest by this many times log(like) are looked at more closely.
+_NEAR = 4.0
 # A fit is made anew when that part of its meters changed, or after so many changes (rounding).
 _ANEW = 6
 _MOST_CHANGES = 400
@@ -236,6 +240,7 @@ class Search:
         self.here = replace(here, limits=replace(here.limits, sigmas=sigmas))
         self.keep = _held(trust, s)
         self.accused = tuple(suspicion for suspicion in trust.accused if suspicion[1] > s)
+        self.turned: list[Explanation] = []
 
     def __call__(self, now: Fit, view: View) -> tuple[Found, Trust]:
         """What is found, and whom that leaves trusted.
@@ -269,7 +274,7 @@ class Search:
             better = free.best.cost < best.cost and self._total(free.best) < self._total(best)
             first, second = (free, found) if better else (found, free)
             found = Found(first.best, (second.best.bare(), *first.others, *second.others))
-        rivals = (*found.others, *self._instead(found.best))
+        rivals = (*found.others, *self.turned, *self._instead(found.best))
         return replace(found, others=self._compared(found.best, rivals)), self._believe(found.best)
 
     def _instead(self, best: Solution) -> list[Explanation]:
@@ -277,10 +282,7 @@ class Search:
         fresh = self.here.enough & ~best.trusted & ~self.trust.named
         if np.count_nonzero(fresh) > _CLOSE:
             return []
-        out, keep = [], self.keep & self.trust.named
-        # Nobody is named by this: whatever makes an explanation cheaper is worth trying.
-        fair = float(np.sqrt(search.price(fresh.size, 1)))
-        limits = replace(self.here.limits, sigmas=min(self.here.limits.sigmas, fair))
+        out, keep, limits = [], self.keep & self.trust.named, self._fair()
         for j in np.flatnonzero(fresh).tolist():
             book, one = _doubtful(self.book), np.array([j])
             other = self._descend(best.fit, keep, book, innocent=one, pairs=True, limits=limits)
@@ -298,26 +300,50 @@ class Search:
         Where many of a street, or of a phase, tell the same small lie, the word of many stands against that
         of many, and no single meter that changes sides makes either explanation better.
         """
-        here, prior, loose, out = self.here, self.scales.prior, best.fit.loose, []
-        within, most = 2.0 * np.log(self.design.options.like), self.design.most
-        for group in self._agreeing(best):
-            if np.count_nonzero(self._contradict(group[group.size // 2])) > most:
-                continue
-            among = np.zeros_like(best.trusted)
-            among[group] = True
-            judged = judge(fit(prior, here.noise, among, loose), here.m)
-            # What these leave unexplained among themselves, all others can only add to.
-            if judged.misfit > best.cost - best.charge + within:
-                continue
-            start = here.enough & (among | (np.abs(judged.offset) <= here.limits.of(judged.std)))
-            if np.count_nonzero(here.enough & ~start) > most:
-                continue
-            now = fit(prior, here.noise, start, loose)
-            other = self._descend(now, np.zeros_like(among), innocent=group, fresh=True)
-            if np.count_nonzero(here.enough & ~other.trusted) <= most:
-                charge, cost = best.charge + other.charge, best.charge + other.cost
-                out.append(replace(other, loosened=best.loosened, charge=charge, cost=cost))
+        out: list[Solution] = []
+        for _ in range(_TURNS):
+            pairs = [
+                (group, other) for group in self._agreeing(best) for other in self._believing(best, group)
+            ]
+            out += [other for _, other in pairs]
+            near = best.cost + _NEAR * np.log(self.design.options.like)
+            self.turned += [self._closer(group, other) for group, other in pairs if other.cost <= near]
+            cheapest = min((other for _, other in pairs), key=lambda other: other.cost, default=best)
+            if not cheapest.cost < best.cost:
+                break
+            best = cheapest
         return out
+
+    def _believing(self, best: Solution, group: Ints) -> list[Solution]:
+        """The nearest explanation in which a group that `best` accuses is honest; none if that is absurd."""
+        here, prior, loose, most = self.here, self.scales.prior, best.fit.loose, self.design.most
+        if np.count_nonzero(self._contradict(group[group.size // 2])) > most:
+            return []
+        among = np.zeros_like(best.trusted)
+        among[group] = True
+        judged = judge(fit(prior, here.noise, among, loose), here.m)
+        # What these leave unexplained among themselves, all others can only add to.
+        if judged.misfit > best.cost - best.charge + 2.0 * np.log(self.design.options.like):
+            return []
+        start = among | (best.trusted & (np.abs(judged.offset) <= here.limits.of(judged.std)))
+        if np.count_nonzero(here.enough & ~start) > _MUCH * most:
+            return []
+        nobody, now = np.zeros_like(among), fit(prior, here.noise, start, loose)
+        other = self._descend(now, nobody, innocent=group, fresh=True)
+        few = np.count_nonzero(here.enough & ~other.trusted) <= most
+        return [_after(best, other)] if few else []
+
+    def _closer(self, group: Ints, other: Solution) -> Explanation:
+        """One that believes the group on less evidence against the rest: what might be the case."""
+        nobody = np.zeros_like(other.trusted)
+        closer = self._descend(other.fit, nobody, innocent=group, limits=self._fair())
+        few = np.count_nonzero(self.here.enough & ~closer.trusted) <= self.design.most
+        return (_after(other, closer) if few else other).bare()
+
+    def _fair(self) -> Limits:
+        """Limits by which nobody is named: whatever makes an explanation cheaper is worth trying."""
+        fair = float(np.sqrt(search.price(self.keep.size, 1)))
+        return replace(self.here.limits, sigmas=min(self.here.limits.sigmas, fair))
 
     def _contradict(self, j: int) -> Bools:
         """Meters that cannot be honest if meter j is, as far as the two of them alone can tell, (p,)."""
@@ -445,6 +471,12 @@ class Search:
     def _believe(self, best: Explanation) -> Trust:
         accused = (*self.accused, *((k, self.s) for k in best.loosened))
         return believe(self.trust, self._trusted(best), self.s, accused)
+
+
+def _after(before: Solution, found: Solution) -> Solution:
+    """What a descent found that began with all that another solution had loosened."""
+    charge, cost = before.charge + found.charge, before.charge + found.cost
+    return replace(found, loosened=before.loosened + found.loosened, charge=charge, cost=cost)
 
 
 def _linked(link: Bools) -> list[Ints]:
