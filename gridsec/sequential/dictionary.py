@@ -12,7 +12,7 @@ is one move.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -63,6 +63,10 @@ class Dictionary:
         """
         charge, of_liar = self.charge[which], (self.meter[which] >= 0) & ~trusted[self.meter[which]]
         return np.where(of_liar, np.minimum(charge, OF_A_LIAR), charge)
+
+    def doubtful(self) -> Dictionary:
+        """The book for those who look for reasons not to name anybody."""
+        return replace(self, charge=np.minimum(self.charge, OF_A_LIAR))
 
 
 # So many directions are tried, those that the residuals point at most.

@@ -16,7 +16,7 @@ from gridsec.sequential import search
 from gridsec.sequential.commission import Learned
 from gridsec.sequential.conditional import Fit, Judged, Prior, admit, drop, fit, judge, misfit
 from gridsec.sequential.design import SequentialDesign
-from gridsec.sequential.dictionary import OF_A_LIAR, Dictionary
+from gridsec.sequential.dictionary import Dictionary
 from gridsec.sequential.search import Explanation, Found, Limits, Solution, likelier
 from gridsec.sequential.state import Trust
 from gridsec.sequential.windows import Window
@@ -284,7 +284,7 @@ class Search:
             return []
         out, keep, limits = [], self.keep & self.trust.named, self._fair()
         for j in np.flatnonzero(fresh).tolist():
-            book, one = _doubtful(self.book), np.array([j])
+            book, one = self.book.doubtful(), np.array([j])
             other = self._descend(best.fit, keep, book, innocent=one, pairs=True, limits=limits)
             few = np.count_nonzero(self.here.enough & ~other.trusted) <= self.design.most
             honest = self.scales[self.s].limits.of(other.judged.std)[j]
@@ -317,7 +317,7 @@ class Search:
     def _believing(self, best: Solution, group: Ints) -> list[Solution]:
         """The nearest explanation in which a group that `best` accuses is honest; none if that is absurd."""
         here, prior, loose, most = self.here, self.scales.prior, best.fit.loose, self.design.most
-        if np.count_nonzero(self._contradict(group[group.size // 2])) > most:
+        if np.count_nonzero(self._contradict(group[group.size // 2], loose)) > most:
             return []
         among = np.zeros_like(best.trusted)
         among[group] = True
@@ -331,25 +331,32 @@ class Search:
         nobody, now = np.zeros_like(among), fit(prior, here.noise, start, loose)
         other = self._descend(now, nobody, innocent=group, fresh=True)
         few = np.count_nonzero(here.enough & ~other.trusted) <= most
-        return [_after(best, other)] if few else []
+        return [self._after(best, other)] if few else []
 
     def _closer(self, group: Ints, other: Solution) -> Explanation:
         """One that believes the group on less evidence against the rest: what might be the case."""
         nobody = np.zeros_like(other.trusted)
         closer = self._descend(other.fit, nobody, innocent=group, limits=self._fair())
         few = np.count_nonzero(self.here.enough & ~closer.trusted) <= self.design.most
-        return (_after(other, closer) if few else other).bare()
+        return (self._after(other, closer) if few else other).bare()
+
+    def _after(self, before: Solution, found: Solution) -> Solution:
+        """What a descent without a book found, from all that another loosened: powers of liars cost less."""
+        loosened, live = before.loosened, int(np.count_nonzero(self.here.enough))
+        charges = self.book.charges(np.array(loosened, dtype=np.intp), found.trusted)
+        charge = float(charges.sum()) * search.price(live, 1)
+        return replace(found, loosened=loosened, charge=charge, cost=found.cost + charge)
 
     def _fair(self) -> Limits:
         """Limits by which nobody is named: whatever makes an explanation cheaper is worth trying."""
         fair = float(np.sqrt(search.price(self.keep.size, 1)))
         return replace(self.here.limits, sigmas=min(self.here.limits.sigmas, fair))
 
-    def _contradict(self, j: int) -> Bools:
+    def _contradict(self, j: int, loose: Floats) -> Bools:
         """Meters that cannot be honest if meter j is, as far as the two of them alone can tell, (p,)."""
-        here, prior = self.here, self.scales.prior
-        column = prior.of_meters[prior.meters, j]
-        own = prior.variance[prior.meters] + here.noise
+        here, prior, more = self.here, self.scales.prior, loose[self.scales.prior.meters]
+        column = prior.of_meters[prior.meters, j] + more @ more[j]
+        own = prior.variance[prior.meters] + here.noise + (more * more).sum(axis=1)
         apart = np.maximum(own + own[j] - 2.0 * column, 0.0)
         return np.asarray(here.enough & (np.abs(here.m - here.m[j]) > here.limits.of(np.sqrt(apart))))
 
@@ -473,12 +480,6 @@ class Search:
         return believe(self.trust, self._trusted(best), self.s, accused)
 
 
-def _after(before: Solution, found: Solution) -> Solution:
-    """What a descent found that began with all that another solution had loosened."""
-    charge, cost = before.charge + found.charge, before.charge + found.cost
-    return replace(found, loosened=before.loosened + found.loosened, charge=charge, cost=cost)
-
-
 def _linked(link: Bools) -> list[Ints]:
     """Connected parts of a graph of few nodes, each of which is linked to itself."""
     out, left = [], np.ones(len(link), dtype=np.bool_)
@@ -490,11 +491,6 @@ def _linked(link: Bools) -> list[Ints]:
         out.append(np.flatnonzero(part))
         left &= ~part
     return out
-
-
-def _doubtful(book: Dictionary) -> Dictionary:
-    """The book for those who look for reasons not to name anybody."""
-    return replace(book, charge=np.minimum(book.charge, OF_A_LIAR))
 
 
 def _held(trust: Trust, s: int) -> Bools:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.sparse.csgraph import connected_components
@@ -11,9 +13,12 @@ from gridsec.arrays import Bools, Floats
 from gridsec.detect import MeterAccuracy
 from gridsec.droop import fleet
 from gridsec.feeder import Feeder
+from gridsec.network import Power, columns
 from gridsec.plant import Plant
 from gridsec.sequential import LoadDoubt, SequentialDesign
-from gridsec.sequential.explain import Scales, Search, _linked, adapt, view_of
+from gridsec.sequential.conditional import Fit
+from gridsec.sequential.dictionary import OF_A_LIAR
+from gridsec.sequential.explain import Scales, Search, View, _linked, adapt, view_of
 from gridsec.sequential.search import Found, price
 from gridsec.sequential.windows import push
 
@@ -47,20 +52,26 @@ def two_streets() -> SequentialDesign:
 
 def search(design: SequentialDesign, m: Floats) -> Found:
     """What the first scale finds when everybody was believed until now."""
+    made, now, view = prepared(design, m)
+    return made(now, view)[0]
+
+
+def prepared(design: SequentialDesign, m: Floats) -> tuple[Search, Fit, View]:
+    """The search itself, and what it begins with."""
     state, everybody = sequential.init(design, 0.0), np.ones(m.size, dtype=np.bool_)
     window = push(state.window, design.lengths, m, everybody)
     scales = Scales(design, design.prior, window, state.learned, np.zeros(m.size))
     now = adapt(None, design.prior, scales[0].noise, everybody, None)
     view = view_of(design, scales[0], now)
-    found, _ = Search(design, scales, design.book, state.fits, state.trust, 0)(now, view)
-    return found
+    return Search(design, scales, design.book, state.fits, state.trust, 0), now, view
 
 
-def cost(design: SequentialDesign, m: Floats, liars: Bools) -> float:
-    """J by definition."""
+def cost(design: SequentialDesign, m: Floats, liars: Bools, loosened: tuple[int, ...] = ()) -> float:
+    """J by definition, without what loosened directions are charged."""
     at = np.flatnonzero(~liars)
     whole = design.prior.between[np.ix_(at, at)] + np.diag(design.white[at])
-    return float(m[at] @ np.linalg.solve(whole, m[at])) + price(m.size, int(liars.sum()))
+    more = (design.book.columns(np.array(loosened, dtype=int)) * design.book.std[list(loosened)])[at + 1]
+    return float(m[at] @ np.linalg.solve(whole + more @ more.T, m[at])) + price(m.size, int(liars.sum()))
 
 
 def draw(design: SequentialDesign, seed: int, size: float) -> tuple[Floats, Bools]:
@@ -91,6 +102,31 @@ def test_where_the_word_of_many_stands_against_that_of_many_nobody_is_sure(size:
             near = [~each.trusted for each in (found.best, *found.others) if each.cost <= within]
             assert not np.logical_and.reduce(near)[NEAR:].any()
     assert both_told > 20
+
+
+def test_a_street_is_turned_round_where_powers_are_accused_too() -> None:
+    """One of the seven claims a load as well that is not there: if it is honest, that is charged in full."""
+    plain, told, full = two_streets(), 0, 0
+    book = plain.book
+    design = replace(plain, book=replace(book, std=np.full(book.std.size, 0.4)))
+    feeder, count = design.plant.feeder, NEAR + FAR
+    for seed in range(8):
+        rng = np.random.default_rng([8, seed])
+        w = rng.multivariate_normal(np.zeros(count), design.prior.between + 1e-18 * np.eye(count))
+        group = NEAR + rng.choice(FAR, 7, replace=False)
+        m = w + np.sqrt(design.white) * rng.normal(size=count)
+        m -= 0.2 * columns(feeder, Power.ACTIVE, group[:1])[feeder.bus, 0]
+        m[group] -= 0.018
+        made, now, _ = prepared(design, m)
+        for each in made._turned(made._descend(now, np.zeros(count, dtype=bool), design.book)):
+            liars, which = ~each.trusted, np.array(each.loosened, dtype=int)
+            honest = each.trusted[book.meter[which]]
+            charge = np.where(honest, book.charge[which], OF_A_LIAR).sum() * price(count, 1)
+            told, full = told + bool(which.size), full + bool(honest.any())
+            assert each.charge == pytest.approx(charge)
+            assert each.cost == pytest.approx(cost(design, m, liars, each.loosened) + charge, rel=1e-6)
+    assert told > 4
+    assert full > 0
 
 
 def test_linked_are_connected_components() -> None:
