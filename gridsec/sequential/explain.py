@@ -63,6 +63,8 @@ _CLOSE = 8
 _TOGETHER = 0.5
 # Groups are believed one after the other at most so many times; a start may accuse this many times the most.
 _TURNS, _MUCH = 6, 1.5
+# And so many times that the number of meters to the third, times that, is no more than this: two seconds.
+_EFFORT = 4e9
 # Those no worse than the likeliest by this many times log(like) are looked at more closely.
 _NEAR = 4.0
 # A fit is made anew when that part of its meters changed, or after so many changes (rounding).
@@ -301,11 +303,12 @@ class Search:
         of many, and no single meter that changes sides makes either explanation better.
         """
         out: list[Solution] = []
+        left = int(_EFFORT / best.trusted.size**3)
         for _ in range(_TURNS):
-            pairs = [
-                (group, other) for group in self._agreeing(best) for other in self._believing(best, group)
-            ]
+            groups = sorted(self._agreeing(best), key=len, reverse=True)[:left]
+            pairs = [(group, other) for group in groups for other in self._believing(best, group)]
             out += [other for _, other in pairs]
+            left -= len(groups)
             near = best.cost + _NEAR * np.log(self.design.options.like)
             self.turned += [self._closer(group, other) for group, other in pairs if other.cost <= near]
             cheapest = min((other for _, other in pairs), key=lambda other: other.cost, default=best)
