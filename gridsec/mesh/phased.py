@@ -198,13 +198,21 @@ def admittance(feeder: PhasedMesh) -> csc_array:
     ----------
     feeder
         The feeder.
+
+    Raises
+    ------
+    FeederInvalid
+        If the impedances of a line have no inverse.
     """
     tree = feeder.tree
     lines = np.vstack([np.column_stack([tree.parent, np.arange(1, len(tree.buses))]), feeder.ends])
     series = np.zeros((len(lines), 3, 3), dtype=np.complex128)
     present = np.vstack([tree.phases[1:], feeder.phases])
-    for out, z, here in zip(series, [*tree.z, *feeder.z], present, strict=True):
+    for k, (out, z, here) in enumerate(zip(series, [*tree.z, *feeder.z], present, strict=True)):
         some = np.ix_(here, here)
+        if np.linalg.cond(z[some]) > _SINGULAR:
+            where = f"branch {k}" if k < len(tree.z) else f"tie {k - len(tree.z)}"
+            raise FeederInvalid([f"{where}: z is singular; with charging every current has to meet some"])
         out[some] = np.linalg.inv(z[some])
     one, other = lines.T
     every = np.arange(len(tree.buses))

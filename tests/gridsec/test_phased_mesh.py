@@ -286,3 +286,14 @@ def test_every_problem_is_named() -> None:
             -1j * np.abs(lateral.z[:1]),
             np.zeros((1, 3, 3)),
         )
+
+
+@pytest.mark.parametrize("nearly", [0.0, 1e-17, 1e-16])
+def test_conductors_without_impedances_of_their_own_have_no_charging(nearly: float) -> None:
+    """Only what the three carry together meets an impedance: there is no admittance to put charging beside."""
+    three = in_phases(random_mesh(3, ties=1, customers=3), 3.0)
+    block = np.full((1, 3, 3), 0.01 + 0.01j) + nearly * np.eye(3)
+    b = np.array([0.01 * np.eye(3)])
+    assert np.isfinite(replace(three, z=block).R).all()
+    with pytest.raises(FeederInvalid, match="tie 0: z is singular"):
+        replace(three, z=block, charging=b)
