@@ -290,7 +290,7 @@ def test_every_problem_is_named() -> None:
 
 @pytest.mark.parametrize("nearly", [0.0, 1e-17, 1e-16])
 def test_conductors_without_impedances_of_their_own_have_no_charging(nearly: float) -> None:
-    """Only what the three carry together meets an impedance: there is no admittance to put charging beside."""
+    """Only what the three carry together meets an impedance; charging needs an admittance."""
     three = in_phases(random_mesh(3, ties=1, customers=3), 3.0)
     block = np.full((1, 3, 3), 0.01 + 0.01j) + nearly * np.eye(3)
     b = np.array([0.01 * np.eye(3)])
