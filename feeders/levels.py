@@ -48,6 +48,14 @@ def nominal_volts(found: Tree, edges: Sequence[Edge | LineRow], volt: float) -> 
     volt
         That of the busbar, V.
     """
+    nominal = _found(found, edges, volt)
+    for k, above in enumerate(found.parent):  # only what `problems` tells is not known by now
+        nominal.setdefault(k + 1, nominal[above])
+    return [nominal[k] for k in range(len(found.buses))]
+
+
+def _found(found: Tree, edges: Sequence[Edge | LineRow], volt: float) -> dict[int, float]:
+    """Return the nominal voltages that a way from the busbar leads to, which passes transformers forwards."""
     near: dict[int, list[tuple[int, float | None]]] = defaultdict(list)
     for line in edges:
         if line.from_bus in found.group:
@@ -61,27 +69,24 @@ def nominal_volts(found: Tree, edges: Sequence[Edge | LineRow], volt: float) -> 
             if other not in nominal:
                 nominal[other] = nominal[bus] if changed is None else changed
                 order.append(other)
-    for k, above in enumerate(found.parent):  # only what `problems` tells is not known by now
-        nominal.setdefault(k + 1, nominal[above])
-    return [nominal[k] for k in range(len(found.buses))]
+    return nominal
 
 
 def problems(found: Tree, edges: Sequence[Edge | LineRow], volt: float) -> Iterator[tuple[int, str]]:
     """Yield every line whose `to_volt` cannot be, with what is wrong; arguments as of `nominal_volts`."""
-    nominal = nominal_volts(found, edges, volt)
+    nominal, known = nominal_volts(found, edges, volt), _found(found, edges, volt).keys()
     above = dict(zip(found.branch, found.parent, strict=True))
     for k, line in enumerate(edges):
         if line.from_bus not in found.group:
             continue
         here, there = found.group[line.from_bus], found.group[line.to_bus]
         told = nominal[here] if line.to_volt is None else line.to_volt
+        backwards = line.to_volt is not None and above.get(k) == there
         if here == there and not same_level(told, nominal[here]):
             yield k, f"{told:g} on a line without impedance; expected the transformer's r_ohm and x_ohm"
-        elif same_level(told, nominal[there]):
-            continue
-        elif above.get(k) == there:
+        elif backwards and (here not in known or not same_level(told, nominal[there])):
             yield k, f"{told:g}, but {line.to_bus!r} is on the side of the busbar; {_TURN}"
-        else:
+        elif not same_level(told, nominal[there]):
             yield k, f"{told:g} V at {line.to_bus!r}, {nominal[there]:g} V around the loop; expected the same"
 
 

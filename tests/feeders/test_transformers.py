@@ -177,6 +177,16 @@ def test_all_that_is_wrong_is_told_at_once() -> None:
         assert any(text in problem for problem in problems), (text, problems)
 
 
+def test_a_transformer_given_from_its_far_end_is_refused_although_its_voltage_is_right() -> None:
+    """Taken as it stands it would be a line of 20 kV, and the whole street behind it too."""
+    wrong = changed(T1={"from_bus": "s1", "to_bus": "m2", "to_volt": MV, "r_ohm": 8.75, "x_ohm": 24.0})
+    (problem,) = validate(wrong)
+    assert "(T1), column to_volt: 11547, but 'm2' is on the side of the busbar" in problem
+    (problem,) = validate(changed(B1={"to_volt": LV}))  # nothing says what is before it
+    assert "(B1), column to_volt: 230.94, but 's2' is on the side of the busbar" in problem
+    assert validate(changed(A1={"to_volt": LV}, M2={"to_volt": MV})) == ()
+
+
 @pytest.mark.parametrize(
     ("rows", "doubt"),
     [
