@@ -90,7 +90,8 @@ def protect(
         str, typer.Option(help="identify: liars are named; notice: some lie is; bound: lies stay small.")
     ] = "identify",
     lie_volt: Annotated[
-        float | None, typer.Option(help="For bound: largest lie that may stay unnoticed, V.")
+        float | None,
+        typer.Option(help="For bound: largest unnoticed lie, V of the busbar's level."),
     ] = None,
     attack: Annotated[str, typer.Option(help="Attacks that count: persistent or any.")] = "persistent",
     unknown: Unknown = None,

@@ -34,7 +34,9 @@ MaxAttacked = Annotated[int, typer.Option(help="M: how many meters lie together 
 GoalOf = Annotated[
     str, typer.Option(help="Protect so that liars are named: identify; noticed: notice; small: bound.")
 ]
-LieVolt = Annotated[float | None, typer.Option(help="For bound: largest lie that may stay unnoticed, V.")]
+LieVolt = Annotated[
+    float | None, typer.Option(help="For bound: largest unnoticed lie, V of the busbar's level.")
+]
 Scenarios = Annotated[int, typer.Option(help="How many attacks are simulated.", min=1)]
 Workers = Annotated[
     int | None, typer.Option(help="Processes for simulated attacks. [default: all cores]", min=1)

@@ -244,7 +244,7 @@ def protect(site: Site, found: Protect) -> Section:
         ),
         tables=found.tables,
         columns={
-            "before, after": "largest hidden lie, V"
+            "before, after": "largest hidden lie, V of the busbar's level"
             if found.goal is Goal.BOUND
             else "fewest liars that stay invisible, without and with protection",
             "least": "no fewer protected meters suffice",
@@ -266,10 +266,12 @@ def _protection(site: Site, found: Protect) -> Finding:
     count, liars = len(found.meters), found.max_attacked
     others = f"any {liars} liars" if liars > 1 else "any single liar"
     among = " among the other meters" if count else ""
+    several = bool((site.nominal_volt != site.nominal_volt[0]).any())
+    there = f" where {site.nominal_volt[0]:.1f} V are nominal, or the same part elsewhere," if several else ""
     purpose = {
         Goal.IDENTIFY: f"{others}{among} would be identified",
         Goal.NOTICE: f"the lies of {others}{among} would be noticed",
-        Goal.BOUND: f"no lie above {number(found.lie_volt)} V of {others} fits to an honest feeder",
+        Goal.BOUND: f"no lie above {number(found.lie_volt)} V{there} of {others} fits to an honest feeder",
     }[found.goal]
     scope = "" if found.goal is Goal.BOUND else " by someone who knows all other loads and errors exactly"
     if not count:

@@ -51,7 +51,8 @@ class Protect:
     goal, max_attacked, attack, lie_volt
         What was asked: M, which attacks count, and the bound of lies (NaN where the goal is none).
     before, after
-        Without and with protection: the fewest liars that stay invisible, or the largest hidden lie, V.
+        Without and with protection: the fewest liars that stay invisible, or the largest hidden lie, V; it
+        too as the busbar's level has it.
     least
         No fewer meters suffice. Equal to the number of meters where they are proven the fewest.
     meters
@@ -124,7 +125,8 @@ def protect(
         `IDENTIFY`: the liars follow from the readings. `NOTICE`: some lie is noticed. Both as in
         `feeders.studies.redundancy`. `BOUND`: no lie larger than `lie_volt` fits to an honest feeder.
     lie_volt
-        Bound of the lie, V, at nominal voltage.
+        Bound of the lie, V, at nominal voltage; behind a transformer to another level, where volts do not
+        compare with the busbar's, the same part of the nominal voltage there.
     attack, unknown, busbar_known
         For `IDENTIFY` and `NOTICE`: which attacks count, and what nobody knows.
     curves
@@ -159,7 +161,7 @@ def protect(
         "digest": site.digest,
         "goal": str(goal),
         "max_attacked": max_attacked,
-        "lie_volt": lie_volt if goal is Goal.BOUND else None,
+        "lie_part": lie_volt / site.tables.meta.voltage_volt if goal is Goal.BOUND else None,
         "attack": str(attack),
         "unknown": None if unknown is None else sorted(unknown),
         "busbar_known": busbar_known,
@@ -210,8 +212,10 @@ def _hidden(given: Patterns, max_attacked: int, goal: Goal) -> tuple[Attacker, M
 def _bounded(
     site: Site, max_attacked: int, lie_volt: float, share: float, curves: Curves
 ) -> tuple[Attacker, Measure]:
-    """Whose lie is too large, and the largest there is, V."""
-    given, base = box(site, share=share, curves=curves), site.customer_volt[site.meters]
+    """Whose lie is too large, and the largest there is, V; every level counted in volts of the busbar's."""
+    given = box(site, share=share, curves=curves)
+    # Around a tap or a transformer, 1 pu of a customer is so many volts where the busbar's level is nominal.
+    base = (site.customer_volt / site.customer_nominal)[site.meters] * site.tables.meta.voltage_volt
 
     def largest(protected: Bools) -> float:
         sizes = [largest_lie(given, j, max_attacked, honest=protected).bound for j in range(protected.size)]

@@ -7,12 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from feeders.load import load
+from feeders.load import from_tables, load
 from feeders.studies.hidden import Attack
 from feeders.studies.operating import box, squared, volts_of_lie
 from feeders.studies.protect import Goal, protect
 from gridsec.errors import DesignInfeasible
 from gridsec.studies.lies import largest_lie
+from tests.feeders import stations
 
 RURAL = load("simbench-lv-rural1")
 UNKNOWN = ("LV1.101 Load 4", "LV1.101 Load 8")
@@ -46,6 +47,19 @@ def test_lies_stay_below_the_bound_in_volts() -> None:
     given = box(RURAL)
     sizes = [volts_of_lie(RURAL.feeder.base_volt, largest_lie(given, j, 2).size) for j in range(13)]
     assert sorted(np.argsort(sizes)[-2:].tolist()) == [5, 12]
+
+
+def test_a_bound_is_the_same_part_of_every_level() -> None:
+    """250 V of 11 547 V are 5 V of 230.94 V: a lie as large as a street's voltage is no small one."""
+    site = from_tables(stations.tables())
+    given, part = box(site), 250.0 / stations.MV
+    sizes = np.array([largest_lie(given, j, 1).bound for j in range(site.meters.size)])
+    lies = volts_of_lie(site.customer_volt, sizes) / site.customer_nominal
+    np.testing.assert_array_equal(lies > part, site.customer_nominal == stations.LV)
+    found = protect(site, max_attacked=1, goal=Goal.BOUND, lie_volt=250.0)
+    assert set(found.meters["customer"]) == {site.feeder.customers[k] for k in np.flatnonzero(lies > part)}
+    assert found.before == pytest.approx(lies.max() * stations.MV)
+    assert found.after <= 250.0
 
 
 def test_what_cannot_be_done_is_told_with_names() -> None:
