@@ -182,7 +182,14 @@ def fit(prior: Prior, noise: Floats, trusted: Bools, loose: Floats | None = None
     return now
 
 
-def misfit(prior: Prior, noise: Floats, m: Floats, trusted: Bools, loose: Floats | None = None) -> float:
+def misfit(  # noqa: PLR0917  # as `fit`, and what is asked
+    prior: Prior,
+    noise: Floats,
+    m: Floats,
+    trusted: Bools,
+    loose: Floats | None = None,
+    alike: Floats | None = None,
+) -> float:
     """``m^T Q m`` alone, in a third of the time of `fit`.
 
     Parameters
@@ -191,12 +198,17 @@ def misfit(prior: Prior, noise: Floats, m: Floats, trusted: Bools, loose: Floats
         As in `fit`.
     m : (p,)
         As in `judge`.
+    alike : (p, k)
+        Amounts by which some meters are off together, each times its standard deviation.
     """
     at = np.flatnonzero(trusted)
     if not at.size:
         return 0.0
     more = np.zeros((prior.variance.size, 0)) if loose is None else loose
-    return float(m[at] @ solved(_between(prior, noise[at], at, more), m[at]))
+    between = _between(prior, noise[at], at, more)
+    if alike is not None:
+        between += alike[at] @ alike[at].T
+    return float(m[at] @ solved(between, m[at]))
 
 
 def solved(matrix: Floats, right: Floats) -> Floats:

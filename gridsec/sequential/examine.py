@@ -15,7 +15,8 @@ from gridsec.arrays import Bools, Floats, Ints
 from gridsec.sequential.conditional import Fit, drop, judge
 from gridsec.sequential.decoder import Accused, Evidence
 from gridsec.sequential.design import SequentialDesign
-from gridsec.sequential.explain import Scale, Scales, Search, View, adapt, believe, directions, view_of
+from gridsec.sequential.explain import Search
+from gridsec.sequential.scales import Scale, Scales, View, adapt, believe, directions, view_of
 from gridsec.sequential.search import Explanation, Found, Solution
 from gridsec.sequential.state import SequentialState, Trust
 from gridsec.sequential.windows import Window

@@ -7,53 +7,18 @@ docs/theory-sequential.md, sections 3 to 5.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.sequential import search
-from gridsec.sequential.commission import Learned
-from gridsec.sequential.conditional import Fit, Judged, Prior, admit, drop, fit, judge, misfit
+from gridsec.sequential.conditional import Fit, fit, judge, misfit
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.dictionary import Dictionary
+from gridsec.sequential.scales import Scales, View, believe, directions
 from gridsec.sequential.search import Explanation, Found, Limits, Solution, likelier
 from gridsec.sequential.state import Trust
-from gridsec.sequential.windows import Window
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class View:
-    """What one scale says. p meters.
-
-    Attributes
-    ----------
-    judged
-        Every meter, judged by the trusted others.
-    enough : (p,)
-        Meters with enough readings on this scale.
-    limit : (p,)
-        Largest honest offset, squared pu.
-    over : (p,)
-        Whose offset is larger.
-    limits, lower
-        How the limits come about, and the part of `sigmas` that is expected of a meter that is to be
-        trusted again.
-    """
-
-    judged: Judged
-    enough: Bools
-    limit: Floats
-    over: Bools
-    limits: Limits
-    lower: float
-
-    @property
-    def still(self) -> Bools:
-        """Whose offset is larger than what is expected of a meter that is to be trusted again, (p,)."""
-        judged = self.judged
-        return self.enough & (np.abs(judged.offset) > self.limits.of(judged.std, self.lower))
-
 
 # With more meters than this beyond their limits at once, moving one after the other is no good start.
 _FEW = 32
@@ -66,140 +31,9 @@ _TURNS, _MUCH = 6, 1.5
 # And so many times that the number of meters to the third, times that, is no more than this: two seconds.
 _EFFORT = 4e9
 # Those no worse than the likeliest by this many times log(like) are looked at more closely.
-_NEAR = 4.0
-# A fit is made anew when that part of its meters changed, or after so many changes (rounding).
-_ANEW = 6
-_MOST_CHANGES = 400
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Scale:
-    """What one scale has to judge by. p meters.
-
-    Attributes
-    ----------
-    noise : (p,)
-        Variance of each meter's mean, squared pu^2.
-    m : (p,)
-        Mean residual, squared pu.
-    enough : (p,)
-        Meters with enough readings.
-    limits
-        What is evidence.
-    """
-
-    noise: Floats
-    m: Floats
-    enough: Bools
-    limits: Limits
-
-
-class Scales:
-    """All scales at one tick, by index.
-
-    Parameters
-    ----------
-    design
-        The design.
-    prior, window, learned
-        What the powers may do, the last residuals, and what is known of the meters' errors.
-    model : (p,)
-        What the model may be off, squared pu.
-    """
-
-    def __init__(
-        self, design: SequentialDesign, prior: Prior, window: Window, learned: Learned, model: Floats
-    ) -> None:
-        self.design, self.prior, self.window, self.model = design, prior, window, model
-        self.learned = learned
-
-    def __getitem__(self, s: int) -> Scale:
-        design, counts = self.design, self.window.counts[s]
-        need = max(1, int(np.ceil(design.options.enough * design.lengths[s])))
-        return Scale(
-            noise=design.white / need + self.learned.variance,
-            m=self.window.sums[s] / np.maximum(counts, 1),
-            enough=counts >= need,
-            limits=Limits(design.sigmas[s], self.model, self.learned.allowed, self.learned.variance),
-        )
-
-
-def view_of(design: SequentialDesign, here: Scale, now: Fit) -> View:
-    """What a scale says of every meter when it rests on a fit.
-
-    Parameters
-    ----------
-    design, here, now
-        The design, the scale, and the fit.
-    """
-    judged = judge(now, here.m)
-    limit = here.limits.of(judged.std)
-    over = here.enough & (np.abs(judged.offset) > limit)
-    return View(judged, here.enough, limit, over, here.limits, design.options.lower)
-
-
-def directions(book: Dictionary, accused: tuple[tuple[int, int], ...]) -> Floats | None:
-    """Loosened directions with their standard deviations, (n, k); None for none.
-
-    Parameters
-    ----------
-    book
-        What else but meters can be wrong.
-    accused
-        Its indices, each with a scale.
-    """
-    if not accused:
-        return None
-    which = np.array([k for k, _ in accused])
-    return np.asarray(book.columns(which) * book.std[which])
-
-
-def adapt(before: Fit | None, prior: Prior, noise: Floats, wanted: Bools, loose: Floats | None) -> Fit:
-    """A fit of the wanted meters, from the last one where that is cheaper.
-
-    Parameters
-    ----------
-    before
-        The last fit of this scale.
-    prior, noise
-        As in `conditional.fit`.
-    wanted : (p,)
-        The meters to rest on.
-    loose : (n, k)
-        Loosened directions.
-    """
-    if before is None or before.prior is not prior:
-        return fit(prior, noise, wanted, loose)
-    if before.loose.shape[1] if loose is None else not np.array_equal(before.loose, loose):
-        return fit(prior, noise, wanted, loose)
-    change = np.flatnonzero(before.trusted != wanted)
-    if not change.size:
-        return before
-    if change.size * _ANEW > wanted.size or before.changes + change.size > _MOST_CHANGES:
-        return fit(prior, noise, wanted, loose)
-    now = before.copy()
-    for j in change.tolist():
-        (admit if wanted[j] else drop)(now, j)
-    return now
-
-
-def believe(trust: Trust, trusted: Bools, s: int, accused: tuple[tuple[int, int], ...]) -> Trust:
-    """Whom an explanation leaves trusted.
-
-    Parameters
-    ----------
-    trust
-        Who was believed.
-    trusted : (p,)
-        Who is.
-    s
-        The scale that it was found on.
-    accused
-        What else is suspected, each with a scale.
-    """
-    fallen = trust.trusted & ~trusted
-    scale, quiet = np.where(fallen, s, trust.scale), np.where(fallen, 0, trust.quiet)
-    return replace(trust, trusted=trusted, scale=scale, quiet=quiet, accused=accused)
+_NEAR = 8.0
+# Standard deviations of chi-square that chance may add; what all of a group may be off by, squared pu.
+_CHANCE, _ANY_LIE = 4.0, 0.2
 
 
 class Search:
@@ -365,30 +199,71 @@ class Search:
 
     def _agreeing(self, best: Solution) -> list[Ints]:
         """Accused meters of one kind: they read too high, or too low, where the same loads move them."""
-        prior, accused = self.scales.prior, self.here.enough & ~best.trusted
-        out = []
+        accused, out = self.here.enough & ~best.trusted, []
         for sign in (accused & (best.judged.offset > 0.0), accused & (best.judged.offset < 0.0)):
             at = np.flatnonzero(sign)
-            between = prior.of_meters[np.ix_(prior.meters[at], at)]
-            std = np.sqrt(between.diagonal())
-            out += [at[group] for group in _linked(between >= _TOGETHER * np.multiply.outer(std, std))]
-        return [group for group in out if group.size > 1]
+            out += [at[group] for group in _linked(self._together(at)) if group.size > 1]
+        return out
 
     def _compared(self, best: Solution, rivals: tuple[Explanation, ...]) -> tuple[Explanation, ...]:
-        """Rivals, each at what it costs on the scale that speaks most against it.
+        """Rivals, each once, at what it costs on the scale that speaks most against it.
 
         Long means hardly know yet of a lie that has just begun, short ones hardly see a small one.
         """
-        within, ours, out = 2.0 * np.log(self.design.options.like), None, []
-        for other in rivals:
-            same = other.loosened == best.loosened and np.array_equal(other.trusted, best.trusted)
-            if same or other.cost - best.cost > within:
-                out.append(other)
+        like, ours = np.log(self.design.options.like), None
+        out: dict[tuple[bytes, tuple[int, ...]], Explanation] = {}
+        for other in sorted(rivals, key=lambda rival: rival.cost):
+            who = other.trusted.tobytes(), other.loosened
+            if who in out or who == (best.trusted.tobytes(), best.loosened):
                 continue
-            ours = self._misfits(best) if ours is None else ours
-            worse = max(theirs - own for theirs, own in zip(self._misfits(other), ours, strict=True))
-            out.append(replace(other, cost=best.cost + self._prices(other) - self._prices(best) + worse))
-        return tuple(out)
+            cost = other.cost
+            if cost - best.cost <= 2.0 * like:
+                ours = self._misfits(best) if ours is None else ours
+                worse = max(theirs - own for theirs, own in zip(self._misfits(other), ours, strict=True))
+                cost = best.cost + self._prices(other) - self._prices(best) + worse
+            if other.cost - best.cost <= _NEAR * like:
+                cost = min(cost, self._swapped(best, other))
+            out[who] = replace(other, cost=cost)
+        return tuple(out.values())
+
+    def _swapped(self, best: Solution, other: Explanation) -> float:
+        """What a rival costs where groups change sides and either group tells one lie; infinite elsewhere.
+
+        Dropping a group drops what chance does to its meters, which differs from group to group by more than
+        the explanations do. Both sides are therefore asked about the same meters: all that either trusts,
+        with one unknown amount for each group that it accuses.
+        """
+        here = self.here
+        believed = here.enough & other.trusted & ~best.trusted
+        accused = here.enough & best.trusted & ~other.trusted
+        if min(np.count_nonzero(believed), np.count_nonzero(accused)) < 2:
+            return np.inf
+        ours, freedom = self._alike(best, believed)
+        if ours[self.s] - best.judged.misfit > freedom + _CHANCE * np.sqrt(2.0 * freedom):
+            return np.inf  # those it accuses do not tell one lie
+        theirs, _ = self._alike(other, accused)
+        worse = max(his - own for his, own in zip(theirs, ours, strict=True))
+        return best.cost + self._prices(other) - self._prices(best) + worse
+
+    def _alike(self, found: Explanation, group: Bools) -> tuple[list[float], int]:
+        """What an explanation leaves unexplained where a group it accuses is off by one amount a street.
+
+        By scale; and how many meters more than amounts there are.
+        """
+        at = np.flatnonzero(group)
+        parts = _linked(self._together(at))
+        alike = np.zeros((group.size, len(parts)))
+        for k, part in enumerate(parts):
+            alike[at[part], k] = _ANY_LIE
+        return self._misfits(found, group, alike), at.size - len(parts)
+
+    def _together(self, at: Ints) -> Bools:
+        """Which of some meters are moved by the same loads, (k, k)."""
+        prior = self.scales.prior
+        between = prior.of_meters[np.ix_(prior.meters[at], at)]
+        std = np.sqrt(between.diagonal())
+        limit = _TOGETHER * np.multiply.outer(std, std)
+        return np.asarray((between >= limit) & (limit > 0.0) | np.eye(at.size, dtype=np.bool_))
 
     def _suspected(self, found: Found) -> int:
         """How many meters are suspected at least."""
@@ -465,17 +340,20 @@ class Search:
     def _trusted(self, found: Explanation) -> Bools:
         return np.where(self.here.enough, found.trusted, self.trust.trusted)
 
-    def _misfits(self, found: Explanation) -> list[float]:
-        """What an explanation leaves unexplained on each scale."""
+    def _misfits(
+        self, found: Explanation, more: Bools | None = None, alike: Floats | None = None
+    ) -> list[float]:
+        """What an explanation leaves unexplained on each scale; of `more` meters, which may be off alike."""
         trusted, out = self._trusted(found), []
+        trusted = trusted if more is None else trusted | more
         loose = directions(self.book, (*self.accused, *((k, self.s) for k in found.loosened)))
         for s in range(len(self.fits)):
             there = self.scales[s]
-            if s == self.s and isinstance(found, Solution):
+            if s == self.s and more is None and isinstance(found, Solution):
                 out.append(found.judged.misfit)
             else:
                 wanted = trusted & there.enough
-                out.append(misfit(self.scales.prior, there.noise, there.m, wanted, loose))
+                out.append(misfit(self.scales.prior, there.noise, there.m, wanted, loose, alike))
         return out
 
     def _believe(self, best: Explanation) -> Trust:

@@ -14,11 +14,13 @@ from gridsec.detect import MeterAccuracy
 from gridsec.droop import fleet
 from gridsec.feeder import Feeder
 from gridsec.network import Power, columns
+from gridsec.online import Frame
 from gridsec.plant import Plant
 from gridsec.sequential import LoadDoubt, SequentialDesign
-from gridsec.sequential.conditional import Fit
+from gridsec.sequential.conditional import Fit, misfit
 from gridsec.sequential.dictionary import OF_A_LIAR
-from gridsec.sequential.explain import Scales, Search, View, _linked, adapt, view_of
+from gridsec.sequential.explain import Search, _linked
+from gridsec.sequential.scales import Scales, View, adapt, view_of
 from gridsec.sequential.search import Found, price
 from gridsec.sequential.windows import push
 
@@ -102,6 +104,59 @@ def test_where_the_word_of_many_stands_against_that_of_many_nobody_is_sure(size:
             near = [~each.trusted for each in (found.best, *found.others) if each.cost <= within]
             assert not np.logical_and.reduce(near)[NEAR:].any()
     assert both_told > 20
+
+
+def watched(design: SequentialDesign, seed: int, far: int) -> tuple[set[int], set[int]]:
+    """Who is ever named, and who lies, where loads wander for 40 s as the design supposes."""
+    rng = np.random.default_rng([11, seed])
+    count = NEAR + FAR
+    street, near = NEAR + rng.choice(FAR, far, replace=False), rng.choice(NEAR, 3, replace=False)
+    root = np.linalg.cholesky(design.prior.between + 1e-14 * np.eye(count))
+    keeps = np.exp(-1.0 / 600.0)
+    none, zero, z = np.full(count, np.nan), np.zeros(count), rng.normal(size=count)
+    state, named = sequential.init(design, 0.0), set()
+    for k in range(40):
+        z = keeps * z + np.sqrt(1.0 - keeps**2) * rng.normal(size=count)
+        y = 1.0 + root @ z + np.sqrt(design.white) * rng.normal(size=count)
+        if k >= 10:
+            y[street] -= 0.018
+            y[near] += 0.02
+        seen = np.ones(count, dtype=np.bool_)
+        frame = Frame(k + 1.0, y, seen, 1.0, zero, zero, zero, zero, none, np.full(count, np.inf))
+        state, _, verdict = sequential.step(design, state, frame)
+        named |= set(np.flatnonzero(verdict.suspects).tolist())
+    return named, {*street.tolist(), *near.tolist()}
+
+
+@pytest.mark.parametrize("seed", [2, 6, 16, 20, 26])
+def test_nobody_of_the_other_side_is_named_by_a_breath_of_noise(seed: int) -> None:
+    """Seven of fifteen tell one lie: without a common amount for them, noise tips the scales at some tick."""
+    named, liars = watched(two_streets(), seed, 7)
+    assert named <= liars
+
+
+def test_a_third_of_a_street_is_named() -> None:
+    for seed in range(4):
+        named, liars = watched(two_streets(), seed, 5)
+        assert named == liars
+
+
+def test_one_amount_for_a_group_by_definition() -> None:
+    design, rng = two_streets(), np.random.default_rng(9)
+    m, _ = draw(design, 3, 0.02)
+    alike = np.zeros((m.size, 2))
+    alike[NEAR : NEAR + 4, 0] = alike[2:5, 1] = 0.2
+    trusted = rng.random(m.size) < 0.8
+    at = np.flatnonzero(trusted)
+    whole = design.prior.between + np.diag(design.white) + alike @ alike.T
+    wanted = m[at] @ np.linalg.solve(whole[np.ix_(at, at)], m[at])
+    found = misfit(design.prior, design.white, m, trusted, None, alike)
+    assert found == pytest.approx(wanted, rel=1e-8)
+    # One that may be off by anything by itself is as good as dropped.
+    one, there = np.zeros((m.size, 1)), trusted.copy()
+    one[at[3]], there[at[3]] = 1e3, False
+    without = misfit(design.prior, design.white, m, there)
+    assert misfit(design.prior, design.white, m, trusted, None, one) == pytest.approx(without, rel=1e-5)
 
 
 def test_a_street_is_turned_round_where_powers_are_accused_too() -> None:

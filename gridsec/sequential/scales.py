@@ -1,0 +1,189 @@
+"""What every scale judges by: its means and limits, the view of a fit, and fits made from one another.
+
+References
+----------
+docs/theory-sequential.md, section 3.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats
+from gridsec.sequential.commission import Learned
+from gridsec.sequential.conditional import Fit, Judged, Prior, admit, drop, fit, judge
+from gridsec.sequential.design import SequentialDesign
+from gridsec.sequential.dictionary import Dictionary
+from gridsec.sequential.search import Limits
+from gridsec.sequential.state import Trust
+from gridsec.sequential.windows import Window
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """What one scale says. p meters.
+
+    Attributes
+    ----------
+    judged
+        Every meter, judged by the trusted others.
+    enough : (p,)
+        Meters with enough readings on this scale.
+    limit : (p,)
+        Largest honest offset, squared pu.
+    over : (p,)
+        Whose offset is larger.
+    limits, lower
+        How the limits come about, and the part of `sigmas` that is expected of a meter that is to be
+        trusted again.
+    """
+
+    judged: Judged
+    enough: Bools
+    limit: Floats
+    over: Bools
+    limits: Limits
+    lower: float
+
+    @property
+    def still(self) -> Bools:
+        """Whose offset is larger than what is expected of a meter that is to be trusted again, (p,)."""
+        judged = self.judged
+        return self.enough & (np.abs(judged.offset) > self.limits.of(judged.std, self.lower))
+
+
+# A fit is made anew when that part of its meters changed, or after so many changes (rounding).
+_ANEW = 6
+_MOST_CHANGES = 400
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scale:
+    """What one scale has to judge by. p meters.
+
+    Attributes
+    ----------
+    noise : (p,)
+        Variance of each meter's mean, squared pu^2.
+    m : (p,)
+        Mean residual, squared pu.
+    enough : (p,)
+        Meters with enough readings.
+    limits
+        What is evidence.
+    """
+
+    noise: Floats
+    m: Floats
+    enough: Bools
+    limits: Limits
+
+
+class Scales:
+    """All scales at one tick, by index.
+
+    Parameters
+    ----------
+    design
+        The design.
+    prior, window, learned
+        What the powers may do, the last residuals, and what is known of the meters' errors.
+    model : (p,)
+        What the model may be off, squared pu.
+    """
+
+    def __init__(
+        self, design: SequentialDesign, prior: Prior, window: Window, learned: Learned, model: Floats
+    ) -> None:
+        self.design, self.prior, self.window, self.model = design, prior, window, model
+        self.learned = learned
+
+    def __getitem__(self, s: int) -> Scale:
+        design, counts = self.design, self.window.counts[s]
+        need = max(1, int(np.ceil(design.options.enough * design.lengths[s])))
+        return Scale(
+            noise=design.white / need + self.learned.variance,
+            m=self.window.sums[s] / np.maximum(counts, 1),
+            enough=counts >= need,
+            limits=Limits(design.sigmas[s], self.model, self.learned.allowed, self.learned.variance),
+        )
+
+
+def view_of(design: SequentialDesign, here: Scale, now: Fit) -> View:
+    """What a scale says of every meter when it rests on a fit.
+
+    Parameters
+    ----------
+    design, here, now
+        The design, the scale, and the fit.
+    """
+    judged = judge(now, here.m)
+    limit = here.limits.of(judged.std)
+    over = here.enough & (np.abs(judged.offset) > limit)
+    return View(judged, here.enough, limit, over, here.limits, design.options.lower)
+
+
+def directions(book: Dictionary, accused: tuple[tuple[int, int], ...]) -> Floats | None:
+    """Loosened directions with their standard deviations, (n, k); None for none.
+
+    Parameters
+    ----------
+    book
+        What else but meters can be wrong.
+    accused
+        Its indices, each with a scale.
+    """
+    if not accused:
+        return None
+    which = np.array([k for k, _ in accused])
+    return np.asarray(book.columns(which) * book.std[which])
+
+
+def adapt(before: Fit | None, prior: Prior, noise: Floats, wanted: Bools, loose: Floats | None) -> Fit:
+    """A fit of the wanted meters, from the last one where that is cheaper.
+
+    Parameters
+    ----------
+    before
+        The last fit of this scale.
+    prior, noise
+        As in `conditional.fit`.
+    wanted : (p,)
+        The meters to rest on.
+    loose : (n, k)
+        Loosened directions.
+    """
+    if before is None or before.prior is not prior:
+        return fit(prior, noise, wanted, loose)
+    if before.loose.shape[1] if loose is None else not np.array_equal(before.loose, loose):
+        return fit(prior, noise, wanted, loose)
+    change = np.flatnonzero(before.trusted != wanted)
+    if not change.size:
+        return before
+    if change.size * _ANEW > wanted.size or before.changes + change.size > _MOST_CHANGES:
+        return fit(prior, noise, wanted, loose)
+    now = before.copy()
+    for j in change.tolist():
+        (admit if wanted[j] else drop)(now, j)
+    return now
+
+
+def believe(trust: Trust, trusted: Bools, s: int, accused: tuple[tuple[int, int], ...]) -> Trust:
+    """Whom an explanation leaves trusted.
+
+    Parameters
+    ----------
+    trust
+        Who was believed.
+    trusted : (p,)
+        Who is.
+    s
+        The scale that it was found on.
+    accused
+        What else is suspected, each with a scale.
+    """
+    fallen = trust.trusted & ~trusted
+    scale, quiet = np.where(fallen, s, trust.scale), np.where(fallen, 0, trust.quiet)
+    return replace(trust, trusted=trusted, scale=scale, quiet=quiet, accused=accused)
