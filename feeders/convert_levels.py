@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final
 from feeders.convert_changes import WHOLE, Change
 from feeders.convert_draws import Draw
 from feeders.convert_graph import Coupling, above_busbar, as_rows, fused_with, reached
-from feeders.convert_lines import VOLT_DIGITS
+from feeders.convert_lines import VOLT_DIGITS, turned
 from feeders.levels import same_level
 from feeders.schema import LineRow
 
@@ -72,6 +72,7 @@ def transformed(
     lines: list[LineRow] = []
     draws: list[Draw] = []
     joined = _Joined(rows, loops=extent.meshed)
+    away = reached(busbar, [*rows, *as_rows(network.couplings)])
     for each in network.couplings:
         if each.line is None or not above.isdisjoint(set(each.buses) - fused.keys()):
             left.append(each)
@@ -86,7 +87,8 @@ def transformed(
                 continue
         lines.append(line)
         draws += [] if each.idle is None else [each.idle]
-        changes.append(_told(each, line))
+        backwards = away.get(line.from_bus, 0) > away.get(line.to_bus, 0)
+        changes.append(_told(each, turned(line, network.nominal) if backwards else line))
         if each.idle is None and not network.volts:
             effect = "without the source's power flow not known"
             changes.append(Change(each.name, "no-load current", "left out", effect))

@@ -18,6 +18,7 @@ from typing import Any, Final
 import numpy as np
 
 from feeders.convert_changes import WHOLE, Change
+from feeders.convert_customers import rounded
 from feeders.convert_draws import Draw, is_even
 from feeders.convert_graph import Coupling
 from feeders.convert_lines import capacitor, line_row, open_end, with_taps
@@ -361,7 +362,16 @@ def _regulator(dss: Any, each: _Element, network: Network) -> tuple[LineRow | No
     idle[phases] = np.abs(v) ** 2 * np.conj(far - 1.0 / series) / 1e3
     takes = np.abs(idle).sum() > NO_LOAD * float(dss.Properties.Value("kva"))  # False for NaN
     draw = Draw(f"{label} no-load", each.buses[1], idle, even=is_even(idle), idle=True) if takes else None
-    return with_taps(row, taps), draw
+    return replace(with_taps(row, taps), rating_a=_amps(dss, each, count)), draw
+
+
+def _amps(dss: Any, each: _Element, count: int) -> float | None:
+    """Rated current of a transformer's second winding, A; its voltage is said between phases, if several."""
+    dss.Transformers.Name(each.name)
+    dss.Transformers.Wdg(2)
+    kva, kv = float(dss.Transformers.kVA()), float(dss.Transformers.kV())
+    neutral = kv / 3**0.5 if count > 1 else kv
+    return rounded(kva / count / neutral) if kva > 0 and kv > 0 else None
 
 
 def _is_shunt(each: _Element) -> bool:

@@ -225,6 +225,21 @@ def test_opendss_stars_with_grounded_neutrals(tmp_path: Path) -> None:
     assert sum(row.load_kw for row in idle) == pytest.approx(1.2, rel=0.1)
 
 
+def test_an_opendss_transformer_whose_first_winding_is_the_lower_one(tmp_path: Path) -> None:
+    """The report and the rating are of the line in the file, which leads away from the busbar."""
+    path = tmp_path / "town.dss"
+    star = "windings=2 buses=(mid,low) conns=(wye,wye) kvs=(20,0.4)"
+    assert star in OPENDSS
+    found = []
+    for text in (OPENDSS, OPENDSS.replace(star, "windings=2 buses=(low,mid) conns=(wye,wye) kvs=(0.4,20)")):
+        path.write_text(text.replace("taps=(1.025,1)", ""))
+        done = convert(str(path), tmp_path / f"x{len(found)}", root="grid")
+        (row,) = (row for row in read(tmp_path / f"x{len(found)}").lines if row.to_volt is not None)
+        found.append((row.from_bus, row.to_bus, row.rating_a))
+        assert any("transformer star; a line to 230.94 V" in note for note in done.notes), done.notes
+    assert found == [("mid", "low", pytest.approx(400 / 0.4 / 3**0.5))] * 2
+
+
 def test_lines_between_voltages_are_refused(tmp_path: Path) -> None:
     net = village()
     end, home = (net.bus.index[net.bus.name == name][0] for name in ("end", "home"))
