@@ -53,6 +53,7 @@ def detectable(site: Site, found: Detectable) -> Section:
         The feeder, and what was found.
     """
     liars, sure = found.max_attacked, f"{100.0 * (1.0 - found.risk):.6g} %"
+    (meters, unit), (customers, _) = (_comparable(site, each) for each in (found.meters, found.customers))
     return Section(
         title="How large a lie must be",
         answers={
@@ -65,22 +66,22 @@ def detectable(site: Site, found: Detectable) -> Section:
                 "What becomes of a lie, by its size",
                 f"Each meter lying together with at most {liars - 1} more. Left: nobody is named. "
                 "Middle: it depends on the honest errors of the moment. From the end of the last bar on the "
-                f"lying meter is named.{_largest_only(found.meters)}",
-                partial(_sizes_chart, found.meters),
+                f"lying meter is named.{_largest_only(meters)}",
+                partial(_sizes_chart, meters, unit=unit),
             ),
             Figure(
                 "detectable-map",
                 "Where lies may stay unnoticed",
-                f"Size from which a lie is surely noticed, V, {liars} {plural(liars, 'liar')} together. "
-                f"Larger discs, larger lies. Largest at {_extreme(found.meters, 'meter', 'noticed')}.",
-                partial(size_map, site, found.meters, who="meter", column="noticed"),
+                f"Size from which a lie is surely noticed, {unit}, {liars} {plural(liars, 'liar')} together. "
+                f"Larger discs, larger lies. Largest at {_extreme(meters, 'meter', 'noticed')}.",
+                partial(size_map, site, meters, who="meter", column="noticed", unit=unit),
             ),
             Figure(
                 "detectable-picture",
                 "How wrong the picture of the voltage can be",
                 f"Largest error of each customer's reconstructed voltage under {liars} unnoticed "
-                f"{plural(liars, 'liar')}, V. Largest at {_extreme(found.customers, 'customer', 'error')}.",
-                partial(size_map, site, found.customers, who="customer", column="error"),
+                f"{plural(liars, 'liar')}, {unit}. Largest at {_extreme(customers, 'customer', 'error')}.",
+                partial(size_map, site, customers, who="customer", column="error", unit=unit),
             ),
         ),
         tables=found.tables,
@@ -105,6 +106,16 @@ def detectable(site: Site, found: Detectable) -> Section:
             "on the safe side.",
         ),
     )
+
+
+def _comparable(site: Site, table: pd.DataFrame) -> tuple[pd.DataFrame, str]:
+    """A table of volts and their unit: in parts of the nominal voltage where there are several."""
+    if bool((site.nominal_volt == site.nominal_volt[0]).all()):
+        return table, "V"
+    nominal = dict(zip(site.feeder.customers, site.customer_nominal, strict=True))
+    share = 100.0 / table["customer"].map(nominal).astype(float)
+    sizes = table.select_dtypes("number").mul(share, axis="index")
+    return table.assign(**{str(name): sizes[name] for name in sizes}), "% of nominal"
 
 
 def _sizes(meters: pd.DataFrame, liars: int, sure: str) -> Finding:
@@ -183,7 +194,7 @@ def _largest_only(table: pd.DataFrame) -> str:
     return f" The {ROWS} largest of {len(table)} are shown." if len(table) > ROWS else ""
 
 
-def _sizes_chart(meters: pd.DataFrame, width: float) -> Drawing:
+def _sizes_chart(meters: pd.DataFrame, width: float, *, unit: str) -> Drawing:
     shown = meters.sort_values(["named", "meter"], ascending=[False, True]).head(ROWS)
     finite = [v for v in shown[["hidden", "noticed", "named"]].to_numpy().ravel() if math.isfinite(v)]
     end = 1.15 * max(finite, default=1.0)
@@ -196,25 +207,26 @@ def _sizes_chart(meters: pd.DataFrame, width: float) -> Drawing:
                 a,
                 "fill-bad",
                 "nobody is named",
-                f"to {number(row['hidden'], 3, Side.BELOW)} V nobody is named",
+                f"to {number(row['hidden'], 3, Side.BELOW)} {unit} nobody is named",
             ),
             Bar(
                 a,
                 b,
                 "band0",
                 "it depends on honest errors",
-                f"surely noticed from {number(row['noticed'], 2, Side.ABOVE)} V on",
+                f"surely noticed from {number(row['noticed'], 2, Side.ABOVE)} {unit} on",
             ),
             Bar(
                 b,
                 max(b, c),
                 "band2",
                 "noticed, not yet surely named",
-                f"named from {number(row['named'], 2, Side.ABOVE)} V on",
+                f"named from {number(row['named'], 2, Side.ABOVE)} {unit} on",
             ),
         )
-        data.append(Row(str(row["meter"]), bars, f"{number(row['named'], 2, Side.ABOVE)} V"))
-    return rows(data, width, axis="size of the lie, V at nominal voltage")
+        data.append(Row(str(row["meter"]), bars, f"{number(row['named'], 2, Side.ABOVE)} {unit[0]}"))
+    axis = "size of the lie, V at nominal voltage" if unit == "V" else f"size of the lie, {unit}"
+    return rows(data, width, axis=axis)
 
 
 # --- protect ------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from feeders.load import Site
+from feeders.load import Site, from_tables
 from feeders.report import records
 from feeders.report.attacks import campaign as attacks
 from feeders.report.figure import NARROW, WIDE
@@ -29,6 +29,7 @@ from feeders.studies.droop_safety import Kept
 from feeders.studies.droop_verdict import Verdict
 from feeders.studies.protect import Goal, Protect
 from feeders.studies.redundancy import Redundancy
+from tests.feeders import stations
 
 
 def told(section: Section, question: Question) -> str:
@@ -122,6 +123,26 @@ def test_sizes_that_are_not_proved_are_said_to_be_none(site: Site, outcomes: lis
     assert section.answers[Question.PICTURE].standing is Standing.OPEN
     for figure in section.figures:
         assert figure.draw(WIDE).marks
+
+
+def test_sizes_on_two_levels_are_drawn_in_parts_of_the_nominal_voltage() -> None:
+    """In volts whoever is on the higher level would always be the worst."""
+    two = from_tables(stations.tables())
+    names, street = list(two.feeder.customers), two.customer_nominal == stations.LV
+    percent = np.where(street, 2.0, 1.0)
+    percent[names.index("a2-west")] = 3.0
+    volt = percent / 100.0 * two.customer_nominal
+    meters = pd.DataFrame({"meter": names, "customer": names, "bus": names})
+    meters = meters.assign(hidden=0.1 * volt, noticed=volt, named=2.0 * volt)
+    customers = pd.DataFrame({"customer": names, "bus": names, "error": volt, "error_fits": volt})
+    section = sizes(two, Detectable("two", "", 1, 1e-3, meters, customers))
+    by_name = {figure.name: figure for figure in section.figures}
+    for key in ("detectable-map", "detectable-picture"):
+        assert "% of nominal" in by_name[key].text
+        assert "Largest at a2-west." in by_name[key].text
+    drawn = str(by_name["detectable-sizes"].draw(WIDE).marks)
+    assert drawn.index("a2-west") < drawn.index("sawmill")
+    assert "6 %" in drawn
 
 
 def test_a_search_that_gave_up_is_not_an_all_clear(site: Site, outcomes: list[Outcome]) -> None:
