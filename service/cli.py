@@ -342,7 +342,13 @@ def replay(
     name = feeder or recording.feeder
     if name is None:
         raise typer.BadParameter("the file does not say which feeder it belongs to", param_hint="--feeder")
-    site = load(name)
+    try:
+        site = load(name)
+    except FeederInvalid as error:
+        if feeder is not None:
+            raise
+        where = f"{file} was recorded on {name!r}: --feeder says where its folder is"
+        raise FeederInvalid([where, *error.problems]) from error
     if recording.digest not in {None, site.digest}:
         console.err.print(f"[yellow]{escape(name)} has changed since this was recorded.[/]")
     tally = Tally()

@@ -265,6 +265,18 @@ def test_a_recording_knows_its_season(gridsec: Run, tmp_path: Path) -> None:
     assert scenario.season == "winter"
 
 
+def test_a_recording_of_a_folder_asks_where_that_is(gridsec: Run, tmp_path: Path) -> None:
+    folder, file = tmp_path / "mine", tmp_path / "day.parquet"
+    shutil.copytree(CASES.parents[1] / "data/feeders" / FEEDER, folder)
+    meta = folder / "feeder.toml"
+    meta.write_text(meta.read_text().replace(f'name = "{FEEDER}"', 'name = "mine-alone"'))
+    made = gridsec("simulate", str(folder), "--out", str(file), "--duration", "2", "--start", "1795212000")
+    assert made.returncode == 0, made.stderr
+    told = gridsec("replay", str(file))
+    assert "recorded on 'mine-alone': --feeder says where" in " ".join(refused(told.returncode, told).split())
+    assert told.returncode == gridsec("replay", str(file), "--feeder", str(tmp_path / "no")).returncode > 0
+
+
 def test_a_wrong_inverter_is_recorded_and_raises_its_alarm(gridsec: Run, tmp_path: Path) -> None:
     """Both named through files alone: a feeder's file that chooses the estimator, and a recording."""
     folder, file = tmp_path / FEEDER, tmp_path / "day.parquet"
