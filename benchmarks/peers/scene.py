@@ -191,6 +191,7 @@ def _behind(tree: Feeder, grid: Grid, of: Transformer) -> tuple[Feeder, Grid]:
         tap=None if grid.tap is None else np.append(grid.tap, 1.0),
         busbar=source,
         bus_count=source + 1,
+        nominal_volt=tree.base_volt,
     )
 
 
