@@ -97,9 +97,11 @@ class Powers:
         self.columns = dictionary.columns(self.index)
         self.seen = self.columns[now.prior.meters]
         self.std, self.meter = dictionary.std[self.index], dictionary.meter[self.index]
-        now.inverse = now.Q
-        self.spread = now.inverse @ self.seen
-        self.form = np.einsum("ij,ij->j", self.spread, self.seen)
+        at, Q = now.trusting()
+        seen = self.seen[at]
+        self.spread = np.zeros_like(self.seen)
+        self.spread[at] = spread = Q @ seen
+        self.form = np.einsum("ij,ij->j", spread, seen)
         self.accused: list[int] = []
 
     @property

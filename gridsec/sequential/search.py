@@ -196,7 +196,7 @@ def descend(
         admit(now, j)
     for j in np.flatnonzero(now.trusted & ~live):
         drop(now, int(j))
-    judged = judge(now, m)
+    judged, before = judge(now, m), now.changes
     powers = None if dictionary is None else Powers(now, dictionary, judged.weights)
     for _ in range(_MOVES_PER_METER * m.size):
         steps = _best(_Place(now, judged, limits, barred, innocent, pairs, powers))
@@ -205,7 +205,8 @@ def descend(
         for step in steps:
             judged = follow(now, m, judged, step())
     now.shrink()
-    judged = judge(now, m)  # without what rounding has left
+    if now.changes > before:
+        judged = judge(now, m)  # without what rounding has left
     dropped = int(np.count_nonzero(live & ~now.trusted))
     loosened = () if powers is None else powers.loosened
     size = int(np.count_nonzero(live))
@@ -369,7 +370,7 @@ def robust(prior: Prior, noise: Floats, m: Floats, live: Bools, bound: Floats) -
 def _residual(signal: Floats, noise: Floats, y: Floats) -> Floats:
     """``y - w_hat`` of meters with covariance `signal` and their noise."""
     whole = signal.copy(order="F")
-    whole[np.diag_indices(y.size)] += noise
+    whole.T.flat[:: y.size + 1] += noise
     return np.asarray(noise * solved(whole, y))
 
 
