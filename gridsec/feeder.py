@@ -20,7 +20,7 @@ import numpy as np
 
 from gridsec.arrays import Floats, Ints, frozen, frozen_ints
 from gridsec.errors import FeederInvalid
-from gridsec.trees import below, from_root, walk
+from gridsec.trees import below, from_root, shrinking, walk
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -378,10 +378,6 @@ def model_error_bound(feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats |
     return _remainder(feeder, _linear_flows(feeder, p, q, v0_squared))
 
 
-# Where the second step is more than this part of the first, later ones may shrink by less than half.
-_SHRINK = 0.2
-
-
 def _remainder(feeder: Feeder, flows: _Flows) -> Floats:
     with np.errstate(all="ignore"):
         current = (flows.P**2 + flows.charged**2) / flows.v2[..., 1:]
@@ -392,7 +388,7 @@ def _remainder(feeder: Feeder, flows: _Flows) -> Floats:
         first = from_root(feeder, _losses(feeder, np.abs(current), np.abs(charge), sign=1.0)[2])
         change = np.abs(feeder.half * (v2 - flows.v2))
         second = from_root(feeder, _losses(feeder, np.abs(later - current), change, sign=1.0)[2])
-        shrinks = np.max(second, axis=-1, keepdims=True) <= _SHRINK * np.max(first, axis=-1, keepdims=True)
+        shrinks = shrinking(first, second, (-1,))
         shrinks &= np.all(v2 > 0, axis=-1, keepdims=True) & np.all(flows.v2 > 0, axis=-1, keepdims=True)
         bound = np.where(shrinks, 2.0 * second, np.inf)
     return np.asarray(bound[..., feeder.bus])

@@ -10,7 +10,7 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
-from gridsec.arrays import Floats, Ints, Phasors, frozen_ints
+from gridsec.arrays import Bools, Floats, Ints, Phasors, frozen_ints
 
 Values = TypeVar("Values", Floats, Phasors)
 
@@ -26,6 +26,46 @@ class Walked(Protocol):
     def enter(self) -> Ints: ...  # noqa: D102
     @property
     def leave(self) -> Ints: ...  # noqa: D102
+
+
+class Named(Protocol):
+    """A feeder by its names and its per unit."""
+
+    @property
+    def name(self) -> str: ...  # noqa: D102
+    @property
+    def customers(self) -> tuple[str, ...]: ...  # noqa: D102
+    @property
+    def base_volt(self) -> float: ...  # noqa: D102
+    @property
+    def base_kva(self) -> float: ...  # noqa: D102
+
+
+class OnTree:
+    """A feeder that has its customers and its per unit from a radial one, its `tree`."""
+
+    __slots__ = ()
+    tree: Named
+
+    @property
+    def name(self) -> str:
+        """Name of the feeder."""
+        return self.tree.name
+
+    @property
+    def customers(self) -> tuple[str, ...]:
+        """Identifiers of the customers, (N,)."""
+        return self.tree.customers
+
+    @property
+    def base_volt(self) -> float:
+        """Nominal phase-to-neutral voltage (1 pu), V."""
+        return self.tree.base_volt
+
+    @property
+    def base_kva(self) -> float:
+        """Three-phase base power (1 pu), kVA."""
+        return self.tree.base_kva
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,3 +155,21 @@ def meetings(parent: Ints, tree: Walked, buses: Ints) -> Ints:
     for k, above in enumerate(parent.tolist(), start=1):
         out[k] = np.where((tree.start[k] <= at) & (at < tree.stop[k]), k, out[above])
     return out
+
+
+# Where a second step is more than this part of the first, later ones may shrink by less than half.
+_SHRINK = 0.2
+
+
+def shrinking(first: Floats, second: Floats, axis: tuple[int, ...]) -> Bools:
+    """Whether the steps of a sweep get small fast enough for all later ones to be at most the second.
+
+    Parameters
+    ----------
+    first, second : (…)
+        How far the first two steps move.
+    axis
+        Axes of the buses; kept, with one entry.
+    """
+    largest = np.max(first, axis=axis, keepdims=True)
+    return np.asarray(np.max(second, axis=axis, keepdims=True) <= _SHRINK * largest)

@@ -28,10 +28,11 @@ from scipy.sparse.linalg import splu
 from gridsec.arrays import Floats, Ints, Phasors, frozen, frozen_ints
 from gridsec.errors import FeederInvalid
 from gridsec.feeder import Feeder, common_paths
+from gridsec.trees import OnTree
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MeshedFeeder:
+class MeshedFeeder(OnTree):
     """A feeder whose closed lines form loops. N customers, b + 1 buses, t ties.
 
     Attributes
@@ -99,34 +100,14 @@ class MeshedFeeder:
         put("size", frozen(np.abs(self.between)))
 
     @property
-    def name(self) -> str:
-        """Name of the feeder."""
-        return self.tree.name
-
-    @property
     def bus(self) -> Ints:
         """Bus of each customer, (N,)."""
         return self.tree.bus
 
     @property
-    def customers(self) -> tuple[str, ...]:
-        """Identifiers of the customers, (N,)."""
-        return self.tree.customers
-
-    @property
     def buses(self) -> tuple[str, ...]:
         """Identifiers of the buses, the busbar first, (b + 1,)."""
         return self.tree.buses
-
-    @property
-    def base_volt(self) -> float:
-        """Nominal phase-to-neutral voltage (1 pu), V."""
-        return self.tree.base_volt
-
-    @property
-    def base_kva(self) -> float:
-        """Three-phase base power (1 pu), kVA."""
-        return self.tree.base_kva
 
 
 def _problems(feeder: MeshedFeeder) -> list[str]:

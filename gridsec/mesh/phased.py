@@ -19,10 +19,11 @@ from gridsec.errors import FeederInvalid
 from gridsec.phases import PHASES, ROTATION, PhasedFeeder, ThreePhaseFeeder
 from gridsec.phases.feeder import line_problems, named
 from gridsec.phases.flow import common_paths
+from gridsec.trees import OnTree
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PhasedMesh:
+class PhasedMesh(OnTree):
     """A feeder of single-phase customers with closed ties. N customers, t ties, n = 3 (b + 1) places.
 
     Attributes
@@ -108,26 +109,6 @@ class PhasedMesh:
         put("transfer", transfer)
         put("between", transfer[self.bus])
         put("size", np.abs(self.between))
-
-    @property
-    def name(self) -> str:
-        """Name of the feeder."""
-        return self.tree.name
-
-    @property
-    def customers(self) -> tuple[str, ...]:
-        """Identifiers of the customers, (N,)."""
-        return self.tree.customers
-
-    @property
-    def base_volt(self) -> float:
-        """Nominal phase-to-neutral voltage (1 pu), V."""
-        return self.tree.base_volt
-
-    @property
-    def base_kva(self) -> float:
-        """Three-phase base power (1 pu), kVA."""
-        return self.tree.base_kva
 
 
 def _problems(feeder: PhasedMesh) -> list[str]:

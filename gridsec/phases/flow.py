@@ -31,7 +31,7 @@ import numpy as np
 from gridsec.arrays import Floats, Ints, Phasors, frozen
 from gridsec.intervals import Sweeps, bounds
 from gridsec.phases.feeder import ROTATION, ThreePhaseFeeder
-from gridsec.trees import below, from_root, meetings
+from gridsec.trees import below, from_root, meetings, shrinking
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -429,19 +429,12 @@ def _forward(feeder: ThreePhaseFeeder, v0: Phasors, drawn: Phasors) -> Phasors:
     return np.asarray(v0 - from_root(feeder, np.einsum("bij,...jb->...ib", feeder.z, current)))
 
 
-# Where a sweep is more than this part of the one before, later ones may shrink by less than half.
-_SHRINK = 0.2
-
-
 def _remainder(feeder: ThreePhaseFeeder, start: _Start, once: Phasors) -> Floats:
     with np.errstate(all="ignore"):
         before = _drawn(feeder, start.s, start.phasors)
         first = _reach(feeder, before - start.flat)
         second = _reach(feeder, _drawn(feeder, start.s, once) - before)
-        most = (-2, -1)
-        shrinks = np.max(second, axis=most, keepdims=True) <= _SHRINK * np.max(
-            first, axis=most, keepdims=True
-        )
+        shrinks = shrinking(first, second, (-2, -1))
         bound = np.where(shrinks, 2.0 * second * (2.0 * np.abs(once) + 2.0 * second), np.inf)
     return np.asarray(bound[..., feeder.phase, feeder.at])
 

@@ -16,10 +16,11 @@ from gridsec.errors import FeederInvalid
 from gridsec.phases import flow
 from gridsec.phases.feeder import PHASES, ThreePhaseFeeder
 from gridsec.phases.flow import lindist3flow
+from gridsec.trees import OnTree
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PhasedFeeder:
+class PhasedFeeder(OnTree):
     """A feeder of single-phase customers. N customers, b + 1 buses, n = 3 (b + 1) places.
 
     Attributes
@@ -63,26 +64,6 @@ class PhasedFeeder:
             # 1 pu of the power of a phase is a third of S.
             by_place = 3.0 * np.moveaxis(found, 0, 1).reshape(len(names), tree.at.size)
             object.__setattr__(self, name, frozen(by_place))
-
-    @property
-    def name(self) -> str:
-        """Name of the feeder."""
-        return self.tree.name
-
-    @property
-    def customers(self) -> tuple[str, ...]:
-        """Identifiers of the customers, (N,)."""
-        return self.tree.customers
-
-    @property
-    def base_volt(self) -> float:
-        """Nominal phase-to-neutral voltage (1 pu), V."""
-        return self.tree.base_volt
-
-    @property
-    def base_kva(self) -> float:
-        """Three-phase base power (1 pu), kVA."""
-        return self.tree.base_kva
 
 
 def bus_voltages(

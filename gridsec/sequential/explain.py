@@ -122,9 +122,8 @@ class Search:
         for j in np.flatnonzero(fresh).tolist():
             book, one = self.book.doubtful(), np.array([j])
             other = self._descend(best.fit, keep, book, innocent=one, pairs=True, limits=limits)
-            few = np.count_nonzero(self.here.enough & ~other.trusted) <= self.design.most
             honest = self.scales[self.s].limits.of(other.judged.std)[j]
-            if few and abs(other.judged.offset[j]) <= honest:
+            if self._admissible(other) and abs(other.judged.offset[j]) <= honest:
                 charge = best.charge + other.charge
                 cost, loosened = best.charge + other.cost, best.loosened + other.loosened
                 out.append(Explanation(other.trusted, loosened, charge, cost))
@@ -167,15 +166,17 @@ class Search:
             return []
         nobody, now = np.zeros_like(among), fit(prior, here.noise, start, loose)
         other = self._descend(now, nobody, innocent=group, fresh=True)
-        few = np.count_nonzero(here.enough & ~other.trusted) <= most
-        return [self._after(best, other)] if few else []
+        return [self._after(best, other)] if self._admissible(other) else []
+
+    def _admissible(self, found: Explanation) -> bool:
+        """Whether no more meters are accused than can be told apart."""
+        return bool(np.count_nonzero(self.here.enough & ~found.trusted) <= self.design.most)
 
     def _closer(self, group: Ints, other: Solution) -> Explanation:
         """One that believes the group on less evidence against the rest: what might be the case."""
         nobody = np.zeros_like(other.trusted)
         closer = self._descend(other.fit, nobody, innocent=group, limits=self._fair())
-        few = np.count_nonzero(self.here.enough & ~closer.trusted) <= self.design.most
-        return (self._after(other, closer) if few else other).bare()
+        return (self._after(other, closer) if self._admissible(closer) else other).bare()
 
     def _after(self, before: Solution, found: Solution) -> Solution:
         """What a descent without a book found, from all that another loosened: powers of liars cost less."""
@@ -219,8 +220,7 @@ class Search:
             cost = other.cost
             if cost - best.cost <= 2.0 * like:
                 ours = self._misfits(best) if ours is None else ours
-                worse = max(theirs - own for theirs, own in zip(self._misfits(other), ours, strict=True))
-                cost = best.cost + self._prices(other) - self._prices(best) + worse
+                cost = self._beside(best, other, ours, self._misfits(other))
             if other.cost - best.cost <= _NEAR * like:
                 cost = min(cost, self._swapped(best, other))
             out[who] = replace(other, cost=cost)
@@ -242,6 +242,10 @@ class Search:
         if ours[self.s] - best.judged.misfit > freedom + _CHANCE * np.sqrt(2.0 * freedom):
             return np.inf  # those it accuses do not tell one lie
         theirs, _ = self._alike(other, accused)
+        return self._beside(best, other, ours, theirs)
+
+    def _beside(self, best: Solution, other: Explanation, ours: list[float], theirs: list[float]) -> float:
+        """What another explanation costs beside the best by what both leave unexplained, scale by scale."""
         worse = max(his - own for his, own in zip(theirs, ours, strict=True))
         return best.cost + self._prices(other) - self._prices(best) + worse
 
