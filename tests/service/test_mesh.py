@@ -9,15 +9,12 @@ import numpy as np
 import pytest
 
 from benchmarks.mesh import baran_wu
-from feeders.recording import read_recording, record
 from feeders.scenario import Scenario, random_attacks, simulate
-from feeders.schema import to_json, write
+from feeders.schema import to_json
 from gridsec.feeder import Feeder
 from service.describe import detail
 from service.models import FeederDetail, State
-from service.replay import Tally, replay
-from service.simulate import Pace, play
-from tests.service.running import service, until
+from tests.service.played import replayed, served
 
 START = 1_795_212_000.0
 NAME = "case33bw"
@@ -41,11 +38,7 @@ def test_the_layout_is_a_tree_and_its_ties() -> None:
 
 def test_the_service_names_the_liars(scenario: Scenario, tmp_path: Path) -> None:
     site = baran_wu()
-    write(site.tables, tmp_path / NAME)
-    with service(tmp_path, (str(tmp_path / NAME),), clock="events") as live:
-        samples = list(play(site, scenario, live.meters, Pace(float("inf"), ahead=3)))
-        until(lambda: live.state(NAME).get("t", 0.0) >= samples[-1].t - 2.0, "the end")
-        state = live.state(NAME)
+    samples, state = served(site, scenario, tmp_path, NAME)
     lying = {site.meter_ids[k] for k in np.flatnonzero(samples[-1].manipulated)}
     assert len(lying) == 10
     assert state["verdict"] == "attacked"
@@ -57,9 +50,8 @@ def test_the_service_names_the_liars(scenario: Scenario, tmp_path: Path) -> None
 
 def test_a_recording_is_replayed(scenario: Scenario, tmp_path: Path) -> None:
     site, short = baran_wu(), replace(scenario, duration_s=20.0)
-    recording = record(site, short, tmp_path / "day.parquet")
     samples = list(simulate(site, short))
-    reports = [one.report for one in replay(site, read_recording(recording.path).readings(), Tally())]
+    reports = replayed(site, short, tmp_path)
     lying = {site.meter_ids[k] for k in np.flatnonzero(samples[-1].manipulated)}
     assert {meter.meter for meter in reports[-1].meters if meter.suspect} == lying
     assert reports[-1].verdict == "attacked"

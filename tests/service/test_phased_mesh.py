@@ -9,16 +9,13 @@ import pytest
 from typer.testing import CliRunner
 
 from benchmarks.mesh import european
-from feeders.recording import read_recording, record
 from feeders.scenario import Scenario, random_attacks, simulate
 from feeders.schema import write
 from gridsec.mesh import PhasedMesh
 from service.cli import app
 from service.describe import detail
 from service.models import FeederDetail, State
-from service.replay import Tally, replay
-from service.simulate import Pace, play
-from tests.service.running import service, until
+from tests.service.played import replayed, served
 
 START = 1_795_212_000.0
 NAME = "ieee-european-lv"
@@ -50,11 +47,7 @@ def test_the_layout_is_a_tree_and_its_tie() -> None:
 
 def test_the_service_names_the_liars(scenario: Scenario, tmp_path: Path) -> None:
     site = european()
-    write(site.tables, tmp_path / NAME)
-    with service(tmp_path, (str(tmp_path / NAME),), clock="events") as live:
-        samples = list(play(site, scenario, live.meters, Pace(float("inf"), ahead=3)))
-        until(lambda: live.state(NAME).get("t", 0.0) >= samples[-1].t - 2.0, "the end")
-        state = live.state(NAME)
+    samples, state = served(site, scenario, tmp_path, NAME)
     lying = {site.meter_ids[k] for k in np.flatnonzero(samples[-1].manipulated)}
     assert len(lying) == 6
     assert state["verdict"] == "attacked"
@@ -66,9 +59,8 @@ def test_the_service_names_the_liars(scenario: Scenario, tmp_path: Path) -> None
 
 def test_a_recording_is_replayed(scenario: Scenario, tmp_path: Path) -> None:
     site = european()
-    recording = record(site, scenario, tmp_path / "day.parquet")
     samples = list(simulate(site, scenario))
-    reports = [one.report for one in replay(site, read_recording(recording.path).readings(), Tally())]
+    reports = replayed(site, scenario, tmp_path)
     lying = {site.meter_ids[k] for k in np.flatnonzero(samples[-1].manipulated)}
     assert {meter.meter for meter in reports[-1].meters if meter.suspect} == lying
     clean = [report for report in reports if report.t < START + 15]

@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 
 from feeders.load import Site, from_tables, load
-from feeders.recording import read_recording, record
 from feeders.scenario import Scenario, simulate
 from gridsec.attack import Bias
 from gridsec.phases import PhasedFeeder
 from service.describe import detail
 from service.models import FeederDetail
-from service.replay import Tally, replay
+from tests.service.played import replayed
 
 START = 1_795_212_000.0
 T_ON = START + 20.0
@@ -46,8 +45,7 @@ def test_the_liars_behind_a_tap_are_named_in_volts(name: str, tmp_path: Path) ->
     lie = Bias(liars, T_ON, START + 60.0, np.array([0.03, -0.03, 0.03]))
     scenario = Scenario(seed=3, start=START, duration_s=28.0, attacks=(lie,))
     samples = list(simulate(site, scenario))
-    recording = record(site, scenario, tmp_path / "day.parquet")
-    reports = [one.report for one in replay(site, read_recording(recording.path).readings(), Tally())]
+    reports = replayed(site, scenario, tmp_path)
     honest = next(report for report in reports if report.t == T_ON - 2.0)
     assert honest.verdict != "attacked"
     last = reports[-1]

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from feeders.load import Site, from_tables
-from feeders.recording import read_recording, record
 from feeders.scenario import Scenario, simulate
 from feeders.schema import to_json
 from gridsec.attack import Bias
@@ -19,13 +18,13 @@ from service.conditions import conditions
 from service.describe import detail
 from service.models import FeederDetail, State
 from service.reading import BadReading
-from service.replay import Tally, replay
 from service.report import FeederReport
 from service.report import to_json as report_json
 from service.watch import known_of
 from service.wire import Wire
 from tests.feeders import stations
 from tests.feeders.stations import LV, MV
+from tests.service.played import replayed
 
 START = 1_795_212_000.0
 T_ON = START + 20.0
@@ -44,8 +43,7 @@ def test_a_liar_on_each_level_is_named_in_volts(phases: bool, tmp_path: Path) ->
     lie = Bias(liars, T_ON, START + 60.0, np.where(liars == low[-1], -0.03, 0.03))
     scenario = Scenario(seed=5, start=START, duration_s=28.0, attacks=(lie,))
     samples = list(simulate(site, scenario))
-    recording = record(site, scenario, tmp_path / "day.parquet")
-    reports = [one.report for one in replay(site, read_recording(recording.path).readings(), Tally())]
+    reports = replayed(site, scenario, tmp_path)
     honest = next(report for report in reports if report.t == T_ON - 2.0)
     assert honest.verdict != "attacked"
     last = reports[-1]

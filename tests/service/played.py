@@ -1,0 +1,38 @@
+"""Scenarios played through the service: live over zenoh, or as a recording that is replayed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from feeders.load import Site
+from feeders.recording import read_recording, record
+from feeders.scenario import Sample, Scenario
+from feeders.schema import write
+from service.replay import Tally, replay
+from service.report import FeederReport
+from service.simulate import Pace, play
+from tests.service.running import service, until
+
+
+def served(site: Site, scenario: Scenario, folder: Path, name: str) -> tuple[list[Sample], dict[str, Any]]:
+    """Play a scenario into a running service; what was played, and the feeder's state at its end.
+
+    Parameters
+    ----------
+    site, scenario
+        The feeder, and what happens.
+    folder, name
+        Where its files are written, and as what.
+    """
+    write(site.tables, folder / name)
+    with service(folder, (str(folder / name),), clock="events") as live:
+        samples = list(play(site, scenario, live.meters, Pace(float("inf"), ahead=3)))
+        until(lambda: live.state(name).get("t", 0.0) >= samples[-1].t - 2.0, "the end")
+        return samples, live.state(name)
+
+
+def replayed(site: Site, scenario: Scenario, folder: Path) -> list[FeederReport]:
+    """Record a scenario into a folder and replay it; one report a tick."""
+    recording = record(site, scenario, folder / "day.parquet")
+    return [one.report for one in replay(site, read_recording(recording.path).readings(), Tally())]
