@@ -18,18 +18,7 @@ if TYPE_CHECKING:
     from feeders.load import Site
     from feeders.load_phases import ThreePhaseSite
 
-__all__ = ["Bases", "line_rows", "nominal_volt"]
-
-
-def nominal_volt(site: Site | ThreePhaseSite) -> Floats:
-    """Nominal voltage at every customer, phase to neutral, V, (N,).
-
-    Parameters
-    ----------
-    site
-        The feeder.
-    """
-    return site.customer_nominal
+__all__ = ["Bases", "line_rows"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,7 +39,7 @@ class Bases:
     @classmethod
     def of(cls, site: Site) -> Self:
         """The bases of a feeder."""
-        return cls(site.customer_volt, nominal_volt(site))
+        return cls(site.customer_volt, site.customer_nominal)
 
     @property
     def ratio(self) -> Floats:
