@@ -14,10 +14,9 @@ from hypothesis import given, settings
 from benchmarks.mesh import baran_wu, closed, landnetz, rural3
 from feeders.estimators import choose, design
 from feeders.lies import Lie, Trick
-from feeders.load import Site, from_tables, load, to_frame
+from feeders.load import Site, from_tables, load
 from feeders.powerflow import PowerFlow
 from feeders.powerflow_unbalanced import power_flow
-from feeders.scenario import START, Scenario, random_attacks, simulate, snapshots
 from feeders.schema import LineRow, examine, read, validate, write
 from feeders.studies.detectable import detectable
 from feeders.studies.redundancy import redundancy
@@ -25,8 +24,8 @@ from feeders.trials import LoadError, Meters, Outcome, Trial, judge
 from gridsec.errors import FeederInvalid
 from gridsec.mesh import MeshedFeeder
 from gridsec.network import bus_voltages, model_error_bound
-from gridsec.online import Decision
 from tests.feeders import villages
+from tests.feeders.watched import names_the_liar_alone
 
 SITES = [landnetz, rural3, baran_wu]
 
@@ -216,18 +215,7 @@ def test_two_lines_in_parallel_are_watched_and_studied_as_one_of_half_the_impeda
     "name", ["exact-bank", "windowed-bank", "set-search", "partial-observers", "unknown-input"]
 )
 def test_the_methods_of_the_papers_name_the_liar_alone(name: str) -> None:
-    site = choose(landnetz(), estimator=name, max_attacked=1)
-    watcher = design(site)
-    attacks = random_attacks(site, 5, "bias", 1, 0.08, t_on=START + 20, t_off=START + 130)
-    state, named = watcher.init(START), set()
-    run = simulate(site, Scenario(seed=5, duration_s=130, attacks=attacks))
-    for k, snapshot in enumerate(snapshots(run)):
-        state, _, verdict = watcher.step(state, to_frame(site, snapshot))
-        named |= set(np.flatnonzero(verdict.suspects).tolist())
-        # Windows of 50 readings answer at their ends.
-        assert verdict.decision is not Decision.CLEAN or k < (100 if name == "windowed-bank" else 22)
-    assert named == set(attacks[0].meters.tolist())
-    assert verdict.decision is Decision.ATTACKED
+    names_the_liar_alone(choose(landnetz(), estimator=name, max_attacked=1))
 
 
 @pytest.mark.parametrize("part", [lambda site: site.tree, lambda site: site.balanced])

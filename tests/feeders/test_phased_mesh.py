@@ -14,10 +14,9 @@ from hypothesis import given, settings
 from benchmarks.mesh import closed, european, landnetz, sensitivity
 from feeders.estimators import choose, design
 from feeders.lies import Lie, Trick
-from feeders.load import Site, from_tables, load, to_frame
+from feeders.load import Site, from_tables, load
 from feeders.load_phases import three_phase
 from feeders.powerflow_unbalanced import PlacesFlow, power_flow
-from feeders.scenario import START, Scenario, random_attacks, simulate, snapshots
 from feeders.schema import FeederTables, LineRow, examine, read, validate, write
 from feeders.studies.calibrate_feeder import network
 from feeders.studies.detectable import detectable
@@ -27,9 +26,9 @@ from feeders.trials import LoadError, Meters, Outcome, Trial, judge
 from gridsec.errors import FeederInvalid
 from gridsec.mesh import MeshedFeeder, PhasedMesh
 from gridsec.network import bus_voltages, model_error_bound
-from gridsec.online import Decision
 from gridsec.phases import PhasedFeeder
 from tests.feeders import asymmetric, villages
+from tests.feeders.watched import names_the_liar_alone
 
 
 def zero(rows: tuple[LineRow, ...], ratio: float = 3.0) -> tuple[LineRow, ...]:
@@ -308,18 +307,7 @@ def test_clean_is_clean(meters: Meters) -> None:
     "name", ["exact-bank", "windowed-bank", "set-search", "partial-observers", "unknown-input"]
 )
 def test_the_methods_of_the_papers_name_the_liar_alone(name: str) -> None:
-    site = choose(ring(), estimator=name, max_attacked=1)
-    watcher = design(site)
-    attacks = random_attacks(site, 5, "bias", 1, 0.08, t_on=START + 20, t_off=START + 130)
-    state, named = watcher.init(START), set()
-    run = simulate(site, Scenario(seed=5, duration_s=130, attacks=attacks))
-    for k, snapshot in enumerate(snapshots(run)):
-        state, _, verdict = watcher.step(state, to_frame(site, snapshot))
-        named |= set(np.flatnonzero(verdict.suspects).tolist())
-        # Windows of 50 readings answer at their ends.
-        assert verdict.decision is not Decision.CLEAN or k < (100 if name == "windowed-bank" else 22)
-    assert named == set(attacks[0].meters.tolist())
-    assert verdict.decision is Decision.ATTACKED
+    names_the_liar_alone(choose(ring(), estimator=name, max_attacked=1))
 
 
 def test_studies_take_lines_in_parallel_as_one() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from types import ModuleType
 
 import numpy as np
 
@@ -90,3 +91,21 @@ class PhasedStreet(Street):
         v0 = self.v0 * self.phases * (1.0 + self.busbar_bias)
         v0 = (np.round(v0 / RESOLUTION) * RESOLUTION) ** 2
         return replace(one, v0_squared=float(v0.mean()), v0_phases=v0)
+
+
+def errors_at_their_ends(family: ModuleType, plant: Plant, rng: np.random.Generator, seed: int) -> None:
+    """Watch a street whose errors are as large as they may be: bounds hold, and nobody honest is accused."""
+    count = plant.meters.size
+    design = family.design(plant, max_attacked=1, step_s=1.0)
+    told = np.arange(0, count, 2) if seed % 2 else None
+    street = PhasedStreet(plant, rng, extreme=True, metered_q=told, phases=rng.uniform(0.98, 1.02, 3))
+    state, liar = family.init(design, 1000.0), int(rng.integers(count))
+    honest = np.arange(count) != (liar if seed % 4 else -1)
+    for tick in range(16):
+        street.advance(float(rng.choice([0.3, 1.0, 5.0, 900.0])))
+        lie = {liar: float(rng.choice([-0.1, -0.04, 0.03, 0.08]))} if tick > 3 and seed % 4 else {}
+        silent = (int(rng.integers(count)),) if tick % 5 == 4 else ()
+        state, estimate, verdict = family.step(design, state, street.frame(lie, silent))
+        assert (np.abs(estimate.v2 - street.truth()) <= estimate.bound).all()
+        assert not (np.nan_to_num(verdict.score) > verdict.threshold)[honest].any()
+        assert not verdict.suspects[honest].any()

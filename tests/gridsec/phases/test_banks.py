@@ -18,7 +18,7 @@ from gridsec.mesh import MeshedFeeder
 from gridsec.online import Cause, Decision, Estimate, Verdict
 from gridsec.phases import PhasedFeeder
 from gridsec.plant import Plant
-from tests.gridsec.phases.streets import PhasedStreet, coupled
+from tests.gridsec.phases.streets import PhasedStreet, coupled, errors_at_their_ends
 from tests.gridsec.sequential.test_phases import CUSTOMERS, apart, together
 from tests.gridsec.street import Street, make_plant
 
@@ -261,17 +261,4 @@ class TestCoupledPhases:
         rng = np.random.default_rng([seed, 99])
         family = (monitor, set_search, partial)[seed % 3]
         plant = coupled(seed, customers=int(rng.integers(5, 9)), drop=float(rng.choice([0.02, 0.04, 0.06])))
-        count = plant.meters.size
-        design = family.design(plant, max_attacked=1, step_s=1.0)
-        told = np.arange(0, count, 2) if seed % 2 else None
-        street = PhasedStreet(plant, rng, extreme=True, metered_q=told, phases=rng.uniform(0.98, 1.02, 3))
-        state, liar = family.init(design, 1000.0), int(rng.integers(count))
-        honest = np.arange(count) != (liar if seed % 4 else -1)
-        for tick in range(16):
-            street.advance(float(rng.choice([0.3, 1.0, 5.0, 900.0])))
-            lie = {liar: float(rng.choice([-0.1, -0.04, 0.03, 0.08]))} if tick > 3 and seed % 4 else {}
-            silent = (int(rng.integers(count)),) if tick % 5 == 4 else ()
-            state, estimate, verdict = family.step(design, state, street.frame(lie, silent))
-            assert (np.abs(estimate.v2 - street.truth()) <= estimate.bound).all()
-            assert not (np.nan_to_num(verdict.score) > verdict.threshold)[honest].any()
-            assert not verdict.suspects[honest].any()
+        errors_at_their_ends(family, plant, rng, seed)

@@ -12,7 +12,7 @@ from gridsec import monitor
 from gridsec.families import partial, set_search, unknown_input, windowed
 from gridsec.mesh import PhasedMesh
 from gridsec.online import Decision
-from tests.gridsec.phases.streets import PhasedStreet, coupled, ringed
+from tests.gridsec.phases.streets import PhasedStreet, coupled, errors_at_their_ends, ringed
 from tests.gridsec.phases.test_banks import lied
 
 
@@ -56,17 +56,4 @@ def test_random_streets_with_errors_at_their_ends(seed: int) -> None:
     rng = np.random.default_rng([seed, 99])
     family = (monitor, set_search, partial)[seed % 3]
     plant = ringed(coupled(seed, customers=int(rng.integers(5, 9)), drop=float(rng.choice([0.02, 0.06]))))
-    count = plant.meters.size
-    design = family.design(plant, max_attacked=1, step_s=1.0)
-    told = np.arange(0, count, 2) if seed % 2 else None
-    street = PhasedStreet(plant, rng, extreme=True, metered_q=told, phases=rng.uniform(0.98, 1.02, 3))
-    state, liar = family.init(design, 1000.0), int(rng.integers(count))
-    honest = np.arange(count) != (liar if seed % 4 else -1)
-    for tick in range(16):
-        street.advance(float(rng.choice([0.3, 1.0, 5.0, 900.0])))
-        lie = {liar: float(rng.choice([-0.1, -0.04, 0.03, 0.08]))} if tick > 3 and seed % 4 else {}
-        silent = (int(rng.integers(count)),) if tick % 5 == 4 else ()
-        state, estimate, verdict = family.step(design, state, street.frame(lie, silent))
-        assert (np.abs(estimate.v2 - street.truth()) <= estimate.bound).all()
-        assert not (np.nan_to_num(verdict.score) > verdict.threshold)[honest].any()
-        assert not verdict.suspects[honest].any()
+    errors_at_their_ends(family, plant, rng, seed)
