@@ -18,6 +18,7 @@ from gridsec.errors import FeederInvalid
 from gridsec.feeder import lindistflow
 from gridsec.lure import close_loop
 from gridsec.mesh import MeshedFeeder, admittance, bus_voltages, impedances, model_error_bound
+from tests.gridsec.derivatives import derivatives_are
 from tests.gridsec.meshes import ac, random_mesh
 from tests.gridsec.radial import random_feeder
 
@@ -166,16 +167,7 @@ def test_sensitivities_are_the_derivatives_under_load(charging: float, seed: int
     p, q = loads(feeder, seed, 0.01)
     v0 = 1.02
     found = mesh.sensitivities(feeder, p, q, v0, steps=20)
-    step = 1e-3
-    for k in range(feeder.bus.size):
-        unit = step * (np.arange(p.size) == k)
-        for column, up, down in (
-            (found.R_bus[:, k], (p + unit, q), (p - unit, q)),
-            (found.X_bus[:, k], (p, q + unit), (p, q - unit)),
-        ):
-            above, below = (ac(feeder, *each, v0) for each in (up, down))
-            slope, there = (above - below) / (4.0 * step), ~np.isnan(above)
-            np.testing.assert_allclose(slope[there], column[there], rtol=0, atol=2e-5)
+    derivatives_are(found, lambda p, q: ac(feeder, p, q, v0), p, q, atol=2e-5)
     none = mesh.sensitivities(feeder, 0.0 * p, 0.0 * q, 1.0)
     if not charging:
         np.testing.assert_allclose(none.R_bus, feeder.R, rtol=0, atol=1e-12)

@@ -17,6 +17,7 @@ from gridsec.mesh import MeshedFeeder, PhasedMesh
 from gridsec.mesh.phased import admittance
 from gridsec.network import bus_voltages, hangs_on, model_error_bound, one_busbar
 from gridsec.phases import ROTATION, PhasedFeeder, ThreePhaseFeeder, sequence_matrix
+from tests.gridsec.derivatives import derivatives_are
 from tests.gridsec.meshes import random_mesh
 from tests.gridsec.unbalanced import ac_places, admittances, random_phased_mesh
 
@@ -214,16 +215,7 @@ def test_sensitivities_are_the_derivatives_under_load(charging: float, seed: int
     p, q = loads(feeder, seed, 0.01)
     v0 = np.array([1.02, 1.0, 0.97])
     found = mesh.sensitivities(feeder, p, q, v0, steps=20)
-    step = 1e-3
-    for k in range(feeder.bus.size):
-        unit = step * (np.arange(p.size) == k)
-        for column, up, down in (
-            (found.R_bus[:, k], (p + unit, q), (p - unit, q)),
-            (found.X_bus[:, k], (p, q + unit), (p, q - unit)),
-        ):
-            above, below = (ac_places(feeder, *each, v0) for each in (up, down))
-            slope, there = (above - below) / (4.0 * step), ~np.isnan(above)
-            np.testing.assert_allclose(slope[there], column[there], rtol=0, atol=1e-6)
+    derivatives_are(found, lambda p, q: ac_places(feeder, p, q, v0), p, q, atol=1e-6)
     none = mesh.sensitivities(feeder, 0.0 * p, 0.0 * q, 1.0)
     if not charging:
         np.testing.assert_allclose(none.R_bus, feeder.R, rtol=0, atol=1e-12)
