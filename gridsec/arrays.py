@@ -58,6 +58,27 @@ def frozen_ints(values: Ints) -> Ints:
     return out
 
 
+def submatrix(matrix: Floats, rows: Ints, columns: Ints) -> Floats:
+    """``matrix[np.ix_(rows, columns)]``, several times as fast where most of a matrix is picked.
+
+    Parameters
+    ----------
+    matrix : (n, m)
+        Any matrix.
+    rows, columns : (k,), (l,)
+        What to pick, in any order and with repetitions.
+
+    Returns
+    -------
+    (k, l)
+        A copy, row by row.
+    """
+    n, m = matrix.shape
+    if rows.size * m <= n * columns.size:
+        return matrix.take(rows, axis=0).take(columns, axis=1)
+    return matrix.take(columns, axis=1).take(rows, axis=0)
+
+
 def symmetry_defect(matrix: Floats) -> float:
     """Largest `|M - M^T|`, relative to the largest `|M|`; 0 for the zero matrix.
 

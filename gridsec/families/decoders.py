@@ -129,7 +129,7 @@ def _stack(evidence: Evidence) -> tuple[Ints, Floats, Floats]:
     """Columns of unit weight: the meters' own, then the principal directions of the loads' covariance."""
     at = np.flatnonzero(evidence.live)
     prior = evidence.whole.prior
-    S = prior.of_meters[np.ix_(prior.meters[at], at)]
+    S = prior.among(at)
     values, vectors = np.linalg.eigh(S)
     keep = values > values.max(initial=0.0) * at.size * np.finfo(np.float64).eps
     F = np.hstack([np.diag(np.sqrt(evidence.whole.noise[at])), vectors[:, keep] * np.sqrt(values[keep])])

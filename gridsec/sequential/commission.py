@@ -27,7 +27,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, Ints
+from gridsec.arrays import Bools, Floats, Ints, submatrix
 from gridsec.network import one_busbar
 from gridsec.sequential.conditional import invert
 from gridsec.sequential.design import SequentialDesign
@@ -236,7 +236,7 @@ def conclude(
         return Commission(known, gathered)
     B, n = known.variance[heard], gathered.count[heard]
     # One matrix of this size, inverted where it is.
-    K = design.prior.of_meters[np.ix_(design.prior.meters[heard], heard)].T
+    K = design.prior.among(heard)
     time = gathered.time_s[heard] / design.doubt.time_s
     for first in range(0, heard.size, _COLUMNS):
         some = slice(first, first + _COLUMNS)
@@ -278,7 +278,7 @@ def _lasting(design: SequentialDesign, heard: Ints, some: slice) -> Floats:
     The fixed error of the busbar's meter is one of them, whatever is known of the loads; phases have their
     own.
     """
-    of_loads = design.prior.of_meters[np.ix_(design.prior.meters[heard], heard[some])]
+    of_loads = submatrix(design.prior.of_meters, design.prior.meters[heard], heard[some])
     lasting = design.doubt.lasting
     places, feeder = design.prior.meters, design.plant.feeder
     same = one_busbar(feeder, places[heard], places[heard[some]])

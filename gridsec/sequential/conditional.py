@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import blas, lapack
 
-from gridsec.arrays import Bools, Floats, Ints
+from gridsec.arrays import Bools, Floats, Ints, submatrix
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,6 +48,17 @@ class Prior:
     def between(self) -> Floats:
         """Covariance between the meters' buses, (p, p)."""
         return np.asarray(self.of_meters[self.meters])
+
+    def among(self, at: Ints) -> Floats:
+        """Covariance between the buses of some meters, (k, k), in the order of LAPACK.
+
+        Parameters
+        ----------
+        at : (k,)
+            The meters.
+        """
+        # Symmetric: the transpose is the same in the order of LAPACK.
+        return submatrix(self.of_meters, self.meters[at], at).T
 
 
 @dataclass(slots=True, eq=False)
@@ -93,7 +104,7 @@ class Fit:
     def trusting(self) -> tuple[Ints, Floats]:
         """The trusted meters, and the inverse covariance of these alone, (t,) and (t, t)."""
         at = np.flatnonzero(self.trusted)
-        return at, self.inverse if len(self.inverse) == at.size else self.inverse[np.ix_(at, at)]
+        return at, self.inverse if len(self.inverse) == at.size else submatrix(self.inverse, at, at)
 
     def weights(self, m: Floats) -> Floats:
         """Q m, (p,)."""
@@ -115,7 +126,7 @@ class Fit:
         """Keep nothing about meters that are not trusted, where that saves much."""
         at = np.flatnonzero(self.trusted)
         if at.size**2 < _MUCH * len(self.inverse) ** 2:
-            self.inverse = self.inverse[np.ix_(at, at)]
+            self.inverse = submatrix(self.inverse, at, at)
 
     def copy(self) -> Fit:
         """A fit that can be changed without changing this one."""
@@ -229,8 +240,7 @@ def solved(matrix: Floats, right: Floats) -> Floats:
 
 def _between(prior: Prior, noise: Floats, at: Ints, more: Floats) -> Floats:
     """Covariance of the readings of meters `at`, in the order of LAPACK."""
-    # Symmetric: the transpose is the same in the order of LAPACK.
-    out = prior.of_meters[np.ix_(prior.meters[at], at)].T
+    out = prior.among(at)
     if more.shape[1]:
         out += more[prior.meters[at]] @ more[prior.meters[at]].T
     out[np.diag_indices(at.size)] += noise
@@ -252,7 +262,7 @@ def _narrow(now: Fit, at: Ints, inverse: Floats) -> None:
     others = np.flatnonzero(left)
     for first in range(0, others.size if at.size else 0, _ROWS):
         some = others[first : first + _ROWS]
-        K = now.prior.of_meters[np.ix_(some, at)]
+        K = submatrix(now.prior.of_meters, some, at)
         if now.loose.shape[1]:
             K += now.loose[some] @ now.loose[now.prior.meters[at]].T
         before[some] -= np.einsum("ij,ij->i", K @ inverse, K)
@@ -260,8 +270,9 @@ def _narrow(now: Fit, at: Ints, inverse: Floats) -> None:
     np.maximum(before, 0.0, out=before)
 
 
-# Rows that are worked on together.
+# Rows that are worked on together, and where such a block has its lower triangle.
 _ROWS = 256
+_LOWER = np.tri(_ROWS, dtype=np.bool_)
 
 
 def invert(matrix: Floats) -> None:
@@ -281,7 +292,7 @@ def invert(matrix: Floats) -> None:
     for first in range(0, len(matrix), _ROWS):
         last = first + _ROWS
         corner = matrix[first:last, first:last]
-        corner[:] = np.tril(corner) + np.tril(corner, -1).T
+        corner[:] = np.where(_LOWER[: len(corner), : len(corner)], corner, corner.T)
         matrix[first:last, last:] = matrix[last:, first:last].T
 
 

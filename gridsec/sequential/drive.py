@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, Ints
+from gridsec.arrays import Bools, Floats, Ints, submatrix
 from gridsec.errors import DesignInfeasible
 from gridsec.lure import POLICY, Lure, Transition, advance, step, transition
 from gridsec.sequential.design import SequentialDesign
@@ -102,7 +102,7 @@ def _prepared(design: SequentialDesign, rows: Ints, h: float, before: Free | Non
 
 def _among(design: SequentialDesign, rows: Ints) -> Lure:
     droop = design.plant.droop
-    H = design.loop[np.ix_(rows, rows)]
+    H = submatrix(design.loop, rows, rows)
     rate, size = 1.0 / droop.tau[rows], rows.size
     return Lure(
         A=-np.diag(rate),

@@ -82,7 +82,7 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats) -> 
             found[s], trust = _decoded(design, here, now, trust, s)
             now = found[s].best.fit
             view = view_of(design, here, now)
-        elif (view.over & trust.trusted).any() or _due(design, trust, view, s, tick):
+        elif (view.over & trust.trusted).any() or _due(design, trust, view, s, tick, searched=bool(found)):
             found[s], trust = Search(design, scales, book, fits, trust, s)(now, view)
             now = found[s].best.fit
             view = view_of(design, here, now)
@@ -128,11 +128,11 @@ def ended(design: SequentialDesign, trust: Trust, seen: Examined, window: Window
     return out
 
 
-def _due(design: SequentialDesign, trust: Trust, view: View, s: int, tick: int) -> bool:
+def _due(design: SequentialDesign, trust: Trust, view: View, s: int, tick: int, *, searched: bool) -> bool:
     """Whether what is believed is looked into again, though nothing new speaks against it.
 
     Before a meter is named, and now and then while that is in doubt; while more is suspected than meters;
-    and from time to time.
+    and from time to time, at ticks at which no shorter scale has just searched.
     """
     if any(scale <= s for _, scale in trust.accused):
         return True
@@ -144,7 +144,7 @@ def _due(design: SequentialDesign, trust: Trust, view: View, s: int, tick: int) 
     if (about & first).any() or (tick % _AGAIN == 0 and about.any()):
         return True
     last = len(design.lengths) - 1
-    return s == last and tick % design.lengths[last] == 0
+    return s == last and tick % design.lengths[last] == 0 and not searched
 
 
 def _every(length: int) -> int:

@@ -264,7 +264,7 @@ class Search:
     def _together(self, at: Ints) -> Bools:
         """Which of some meters are moved by the same loads, (k, k)."""
         prior = self.scales.prior
-        between = prior.of_meters[np.ix_(prior.meters[at], at)]
+        between = prior.among(at)
         std = np.sqrt(between.diagonal())
         limit = _TOGETHER * np.multiply.outer(std, std)
         return np.asarray((between >= limit) & (limit > 0.0) | np.eye(at.size, dtype=np.bool_))

@@ -198,18 +198,17 @@ def describe(shapes: Shapes, heard: Kinds, model: Floats, named: Bools, variance
     since = np.where(named, np.where(heard.since < 0, tick, heard.since), -1)
     alone = [kind if there else None for kind, there in zip(heard.alone, named.tolist(), strict=True)]
     told, new = heard.told & named, bool((since == tick).any())
-    look: dict[int, list[int]] = {}
-    for j in np.flatnonzero(named).tolist():
-        if memory.stuck[j] or memory.run[j] * shapes.rules.surprise[j] >= _CALLED_STUCK:
-            alone[j] = Kind.STUCK
-        elif memory.lag[j]:
-            alone[j] = Kind.REPLAY
-        elif since[j] == tick or (tick + j) % _EVERY == 0:
-            look.setdefault(int(tick - since[j]), []).append(j)
-    for age, meters in look.items():
-        found = _alone(shapes, memory, np.array(meters), age, variance, heard.alone)
-        for j, kind in zip(meters, found, strict=True):
+    stuck = named & (memory.stuck | (memory.run * shapes.rules.surprise >= _CALLED_STUCK))
+    replays = named & ~stuck & (memory.lag > 0)
+    for kind, which in ((Kind.STUCK, stuck), (Kind.REPLAY, replays)):
+        for j in np.flatnonzero(which).tolist():
             alone[j] = kind
+    due = named & ~stuck & ~replays & ((since == tick) | ((tick + np.arange(named.size)) % _EVERY == 0))
+    for age in np.unique(tick - since[due]).tolist():
+        meters = np.flatnonzero(due & (since == tick - age))
+        found = _alone(shapes, memory, meters, age, variance, heard.alone)
+        for j, looks in zip(meters.tolist(), found, strict=True):
+            alone[j] = looks
     if new or tick % _EVERY == 0:
         told = _together(shapes, memory, since, variance)
     return Kinds(memory, since, tuple(alone), told)
@@ -299,12 +298,13 @@ def _drifts(lies: Floats, noise: Floats) -> Bools:
     ramps, size, lasts = _ramps(count)
     centred = means - means.mean(axis=0)
     along = ramps @ centred
-    left = np.maximum(np.einsum("ij,ij->j", centred, centred) - along**2, 0.0)
-    best, at = left.argmin(axis=0), np.arange(noise.size)
-    least, grown = left[best, at], along[best, at] / size[best]
+    explained, whole = along * along, np.einsum("ij,ij->j", centred, centred)
+    best, at = explained.argmax(axis=0), np.arange(noise.size)
+    least, grown = np.maximum(whole - explained[best, at], 0.0), along[best, at] / size[best]
+    by_step = np.maximum(whole - explained[lasts <= 1].max(axis=0), 0.0)
     floor = count * noise**2 / width
     lasting = lasts[best] >= _LASTS * count
-    lasting &= least + floor < _BETTER * (left[lasts <= 1].min(axis=0) + floor)
+    lasting &= least + floor < _BETTER * (by_step + floor)
     # What is left must be small against what has grown, or this is just a wild lie.
     return np.asarray(lasting & (np.sqrt(least / count) < _LEFT * np.abs(grown)))
 

@@ -29,7 +29,7 @@ from functools import cache, partial
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, Ints, frozen_ints
+from gridsec.arrays import Bools, Floats, Ints, frozen_ints, submatrix
 from gridsec.sequential.conditional import Fit, Judged, Move, Prior, admit, drop, follow, judge, solved
 from gridsec.sequential.dictionary import Dictionary, Powers, Step
 
@@ -291,7 +291,7 @@ def _pair(here: _Place, than: float) -> tuple[tuple[int, ...], float]:
         at = np.sort(at[np.argsort(-(weights[at] ** 2) / now.Q[at, at])[:_PAIRED]])
     if at.size < 2:
         return (), than
-    Q, b = now.Q[np.ix_(at, at)], weights[at]
+    Q, b = submatrix(now.Q, at, at), weights[at]
     d = Q.diagonal()
     determinant = np.multiply.outer(d, d) - Q * Q
     np.fill_diagonal(determinant, np.inf)
@@ -347,8 +347,7 @@ def robust(prior: Prior, noise: Floats, m: Floats, live: Bools, bound: Floats) -
     if not at.size:
         return trusted
     d, y, limit = noise[at], m[at], bound[at] ** 2
-    # In the order of LAPACK; symmetric, so the transpose is the same.
-    signal = prior.of_meters[np.ix_(prior.meters[at], at)].T
+    signal = prior.among(at)
     rest = _residual(signal, d, y)
     largest = float(np.max(rest * rest / limit))
     if largest <= 1.0:
@@ -423,7 +422,7 @@ def swaps(found: Solution, live: Bools, within: float, limits: Limits) -> list[S
     inside, (at, Q) = now.loose[prior.meters], now.trusting()
     for first in range(0, accused.size if at.size else 0, _COLUMNS):
         who = accused[first : first + _COLUMNS]
-        columns = prior.of_meters[np.ix_(prior.meters[at], who)]
+        columns = submatrix(prior.of_meters, prior.meters[at], who)
         if inside.shape[1]:
             columns += inside[at] @ inside[who].T
         v, s = Q @ columns, judged.std[who] ** 2

@@ -34,7 +34,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import lapack
 
-from gridsec.arrays import Bools, Floats
+from gridsec.arrays import Bools, Floats, submatrix
 from gridsec.sequential.alike import Set, alike, worth
 from gridsec.sequential.conditional import Prior
 from gridsec.sequential.rises import Curved, FalsePowers, Lies, Problem, State, suspicious
@@ -125,7 +125,7 @@ def identify(
         d, y, K = noise, m, prior.between
     else:
         at = np.flatnonzero(live)
-        d, y, K = noise[at], m[at], prior.of_meters[np.ix_(prior.meters[at], at)]
+        d, y, K = noise[at], m[at], submatrix(prior.of_meters, prior.meters[at], at)
         false = None if false is None else false.of(at)
     K.ravel()[:: d.size + 1] += d
     W = _whitening(K)

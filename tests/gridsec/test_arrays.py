@@ -16,6 +16,7 @@ from gridsec.arrays import (
     frozen_ints,
     perron_bound,
     spectral_radius,
+    submatrix,
     symmetry_defect,
 )
 
@@ -33,6 +34,19 @@ def test_frozen_copies_and_locks() -> None:
 def test_indices_must_be_integers(values: np.ndarray) -> None:
     with pytest.raises(TypeError, match="indices must be integers"):
         frozen_ints(values)
+
+
+@given(st.data(), st.integers(1, 6), st.integers(1, 6))
+def test_a_submatrix_is_picked_entry_by_entry(data: st.DataObject, n: int, m: int) -> None:
+    matrix = np.arange(float(n * m)).reshape(n, m)
+    rows = data.draw(st.lists(st.integers(0, n - 1), max_size=9))
+    columns = data.draw(st.lists(st.integers(0, m - 1), max_size=9))
+    out = submatrix(matrix, np.array(rows, dtype=np.intp), np.array(columns, dtype=np.intp))
+    assert out.shape == (len(rows), len(columns))
+    assert out.flags.c_contiguous
+    assert out.tolist() == [[matrix[i, j] for j in columns] for i in rows]
+    out += 1.0
+    assert matrix[0, 0] == 0.0, "a copy"
 
 
 def test_no_indices_at_all_are_integers_of_any_type() -> None:
