@@ -212,7 +212,7 @@ def _meter(  # noqa: PLR0917  # the feeder twice, and which of its meters
 
 def _customer(site: Site, given: Rule, worst: Box, liars: int, i: int) -> dict[str, Any]:
     bus, base = int(site.feeder.bus[i]), site.customer_volt[i]
-    moved = max(largest_shift(given, along, liars, seen=True).bound for along in given.weights(bus))
+    moved = largest_shift(given, given.weights(bus), liars, seen=True).bound
     return {
         "customer": site.feeder.customers[i],
         "bus": site.feeder.buses[bus],

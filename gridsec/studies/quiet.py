@@ -9,7 +9,7 @@ scales and at p meters together, all are within ``H_j`` with probability at leas
 - named:   every explanation that believes meter k leaves a misfit of at least ``m_k^2 / (S_kk + d_k)``,
   whatever all other meters say; where that exceeds what the truth costs by 2 ln(like), none is a rival.
 
-The first two are linear in a but for the number of liars: mixed-integer programs.
+The first two are linear in a but for the number of liars: `gridsec.studies.collusion` searches them.
 
 References
 ----------
@@ -22,15 +22,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import Bounds, LinearConstraint, milp
 
 from gridsec.arrays import Bools, Floats
-from gridsec.errors import DesignInfeasible
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.dictionary import OF_A_LIAR
 from gridsec.sequential.search import Limits, price
+from gridsec.studies.collusion import Corridor, Shift, corridor, furthest
 
-__all__ = ["Rule", "Shift", "largest_shift", "named_size", "rule"]
+__all__ = ["Rule", "Shift", "largest_shift", "named_size", "rule", "within"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,25 +75,6 @@ class Rule:
         return self.deviations * float(np.sqrt(np.maximum(left, 0.0).max())) + float(self.model.max())
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Shift:
-    """Lies that move something furthest while all residuals stay within their bounds.
-
-    Attributes
-    ----------
-    size
-        How far, squared pu; reached by `lies`.
-    bound
-        Nothing moves it further, by the solver's bound; far above `size` where the search was cut short.
-    lies : (p,)
-        a.
-    """
-
-    size: float
-    bound: float
-    lies: Floats
-
-
 def rule(design: SequentialDesign, *, risk: float, model: Floats) -> Rule:
     """Write a monitor's rule down.
 
@@ -126,6 +106,34 @@ def rule(design: SequentialDesign, *, risk: float, model: Floats) -> Rule:
     return Rule(design, risk, t, inverse, limit, honest, noise, model)
 
 
+def within(given: Rule, liars: int, *, seen: bool, honest: Bools | None = None) -> Corridor:
+    """What lies of at most M meters must keep to, so that no residual is beyond its bound.
+
+    Parameters
+    ----------
+    given
+        The rule.
+    liars
+        M.
+    seen
+        The bound: False for limit - H (certainly within the limit: hidden), True for limit + H + what the
+        model may be off on both sides (beyond which somebody is certainly over the limit).
+    honest : (p,), optional
+        Meters that cannot lie.
+    """
+    s, p = given.limit.shape
+    width = given.limit + given.honest + 2.0 * given.model if seen else given.limit - given.honest
+    if liars < 1 or (width <= 0.0).any():
+        return Corridor(np.zeros((0, p)), np.zeros(p), 1)
+    size = np.einsum("sjj->sj", given.inverse)
+    rows = (given.inverse / (width * size)[:, :, None]).reshape(s * p, p)
+    # |a| <= |Q^-1| |Q a|
+    most = np.min(
+        [np.abs(np.linalg.inv(Q)) @ (w * d) for Q, w, d in zip(given.inverse, width, size, strict=True)], 0
+    )
+    return corridor(rows, liars, reach=most if honest is None else np.where(honest, 0.0, most))
+
+
 def largest_shift(
     given: Rule,
     along: Floats,
@@ -139,68 +147,15 @@ def largest_shift(
 
     Parameters
     ----------
-    given
-        The rule.
-    along : (p,)
-        What is moved by each lie; a unit vector for the lie of one meter itself.
-    liars
-        M.
-    seen
-        The bound: False for limit - H (certainly within the limit: hidden), True for limit + H + what the
-        model may be off on both sides (beyond which somebody is certainly over the limit).
+    given, liars, seen, honest
+        As in `within`.
+    along : (p,) or (d, p)
+        What is moved by each lie; a unit vector for the lie of one meter itself. Of several rows, whichever
+        is moved furthest.
     must
         A meter that lies in any case.
-    honest : (p,), optional
-        Meters that cannot lie.
-
-    Raises
-    ------
-    DesignInfeasible
-        If the solver fails.
     """
-    s, p = given.limit.shape
-    width = given.limit + given.honest + 2.0 * given.model if seen else given.limit - given.honest
-    if liars < 1 or (width <= 0.0).any():
-        return Shift(0.0, 0.0, np.zeros(p))
-    size = np.einsum("sjj->sj", given.inverse)
-    rows = (given.inverse / (width * size)[:, :, None]).reshape(s * p, p)
-    # |a| <= |Q^-1| |Q a|: the least of it over the scales is a tight constant.
-    most = np.min(
-        [np.abs(np.linalg.inv(Q)) @ (w * d) for Q, w, d in zip(given.inverse, width, size, strict=True)], 0
-    )
-    least = np.zeros(p)
-    upper = np.ones(p) if honest is None else (~honest).astype(np.float64)
-    if must is not None:
-        least[must] = upper[must]
-    reach = most / _PART
-    gain = along * reach
-    unit = float(np.abs(gain).max()) or 1.0
-    one = np.eye(p)
-    found = milp(
-        np.concatenate([-gain / unit, np.zeros(p)]),
-        constraints=[
-            LinearConstraint(np.hstack([rows * reach, np.zeros((s * p, p))]), lb=-1.0, ub=1.0),
-            LinearConstraint(np.hstack([one, -_PART * one]), ub=0.0),
-            LinearConstraint(np.hstack([-one, -_PART * one]), ub=0.0),
-            LinearConstraint(np.concatenate([np.zeros(p), np.ones(p)])[None, :], ub=float(liars)),
-        ],
-        bounds=Bounds(
-            np.concatenate([np.full(p, -_PART), least]), np.concatenate([np.full(p, _PART), upper])
-        ),
-        integrality=np.repeat(np.arange(2), p),
-        options={"mip_rel_gap": 1e-6, "node_limit": max(1, _WORK // (s * p * p))},
-    )
-    if found.x is None:
-        raise DesignInfeasible("largest lie that the monitor does not see", found.message)
-    lies = np.where(found.x[p:] > 0.5, found.x[:p] * reach, 0.0)
-    reached = float(along @ lies)
-    return Shift(reached, max(reached, float(-found.mip_dual_bound) * unit), lies)
-
-
-# HiGHS takes binaries within 1e-6 for integers: in larger units, what that frees is within its tolerance.
-_PART = 0.1
-# Nodes of a search times entries of its constraints: beyond, the bound is what was proven until then.
-_WORK = 200_000
+    return furthest(within(given, liars, seen=seen, honest=honest), along, must=must)
 
 
 def named_size(given: Rule, meter: int, liars: int, *, claims: Floats) -> float:
