@@ -34,7 +34,7 @@ from feeders.studies.calibrate_search import (
     correction,
     prepare,
 )
-from feeders.studies.journal import Journal, Progress
+from feeders.studies.journal import Journal, Progress, Where
 
 if TYPE_CHECKING:
     from feeders.load import Site
@@ -145,7 +145,7 @@ def calibrate(
     tolerance: float = 0.02,
     exclude: Sequence[str] = (),
     kinds: Sequence[Kind] = tuple(Kind),
-    journal: Path | None = None,
+    journal: Where = None,
     progress: Progress | None = None,
 ) -> Calibrate:
     """Compare recorded readings with a feeder's files.
@@ -179,12 +179,12 @@ def calibrate(
         If closed lines form loops in three phases.
     OtherStudy
         If the journal is another study's.
+    InUse
+        If another process is writing it.
     """
     _check(site, risk, tolerance, exclude)
     given = frames(site, readings)
-    kept = Journal(
-        journal, _subject(site, given, risk, tolerance) | {"exclude": sorted(exclude), "kinds": sorted(kinds)}
-    )
+    subject = _subject(site, given, risk, tolerance) | {"exclude": sorted(exclude), "kinds": sorted(kinds)}
 
     def weighed(now: Round) -> Verdict:
         return compare(now, given, risk, progress or _quiet, kinds)
@@ -192,7 +192,8 @@ def calibrate(
     def fitted(state: State) -> Round:
         return prepare(state, given, tolerance=tolerance, errors=True)
 
-    now, verdict, found = _searched(State(site.tables, tuple(exclude)), fitted, weighed, risk, kept)
+    with Journal(journal, subject) as kept:
+        now, verdict, found = _searched(State(site.tables, tuple(exclude)), fitted, weighed, risk, kept)
     lines, ids = calibrate_tables.lines(now, tolerance)
     wrongs = [_read(row["correction"]) for row in found]
     rows, sure = calibrate_tables.final(found, wrongs, lines, ids)

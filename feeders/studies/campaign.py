@@ -12,7 +12,6 @@ from __future__ import annotations
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import pandas as pd
@@ -23,7 +22,7 @@ from feeders.studies import campaign_tables
 from feeders.studies.campaign_plan import Plan
 from feeders.studies.campaign_run import Here, Runner, versions
 from feeders.studies.campaign_watch import Prepared, prepare, watch
-from feeders.studies.journal import Journal, Progress
+from feeders.studies.journal import Journal, Progress, Where
 from gridsec.errors import GridsecError
 
 if TYPE_CHECKING:
@@ -117,7 +116,7 @@ def campaign(
     *,
     seed: int | None = None,
     runner: Runner | None = None,
-    journal: Path | None = None,
+    journal: Where = None,
     progress: Progress | None = None,
 ) -> Campaign:
     """Play a campaign on a feeder.
@@ -145,6 +144,8 @@ def campaign(
         If the feeder can carry its loads at no moment that was drawn.
     OtherStudy
         If the journal is another study's.
+    InUse
+        If another process is writing it.
     ClusterUnusable, WorkerLost
         From the runner; what is finished is in the journal.
     """
@@ -158,23 +159,27 @@ def campaign(
         "digest": site.digest,
         "plan": plan.subject,
     }
-    kept = Journal(journal, subject)
-    todo = [scene for scene in range(plan.scenes) if _key(scene) not in kept]
-    done = plan.scenes - len(todo)
-    if progress is not None:
-        progress(done * plan.together, plan.scenarios)
-    with closing((runner or Here()).run(partial(_scene, site.tables, plan), todo)) as results:
-        for scene, rows in results:
-            kept.put(_key(scene), rows)
-            done += 1
-            if progress is not None:
-                progress(done * plan.together, plan.scenarios)
-    rows = [row for scene in range(plan.scenes) for row in kept[_key(scene)]]
+    with Journal(journal, subject, of=plan.scenes) as kept:
+        rows = _played(site, plan, runner or Here(), kept, progress)
     return _campaign(site, plan, used, rows)
 
 
-def _key(scene: int) -> str:
-    return f"scene|{scene}"
+def _played(
+    site: Site, plan: Plan, runner: Runner, kept: Journal, progress: Progress | None
+) -> list[dict[str, Any]]:
+    """The rows of all scenes; those that the journal does not have are played."""
+    keys = [f"scene|{scene}" for scene in range(plan.scenes)]
+    todo = [scene for scene, key in enumerate(keys) if key not in kept]
+    done = plan.scenes - len(todo)
+    if progress is not None:
+        progress(done * plan.together, plan.scenarios)
+    with closing(runner.run(partial(_scene, site.tables, plan), todo)) as results:
+        for scene, rows in results:
+            kept.put(keys[scene], rows)
+            done += 1
+            if progress is not None:
+                progress(done * plan.together, plan.scenarios)
+    return [row for key in keys for row in kept[key]]
 
 
 # What the worker of this process prepared last, and for what.

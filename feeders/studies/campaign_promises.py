@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from contextlib import closing
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,7 +14,7 @@ from feeders.schema import FeederTables
 from feeders.studies.campaign_plan import Kind, Promise
 from feeders.studies.campaign_run import Here, Runner
 from feeders.studies.detectable import Detectable, monitor_rule
-from feeders.studies.journal import Journal, Progress
+from feeders.studies.journal import Journal, Progress, Where
 from feeders.studies.operating import SHARE, volts_of_lie
 from feeders.studies.rehearsal import Rehearsal, rehearse
 from gridsec.studies.quiet import largest_shift
@@ -95,7 +94,7 @@ def rehearse_everywhere(
     share: float = SHARE,
     runner: Runner | None = None,
     piece: int = PIECE,
-    journal: Path | None = None,
+    journal: Where = None,
     progress: Progress | None = None,
 ) -> Rehearsal:
     """As `rehearsal.rehearse`, in pieces that are worked on anywhere.
@@ -119,6 +118,8 @@ def rehearse_everywhere(
     ------
     OtherStudy
         If the journal is another study's.
+    InUse
+        If another process is writing it.
     ClusterUnusable, WorkerLost
         From the runner; what is finished is in the journal.
     """
@@ -130,20 +131,20 @@ def rehearse_everywhere(
         "seed": seed,
         "share": share,
     }
-    kept = Journal(journal, subject)
     sizes = [min(piece, trials - begin) for begin in range(0, trials, piece)]
-    todo = [k for k in range(len(sizes)) if str(k) not in kept]
-    done = trials - sum(sizes[k] for k in todo)
-    if progress is not None:
-        progress(done, trials)
     work = partial(_piece, site.tables, found, sizes, seed, share)
-    with closing((runner or Here()).run(work, todo)) as results:
-        for k, counted in results:
-            kept.put(str(k), counted)
-            done += sizes[k]
-            if progress is not None:
-                progress(done, trials)
-    counts = [kept[str(k)] for k in range(len(sizes))]
+    with Journal(journal, subject, of=len(sizes)) as kept:
+        todo = [k for k in range(len(sizes)) if str(k) not in kept]
+        done = trials - sum(sizes[k] for k in todo)
+        if progress is not None:
+            progress(done, trials)
+        with closing((runner or Here()).run(work, todo)) as results:
+            for k, counted in results:
+                kept.put(str(k), counted)
+                done += sizes[k]
+                if progress is not None:
+                    progress(done, trials)
+        counts = [kept[str(k)] for k in range(len(sizes))]
     return Rehearsal(trials, *(sum(each[i] for each in counts) for i in range(3)))
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,7 +18,7 @@ import pandas as pd
 from feeders.doubts import load_doubt
 from feeders.load import plant
 from feeders.studies.hidden import Curves
-from feeders.studies.journal import Journal, Progress, worked
+from feeders.studies.journal import Progress, Where, worked
 from feeders.studies.operating import SHARE, box, volts_of_lie
 from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible
@@ -86,7 +85,7 @@ def detectable(
     max_attacked: int,
     share: float = SHARE,
     risk: float = RISK,
-    journal: Path | None = None,
+    journal: Where = None,
     progress: Progress | None = None,
 ) -> Detectable:
     """Find the smallest lies that are surely named, and the largest that stay unnoticed.
@@ -114,6 +113,8 @@ def detectable(
         If `max_attacked` or `risk` is out of range.
     OtherStudy
         If the journal is another study's.
+    InUse
+        If another process is writing it.
     """
     if not 1 <= max_attacked <= site.meters.size:
         raise ValueError(f"max_attacked is {max_attacked}; it must be from 1 to {site.meters.size}")
@@ -136,7 +137,7 @@ def detectable(
         (f"customer|{i}", partial(_customer, site, given, worst, max_attacked, i))
         for i in range(site.feeder.bus.size)
     ]
-    done = worked(Journal(journal, subject), tasks, progress)
+    done = worked(journal, subject, tasks, progress)
     rows = {kind: [v for k, v in done.items() if k.startswith(kind)] for kind in ("meter", "customer")}
     return Detectable(
         site.feeder.name,

@@ -11,7 +11,6 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -32,7 +31,7 @@ from feeders.studies.droop_verdict import (
     margin,
     worst,
 )
-from feeders.studies.journal import Journal, Progress, worked
+from feeders.studies.journal import Progress, Where, worked
 from gridsec.droop import PRESETS, Droop
 from gridsec.studies.droop_network import Box
 from gridsec.studies.droop_rest import rest
@@ -187,7 +186,7 @@ def droop(
     options: DroopOptions | None = None,
     *,
     seed: int = 0,
-    journal: Path | None = None,
+    journal: Where = None,
     progress: Progress | None = None,
 ) -> DroopStudy:
     """Study the droop fleet of a feeder.
@@ -213,6 +212,8 @@ def droop(
         If options are out of range.
     OtherStudy
         If the journal is another study's.
+    InUse
+        If another process is writing it.
     """
     given = options or DroopOptions()
     study = _Study(Subject.of(site), chosen_fleet(site, given.preset, given.who), given, seed)
@@ -221,7 +222,7 @@ def droop(
         raise ValueError(f"the band from {low:g} to {high:g} is none; expected two ascending voltages, pu")
     subject = {"study": "droop", "digest": site.digest, "seed": seed, "options": asdict(given)}
     _ = study.update, study.box  # wrong options are told before the work, not in the midst of it
-    done = worked(Journal(journal, subject), _tasks(study), progress)
+    done = worked(journal, subject, _tasks(study), progress)
     tables = _tables(site, done)
     band = tables["band"].iloc[0]
     return DroopStudy(

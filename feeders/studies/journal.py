@@ -1,21 +1,32 @@
 """What a long study has done so far, in a file: interrupted at half, it goes on where it was.
 
-JSON lines: first what is studied and with which versions, then one line for each piece of work that is done.
-A line that was cut off while it was written is done again.
+JSON lines: first what is studied and with which program, then one line for each piece of work that is done.
+A line that was cut off while it was written is done again. One process at a time writes a journal.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
+import os
 import platform
+import sys
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import Any, Final, Protocol, Self
 
 from gridsec.errors import GridsecError
 
-__all__ = ["Journal", "OtherStudy", "Progress", "versions", "worked"]
+if sys.platform == "win32":
+    import msvcrt
+else:
+    import fcntl
+
+__all__ = ["InUse", "Journal", "Keeper", "OtherStudy", "Progress", "Where", "versions", "worked"]
 
 Progress = Callable[[int, int], None]
 """Told how many pieces of work are done, and of how many."""
@@ -25,47 +36,113 @@ class OtherStudy(GridsecError):
     """A journal belongs to another study, feeder, version or to other arguments, or is no journal."""
 
 
+class InUse(GridsecError):
+    """Another process is writing a journal."""
+
+
+class Keeper(Protocol):
+    """Who has journals for several studies, and looks after them."""
+
+    def file(self, study: str, digest: str) -> Path | None:
+        """Where the journal of a study is, or is to be; None: nothing is kept."""
+
+    def opened(self, journal: Journal) -> None:
+        """A journal is open: its `path`, what is `done` of it, and of how much."""
+
+    def refused(self, path: Path, why: OSError | OtherStudy | InUse) -> bool:
+        """It cannot be used, or no more. True: try again; False: go on without it; or raise."""
+
+
+Where = Path | Keeper | None
+"""A journal's file, or who has one; None: nothing is kept."""
+
+
 def versions() -> dict[str, str]:
     """Versions of everything that numbers depend on."""
-    found = {name: version(name) for name in ("gridsec", "numpy", "scipy", "power-grid-model")}
-    return {"python": platform.python_version(), **found}
+    names = ("gridsec", "numpy", "scipy", "power-grid-model", "cvxpy", "clarabel")
+    return {"python": platform.python_version(), **{name: version(name) for name in names}}
+
+
+@cache
+def edition() -> str:
+    """Digest of this program's own code: a version may have been edited since a journal was begun."""
+    content = hashlib.sha256()
+    root = Path(__file__).parents[2]
+    for path in sorted(each for name in ("gridsec", "feeders") for each in (root / name).rglob("*.py")):
+        content.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+    return content.hexdigest()[:16]
 
 
 class Journal:
-    """Results by key; kept in memory, and in a file if there is one.
+    """Results by key; kept in memory, and in a file if there is one. To be closed, as by `with`.
 
     Parameters
     ----------
-    path
-        The file; it is made if it does not exist. None: nothing is kept.
+    where
+        The file, which is made if it does not exist; or who has one. None: nothing is kept.
     subject
-        What is studied, with every argument that changes a result.
+        What is studied, with every argument that changes a result; `study` is its name.
+    of
+        How many pieces of work there are, if that is known.
+
+    Attributes
+    ----------
+    path
+        The file; None: there is none.
+    of
+        As above.
 
     Raises
     ------
     OtherStudy
         If the file is about something else.
+    InUse
+        If another process is writing it.
+    OSError
+        If it cannot be written.
     """
 
-    def __init__(self, path: Path | None, subject: Mapping[str, Any]) -> None:
-        self._path = path
+    def __init__(self, where: Where, subject: Mapping[str, Any], *, of: int | None = None) -> None:
+        self._handle: int | None = None
+        self.path: Path | None = None
+        self.of = of
         self._done: dict[str, Any] = {}
-        if path is None:
-            return
-        head = json.dumps({**subject, "versions": versions()}, sort_keys=True)
-        if not path.exists() or not path.stat().st_size:
-            path.write_text(head + "\n", encoding="utf-8")
-            return
-        lines = path.read_text(encoding="utf-8", errors="replace").split("\n")
-        if lines[0] != head:
-            raise OtherStudy(f"{path}: {_other(lines[0], head)}")
-        try:
-            self._done = dict(json.loads(line) for line in lines[1:-1])
-        except (ValueError, TypeError) as error:
-            raise OtherStudy(f"{path}: a line is no result of a study: {error}") from error
-        # What follows the last end of line was cut off: it goes, and so the next line begins a new one.
-        if lines[-1] or len(lines) == 1:
-            path.write_text("\n".join([*lines[:-1], ""] if len(lines) > 1 else [head, ""]), encoding="utf-8")
+        self._keeper = None if isinstance(where, Path) else where
+        head = json.dumps({**subject, "versions": versions(), "edition": edition()}, sort_keys=True)
+        digest = hashlib.sha256(head.encode()).hexdigest()[:16]
+        path = where if isinstance(where, Path) or where is None else where.file(subject["study"], digest)
+        trying = path is not None
+        while trying and path is not None:
+            try:
+                self._handle, self._done = _opened(path, head)
+            except (OSError, OtherStudy, InUse) as error:
+                trying = self._again(path, error)
+            else:
+                self.path, trying = path, False
+        if self._keeper is not None:
+            self._keeper.opened(self)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let others write the file; what is done stays known."""
+        if self._handle is not None:
+            os.close(self._handle)
+            self._handle = None
+
+    def __del__(self) -> None:
+        self.close()
+
+    @property
+    def done(self) -> int:
+        """How many pieces of work are done."""
+        return len(self._done)
 
     def __contains__(self, key: str) -> bool:
         return key in self._done
@@ -94,18 +171,100 @@ class Journal:
         ----------
         key, value
             Its name, and its result, which survives JSON.
+
+        Raises
+        ------
+        OSError
+            If it cannot be written.
         """
         self._done[key] = value
-        if self._path is not None:
-            with self._path.open("a", encoding="utf-8") as file:
-                file.write(json.dumps([key, value]) + "\n")
+        if self._handle is None or self.path is None:
+            return
+        try:
+            _write(self._handle, json.dumps([key, value]))
+        except OSError as error:
+            path = self.path
+            self.close()
+            self.path = None
+            self._again(path, error)
+
+    def _again(self, path: Path, error: OSError | OtherStudy | InUse) -> bool:
+        """Ask whose journal it is whether to try again; nobody's is an error."""
+        if self._keeper is None:
+            raise error
+        return self._keeper.refused(path, error)
+
+
+# A place far beyond the end, which stands for the file: what is locked on Windows nobody else can read.
+_FAR: Final = 1 << 40
+
+
+def _opened(path: Path, head: str) -> tuple[int, dict[str, Any]]:
+    """Open a journal for this process alone, and read it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    while True:
+        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | getattr(os, "O_BINARY", 0), 0o666)
+        try:
+            _lock(handle, path)
+            # Who had it until now may have come to an end, and removed it.
+            with suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(handle), path.stat()):
+                    return handle, _read(handle, path, head)
+        except BaseException:
+            os.close(handle)
+            raise
+        os.close(handle)
+
+
+def _lock(handle: int, path: Path) -> None:
+    """Keep others out until the file is closed, be it by the death of this process."""
+    try:
+        if sys.platform == "win32":
+            os.lseek(handle, _FAR, os.SEEK_SET)
+            msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
+        else:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except (BlockingIOError, PermissionError) as error:
+        raise InUse(f"{path}: another command is writing this journal") from error
+    except OSError:
+        return  # a file system without locks
+
+
+def _read(handle: int, path: Path, head: str) -> dict[str, Any]:
+    """What is in a journal; one that is empty, or was interrupted in its first line, is begun."""
+    with open(handle, "rb", closefd=False) as file:
+        file.seek(0)
+        content = file.read()
+    lines = content.split(b"\n")
+    if len(lines) == 1 and head.encode().startswith(content):
+        os.ftruncate(handle, 0)
+        _write(handle, head)
+        return {}
+    if lines[0] != head.encode():
+        raise OtherStudy(f"{path}: {_other(lines[0].decode(errors='replace'), head)}")
+    try:
+        done = dict(json.loads(line) for line in lines[1:-1])
+    except (ValueError, TypeError) as error:
+        raise OtherStudy(f"{path}: a line is no result of a study: {error}") from error
+    # What follows the last end of line was cut off: it goes, and so the next line begins a new one.
+    if lines[-1]:
+        os.ftruncate(handle, len(content) - len(lines[-1]))
+    return done
+
+
+def _write(handle: int, line: str) -> None:
+    with open(handle, "ab", closefd=False) as file:
+        file.write(line.encode() + b"\n")
 
 
 def _other(found: str, expected: str) -> str:
     """In what a journal's first line is not the one expected."""
     try:
         theirs, ours = json.loads(found), json.loads(expected)
-        if {**theirs, "versions": ours["versions"]} == ours:
+        same = {key: ours[key] for key in ("versions", "edition")}
+        if {**theirs, **same} == ours:
+            if theirs.get("versions") == ours["versions"]:
+                return "written before this program was changed; begin a new journal"
             made = ", ".join(f"{name} {each}" for name, each in theirs.get("versions", {}).items())
             return f"written with other versions ({made or 'which, it does not say'}); begin a new journal"
     except (ValueError, TypeError, AttributeError):
@@ -114,25 +273,35 @@ def _other(found: str, expected: str) -> str:
 
 
 def worked(
-    journal: Journal, tasks: Iterable[tuple[str, Callable[[], Any]]], progress: Progress | None
+    where: Where,
+    subject: Mapping[str, Any],
+    tasks: Iterable[tuple[str, Callable[[], Any]]],
+    progress: Progress | None,
 ) -> dict[str, Any]:
     """Do pieces of work in order, and tell how far it is.
 
     Parameters
     ----------
-    journal
-        What is done already.
+    where, subject
+        As in `Journal`.
     tasks
         Key and work of each.
     progress
         Told before the first and after each.
+
+    Raises
+    ------
+    OtherStudy, InUse, OSError
+        As `Journal`.
     """
-    todo = list(tasks)
-    found: dict[str, Any] = {}
-    for count, (key, work) in enumerate(todo):
+    todo = dict(tasks)
+    with Journal(where, subject, of=len(todo)) as journal:
+        done = sum(key in journal for key in todo)
         if progress is not None:
-            progress(count, len(todo))
-        found[key] = journal.get(key, work)
-    if progress is not None:
-        progress(len(todo), len(todo))
-    return found
+            progress(done, len(todo))
+        for key in (key for key in todo if key not in journal):
+            journal.put(key, todo[key]())
+            done += 1
+            if progress is not None:
+                progress(done, len(todo))
+        return {key: journal[key] for key in todo}

@@ -11,14 +11,13 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 
 from feeders.studies.hidden import Attack, Curves, knowledge, meter_mask
-from feeders.studies.journal import Journal
+from feeders.studies.journal import Journal, Where
 from feeders.studies.operating import SHARE, box, squared, volts_of_lie
 from gridsec.arrays import Bools, Ints
 from gridsec.errors import DesignInfeasible
@@ -110,7 +109,7 @@ def protect(
     share: float = SHARE,
     never: Sequence[str] = (),
     exact: bool = True,
-    journal: Path | None = None,
+    journal: Where = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Protect:
     """Find the fewest meters to protect; a protected meter cannot lie.
@@ -150,6 +149,8 @@ def protect(
         If there is no such customer or meter, or no bound of the lie.
     OtherStudy
         If the journal is another study's.
+    InUse
+        If another process is writing it.
     """
     if max_attacked < 1:
         raise ValueError(f"max_attacked is {max_attacked}; it must be at least 1")
@@ -169,14 +170,14 @@ def protect(
         "share": share,
     }
     count, fixed = site.meters.size, meter_mask(site, never)
-    kept = Journal(journal, subject)
     if goal is Goal.BOUND:
         asked, measure = _bounded(site, max_attacked, lie_volt, share, where)
     else:
         known = knowledge(site, unknown=unknown, silent=(), busbar_known=busbar_known, curves=where)
         asked, measure = _hidden(known.found[attack], max_attacked, goal)
     try:
-        found = fewest_protected(_kept(asked, kept), count, never=fixed, exact=exact, progress=progress)
+        with Journal(journal, subject) as kept:
+            found = fewest_protected(_kept(asked, kept), count, never=fixed, exact=exact, progress=progress)
     except Unprotectable as error:
         who = ", ".join(site.meter_ids[j] for j in error.liars)
         raise DesignInfeasible(

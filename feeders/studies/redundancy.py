@@ -11,14 +11,13 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pandas as pd
 
 from feeders.studies.hidden import Attack, Curves, Knowledge, knowledge
-from feeders.studies.journal import Journal, Progress, worked
+from feeders.studies.journal import Progress, Where, worked
 from gridsec.errors import DesignInfeasible
 from gridsec.index import Index
 from gridsec.studies.patterns import fewest_meters
@@ -97,7 +96,7 @@ def redundancy(
     silent: Sequence[str] = (),
     busbar_known: bool = True,
     curves: Curves = Curves.STEEPEST,
-    journal: Path | None = None,
+    journal: Where = None,
     progress: Progress | None = None,
 ) -> Redundancy:
     """Count liars that stay invisible to whoever knows the feeder, its honest loads and all readings.
@@ -119,6 +118,8 @@ def redundancy(
         If there is no such customer or meter.
     OtherStudy
         If the journal is another study's.
+    InUse
+        If another process is writing it.
     """
     subject = {
         "study": "redundancy",
@@ -134,7 +135,7 @@ def redundancy(
         cases[SILENT] = known(silent=silent)
     pieces = parts(site.spanning, tree_bus(site.feeder)[site.meters], site.ties)
     tasks = [task for case, what in cases.items() for task in _tasks(site, case, what, pieces)]
-    done = worked(Journal(journal, subject), tasks, progress)
+    done = worked(journal, subject, tasks, progress)
     return Redundancy(
         feeder=site.feeder.name,
         digest=site.digest,

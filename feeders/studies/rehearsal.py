@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from feeders.studies.detectable import Detectable, monitor_rule
-from feeders.studies.journal import Progress
+from feeders.studies.journal import Progress, Where, worked
 from feeders.studies.operating import SHARE, squared
 from gridsec import sequential
 from gridsec.arrays import Bools, Floats
@@ -62,6 +63,7 @@ def rehearse(
     trials: int,
     seed: int = 0,
     share: float = SHARE,
+    journal: Where = None,
     progress: Progress | None = None,
 ) -> Rehearsal:
     """Let the monitor watch lies at the limits that were found, by M meters and by one.
@@ -79,28 +81,43 @@ def rehearse(
         Chooses everything random.
     share
         As `found` was made with.
+    journal
+        File in which finished trials are kept; an interrupted rehearsal goes on from it, also to more trials.
     progress
         Told how many trials are done.
+
+    Raises
+    ------
+    OtherStudy
+        If the journal is another study's.
+    InUse
+        If another process is writing it.
     """
+    subject = {
+        "study": "trials",
+        "digest": site.digest,
+        "found": [found.max_attacked, found.risk, *map(float, found.meters["hidden"])],
+        "large": [*map(float, found.meters["named"]), *map(float, found.meters["named_alone"])],
+        "seed": seed,
+        "share": share,
+    }
     given = monitor_rule(site, risk=found.risk, share=share)
     p = site.meters.size
-    worst = [
-        largest_shift(given, np.eye(p)[j], found.max_attacked, seen=False, must=j).lies for j in range(p)
-    ]
-    caught, missed, wronged = 0, 0, 0
-    for k in range(trials):
-        if progress is not None:
-            progress(k, trials)
+
+    @cache
+    def worst(j: int) -> Floats:
+        return largest_shift(given, np.eye(p)[j], found.max_attacked, seen=False, must=j).lies
+
+    def trial(k: int) -> list[int]:
         rng = np.random.default_rng([seed, k])
         sign, j = rng.choice([-1.0, 1.0]), int(rng.integers(p))
-        caught += int(_named(given, site, share, rng, sign * rng.uniform(0.5, 1.0) * worst[j]).any())
+        caught = _named(given, site, share, rng, sign * rng.uniform(0.5, 1.0) * worst(j)).any()
         lies = _large(site, found, rng, j, together=k % 2 == 0)
         named = _named(given, site, share, rng, sign * lies)
-        missed += int(not named[j])
-        wronged += int((named & (lies == 0.0)).any())
-    if progress is not None:
-        progress(trials, trials)
-    return Rehearsal(trials, caught, missed, wronged)
+        return [int(caught), int(not named[j]), int((named & (lies == 0.0)).any())]
+
+    done = worked(journal, subject, ((str(k), partial(trial, k)) for k in range(trials)), progress)
+    return Rehearsal(trials, *(sum(each[i] for each in done.values()) for i in range(3)))
 
 
 def _large(site: Site, found: Detectable, rng: np.random.Generator, j: int, *, together: bool) -> Floats:
