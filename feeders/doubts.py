@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
+from feeders.load import Site, Snapshot, to_frame
 from gridsec.arrays import Floats
+from gridsec.online import Frame
 from gridsec.sequential import LoadDoubt
-
-if TYPE_CHECKING:
-    from feeders.load import Site
 
 TYPICAL: Final = 0.5
 """Share of its peak at which a load's errors are sized where they grow with the load."""
 
 ALIKE: Final = 0.5
-"""Share of the variance of reactive power, where only power factors are known, that customers have in common:
-seasons and habits move all of them the same way."""
+"""Share of a variance that customers have in common, of reactive power where only power factors are known,
+and of all powers that nobody meters: seasons, hours and habits move all of them the same way."""
 
 
 def load_doubt(site: Site) -> LoadDoubt:
@@ -25,8 +24,10 @@ def load_doubt(site: Site) -> LoadDoubt:
 
     Metered active power is as wrong as its register may be, the load's reactive power as the limits of its
     power factor allow; taken as uniform within these, and as lasting: a register and a power factor err in
-    the same direction all the time. `p_std_kw` and `q_std_kvar` say it directly, and then of errors that come
-    and go within `correlation_s`; they are believed as they are.
+    the same direction all the time. Without a meter powers are uniform in the range that `to_frame` has for
+    them, so that design and frames say the same. `p_std_kw` and `q_std_kvar` say it directly, and then of
+    errors that come and go within `correlation_s`; they are believed as they are: with a meter as the error
+    of what it reports, without one as the distance from the middle of the range.
 
     Parameters
     ----------
@@ -37,17 +38,34 @@ def load_doubt(site: Site) -> LoadDoubt:
     typical = TYPICAL * loads.load_peak
     p = (loads.p_fraction * np.maximum(typical, loads.pv_peak) + loads.p_floor) / np.sqrt(3.0)
     q = (0.5 * (loads.tan_max - loads.tan_min) * typical + loads.q_floor) / np.sqrt(3.0)
+    frame, unmetered = unread(site), np.ones(p.size, dtype=np.bool_)
+    unmetered[site.meters] = False
+    p = np.where(unmetered, frame.p_error / np.sqrt(3.0), p)
+    q = np.where(unmetered, frame.q_error / np.sqrt(3.0), q)
     told_p = np.array([np.nan if row.p_std_kw is None else row.p_std_kw for row in rows])
     told_q = np.array([np.nan if row.q_std_kvar is None else row.q_std_kvar for row in rows])
-    by_factor = bool(np.isnan(told_q).any())
-    by_limits = by_factor or bool(np.isnan(told_p).any())
+    by_limits = bool(np.isnan(told_q).any() or np.isnan(told_p).any())
+    open_ = unmetered & np.isnan(told_p)
     return LoadDoubt(
         p=np.where(np.isnan(told_p), p, told_p / base),
         q=np.where(np.isnan(told_q), q, told_q / base),
         time_s=site.tables.meta.load.correlation_s,
-        common_q=ALIKE if by_factor else 0.0,
+        common_q=ALIKE if np.isnan(told_q[site.meters]).any() else 0.0,
         lasting=1.0 if by_limits else 0.0,
+        together=np.where(open_, ALIKE, 0.0) if open_.any() else 0.0,
     )
+
+
+def unread(site: Site) -> Frame:
+    """A frame without readings of meters: all that is known of powers is their range.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    """
+    none = np.full(site.meters.size, np.nan)
+    return to_frame(site, Snapshot(0.0, none, none, none, np.nan))
 
 
 def from_history(error_p: Floats, error_q: Floats, step_s: float) -> LoadDoubt:

@@ -49,6 +49,9 @@ class LoadModel:
         The same fraction, for readings beyond that range.
     credible : (N,)
         Largest |p| that is taken for a measurement.
+    p_unread, q_unread : (N,)
+        Half-width of what is known of p without a reading, and limit of that of q: the range, or what the
+        files say of the powers of a customer that has no meter.
     """
 
     load_peak: Floats
@@ -61,6 +64,8 @@ class LoadModel:
     q_error: Floats
     q_fraction: Floats
     credible: Floats
+    p_unread: Floats
+    q_unread: Floats
 
 
 def names(*, balanced: bool = True) -> list[str]:
@@ -206,9 +211,18 @@ def load_model(tables: FeederTables) -> LoadModel:
         "p_floor": 0.5 * meta.meters.p_resolution_kw / base / (1.0 - p_fraction),
         "q_error": q_fraction * span / base,
         "q_fraction": q_fraction,
+        "p_unread": _unread(rows, "p_std_kw", 0.5 * (load + pv)) / base,
+        "q_unread": _unread(rows, "q_std_kvar", load * tan["power_factor_min"] + floor) / base,
         "credible": np.maximum(CREDIBLE_FACTOR * (load + pv + inverter), CREDIBLE_KW) / base,
     }
     return LoadModel(**{name: frozen(values) for name, values in fields.items()})
+
+
+def _unread(rows: list[CustomerRow], column: str, most: Floats) -> Floats:
+    """Half-width of a uniform error with the standard deviation of the files, where there is no meter."""
+    told = [None if row.meter else getattr(row, column) for row in rows]
+    width = [np.inf if std is None else np.sqrt(3.0) * std for std in told]
+    return np.minimum(most, np.array(width, dtype=np.float64))
 
 
 def positions(tables: FeederTables, found: Tree) -> Floats | None:

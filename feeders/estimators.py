@@ -12,7 +12,7 @@ import numpy as np
 from feeders import outside
 from feeders.columns import ESTIMATORS
 from feeders.design_cache import bank_gains
-from feeders.doubts import load_doubt
+from feeders.doubts import load_doubt, unread
 from feeders.load import Site, from_tables, plant
 from gridsec import monitor, sequential
 from gridsec.arrays import Bools, Floats
@@ -310,7 +310,8 @@ def lmi_options(site: Site, lure: Lure) -> CircleOptions:
 
     Noise is what changes from reading to reading, jitter and rounding; the fixed bias inside the class is
     no noise and is dealt with by the thresholds. The load error has one column for every customer's p and
-    one for its q, each with the largest error that the file allows at the customer's peak.
+    one for its q, each with the largest error that the file allows at the customer's peak, or without any
+    reading where there is no meter.
 
     Parameters
     ----------
@@ -339,6 +340,9 @@ def _load_columns(site: Site) -> Floats:
     model, loads = linear(site.feeder), site.loads
     dp = loads.p_fraction * loads.load_peak + loads.p_floor
     dq = 0.5 * (loads.tan_max - loads.tan_min) * loads.load_peak + loads.q_floor
+    silent, unmetered = unread(site), np.ones(dp.size, dtype=np.bool_)
+    unmetered[site.meters] = False
+    dp, dq = np.where(unmetered, silent.p_error, dp), np.where(unmetered, silent.q_error, dq)
     return np.hstack([2.0 * model.R * dp, 2.0 * model.X * dq])
 
 

@@ -314,12 +314,14 @@ def to_frame(site: Site, snapshot: Snapshot) -> Frame:
     less, and at twice of that not at all: a load that is not there is the cover of colluding voltage meters,
     and a connection limits what it can pretend. Where there is no reading, or one that is not finite or
     beyond anything the customer could draw, all that is known is the interval from full generation without
-    load to full load without generation.
+    load to full load without generation. Its middle is p; `p_std_kw` of a customer without a meter says how
+    far from that the truth is, and the half-width is `sqrt(3)` of it if that is less.
 
     Reactive power of the load (the inverter's is the observer's business): with net import P, the load
     alone lies in ``[max(P, 0), max(P, min(P + pv, load_kw))]``, each end widened by the error of P;
     its reactive power in ``[load_low tan_min - floor, load_high tan_max + floor]``. Without generation
-    the load is P itself. Centre and half-width of that interval go into the frame.
+    the load is P itself. Centre and half-width of that interval go into the frame; `q_std_kvar` of a customer
+    without a meter narrows it as `p_std_kw` does.
 
     Parameters
     ----------
@@ -339,14 +341,13 @@ def to_frame(site: Site, snapshot: Snapshot) -> Frame:
     p = np.where(known, metered, 0.5 * (model.load_peak - model.pv_peak))
     beyond = np.maximum(p - model.load_peak, 0.0) + np.maximum(-p - model.pv_peak, 0.0)
     doubt = np.minimum(2.0 * beyond, np.abs(p))
-    p_error = np.where(
-        known, model.p_fraction * np.abs(p) + model.p_floor + doubt, 0.5 * (model.load_peak + model.pv_peak)
-    )
+    p_error = np.where(known, model.p_fraction * np.abs(p) + model.p_floor + doubt, model.p_unread)
     low = np.maximum(p - p_error, 0.0)
     most = np.minimum(p + p_error + model.pv_peak, model.load_peak)
     high = np.maximum(np.maximum(most, p + p_error), 0.0)
     q_low = low * model.tan_min - model.q_floor
     q_high = high * model.tan_max + model.q_floor
+    q_error = 0.5 * (q_high - q_low)
 
     q_net = np.full(model.load_peak.size, np.nan)
     q_net[site.meters] = -snapshot.q_kvar / base_kva
@@ -360,7 +361,7 @@ def to_frame(site: Site, snapshot: Snapshot) -> Frame:
         p=-p,
         p_error=p_error,
         q=-0.5 * (q_low + q_high),
-        q_error=0.5 * (q_high - q_low),
+        q_error=np.where(known, q_error, np.minimum(q_error, model.q_unread)),
         q_net=q_net,
         q_net_error=np.maximum(model.q_error, model.q_fraction * size),
         v0_phases=v0_phases,

@@ -1,8 +1,9 @@
 """Trials: short simulated runs with known liars, by which any estimator family is judged.
 
 A trial is a `feeders.scenario.Scenario` with one load situation that varies slowly. Its frames hold the
-powers of the profiles, and the true loads differ from these by an Ornstein-Uhlenbeck process at every
-customer that nobody meters; the truth is full AC power flow with the droop inverters in closed loop.
+powers of the profiles of all customers with a meter, and the true loads differ from these by an
+Ornstein-Uhlenbeck process; of all others they know what the service does, the range that these can draw or
+feed in. The truth is full AC power flow with the droop inverters in closed loop.
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ class LoadError:
     Attributes
     ----------
     p_kw, q_kvar
-        Standard deviations at every customer, kW and kvar.
+        Standard deviations at every customer with a meter, kW and kvar.
     correlation_s
         Correlation time, s.
     half_width
@@ -123,6 +124,8 @@ class Trial:
         meta, error = self.site.tables.meta, self.load_error
         rows = tuple(
             replace(row, p_std_kw=error.p_kw, q_std_kvar=error.q_kvar, p_error_percent=None)
+            if row.meter
+            else row
             for row in self.site.tables.customers
         )
         load = replace(meta.load, correlation_s=error.correlation_s)
@@ -210,7 +213,7 @@ def frames(
     ------
     Frame, Truth
         One pair per tick. Frames hold the powers of the profiles (as falsified where the lie says so), and
-        intervals of `LoadError.half_width`.
+        intervals of `LoadError.half_width`, of customers with a meter; the others' are those of `to_frame`.
 
     Raises
     ------
@@ -233,9 +236,10 @@ def frames(
 
 
 def _powers(trial: Trial, site: Site, frame: Frame, p_kw: Floats, q_kvar: Floats) -> Frame:
-    """The frame with powers as told; those that nobody would believe stay what they are in any frame."""
+    """The frame with powers as told; those that nobody would believe, or meters, stay what they are."""
     base, error = site.feeder.base_kva, trial.load_error
-    believed = np.abs(p_kw) <= site.loads.credible * base
+    believed = np.zeros(frame.p.size, dtype=np.bool_)
+    believed[site.meters] = (np.abs(p_kw) <= site.loads.credible * base)[site.meters]
     p_error = np.full(frame.p.size, error.half_width * error.p_kw / base)
     # Registers are exact here, so that what a frame does not believe of them is what no connection carries.
     p_error[site.meters] = np.maximum(p_error[site.meters], frame.p_error[site.meters])

@@ -83,8 +83,8 @@ class Variation:
     tap_interval_s
         There is one tap event in each interval of this length, at a random time in it, s.
     hidden_kw, hidden_kvar, hidden_correlation_s
-        Standard deviations and correlation time, s, of what every customer draws beyond the power that its
-        readings show: readings that are forecasts rather than metered.
+        Standard deviations and correlation time, s, of what every customer with a meter draws beyond the
+        power that its readings show: readings that are forecasts rather than metered.
     """
 
     load_scale: float = 1.0
@@ -243,6 +243,7 @@ class Customers:
         self._unbalance = None
         if isinstance(site.feeder, InPhases):
             self._unbalance = Fluctuation(seed, Stream.UNBALANCE, 3, variation.busbar_correlation_s)
+        self._metered = np.array([bool(row.meter) for row in site.tables.customers])
         self._hidden_p = Fluctuation(seed, Stream.HIDDEN_P, count, variation.hidden_correlation_s)
         self._hidden_q = Fluctuation(seed, Stream.HIDDEN_Q, count, variation.hidden_correlation_s)
 
@@ -258,7 +259,10 @@ class Customers:
     def hidden(self, t: Floats) -> tuple[Floats | float, Floats | float]:
         """What is drawn at times t (T,) beyond `at`, kW and kvar, (T, N) each; 0.0 where nothing is."""
         kw, kvar = self._variation.hidden_kw, self._variation.hidden_kvar
-        return kw * self._hidden_p.at(t) if kw else 0.0, kvar * self._hidden_q.at(t) if kvar else 0.0
+        return (
+            kw * self._metered * self._hidden_p.at(t) if kw else 0.0,
+            kvar * self._metered * self._hidden_q.at(t) if kvar else 0.0,
+        )
 
     def _loads(self, t: Floats) -> Floats:
         spread = self._variation.load_spread

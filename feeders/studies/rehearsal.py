@@ -21,6 +21,7 @@ from gridsec import sequential
 from gridsec.arrays import Bools, Floats
 from gridsec.network import bus_voltages, busbar_places
 from gridsec.online import Frame
+from gridsec.sequential import LoadDoubt
 from gridsec.studies.quiet import Rule, largest_shift
 
 if TYPE_CHECKING:
@@ -153,10 +154,7 @@ def _world(given: Rule, site: Site, share: float, rng: np.random.Generator) -> C
     draw = _bounded if rng.integers(2) else _gaussian
     p = -share * loads.load_peak
     q = 0.5 * (loads.tan_min + loads.tan_max) * p
-    off_p, off_q = (
-        std * (np.sqrt(1.0 - common) * draw(rng, std.size) + np.sqrt(common) * draw(rng, 1))
-        for std, common in ((doubt.p, doubt.common_p), (doubt.q, doubt.common_q))
-    )
+    off_p, off_q = _errors(doubt, draw, rng)
     x = np.zeros(own.size)
     for _ in range(_SETTLING):
         injected = q + off_q + np.bincount(own, weights=x, minlength=q.size)
@@ -185,6 +183,20 @@ def _world(given: Rule, site: Site, share: float, rng: np.random.Generator) -> C
         )
 
     return frame
+
+
+def _errors(
+    doubt: LoadDoubt, draw: Callable[[np.random.Generator, int], Floats], rng: np.random.Generator
+) -> tuple[Floats, Floats]:
+    """What the powers are off, pu, (N,) each."""
+    own = [
+        np.sqrt(1.0 - common) * draw(rng, std.size) + np.sqrt(common) * draw(rng, 1)
+        for std, common in ((doubt.p, doubt.common_p), (doubt.q, doubt.common_q))
+    ]
+    if np.any(doubt.together):
+        level = np.sqrt(doubt.together) * draw(rng, 1)
+        own = [np.sqrt(1.0 - doubt.together) * each + level for each in own]
+    return doubt.p * own[0], doubt.q * own[1]
 
 
 def _gaussian(rng: np.random.Generator, size: int) -> Floats:

@@ -38,6 +38,9 @@ class LoadDoubt:
     lasting
         Share of their variances that no mean takes away, however long, 0 to 1: an unknown power factor is
         wrong in the same direction for years, and grows and shrinks with the load.
+    together : (N,) or one for all
+        Share of both variances, 0 to 1, that goes up and down with that of all others: powers that nobody
+        meters are low together by night, the active and the reactive one alike.
     """
 
     p: Floats
@@ -46,6 +49,7 @@ class LoadDoubt:
     common_p: float = 0.0
     common_q: float = 0.0
     lasting: float = 0.0
+    together: Floats | float = 0.0
 
     def __post_init__(self) -> None:
         problems = [
@@ -57,8 +61,8 @@ class LoadDoubt:
             problems.append(f"time_s is {self.time_s}; it must be positive")
         problems += [
             f"{name} is {getattr(self, name)}; it must be from 0 to 1"
-            for name in ("common_p", "common_q", "lasting")
-            if not 0 <= getattr(self, name) <= 1
+            for name in ("common_p", "common_q", "lasting", "together")
+            if not (np.greater_equal(getattr(self, name), 0) & np.less_equal(getattr(self, name), 1)).all()
         ]
         if problems:
             raise ValueError("; ".join(problems))
@@ -69,8 +73,10 @@ def prior(
 ) -> Prior:
     """Covariance of the buses' squared voltages without any meter.
 
-    ``S = 4 R V_p R^T + 4 X V_q X^T + busbar^2 1 1^T`` with ``V = (1 - common) diag(s^2) + common s s^T``. In
-    three phases places stand for buses, and only those of the same phase share an error of the busbar's.
+    ``S = 4 R V_p R^T + 4 X V_q X^T + u u^T + busbar^2 1 1^T``, where ``u = 2 R g s_p + 2 X g s_q`` with
+    ``g^2 = together`` is what goes up and down together, and of the rest, s now for ``sqrt(1 - together) s``,
+    ``V = (1 - common) diag(s^2) + common s s^T``. In three phases places stand for buses, and only those of
+    the same phase share an error of the busbar's.
 
     Parameters
     ----------
@@ -85,13 +91,15 @@ def prior(
     inverters : (N,)
         Standard deviation of the injections that observers attribute to the customers' inverters, pu.
     """
-    q = doubt.q if inverters is None else np.hypot(doubt.q, inverters)
+    alone, together = (np.sqrt(part) for part in (1.0 - doubt.together, doubt.together))
+    p, q = alone * doubt.p, alone * doubt.q
+    q = q if inverters is None else np.hypot(q, inverters)
     variance = by_place(feeder, busbar**2)
     of_meters: Floats = np.repeat(variance[:, None], at.size, axis=1)
     of_meters *= one_busbar(feeder, np.arange(variance.size), at)
     none = np.zeros_like(q)
     for power, std, common, shared in (
-        (Power.ACTIVE, doubt.p, doubt.common_p, bus_voltages(feeder, doubt.p, none, 0.0, steps=0)),
+        (Power.ACTIVE, p, doubt.common_p, bus_voltages(feeder, p, none, 0.0, steps=0)),
         (Power.REACTIVE, q, doubt.common_q, bus_voltages(feeder, none, q, 0.0, steps=0)),
     ):
         of_meters += covariance(feeder, power, at, (1.0 - common) * std**2)
@@ -99,6 +107,10 @@ def prior(
         if common:
             of_meters += np.multiply.outer(common * shared, shared[at])
             variance += common * shared**2
+    if np.any(together):
+        shared = bus_voltages(feeder, together * doubt.p, together * doubt.q, 0.0, steps=0)
+        of_meters += np.multiply.outer(shared, shared[at])
+        variance += shared**2
     return Prior(of_meters, at, variance)
 
 
