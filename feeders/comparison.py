@@ -11,8 +11,9 @@ import csv
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field, fields
+from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from feeders.campaign import NoSuchAttack
 from feeders.estimators import FAMILIES, Watcher, choose, design
 from feeders.lies import Lie, Trick
 from feeders.outside import EstimatorUnusable
+from feeders.studies.journal import Journal, Where
 from feeders.trials import LoadError, Meters, Outcome, Trial, frames, judge
 from feeders.variation import Variation
 from gridsec.arrays import Floats
@@ -213,7 +215,9 @@ class Row:
     undecided: float = math.nan
 
 
-def compare(site: Site, plan: Plan, *, progress: Callable[[str], None] | None = None) -> list[Row]:
+def compare(
+    site: Site, plan: Plan, *, journal: Where = None, progress: Callable[[str], None] | None = None
+) -> list[Row]:
     """Let all families watch all cases.
 
     Parameters
@@ -222,6 +226,8 @@ def compare(site: Site, plan: Plan, *, progress: Callable[[str], None] | None = 
         The feeder.
     plan
         What is compared.
+    journal
+        File in which finished cases are kept; an interrupted comparison goes on from it.
     progress
         Called with a line for people before each design and each case.
 
@@ -229,20 +235,36 @@ def compare(site: Site, plan: Plan, *, progress: Callable[[str], None] | None = 
     -------
     list of Row
         One for each case and family, case by case.
+
+    Raises
+    ------
+    OtherStudy
+        If the journal is another study's.
+    InUse
+        If another process is writing it.
     """
     tell = progress or (lambda _: None)
     cases = [case for case in CASES if case.name in plan.cases]
-    # What a trial states does not depend on its seed or lie: one design serves all.
-    stated = plan.trial(site, CASES[0], 0).stated
-    watchers: dict[str, Watcher | str] = {}
-    for name in plan.families:
-        tell(f"design of {name}")
-        watchers[name] = _design(stated, name, plan, tell)
-    rows: list[Row] = []
-    for case in cases:
+    asked = {name: value for name, value in asdict(plan).items() if name != "workers"}
+    subject = {"study": "compare", "digest": site.digest, "plan": asked}
+
+    @cache
+    def watchers() -> dict[str, Watcher | str]:
+        # What a trial states does not depend on its seed or lie: one design serves all.
+        stated = plan.trial(site, CASES[0], 0).stated
+        found: dict[str, Watcher | str] = {}
+        for name in plan.families:
+            tell(f"design of {name}")
+            found[name] = _design(stated, name, plan, tell)
+        return found
+
+    def work(case: Case) -> list[dict[str, Any]]:
+        designed = watchers()
         tell(f"case {case.name}")
-        rows += _case(site, case, plan, watchers)
-    return rows
+        return [asdict(row) for row in _case(site, case, plan, designed)]
+
+    with Journal(journal, subject, of=len(cases)) as kept:
+        return [Row(**row) for case in cases for row in kept.get(case.name, partial(work, case))]
 
 
 def _design(site: Site, name: str, plan: Plan, tell: Callable[[str], None]) -> Watcher | str:
