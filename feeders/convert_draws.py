@@ -41,6 +41,13 @@ ONLY_REACTIVE: Final = (
 )
 """The same of a load that draws reactive power only."""
 
+BY_DROOP: Final = (
+    "reactive power",
+    "left out",
+    "its droop curve decides; in the check it is that of the source",
+)
+"""The same of the reactive power of a generator with an inverter."""
+
 EVEN: Final = 1e-6
 """Spread of the phases' powers, as a share of the largest, below which a connection is of three phases."""
 
@@ -58,9 +65,15 @@ class Draw:
     even
         It is one connection of all three phases.
     rating_kva
-        Rating of a generator's inverter; None: no generator.
+        Rating of a generator's inverter; 0: it has none; None: no generator.
     idle
         It is what a transformer takes without load, which no customer pays for and no meter reads.
+    peak_kw
+        Rated peak of a generator; what it feeds in now may be less.
+    phases
+        Those that it is connected to, whether it draws anything there or not.
+    noun
+        What it is called where it is told about; empty: load or generator.
     """
 
     name: str
@@ -69,6 +82,14 @@ class Draw:
     even: bool = True
     rating_kva: float | None = None
     idle: bool = False
+    peak_kw: float = 0.0
+    phases: str = "abc"
+    noun: str = ""
+
+    @property
+    def label(self) -> str:
+        """What it is called where it is told about."""
+        return f"{self.noun or ('load' if self.rating_kva is None else 'generator')} {self.name}"
 
 
 def is_even(power: Phasors) -> bool:
@@ -105,26 +126,38 @@ def customers_of(
     for draw in sorted(own, key=lambda each: each.rating_kva is not None):
         connections = _connections(draw)
         if not connections:
-            what = "load" if draw.rating_kva is None else "generator"
             effect = "draws nothing in the source's power flow"
-            changes.append(Change(f"{what} {draw.name}", WHOLE, "left out", effect))
+            changes.append(Change(draw.label, WHOLE, "left out", effect))
         for phases, kva in connections:
             row = CustomerRow(_unique(draw, phases, {*taken, *power}), draw.bus, 0.0, phases=phases)
             power[row.customer] = kva
-            if draw.rating_kva is None:
-                rows.append(_load(row, kva, len(rows), nominal[draw.bus], changes))
-                continue
-            share = draw.rating_kva if phases == "abc" else draw.rating_kva / len(connections)
-            row = replace(row, pv_kw=rounded(max(-kva.real, 0.0)), pv_profile=f"PV{len(rows) % 8 + 1}")
-            if share > 0:
-                row = replace(row, inverter_kva=rounded(share), droop=droop or droop_preset(share))
-                changes.append(
-                    Change(
-                        f"generator {draw.name}", "droop curve", "added", f"{row.droop}, not in the source"
-                    )
-                )
+            takes = kva.real > EVEN * max(abs(kva), draw.peak_kw)
+            if draw.rating_kva is None or takes:
+                noun, volt = draw.noun or "load", nominal[draw.bus]
+                row = _load(row, kva, len(rows), volt=volt, changes=changes, noun=noun)
+            if draw.rating_kva is not None:
+                row = _generator(row, kva, draw, len(rows), droop=droop, changes=changes)
             rows.append(row)
     return rows, power
+
+
+def _generator(
+    row: CustomerRow, kva: complex, draw: Draw, number: int, *, droop: str | None, changes: list[Change]
+) -> CustomerRow:
+    """Give a customer a generator's peak, and the inverter that it has."""
+    parts = len(_connections(draw))
+    rating = (draw.rating_kva or 0.0) / parts
+    peak = rounded(max(draw.peak_kw / parts, -kva.real, 0.0))
+    row = replace(row, pv_kw=peak, pv_profile=f"PV{number % 8 + 1}")
+    if not rating > 0:
+        effect = f"{row.pv_profile}, not in the source: a feeder's generation follows the sun"
+        changes.append(Change(draw.label, "profile", "added", effect))
+        return row
+    row = replace(row, inverter_kva=rounded(rating), droop=droop or droop_preset(rating))
+    changes.append(Change(draw.label, "droop curve", "added", f"{row.droop}, not in the source"))
+    if abs(kva.imag) > EVEN * rating:
+        changes.append(Change(draw.label, *BY_DROOP))
+    return row
 
 
 def idle_customers(
@@ -161,8 +194,27 @@ def _connections(draw: Draw) -> list[tuple[str, complex]]:
         return [("abc", complex(draw.power_kva.sum()))]
     least = EVEN * float(np.abs(draw.power_kva).max())
     return [
-        (phase, complex(kva)) for phase, kva in zip("abc", draw.power_kva, strict=True) if abs(kva) > least
+        (phase, complex(kva))
+        for phase, kva in zip("abc", draw.power_kva, strict=True)
+        if abs(kva) > least or (draw.peak_kw > 0 and phase in draw.phases)
     ]
+
+
+def in_star(pairs: Phasors, volts: Phasors) -> Phasors:
+    """Return what a load between phases draws from each phase, kVA.
+
+    Between the phases k and k + 1 flows ``conj(S_k / (V_k - V_k+1))``; each phase gives what flows out of it
+    less what flows back into it.
+
+    Parameters
+    ----------
+    pairs : (3,)
+        Powers between a and b, b and c, c and a, kVA.
+    volts : (3,)
+        Voltages of the phases, V.
+    """
+    between = np.conj(pairs / (volts - np.roll(volts, -1)))
+    return np.asarray(volts * np.conj(between - np.roll(between, 1)), dtype=np.complex128)
 
 
 def _unique(draw: Draw, phases: str, taken: Collection[str]) -> str:
@@ -173,18 +225,20 @@ def _unique(draw: Draw, phases: str, taken: Collection[str]) -> str:
     return name
 
 
-def _load(row: CustomerRow, kva: complex, number: int, volt: float, changes: list[Change]) -> CustomerRow:
+def _load(
+    row: CustomerRow, kva: complex, number: int, *, volt: float, changes: list[Change], noun: str
+) -> CustomerRow:
     p, q = kva.real, kva.imag
     if p < 0:
         changes.append(
-            Change(f"load {row.customer}", "p_kw", "changed", "feeds in; its expected load is taken as 0")
+            Change(f"{noun} {row.customer}", "p_kw", "changed", "feeds in; its expected load is taken as 0")
         )
     if q < -NO_POWER * abs(kva):
         changes.append(
-            Change(f"load {row.customer}", "power factor", "approximated", "leading; expected to be 1")
+            Change(f"{noun} {row.customer}", "power factor", "approximated", "leading; expected to be 1")
         )
     if p <= 0.0 and q > NO_POWER:
-        changes.append(Change(f"load {row.customer}", *ONLY_REACTIVE))
+        changes.append(Change(f"{noun} {row.customer}", *ONLY_REACTIVE))
     household = volt < 1000.0 and p <= HOUSEHOLD_KW
     row = replace(row, load_kw=rounded(max(p, 0.0)), load_profile=usual_profile(number, household=household))
     return reactive(row, p / math.hypot(p, q) if p > 0 and q > 0 else None)

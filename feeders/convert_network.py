@@ -213,8 +213,9 @@ def finished(network: Network, part: Part, tables: FeederTables, power: Mapping[
         What each customer draws in the source's power flow, kVA.
     """
     accepted = accepting(tables, part.changes)
+    changes = tuple(dict.fromkeys(part.changes))
     if not network.volts:
-        return Converted(accepted, tuple(part.changes), None, network.unsolved)
+        return Converted(accepted, changes, None, network.unsolved)
     state = SourceState(
         tool=network.tool,
         power_kva=power,
@@ -222,7 +223,7 @@ def finished(network: Network, part: Part, tables: FeederTables, power: Mapping[
         volts={bus: np.abs(network.volts[bus]) for bus in part.inside if bus in network.volts},
         as_found={bus: np.abs(network.as_found[bus]) for bus in part.inside if bus in network.as_found},
     )
-    return Converted(accepted, tuple(part.changes), state)
+    return Converted(accepted, changes, state)
 
 
 def accepting(tables: FeederTables, changes: list[Change]) -> FeederTables:

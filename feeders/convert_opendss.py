@@ -10,7 +10,7 @@ import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
@@ -23,11 +23,20 @@ from feeders.convert_draws import Draw, is_even
 from feeders.convert_graph import Coupling
 from feeders.convert_lines import capacitor, line_row, open_end, with_taps
 from feeders.convert_network import Network
+from feeders.convert_opendss_draws import (
+    GENERATORS,
+    LOADS,
+    PHASES,
+    STORAGE,
+    Element,
+    add_draw,
+    beyond_limits,
+    voltage_dependence,
+)
 from feeders.schema import LineRow
 from gridsec.arrays import Floats, Phasors
 from gridsec.errors import FeederInvalid, GridsecError
 
-PHASES: Final = 3
 SOLVER: Final = ("set mode=snap", "set tolerance=1e-11", "set maxiterations=1000", "set maxcontroliter=200")
 CONSTANT_POWER: Final = (
     "set controlmode=off",
@@ -37,9 +46,6 @@ CONSTANT_POWER: Final = (
 DEAD: Final = 1e-4
 """Voltage, pu, below which nothing energises a phase: only open lines end there."""
 
-SAME_POWER: Final = 1e-6
-"""Relative difference of two powers below which they are the same."""
-
 APART: Final = 1e-6
 """Part of a transformer's largest admittance below which its phases have nothing in common."""
 
@@ -48,40 +54,39 @@ NO_LOAD: Final = 1e-5
 
 SERIES: Final = {"line", "reactor"}
 COUPLINGS: Final = {"transformer", "autotrans"}
-LOADS: Final = {"load"}
-GENERATORS: Final = {"generator", "pvsystem", "storage"}
-SILENT: Final = {"monitor", "energymeter", "sensor"}
-"""Only measure, and change nothing."""
-CONTROLS: Final = {
+MEASURE: Final = "every customer has a meter of the feeder's own kind instead"
+DROOP: Final = "inverters of solar plants follow the droop curve of the customer"
+TOLD: Final = {
+    "monitor": MEASURE,
+    "energymeter": MEASURE,
+    "sensor": MEASURE,
     "regcontrol": "taps stand where the source's power flow left them",
     "capcontrol": "switched as the source's power flow left them",
     "swtcontrol": "stays as the source's power flow left it",
     "fuse": "never blows",
     "relay": "never trips",
     "recloser": "never trips",
-    "invcontrol": "inverters follow the droop curve of the customer",
-    "expcontrol": "inverters follow the droop curve of the customer",
+    "invcontrol": DROOP,
+    "expcontrol": DROOP,
     "storagecontroller": "storage stays as the source's power flow left it",
     "gendispatcher": "generators stay as the source's power flow left them",
+    "espvlcontrol": "plants stay as the source's power flow left them",
+    "upfccontrol": "what it controls is left out",
 }
+"""Classes that carry no current, and what a feeder does without them."""
 
+UNLIKE: Final = "has no place in a feeder; the check shows what that does"
+NO_PLACE: Final = {
+    *("isource", "vccs", "fault", "upfc", "vsconverter"),
+    *("gicsource", "gicline", "gictransformer"),
+}
+"""Classes that carry current and are left out; named, as whatever a later OpenDSS knows besides."""
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Element:
-    """One element of the circuit as solved, terminal by terminal."""
-
-    name: str
-    kind: str
-    buses: tuple[str, ...]
-    nodes: tuple[tuple[int, ...], ...]
-    power_kva: tuple[Phasors, ...]
-    enabled: bool
-    on: tuple[int, ...]
-
-    @property
-    def closed(self) -> bool:
-        """Whether it is connected at all its ends."""
-        return self.enabled and len(self.on) == len(self.buses)
+DEFINITIONS: Final = {
+    *("linecode", "wiredata", "cndata", "tsdata", "linespacing", "linegeometry", "xfmrcode", "spectrum"),
+    *("loadshape", "tshape", "priceshape", "growthshape", "xycurve", "tcc_curve", "dynamicexp"),
+}
+"""Classes of data that mean nothing until an element refers to them, and are told about there."""
 
 
 @contextmanager
@@ -144,13 +149,13 @@ def _read(dss: Any, path: Path) -> Network:
     if not found:
         raise GridsecError(f"{path}: OpenDSS's own power flow does not converge")
     elements = [_element(dss, name, problems) for name in dss.Circuit.AllElementNames()]
-    changes, shapes = _voltage_dependence(dss)
+    changes = voltage_dependence(dss)
     _run(dss, CONSTANT_POWER)
     volts = _solved(dss)
     if volts:
         before = elements
         elements = [_element(dss, name, problems) for name in dss.Circuit.AllElementNames()]
-        changes += _beyond_limits(before, elements, {change.element for _, change in changes})
+        changes += beyond_limits(before, elements, {change.element for _, change in changes})
     nominal = _nominal(dss, problems)
     network = Network(
         tool=f"OpenDSS {version('dss_python_backend')}",
@@ -161,7 +166,7 @@ def _read(dss: Any, path: Path) -> Network:
         xy=_positions(dss),
         unsolved="with loads of constant power OpenDSS's own power flow does not converge",
     )
-    network.of_bus.extend([*changes, *shapes])
+    network.of_bus.extend(changes)
     _build_everything(dss, elements)
     for each in elements:
         _take(dss, each, network, problems)
@@ -216,45 +221,7 @@ def _positions(dss: Any) -> dict[str, tuple[float, float]]:
     return places
 
 
-def _voltage_dependence(dss: Any) -> tuple[list[tuple[str, Change]], list[tuple[str, Change]]]:
-    """Loads that are not of constant power, and those that follow a shape, each with its bus."""
-    changes, shapes = [], []
-    for name in dss.Loads.AllNames():
-        if name.lower() == "none":
-            continue
-        dss.Loads.Name(name)
-        bus = str(dss.CktElement.BusNames()[0]).partition(".")[0].lower()
-        if int(dss.Loads.Model()) != 1:
-            change = Change(
-                f"load {name}",
-                f"model {int(dss.Loads.Model())}",
-                "approximated",
-                "depends on the voltage in the source; taken as constant power",
-            )
-            changes.append((bus, change))
-        shape = str(dss.Loads.Yearly() or dss.Loads.Daily() or dss.Loads.Duty())
-        if shape:
-            effect = "a household's or a trade's profile of the library instead"
-            shapes.append((bus, Change(f"load {name}", f"load shape {shape}", "left out", effect)))
-    return changes, shapes
-
-
-def _beyond_limits(
-    found: list[_Element], constant: list[_Element], known: set[str]
-) -> list[tuple[str, Change]]:
-    """Loads and generators that become impedances at their voltages, though said to be of constant power."""
-    out = []
-    for one, other in zip(found, constant, strict=True):
-        if one.kind not in {"load", "generator"} or not one.enabled:
-            continue
-        label, power = f"{one.kind} {one.name}", other.power_kva[0].sum()
-        if label not in known and abs(one.power_kva[0].sum() - power) > SAME_POWER * abs(power):
-            effect = "beyond them it depends on the voltage in the source; taken as constant power"
-            out.append((one.buses[0], Change(label, "vminpu, vmaxpu", "approximated", effect)))
-    return out
-
-
-def _element(dss: Any, full: str, problems: list[str]) -> _Element:
+def _element(dss: Any, full: str, problems: list[str]) -> Element:
     dss.Circuit.SetActiveElement(full)
     kind, _, name = full.partition(".")
     kind = kind.lower()
@@ -262,9 +229,10 @@ def _element(dss: Any, full: str, problems: list[str]) -> _Element:
     enabled = bool(element.Enabled())
     buses = tuple(str(bus).partition(".")[0].lower() for bus in element.BusNames())
     conductors = int(element.NumConductors())
-    order = list(element.NodeOrder()) if enabled else []
+    live = enabled and bool(buses)  # some controllers have no terminals
+    order = list(element.NodeOrder()) if live else []
     nodes = tuple(tuple(order[k * conductors : (k + 1) * conductors]) for k in range(len(buses)))
-    parts = np.array(element.Powers()).reshape(-1, 2) if enabled else np.empty((0, 2))
+    parts = np.array(element.Powers()).reshape(-1, 2) if live else np.empty((0, 2))
     flat = parts[:, 0] + 1j * parts[:, 1]
     powers = []
     for k, here in enumerate(nodes):
@@ -279,10 +247,10 @@ def _element(dss: Any, full: str, problems: list[str]) -> _Element:
             "expected none"
         )
     on = tuple(k for k in range(len(buses)) if enabled and not element.IsOpen(k + 1, 0))
-    return _Element(name, kind, buses, nodes, tuple(powers), enabled, on)
+    return Element(name, kind, buses, nodes, tuple(powers), enabled, on)
 
 
-def _build_everything(dss: Any, elements: list[_Element]) -> None:
+def _build_everything(dss: Any, elements: list[Element]) -> None:
     """Close what is open, after everything else has been read: matrices are only of what is closed."""
     for each in elements:
         if each.kind in SERIES and each.enabled and not each.closed:
@@ -292,7 +260,7 @@ def _build_everything(dss: Any, elements: list[_Element]) -> None:
     dss.Solution.BuildYMatrix(1, 0)
 
 
-def _take(dss: Any, each: _Element, network: Network, problems: list[str]) -> None:
+def _take(dss: Any, each: Element, network: Network, problems: list[str]) -> None:
     """Add an element to the network, or say what becomes of it."""
     label = f"{each.kind} {each.name}"
     if not each.enabled:
@@ -306,17 +274,16 @@ def _take(dss: Any, each: _Element, network: Network, problems: list[str]) -> No
     elif each.kind in COUPLINGS:
         line, idle = _regulator(dss, each, network)
         network.couplings.append(Coupling(label, each.buses, each.power_kva, line, idle))
-    elif each.kind in LOADS | GENERATORS:
-        _draw(dss, each, network)
-    elif each.kind in CONTROLS:
-        bus = each.buses[0] if each.buses else ""
-        network.of_bus.append((bus, Change(label, WHOLE, "left out", CONTROLS[each.kind])))
-    elif each.kind not in SILENT and each.kind != "vsource":
-        change = Change(label, WHOLE, "left out", "has no place in a feeder; the check shows what that does")
-        network.of_bus.append((each.buses[0], change))
+    elif each.kind in LOADS | GENERATORS | STORAGE:
+        add_draw(dss, each, network)
+    elif each.kind != "vsource":
+        change = Change(label, WHOLE, "left out", TOLD.get(each.kind, UNLIKE))
+        at = [bus for bus in each.buses if bus in network.nominal]
+        network.of_bus.extend((bus, change) for bus in at)
+        network.changes += [] if at else [change]  # on no bus, as controllers of several elements
 
 
-def _regulator(dss: Any, each: _Element, network: Network) -> tuple[LineRow | None, Draw | None]:
+def _regulator(dss: Any, each: Element, network: Network) -> tuple[LineRow | None, Draw | None]:
     """A transformer that is a line with a tap: two ends of the same phases, each phase apart, none turned.
 
     With the admittance y behind a ratio t its admittances are ``y / t^2``, ``-y / t`` and, at the far end, y
@@ -365,7 +332,7 @@ def _regulator(dss: Any, each: _Element, network: Network) -> tuple[LineRow | No
     return replace(with_taps(row, taps), rating_a=_amps(dss, each, count)), draw
 
 
-def _amps(dss: Any, each: _Element, count: int) -> float | None:
+def _amps(dss: Any, each: Element, count: int) -> float | None:
     """Rated current of a transformer's second winding, A; its voltage is said between phases, if several."""
     dss.Transformers.Name(each.name)
     dss.Transformers.Wdg(2)
@@ -374,11 +341,11 @@ def _amps(dss: Any, each: _Element, count: int) -> float | None:
     return rounded(kva / count / neutral) if kva > 0 and kv > 0 else None
 
 
-def _is_shunt(each: _Element) -> bool:
+def _is_shunt(each: Element) -> bool:
     return len(each.buses) == 1 or each.buses[0] == each.buses[1] or set(each.nodes[-1]) == {0}
 
 
-def _yprim(dss: Any, each: _Element) -> Phasors:
+def _yprim(dss: Any, each: Element) -> Phasors:
     dss.Circuit.SetActiveElement(f"{each.kind}.{each.name}")
     flat = np.array(dss.CktElement.YPrim())
     size = round((flat.size // 2) ** 0.5)
@@ -386,7 +353,7 @@ def _yprim(dss: Any, each: _Element) -> Phasors:
     return matrix
 
 
-def _line(dss: Any, each: _Element, network: Network, problems: list[str]) -> None:
+def _line(dss: Any, each: Element, network: Network, problems: list[str]) -> None:
     """A line or a series reactor: its series impedance and its charging from its primitive admittances."""
     label = each.name if each.kind == "line" else f"{each.kind}.{each.name}"
     here, there = each.nodes
@@ -429,7 +396,7 @@ def _line(dss: Any, each: _Element, network: Network, problems: list[str]) -> No
         network.lines += [stub] if stub else []
 
 
-def _rated(dss: Any, each: _Element, row: LineRow) -> LineRow:
+def _rated(dss: Any, each: Element, row: LineRow) -> LineRow:
     limit = 0.0
     if each.kind == "line":
         dss.Lines.Name(each.name)
@@ -437,7 +404,7 @@ def _rated(dss: Any, each: _Element, row: LineRow) -> LineRow:
     return replace(row, closed=each.closed, rating_a=limit if limit > 0 else None)
 
 
-def _shunt(dss: Any, each: _Element, network: Network) -> None:
+def _shunt(dss: Any, each: Element, network: Network) -> None:
     """A capacitor at a bus becomes the charging of a line to nowhere; a reactor is left out."""
     label, bus = f"{each.kind} {each.name}", each.buses[0]
     kvar = -sum(power.sum() for power in each.power_kva).imag
@@ -453,26 +420,3 @@ def _shunt(dss: Any, each: _Element, network: Network) -> None:
     effect = f"{kvar:.4g} kvar as the charging of a line to nowhere"
     network.of_bus.append((bus, Change(label, "connection", "changed", effect)))
     network.lines.append(capacitor(f"capacitor.{each.name}", bus, block, phases))
-
-
-def _draw(dss: Any, each: _Element, network: Network) -> None:
-    power = each.power_kva[0]
-    used = [node for node in each.nodes[0] if 1 <= node <= PHASES]
-    label = f"{each.kind} {each.name}"
-    even = len(used) == PHASES and (is_even(power) or not power.any())
-    if len(used) > 1 and not even:
-        effect = "in star, its phases' powers as the source's power flow has them; exact at these loads only"
-        network.of_bus.append((each.buses[0], Change(label, "delta", "approximated", effect)))
-    rating = None
-    if each.kind in GENERATORS:
-        rating = float(np.abs(power.sum()))
-        dss.Circuit.SetActiveElement(f"{each.kind}.{each.name}")
-        given = (
-            dss.Properties.Value("kva")
-            if "kva" in [n.lower() for n in dss.Element.AllPropertyNames()]
-            else ""
-        )
-        rating = max(rating, float(given or 0.0)) if each.kind == "pvsystem" else 0.0
-        effect = "a customer with generation; its fixed reactive power is that of its droop curve"
-        network.of_bus.append((each.buses[0], Change(label, "control", "changed", effect)))
-    network.draws.append(Draw(each.name, each.buses[0], power, even=even, rating_kva=rating))

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Final
 
 from feeders.convert_changes import WHOLE, BusbarUnclear, Change
 from feeders.convert_customers import (
@@ -27,10 +27,15 @@ from feeders.convert_draws import ONLY_REACTIVE, SWITCHED_OFF, customers_of, idl
 from feeders.convert_graph import as_rows, reached
 from feeders.convert_levels import EVERYTHING, Extent
 from feeders.convert_network import Converted, Network, below, below_source, finished, one_busbar
+from feeders.convert_pandapower_flow import between_phases, phase_powers
 from feeders.convert_pandapower_net import ids, network_of
-from feeders.profiles import envelopes
+from feeders.profiles import envelopes, pv_names
 from feeders.schema import CustomerRow, FeederMeta, FeederTables, LoadDefaults, MonitorDefaults
+from gridsec.arrays import Phasors
 from gridsec.errors import GridsecError
+
+SOLAR: Final = {"pv", "wye", "delta"}
+"""Types of static generators that say nothing against the sun."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +71,8 @@ class _Source:
         Its buses in the feeder.
     changes
         Takes what is not carried over as it is.
+    volts
+        Of the buses, as pandapower solved them, V.
     power
         What each customer draws, kVA.
     """
@@ -74,6 +81,7 @@ class _Source:
     names: dict[int, str]
     inside: set[int]
     changes: list[Change]
+    volts: Mapping[str, Phasors]
     power: dict[str, complex] = field(default_factory=dict)
 
 
@@ -121,7 +129,8 @@ def from_pandapower(
     network = network_of(net)
     names = ids(net.bus, "bus")
     part = below(network, _root(net, network, names, root), opened, extent)
-    source = _Source(net, names, {i for i, bus in names.items() if bus in part.inside}, part.changes)
+    inside = {i for i, bus in names.items() if bus in part.inside}
+    source = _Source(net, names, inside, part.changes, network.volts)
     customers = _customers(source, droop)
     volt = network.nominal[part.busbar]
     more, drawn = customers_of(part.draws, network.nominal, droop, part.changes, set(source.power))
@@ -179,7 +188,11 @@ def _root(net: Any, network: Network, names: dict[int, str], wanted: str | None)
 def _customers(source: _Source, droop: str | None) -> list[CustomerRow]:
     net = source.net
     names = ids(net.load, "load")
-    loads = [int(i) for i in net.load.index if int(net.load.at[i, "bus"]) in source.inside]
+    loads = [
+        int(i)
+        for i, row in net.load.iterrows()
+        if int(row.bus) in source.inside and not between_phases(net, row)
+    ]
     rows = [_load_row(source, i, names[i], k) for k, i in enumerate(loads)]
     rows.extend(_phase_rows(source, len(rows)))
     at_bus: dict[str, list[int]] = defaultdict(list)
@@ -190,35 +203,39 @@ def _customers(source: _Source, droop: str | None) -> list[CustomerRow]:
 
 
 def _phase_rows(source: _Source, number: int) -> Iterable[CustomerRow]:
-    """Loads of single phases: one customer for each phase that draws power."""
+    """Loads of single phases and between phases: one customer for each phase that draws power."""
     net = source.net
-    names = ids(net.asymmetric_load, "phase load", ids(net.load, "load").values())
-    for i in map(int, net.asymmetric_load.index):
-        row = net.asymmetric_load.loc[i]
+    taken = ids(net.load, "load")
+    names = ids(net.asymmetric_load, "phase load", taken.values())
+    each = [(names[i], row) for i, row in net.asymmetric_load.iterrows()]
+    each += [(taken[i], row) for i, row in net.load.iterrows() if between_phases(net, row)]
+    for name, row in each:
         if int(row.bus) not in source.inside:
             continue
-        scale = float(row.scaling) * float(row.in_service) * 1000.0
-        drawn = {phase: complex(row[f"p_{phase}_mw"], row[f"q_{phase}_mvar"]) for phase in "abc"}
-        used = [phase for phase, s in drawn.items() if s != 0]
+        bus = source.names[int(row.bus)]
+        at_work = row.copy()
+        at_work["scaling"], at_work["in_service"] = 1.0, True
+        whole, _ = phase_powers(net, at_work, name, None)
+        power, told = phase_powers(net, row, f"load {name}", source.volts.get(bus))
+        used = [phase for phase, s in zip("abc", whole, strict=True) if s != 0]
         if not used:
             effect = "draws nothing on any phase in the source"
-            source.changes.append(Change(f"load {names[i]}", WHOLE, "left out", effect))
+            source.changes.append(Change(f"load {name}", WHOLE, "left out", effect))
         elif not row.in_service:
-            source.changes.append(Change(f"load {names[i]}", *SWITCHED_OFF))
-        if str(row.get("type", "wye")) == "delta":
-            effect = "in star, each phase with its own power; the check shows what that does"
-            source.changes.append(Change(f"load {names[i]}", "delta", "approximated", effect))
-        for phase in used:
-            s = drawn[phase] * scale
+            source.changes.append(Change(f"load {name}", *SWITCHED_OFF))
+        source.changes.extend(told)
+        for phase, s in zip("abc", power, strict=True):
+            if phase not in used:
+                continue
             customer = CustomerRow(
-                customer=names[i] if len(used) == 1 else f"{names[i]}-{phase}",
-                bus=source.names[int(row.bus)],
+                customer=name if len(used) == 1 else f"{name}-{phase}",
+                bus=bus,
                 load_kw=rounded(max(s.real, 0.0)),
                 phases=phase,
                 load_profile=HOUSEHOLDS[number % len(HOUSEHOLDS)],
             )
             number += 1
-            yield _known(source, customer, s)
+            yield _known(source, customer, complex(s))
 
 
 def _known(source: _Source, customer: CustomerRow, s: complex) -> CustomerRow:
@@ -276,14 +293,17 @@ def _generators(
     names = ids(net.sgen, "generator", ids(net.load, "load").values())
     for i in map(int, net.sgen.index):
         generator = net.sgen.loc[i]
-        if int(generator.bus) not in source.inside:
+        if int(generator.bus) not in source.inside or between_phases(net, generator):
             continue
         bus, label = source.names[int(generator.bus)], f"generator {names[i]}"
         if not generator.in_service:
             source.changes.append(Change(label, WHOLE, "left out", "switched off in the source"))
             continue
         s = complex(generator.p_mw, generator.q_mvar) * float(generator.scaling)
-        kw = rounded(s.real * 1000.0)
+        kw = rounded(max(s.real * 1000.0, 0.0))
+        if s.real < 0.0:
+            effect = "draws; its expected generation is taken as 0"
+            source.changes.append(Change(label, "p_mw", "changed", effect))
         kva = float(generator.sn_mva) * 1000.0
         kva = rounded(kva) if math.isfinite(kva) and kva > 0 else kw
         alone = [k for k in at_bus[bus] if rows[k].phases == "abc"]
@@ -297,16 +317,30 @@ def _generators(
         source.power[rows[k].customer] = source.power.get(rows[k].customer, 0j) - 1000.0 * s
         if s.imag != 0.0:
             source.changes.append(Change(label, "q_mvar", "left out", "its droop curve decides"))
-        profile = generator.get("profile")
         rows[k] = replace(
             rows[k],
             pv_kw=rounded(rows[k].pv_kw + kw),
-            pv_profile=profile if isinstance(profile, str) and profile.startswith("PV") else f"PV{k % 8 + 1}",
+            pv_profile=_sun(source, generator, label, f"PV{k % 8 + 1}"),
             inverter_kva=rounded(rows[k].inverter_kva + kva),
             droop=droop or droop_preset(rows[k].inverter_kva + kva),
         )
         effect = f"{rows[k].droop}, not in the source; at the first customer of its bus"
         source.changes.append(Change(label, "droop curve", "added", effect))
+
+
+def _sun(source: _Source, generator: Any, label: str, usual: str) -> str:
+    """Profile of a static generator: its own if the library has it; otherwise the usual one, and a note."""
+    given = {column: generator.get(column) for column in ("profile", "type")}
+    named = {column: text for column, text in given.items() if isinstance(text, str) and text}
+    profile = named.get("profile", "")
+    if profile in pv_names():
+        return profile
+    source.changes.extend(
+        Change(label, f"{column} {text}", "changed", f"in simulations generation by the sun, {usual}")
+        for column, text in named.items()
+        if column == "profile" or text.lower() not in SOLAR
+    )
+    return usual
 
 
 def _with_fleet(customers: list[CustomerRow], fleet: Fleet, changes: list[Change]) -> list[CustomerRow]:

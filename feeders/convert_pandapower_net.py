@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import json
 import math
 import warnings
@@ -19,18 +18,38 @@ from feeders.convert_customers import rounded
 from feeders.convert_draws import Draw
 from feeders.convert_lines import ALL, by_sequence, capacitor, charging_cells, open_end
 from feeders.convert_network import Network
+from feeders.convert_pandapower_flow import between_phases, flow_into, phase_powers, solve, unbalanced
 from feeders.convert_two_ports import TwoPort, coupling_of
 from feeders.schema import LineRow
-from gridsec.arrays import Phasors
 from gridsec.errors import FeederInvalid
 
 # Tables that are carried over, or told about one by one; every other row in the feeder earns a note.
 CARRIED: Final = {
     "bus", "line", "load", "asymmetric_load", "asymmetric_sgen", "sgen", "switch", "trafo", "trafo3w",
-    "ext_grid", "gen", "storage", "motor", "ward", "shunt",
+    "ext_grid", "gen", "storage", "motor", "ward", "xward", "shunt",
 }  # fmt: skip
-FIXED: Final = {"gen": -1.0, "storage": 1.0, "motor": 1.0, "ward": 1.0}
+FIXED: Final = {"gen": -1.0, "storage": 1.0, "motor": 1.0, "ward": 1.0, "xward": 1.0}
 """Tables of what becomes a customer as the source's power flow has it, and the sign of its results."""
+
+MEASURE: Final = "every customer has a meter of the feeder's own kind instead"
+MONEY: Final = "prices change no voltage"
+DIRECT: Final = "direct current; what it exchanges with the feeder is left out with its converters"
+NOTED: Final = {
+    "measurement": MEASURE,
+    "controller": "taps and set points stand as the file has them",
+    "group": "names of sets; their elements stand for themselves",
+    "poly_cost": MONEY,
+    "pwl_cost": MONEY,
+    "bus_dc": DIRECT,
+    "line_dc": DIRECT,
+    "load_dc": DIRECT,
+    "source_dc": DIRECT,
+    "loadcases": "the loads are those of the net's own tables",
+}
+"""Tables without a place in the network, and what a feeder does without them."""
+
+CURVES: Final = ("characteristic", "capability", "_table", "_spline")
+"""Parts of the names of tables that other tables look values up in: those in force are carried over."""
 
 COLUMNS: Final = {
     "bus": "name vn_kv in_service",
@@ -62,7 +81,6 @@ UNLIMITED_KA: Final = 1000.0
 SWITCH_RX: Final = 2.0
 """R / X of the impedance of switches between buses, which pandapower's power flow takes by itself."""
 
-TURN: Final = np.exp(-2j * np.pi / 3.0 * np.arange(3))
 SIDES: Final = {"trafo": ("hv", "lv"), "trafo3w": ("hv", "mv", "lv")}
 
 
@@ -174,7 +192,7 @@ def network_of(net: Any) -> Network:
     )
     network.xy = {buses[int(i)]: place for i in net.bus.index if (place := _place(net, int(i))) is not None}
     network.lines = [*_line_rows(net, buses, network), *_switch_rows(net, buses)]
-    solved = _solve(net, buses, network)
+    solved = solve(net, buses, network)
     _transformers(net, solved, buses, network)
     _fixed(net, solved, buses, network)
     _shunts(net, buses, network)
@@ -264,65 +282,7 @@ def _switch_rows(net: Any, buses: dict[int, str]) -> Iterator[LineRow]:
             )
 
 
-# --- the power flow of pandapower -----------------------------------------------------------------
-
-
-def unbalanced(net: Any) -> bool:
-    """Return whether a net has loads or generators of single phases."""
-    return any(
-        len(net[table]) and net[table].in_service.any() for table in ("asymmetric_load", "asymmetric_sgen")
-    )
-
-
-def _solve(net: Any, buses: dict[int, str], network: Network) -> Any:
-    """Run the net's own power flow; the solved copy, or None with the reason in the network."""
-    import pandapower
-
-    solved = copy.deepcopy(net)
-    dependent = [
-        column for column in net.load.columns if column.startswith("const_") and (net.load[column] > 0).any()
-    ]
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            if unbalanced(net):
-                pandapower.runpp_3ph(solved, numba=False, tolerance_mva=1e-11)
-            else:
-                if dependent:
-                    pandapower.runpp(solved, numba=False, tolerance_mva=1e-10)
-                    network.as_found = _volts(solved, buses)
-                pandapower.runpp(solved, numba=False, tolerance_mva=1e-10, voltage_depend_loads=False)
-        network.volts = _volts(solved, buses)
-    except Exception as error:  # noqa: BLE001  # whatever the foreign solver raises on a foreign net
-        text = " ".join(str(error).split()) or type(error).__name__
-        network.unsolved = f"pandapower's own power flow fails: {text[:200]}"
-        return None
-    return solved
-
-
-def _volts(net: Any, buses: dict[int, str]) -> dict[str, Phasors]:
-    base = net.bus.vn_kv.to_numpy()[:, None] * 1000.0 / math.sqrt(3.0)
-    if unbalanced(net):
-        found = net.res_bus_3ph.loc[net.bus.index]
-        size = found[[f"vm_{phase}_pu" for phase in "abc"]].to_numpy()
-        angle = found[[f"va_{phase}_degree" for phase in "abc"]].to_numpy()
-        v = base * size * np.exp(1j * np.deg2rad(angle))
-    else:
-        found = net.res_bus.loc[net.bus.index]
-        one = found.vm_pu.to_numpy() * np.exp(1j * np.deg2rad(found.va_degree.to_numpy()))
-        v = base * one[:, None] * TURN
-    return {buses[int(i)]: row for i, row in zip(net.bus.index, v, strict=True)}
-
-
-def _flow(solved: Any, table: str, index: int, side: str) -> Phasors:
-    """What flows into an element, by phase, kVA."""
-    tail = f"_{side}" if side else ""
-    if unbalanced(solved):
-        row = solved[f"res_{table}_3ph"].loc[index]
-        s = [complex(row[f"p_{phase}{tail}_mw"], row[f"q_{phase}{tail}_mvar"]) for phase in "abc"]
-        return np.asarray(np.array(s) * 1e3, dtype=np.complex128)
-    row = solved[f"res_{table}"].loc[index]
-    return np.full(3, complex(row[f"p{tail}_mw"], row[f"q{tail}_mvar"]) * 1e3 / 3.0)
+# --- transformers ---------------------------------------------------------------------------------
 
 
 def _transformers(net: Any, solved: Any, buses: dict[int, str], network: Network) -> None:
@@ -338,7 +298,7 @@ def _transformers(net: Any, solved: Any, buses: dict[int, str], network: Network
                 network.changes.append(Change(label, WHOLE, "left out", "switched off in the source"))
                 continue
             joined = tuple(buses[bus] for _, bus in ends)
-            flows = tuple(_known_flow(solved, table, int(i), side) for side, _ in ends)
+            flows = tuple(flow_into(solved, table, int(i), side) for side, _ in ends)
             port, limit = (ports.get(int(i)), _rating(row)) if table == "trafo" else (None, math.nan)
             made = coupling_of(label, joined, flows, port=port, rating_a=limit, network=network)
             network.couplings.append(made)
@@ -393,23 +353,13 @@ def _alone(bench: Any, *, loaded: bool) -> list[tuple[complex, complex, complex]
     return [(complex(a), complex(b), complex(i)) for (a, b), i in zip(v, current, strict=True)]
 
 
-def _known_flow(solved: Any, table: str, index: int, side: str) -> Phasors:
-    unknown: Phasors = np.full(3, np.nan, dtype=np.complex128)
-    if solved is None:
-        return unknown
-    try:
-        return _flow(solved, table, index, side)
-    except KeyError:  # not every table has results in three phases
-        return unknown
-
-
 def _fixed(net: Any, solved: Any, buses: dict[int, str], network: Network) -> None:
     """What draws or feeds in by rules of its own becomes a customer at the source's operating point."""
     for table, sign in FIXED.items():
         names = ids(net[table], table)
         for i in map(int, net[table].index):
             bus, label = buses[int(net[table].at[i, "bus"])], f"{table} {names[i]}"
-            power = sign * _known_flow(solved, table, i, "")
+            power = sign * flow_into(solved, table, i, "")
             if not np.isfinite(power).all():
                 effect = (
                     "its power is not known; the check shows what that does"
@@ -418,16 +368,20 @@ def _fixed(net: Any, solved: Any, buses: dict[int, str], network: Network) -> No
                 )
                 network.of_bus.append((bus, Change(label, WHOLE, "left out", effect)))
                 continue
-            network.draws.append(Draw(label, bus, power, rating_kva=0.0 if power.real.sum() < 0 else None))
+            plant = table == "gen" and power.real.sum() < 0
+            network.draws.append(Draw(label, bus, power, rating_kva=0.0 if plant else None, noun="customer"))
             effect = f"a customer that draws {power.real.sum():.4g} kW and {power.imag.sum():.4g} kvar"
             network.of_bus.append((bus, Change(label, "control", "changed", effect)))
-    names = ids(net.asymmetric_sgen, "asymmetric_sgen")
-    for i in map(int, net.asymmetric_sgen.index):
-        row = net.asymmetric_sgen.loc[i]
-        scale = -1e3 * float(row.scaling) * float(row.in_service)
-        each = [scale * complex(row[f"p_{p}_mw"], row[f"q_{p}_mvar"]) for p in "abc"]
-        power = np.array(each, dtype=np.complex128)
-        network.draws.append(Draw(names[i], buses[int(row.bus)], power, even=False, rating_kva=0.0))
+    for table in ("asymmetric_sgen", "sgen"):
+        names = ids(net[table], table)
+        for i, row in net[table].iterrows():
+            if table == "asymmetric_sgen" or between_phases(net, row):
+                power, told = phase_powers(
+                    net, row, f"generator {names[i]}", network.volts.get(buses[row.bus])
+                )
+                draw = Draw(names[i], buses[row.bus], -power, even=False, rating_kva=0.0)
+                network.draws.append(draw)
+                network.of_bus.extend((draw.bus, change) for change in told)
 
 
 def _shunts(net: Any, buses: dict[int, str], network: Network) -> None:
@@ -452,14 +406,21 @@ def _shunts(net: Any, buses: dict[int, str], network: Network) -> None:
 
 def _rest(net: Any, buses: dict[int, str], network: Network) -> None:
     """Name every other table with rows: what is there has no place in the format."""
+    for i, row in net.ext_grid[~net.ext_grid.in_service.astype(bool)].iterrows():
+        off = Change(f"ext_grid {i}", WHOLE, "left out", "switched off in the source")
+        network.of_bus.append((buses[int(row.bus)], off))
     for table in sorted(net.keys()):
         content = net[table]
-        if table in CARRIED or not hasattr(content, "columns") or table.startswith("res_"):
+        if table in CARRIED or not hasattr(content, "columns") or table.startswith(("res_", "_")):
             continue
         ends = [column for column in ("bus", "from_bus", "to_bus") if column in content.columns]
-        for i in content.index if ends else ():
+        if table in NOTED or not ends:
+            effect = NOTED.get(table, "no table of a feeder")
+            if len(content) and not any(part in table for part in CURVES):
+                label = f"table {table}, {len(content)} row{'s' if len(content) > 1 else ''}"
+                network.changes.append(Change(label, WHOLE, "left out", effect))
+            continue
+        for i, row in content.iterrows():
+            known = [buses[int(row[end])] for end in ends if row[end] in buses]
             change = Change(f"{table} {i}", WHOLE, "left out", "has no place in a feeder")
-            network.of_bus.append((buses[int(content.at[i, ends[0]])], change))
-    if "controller" in net and len(net.controller):
-        effect = "taps and set points stand as the file has them"
-        network.changes.append(Change(f"{len(net.controller)} controller(s)", WHOLE, "left out", effect))
+            network.of_bus.extend((bus, change) for bus in known)
