@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Annotated, TypeVar
@@ -154,11 +153,11 @@ def _print(found: Campaign) -> None:
 
 def _with_promised(site: Site, plan: Plan, others: tuple[Kind, ...]) -> Plan:
     from feeders.studies.campaign_promises import promised
-    from feeders.studies.detectable import detectable
+    from feeders.studies.detectable import detectable, workers
 
     stated = plan.trial(site, plan.moment(0)).stated
     with bar("lies of meters, errors of customers") as tell:
-        found = detectable(stated, max_attacked=2, progress=tell)
+        found = detectable(stated, max_attacked=2, runner=workers(stated, None), progress=tell)
     return replace(plan, kinds=(*others, *promised(stated, found)))
 
 
@@ -206,11 +205,10 @@ def _setting(text: str) -> tuple[str, float]:
 
 
 def _runner(workers: int | None, dask: str | None) -> Runner:
-    from feeders.studies.campaign_run import Dask, Here, Processes
+    from feeders.studies.campaign_run import Dask, cores
 
     if dask is not None:
         if workers is not None:
             raise typer.BadParameter("a Dask cluster has its own workers", param_hint="--workers")
         return Dask(dask)
-    count = workers or os.cpu_count() or 1
-    return Processes(count) if count > 1 else Here()
+    return cores(workers)

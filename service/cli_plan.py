@@ -149,17 +149,29 @@ def detectable(
     risk: Annotated[float, typer.Option(help="Probability left out of account, at one moment.")] = 1e-3,
     trials: Annotated[int, typer.Option(help="Simulate so many lies of each size.", min=0)] = 0,
     seed: Annotated[int, typer.Option(help="Chooses what is random in simulated lies.")] = 0,
+    workers: Annotated[
+        int | None, typer.Option(help="Processes. [default: all cores, from 50 meters on]", min=1)
+    ] = None,
     journal: Journal = None,
     out: Out = None,
 ) -> None:
     """The smallest lies that are surely named, the largest that stay unnoticed, and what they spoil; in V."""
     from feeders.load import load
     from feeders.studies.detectable import detectable as study
+    from feeders.studies.detectable import workers as where
     from feeders.studies.rehearsal import rehearse
 
     site = load(converted(feeder, out))
     with bar("lies of meters, errors of customers") as tell, said():
-        found = study(site, max_attacked=max_attacked, share=share, risk=risk, journal=journal, progress=tell)
+        found = study(
+            site,
+            max_attacked=max_attacked,
+            share=share,
+            risk=risk,
+            runner=where(site, workers),
+            journal=journal,
+            progress=tell,
+        )
     more = found.max_attacked - 1
     places = ["customer", "bus"]
     show(f"Lies, V: each alone, and with {more} more", found.meters.drop(columns=places).round(2))

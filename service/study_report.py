@@ -93,9 +93,10 @@ class Study:
 
 
 def _detectable(site: Site, asked: Asked, journal: Path | None, tell: Progress | None) -> Result:
-    from feeders.studies.detectable import detectable
+    from feeders.studies.detectable import detectable, workers
 
-    return detectable(site, max_attacked=asked.max_attacked, journal=journal, progress=tell)
+    runner = workers(site, None if asked.workers > 1 else 1)
+    return detectable(site, max_attacked=asked.max_attacked, runner=runner, journal=journal, progress=tell)
 
 
 def _protect(site: Site, asked: Asked, journal: Path | None, tell: Progress | None) -> Result:

@@ -23,7 +23,17 @@ from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]  # h
 from feeders.studies.journal import versions
 from gridsec.errors import GridsecError
 
-__all__ = ["ClusterUnusable", "Dask", "Here", "Processes", "Runner", "WorkerLost", "agree", "versions"]
+__all__ = [
+    "ClusterUnusable",
+    "Dask",
+    "Here",
+    "Processes",
+    "Runner",
+    "WorkerLost",
+    "agree",
+    "cores",
+    "versions",
+]
 
 Work = Callable[[int], Any]
 Made = Generator[tuple[int, Any], None, None]
@@ -116,6 +126,18 @@ class Processes:
             raise
         pool.shutdown()
         return sorted(running.values())
+
+
+def cores(count: int | None = None) -> Runner:
+    """Processes of this machine, or this one where there is but one.
+
+    Parameters
+    ----------
+    count
+        How many; by default one for each core.
+    """
+    count = count or os.cpu_count() or 1
+    return Processes(count) if count > 1 else Here()
 
 
 def _begin() -> None:

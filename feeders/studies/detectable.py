@@ -7,7 +7,8 @@ docs/theory-studies.md, sections 3 and 5.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -16,25 +17,31 @@ import numpy as np
 import pandas as pd
 
 from feeders.doubts import load_doubt
-from feeders.load import plant
+from feeders.load import from_tables, plant
+from feeders.schema import FeederTables
+from feeders.studies.campaign_run import Here, Runner, cores
 from feeders.studies.hidden import Curves
-from feeders.studies.journal import Progress, Where, worked
+from feeders.studies.journal import Journal, Progress, Where
 from feeders.studies.operating import SHARE, box, volts_of_lie
 from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible
 from gridsec.network import model_error_bound
 from gridsec.sequential import SequentialOptions
 from gridsec.sequential import design as design_sequential
+from gridsec.studies.collusion import Corridor, furthest
 from gridsec.studies.lies import Box, largest_lie, worst_error
-from gridsec.studies.quiet import Rule, largest_shift, named_size, rule
+from gridsec.studies.quiet import Rule, named_size, rule, within
 
 if TYPE_CHECKING:
     from feeders.load import Site
 
-__all__ = ["RISK", "Detectable", "detectable", "monitor_rule"]
+__all__ = ["MANY", "RISK", "Detectable", "detectable", "monitor_rule", "workers"]
 
 RISK = 1e-3
 """Probability, at one moment, with which honest errors are beyond what the monitor's figures allow for."""
+
+MANY = 50
+"""From so many meters on, the work is worth more than the seconds in which processes begin."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,6 +92,7 @@ def detectable(
     max_attacked: int,
     share: float = SHARE,
     risk: float = RISK,
+    runner: Runner | None = None,
     journal: Where = None,
     progress: Progress | None = None,
 ) -> Detectable:
@@ -100,6 +108,8 @@ def detectable(
         Share of its peak that every load draws; inverters are in their deadbands.
     risk
         Probability with which honest errors may be beyond what the monitor's figures allow for.
+    runner
+        Where: `campaign_run.Here`, `Processes` or `Dask`; the results are the same.
     journal
         File in which finished work is kept; an interrupted study goes on from it.
     progress
@@ -127,26 +137,102 @@ def detectable(
         "share": share,
         "risk": risk,
     }
-    given, worst = monitor_rule(site, risk=risk, share=share), box(site, share=share, curves=Curves.DEADBAND)
-    claims = _claims(site, given, share)
-    tasks: list[tuple[str, Callable[[], Any]]] = [
-        (f"meter|{j}", partial(_meter, site, given, worst, claims, max_attacked, j))
-        for j in range(site.meters.size)
-    ]
-    tasks += [
-        (f"customer|{i}", partial(_customer, site, given, worst, max_attacked, i))
-        for i in range(site.feeder.bus.size)
-    ]
-    done = worked(journal, subject, tasks, progress)
-    rows = {kind: [v for k, v in done.items() if k.startswith(kind)] for kind in ("meter", "customer")}
+    asked = _Asked(site.tables, max_attacked, share, risk)
+    given = _Given.of(site, asked)  # whatever is wrong with it is told here, and not by a worker
+    keys = [f"meter|{j}" for j in range(site.meters.size)]
+    keys += [f"customer|{i}" for i in range(site.feeder.bus.size)]
+    here = runner is None or isinstance(runner, Here)
+    work = partial(_row, given) if here else partial(_worked, asked)
+    with Journal(journal, subject, of=len(keys)) as kept:
+        todo = [piece for piece, key in enumerate(keys) if key not in kept]
+        done = len(keys) - len(todo)
+        if progress is not None:
+            progress(done, len(keys))
+        with closing((runner or Here()).run(work, todo)) as results:
+            for piece, row in results:
+                kept.put(keys[piece], row)
+                done += 1
+                if progress is not None:
+                    progress(done, len(keys))
+        rows = [kept[key] for key in keys]
     return Detectable(
         site.feeder.name,
         site.digest,
         max_attacked,
         risk,
-        pd.DataFrame(rows["meter"]),
-        pd.DataFrame(rows["customer"]),
+        pd.DataFrame(rows[: site.meters.size]),
+        pd.DataFrame(rows[site.meters.size :]),
     )
+
+
+def workers(site: Site, count: int | None) -> Runner:
+    """Where the study of a feeder is done soonest.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    count
+        So many processes; by default all cores, from MANY meters on.
+    """
+    return Here() if count is None and site.meters.size < MANY else cores(count)
+
+
+@dataclass(frozen=True, slots=True)
+class _Asked:
+    """What is asked of which feeder, as workers are told."""
+
+    tables: FeederTables
+    max_attacked: int
+    share: float
+    risk: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Given:
+    """What all rows share. Corridors are by whether somebody is seen, and how many lie."""
+
+    site: Site
+    max_attacked: int
+    rule: Rule
+    corridors: Mapping[tuple[bool, int], Corridor]
+    worst: Box
+    claims: Floats
+
+    @classmethod
+    def of(cls, site: Site, asked: _Asked) -> _Given:
+        given = monitor_rule(site, risk=asked.risk, share=asked.share)
+        return cls(
+            site,
+            asked.max_attacked,
+            given,
+            {
+                (seen, count): within(given, count, seen=seen)
+                for seen in (False, True)
+                for count in (1, asked.max_attacked)
+            },
+            box(site, share=asked.share, curves=Curves.DEADBAND),
+            _claims(site, given, asked.share),
+        )
+
+
+# What the worker of this process prepared last, and for what.
+_prepared: list[tuple[_Asked, _Given]] = []
+
+
+def _worked(asked: _Asked, piece: int) -> dict[str, Any]:
+    """One row, wherever this is: what all rows share is worked out once in each process."""
+    given = next((made for what, made in _prepared if what == asked), None)
+    if given is None:
+        given = _Given.of(from_tables(asked.tables), asked)
+        _prepared[:] = [(asked, given)]
+    return _row(given, piece)
+
+
+def _row(given: _Given, piece: int) -> dict[str, Any]:
+    """First the meters, then the customers."""
+    p = given.site.meters.size
+    return _meter(given, piece) if piece < p else _customer(given, piece - p)
 
 
 def monitor_rule(site: Site, *, risk: float = RISK, share: float = SHARE) -> Rule:
@@ -185,9 +271,8 @@ def _claims(site: Site, given: Rule, share: float) -> Floats:
     return np.asarray(np.exp2(np.ceil(np.log2(np.maximum(share * site.loads.load_peak, least)))))
 
 
-def _meter(  # noqa: PLR0917  # the feeder twice, and which of its meters
-    site: Site, given: Rule, worst: Box, claims: Floats, liars: int, j: int
-) -> dict[str, Any]:
+def _meter(given: _Given, j: int) -> dict[str, Any]:
+    site = given.site
     unit = (np.arange(site.meters.size) == j).astype(np.float64)
     customer = int(site.meters[j])
     base = site.customer_volt[customer]
@@ -196,27 +281,28 @@ def _meter(  # noqa: PLR0917  # the feeder twice, and which of its meters
         "customer": site.feeder.customers[customer],
         "bus": site.feeder.buses[int(site.feeder.bus[customer])],
     }
-    for suffix, count in (("_alone", 1), ("", liars)):
-        hidden = largest_shift(given, unit, count, seen=False, must=j)
-        noticed = largest_shift(given, unit, count, seen=True, must=j)
-        named = max(named_size(given, j, count, claims=claims), noticed.bound)
+    for suffix, count in (("_alone", 1), ("", given.max_attacked)):
+        hidden = furthest(given.corridors[False, count], unit, must=j)
+        noticed = furthest(given.corridors[True, count], unit, must=j)
+        named = max(named_size(given.rule, j, count, claims=given.claims), noticed.bound)
         sizes = {
             "hidden": hidden.size,
             "noticed": noticed.bound,
             "named": named,
-            "fits": largest_lie(worst, j, count).bound,
-            "identified": largest_lie(worst, j, 2 * count).bound,
+            "fits": largest_lie(given.worst, j, count).bound,
+            "identified": largest_lie(given.worst, j, 2 * count).bound,
         }
         row |= {f"{name}{suffix}": float(volts_of_lie(base, size)) for name, size in sizes.items()}
     return row
 
 
-def _customer(site: Site, given: Rule, worst: Box, liars: int, i: int) -> dict[str, Any]:
+def _customer(given: _Given, i: int) -> dict[str, Any]:
+    site, liars = given.site, given.max_attacked
     bus, base = int(site.feeder.bus[i]), site.customer_volt[i]
-    moved = largest_shift(given, given.weights(bus), liars, seen=True).bound
+    moved = furthest(given.corridors[True, liars], given.rule.weights(bus)).bound
     return {
         "customer": site.feeder.customers[i],
         "bus": site.feeder.buses[bus],
-        "error": float(volts_of_lie(base, moved + given.spread(bus))),
-        "error_fits": float(volts_of_lie(base, worst_error(worst, i, liars).bound)),
+        "error": float(volts_of_lie(base, moved + given.rule.spread(bus))),
+        "error_fits": float(volts_of_lie(base, worst_error(given.worst, i, liars).bound)),
     }
