@@ -69,6 +69,7 @@ def exit_code(error: GridsecError) -> int:
     from feeders.recording import RecordingInvalid
     from service.app import AddressUnavailable
     from service.bus import BusUnavailable
+    from service.places import Unusable
     from service.settings import SettingsInvalid
     from service.store import StoreUnavailable
 
@@ -81,6 +82,7 @@ def exit_code(error: GridsecError) -> int:
         AddressUnavailable: ADDRESS,
         BusUnavailable: ADDRESS,
         RecordingInvalid: FILE,
+        Unusable: FILE,
     }
     return next((code for kind, code in codes.items() if isinstance(error, kind)), FAILED)
 

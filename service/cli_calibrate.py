@@ -9,9 +9,11 @@ import typer
 from rich.markup import escape
 
 from service import console
-from service.cli_plan import Journal, Out, bar, said, show
+from service.cli_plan import Out, bar, said, show
 from service.console import Studied
 from service.foreign import converted
+from service.keeping import JournalAt, NoJournal, keeping
+from service.places import see
 from service.tables import write_tables
 
 if TYPE_CHECKING:
@@ -40,7 +42,8 @@ def calibrate(
     write: Annotated[
         Path | None, typer.Option(help="Write a corrected copy of the feeder into this new folder.")
     ] = None,
-    journal: Journal = None,
+    journal: JournalAt = None,
+    no_journal: NoJournal = False,
     out: Out = None,
 ) -> None:
     """What recorded readings say against a feeder's files: places, phases, lengths, meters, loads.
@@ -54,26 +57,31 @@ def calibrate(
     for name in look_for or ():
         if name not in tuple(Kind):
             raise typer.BadParameter(f"{name!r}: expected one of {', '.join(Kind)}", param_hint="--look-for")
-    if write is not None and write.exists() and (not write.is_dir() or any(write.iterdir())):
-        raise typer.BadParameter(f"{write}: already there; expected a new folder", param_hint="--write")
-    feeder = converted(feeder, out)
-    site = site_of(feeder)
-    with bar("errors that the readings may speak for") as tell, said():
-        found = study(
-            site,
-            readings,
-            risk=risk,
-            tolerance=tolerance,
-            exclude=exclude or (),
-            kinds=[kind for kind in Kind if not look_for or kind in look_for],
-            journal=journal,
-            progress=tell,
-        )
-    _tell(found)
-    write_tables(out, found.tables)
-    if write is not None:
-        found.corrected(feeder, write)
-        console.out.print(escape(f"{write}: {found.feeder} with {len(found.corrections)} corrections"))
+    see(
+        folders={"--out": out},
+        new={"--write": write},
+        files={"--journal": journal},
+        read={"--readings": readings},
+    )
+    with keeping("calibrate", feeder, journal, without=no_journal) as kept:
+        feeder = converted(feeder, out)
+        site = site_of(feeder)
+        with bar("errors that the readings may speak for") as tell, said():
+            found = study(
+                site,
+                readings,
+                risk=risk,
+                tolerance=tolerance,
+                exclude=exclude or (),
+                kinds=[kind for kind in Kind if not look_for or kind in look_for],
+                journal=kept,
+                progress=tell,
+            )
+        _tell(found)
+        write_tables(out, found.tables)
+        if write is not None:
+            found.corrected(feeder, write)
+            console.out.print(escape(f"{write}: {found.feeder} with {len(found.corrections)} corrections"))
 
 
 def _tell(found: Calibrate) -> None:

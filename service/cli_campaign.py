@@ -10,9 +10,11 @@ import typer
 from rich.markup import escape
 
 from service import console
-from service.cli_plan import Journal, Out, bar, said, show
+from service.cli_plan import Out, bar, said, show
 from service.console import Studied
 from service.foreign import converted
+from service.keeping import JournalAt, Keeping, NoJournal, keeping
+from service.places import see
 from service.tables import write_tables
 
 if TYPE_CHECKING:
@@ -99,7 +101,8 @@ def campaign(
     load_error_kvar: LoadErrorKvar = 0.05,
     workers: Workers = None,
     dask: DaskAt = None,
-    journal: Journal = None,
+    journal: JournalAt = None,
+    no_journal: NoJournal = False,
     out: Out = None,
 ) -> None:
     """Simulate attacks over days of profiles: who is named, missed or falsely named, and how soon."""
@@ -109,8 +112,9 @@ def campaign(
     from feeders.studies.campaign_plan import KINDS, Design, Place, Plan
     from feeders.trials import LoadError, Meters
 
+    see(folders={"--out": out}, files={"--journal": journal})
     site, count = load(converted(feeder, out)), min(scenarios, together)
-    with said():
+    with said(), keeping("campaign", feeder, journal, without=no_journal) as kept:
         plan = Plan(
             scenes=-(-scenarios // count),
             together=count,
@@ -131,11 +135,11 @@ def campaign(
             load_error=LoadError(load_error_kw, load_error_kvar),
         )
         if promised:
-            plan = _with_promised(site, plan, plan.kinds if kind else ())
+            plan = _with_promised(site, plan, plan.kinds if kind else (), kept)
         with bar("scenarios") as tell:
-            found = study(site, plan, runner=_runner(workers, dask), journal=journal, progress=tell)
-    _print(found)
-    write_tables(out, found.tables)
+            found = study(site, plan, runner=_runner(workers, dask), journal=kept, progress=tell)
+        _print(found)
+        write_tables(out, found.tables)
 
 
 def _print(found: Campaign) -> None:
@@ -151,13 +155,13 @@ def _print(found: Campaign) -> None:
     show("False names while nobody lies, and liars named", found.false_names)
 
 
-def _with_promised(site: Site, plan: Plan, others: tuple[Kind, ...]) -> Plan:
+def _with_promised(site: Site, plan: Plan, others: tuple[Kind, ...], kept: Keeping) -> Plan:
     from feeders.studies.campaign_promises import promised
     from feeders.studies.detectable import detectable, workers
 
     stated = plan.trial(site, plan.moment(0)).stated
     with bar("lies of meters, errors of customers") as tell:
-        found = detectable(stated, max_attacked=2, runner=workers(stated, None), progress=tell)
+        found = detectable(stated, max_attacked=2, runner=workers(stated, None), journal=kept, progress=tell)
     return replace(plan, kinds=(*others, *promised(stated, found)))
 
 

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
 
 from service import console
-from service.cli_plan import Journal, Out, bar, said, show
+from service.cli_plan import Out, bar, said, show
 from service.console import Studied
 from service.foreign import converted
+from service.keeping import JournalAt, Keeping, NoJournal, keeping
+from service.places import see
 from service.tables import write_tables
 
 if TYPE_CHECKING:
@@ -90,7 +91,8 @@ def droop(
     unit_kw: UnitKw = 5.0,
     draws: Draws = 30,
     seed: Seed = 0,
-    journal: Journal = None,
+    journal: JournalAt = None,
+    no_journal: NoJournal = False,
     out: Out = None,
 ) -> None:
     """Is the volt/VAR fleet stable, with what margins; does it keep the band; how much more is hosted."""
@@ -122,14 +124,16 @@ def droop(
         unit_kw=unit_kw,
         draws=draws,
     )
-    site, others = load(converted(feeder, out)), [load(converted(name, None)) for name in also or ()]
-    found = _studied(site, others, options, seed, journal)
-    _tell(found, options)
-    write_tables(out, found.tables)
+    see(folders={"--out": out}, files={"--journal": journal})
+    with keeping("droop", feeder, journal, without=no_journal) as kept:
+        site, others = load(converted(feeder, out)), [load(converted(name, None)) for name in also or ()]
+        found = _studied(site, others, options, seed, kept)
+        _tell(found, options)
+        write_tables(out, found.tables)
 
 
 def _studied(
-    site: Site, others: Sequence[Site], options: DroopOptions, seed: int, journal: Path | None
+    site: Site, others: Sequence[Site], options: DroopOptions, seed: int, kept: Keeping
 ) -> DroopStudy:
     """The study, with the presets on other feeders below its own."""
     import pandas as pd
@@ -138,11 +142,10 @@ def _studied(
     from feeders.studies.droop import presets_of
 
     with bar("fleets, steps and loads") as tell, said():
-        found = study(site, options, seed=seed, journal=journal, progress=tell)
+        found = study(site, options, seed=seed, journal=kept, progress=tell)
         if others:
-            found.tables["presets"] = pd.concat(
-                [found.tables["presets"], presets_of(others, options, seed=seed)], ignore_index=True
-            )
+            theirs = presets_of(others, options, seed=seed, journal=kept, progress=tell)
+            found.tables["presets"] = pd.concat([found.tables["presets"], theirs], ignore_index=True)
     return found
 
 

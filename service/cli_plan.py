@@ -16,12 +16,15 @@ from rich.table import Table
 from service import console
 from service.console import Studied
 from service.foreign import converted
-from service.tables import A_FEEDER, is_feeder, write_tables
+from service.keeping import JournalAt, NoJournal, keeping
+from service.places import see
+from service.tables import write_tables
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from feeders.studies.journal import Progress as Tell
+    from feeders.studies.protect import Protect
 
 Unknown = Annotated[
     list[str] | None,
@@ -32,20 +35,7 @@ Unknown = Annotated[
 Silent = Annotated[list[str] | None, typer.Option(help="A meter that is missing; may be repeated.")]
 BusbarUnknown = Annotated[bool, typer.Option("--busbar-unknown", help="The busbar's voltage is not metered.")]
 CurvesAt = Annotated[str, typer.Option(help="Where inverters work: steepest or deadband.")]
-Journal = Annotated[Path | None, typer.Option(help="Keep finished work in this file, and go on from it.")]
-
-
-def _apart(folder: Path | None) -> Path | None:
-    """Refuse a feeder's own folder before the work, and not after it."""
-    if folder is not None and is_feeder(folder):
-        raise typer.BadParameter(f"{folder}: {A_FEEDER}")
-    return folder
-
-
-Out = Annotated[
-    Path | None,
-    typer.Option(help="Write the tables into this folder, as CSV and Parquet.", callback=_apart),
-]
+Out = Annotated[Path | None, typer.Option(help="Write the tables into this folder, as CSV and Parquet.")]
 
 
 def redundancy(
@@ -55,31 +45,34 @@ def redundancy(
     silent: Silent = None,
     busbar_unknown: BusbarUnknown = False,
     curves: CurvesAt = "steepest",
-    journal: Journal = None,
+    journal: JournalAt = None,
+    no_journal: NoJournal = False,
     out: Out = None,
 ) -> None:
     """How many lying meters stay invisible: in all, by meter, by part of the feeder, with meters missing."""
     from feeders.load import load
     from feeders.studies.redundancy import redundancy as study
 
-    site = load(converted(feeder, out))
-    with bar("searching for liars that stay invisible") as tell, said():
-        found = study(
-            site,
-            unknown=unknown,
-            silent=silent or (),
-            busbar_known=not busbar_unknown,
-            curves=_curves(curves),
-            journal=journal,
-            progress=tell,
-        )
-    console.out.print(_unknowns(found.unknown, found.feeder))
-    show("Liars that stay invisible", found.summary)
-    show("By meter", found.meters)
-    show("Liars inside one part", found.parts)
-    if found.silent:
-        show(f"What changes without {', '.join(found.silent)}", found.changes)
-    write_tables(out, found.tables)
+    see(folders={"--out": out}, files={"--journal": journal})
+    with keeping("redundancy", feeder, journal, without=no_journal) as kept:
+        site = load(converted(feeder, out))
+        with bar("searching for liars that stay invisible") as tell, said():
+            found = study(
+                site,
+                unknown=unknown,
+                silent=silent or (),
+                busbar_known=not busbar_unknown,
+                curves=_curves(curves),
+                journal=kept,
+                progress=tell,
+            )
+        console.out.print(_unknowns(found.unknown, found.feeder))
+        show("Liars that stay invisible", found.summary)
+        show("By meter", found.meters)
+        show("Liars inside one part", found.parts)
+        if found.silent:
+            show(f"What changes without {', '.join(found.silent)}", found.changes)
+        write_tables(out, found.tables)
 
 
 def protect(
@@ -102,7 +95,8 @@ def protect(
     greedy: Annotated[
         bool, typer.Option("--greedy", help="For large feeders: not proven the fewest; with its gap.")
     ] = False,
-    journal: Journal = None,
+    journal: JournalAt = None,
+    no_journal: NoJournal = False,
     out: Out = None,
 ) -> None:
     """The fewest meters to protect so that liars are named, are noticed, or can only lie a little."""
@@ -115,30 +109,38 @@ def protect(
     for option, (name, known) in kinds.items():
         if name not in known:
             raise typer.BadParameter(f"{name!r}: expected one of {', '.join(known)}", param_hint=option)
-    site = load(converted(feeder, out))
-    with bar("meters protected, against attacks") as tell, said():
-        found = study(
-            site,
-            max_attacked=max_attacked,
-            goal=Goal(goal),
-            lie_volt=math.nan if lie_volt is None else lie_volt,
-            attack=Attack(attack),
-            unknown=unknown,
-            busbar_known=not busbar_unknown,
-            never=never or (),
-            exact=not greedy,
-            journal=journal,
-            progress=lambda known, done: tell(done, known),
-        )
+    see(folders={"--out": out}, files={"--journal": journal})
+    with keeping("protect", feeder, journal, without=no_journal) as kept:
+        site = load(converted(feeder, out))
+        with bar("meters protected, against attacks") as tell, said():
+            found = study(
+                site,
+                max_attacked=max_attacked,
+                goal=Goal(goal),
+                lie_volt=math.nan if lie_volt is None else lie_volt,
+                attack=Attack(attack),
+                unknown=unknown,
+                busbar_known=not busbar_unknown,
+                never=never or (),
+                exact=not greedy,
+                journal=kept,
+                progress=lambda known, done: tell(done, known),
+            )
+        _tell_protection(found, len(site.meter_ids))
+        write_tables(out, found.tables)
+
+
+def _tell_protection(found: Protect, of: int) -> None:
+    from feeders.studies.protect import Goal
+
     count = len(found.meters)
     proof = "no fewer suffice" if not found.gap else f"at least {found.least} are needed"
     measure = "largest hidden lie, V" if found.goal is Goal.BOUND else "fewest liars that stay invisible"
-    console.out.print(escape(f"{found.feeder}: protect {count} of {len(site.meter_ids)} meters; {proof}"))
+    console.out.print(escape(f"{found.feeder}: protect {count} of {of} meters; {proof}"))
     console.out.print(f"{measure}: {_cell(found.before)} before, {_cell(found.after)} after")
     if count:
         show("Protect", found.meters)
         show("Attacks that ask for them", found.attacks)
-    write_tables(out, found.tables)
 
 
 def detectable(
@@ -152,7 +154,8 @@ def detectable(
     workers: Annotated[
         int | None, typer.Option(help="Processes. [default: all cores, from 50 meters on]", min=1)
     ] = None,
-    journal: Journal = None,
+    journal: JournalAt = None,
+    no_journal: NoJournal = False,
     out: Out = None,
 ) -> None:
     """The smallest lies that are surely named, the largest that stay unnoticed, and what they spoil; in V."""
@@ -161,30 +164,34 @@ def detectable(
     from feeders.studies.detectable import workers as where
     from feeders.studies.rehearsal import rehearse
 
-    site = load(converted(feeder, out))
-    with bar("lies of meters, errors of customers") as tell, said():
-        found = study(
-            site,
-            max_attacked=max_attacked,
-            share=share,
-            risk=risk,
-            runner=where(site, workers),
-            journal=journal,
-            progress=tell,
-        )
-    more = found.max_attacked - 1
-    places = ["customer", "bus"]
-    show(f"Lies, V: each alone, and with {more} more", found.meters.drop(columns=places).round(2))
-    show(f"Errors of the voltage with {more + 1} unnoticed liars, V", found.customers.round(2))
-    write_tables(out, found.tables)
-    if trials:
-        with bar("simulated lies") as tell:
-            seen = rehearse(site, found, trials=trials, seed=seed, share=share, progress=tell)
-        console.out.print(
-            f"{seen.trials} lies up to the hidden size: {seen.hidden_named} led to a name\n"
-            f"{seen.trials} lies from the named size on: {seen.large_missed} missed, "
-            f"{seen.honest_named} with an honest meter named"
-        )
+    see(folders={"--out": out}, files={"--journal": journal})
+    with keeping("detectable", feeder, journal, without=no_journal) as kept:
+        site = load(converted(feeder, out))
+        with bar("lies of meters, errors of customers") as tell, said():
+            found = study(
+                site,
+                max_attacked=max_attacked,
+                share=share,
+                risk=risk,
+                runner=where(site, workers),
+                journal=kept,
+                progress=tell,
+            )
+        more = found.max_attacked - 1
+        places = ["customer", "bus"]
+        show(f"Lies, V: each alone, and with {more} more", found.meters.drop(columns=places).round(2))
+        show(f"Errors of the voltage with {more + 1} unnoticed liars, V", found.customers.round(2))
+        write_tables(out, found.tables)
+        if trials:
+            with bar("simulated lies") as tell:
+                seen = rehearse(
+                    site, found, trials=trials, seed=seed, share=share, journal=kept, progress=tell
+                )
+            console.out.print(
+                f"{seen.trials} lies up to the hidden size: {seen.hidden_named} led to a name\n"
+                f"{seen.trials} lies from the named size on: {seen.large_missed} missed, "
+                f"{seen.honest_named} with an honest meter named"
+            )
 
 
 def _unknowns(names: Sequence[str], feeder: str) -> str:

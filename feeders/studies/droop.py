@@ -424,20 +424,36 @@ def _add_phases(site: Site, tables: Sequence[pd.DataFrame]) -> None:
             table.insert(list(table.columns).index("customer") + 1, "phase", phase)
 
 
-def presets_of(sites: Sequence[Site], options: DroopOptions | None = None, *, seed: int = 0) -> pd.DataFrame:
+def presets_of(
+    sites: Sequence[Site],
+    options: DroopOptions | None = None,
+    *,
+    seed: int = 0,
+    journal: Where = None,
+    progress: Progress | None = None,
+) -> pd.DataFrame:
     """The table `presets` of several feeders, one under the other.
 
     Parameters
     ----------
     sites
         The feeders.
-    options, seed
+    options, seed, journal, progress
         As in `droop`.
+
+    Raises
+    ------
+    OtherStudy, InUse
+        As `droop`.
     """
-    given, out = options or DroopOptions(), []
-    for site in sites:
-        subject = Subject.of(site)
-        for name in given.presets:
-            study = _Study(subject, equip(site, name, given.who), given, seed)
-            out.append(_preset(study, name))
-    return pd.DataFrame(out)
+    given = options or DroopOptions()
+    digests = [site.digest for site in sites]
+    subject = {"study": "presets", "digests": digests, "seed": seed, "options": asdict(given)}
+
+    def row(site: Site, name: str) -> dict[str, Any]:
+        return _preset(_Study(Subject.of(site), equip(site, name, given.who), given, seed), name)
+
+    tasks = (
+        (f"{k}|{name}", partial(row, site, name)) for k, site in enumerate(sites) for name in given.presets
+    )
+    return pd.DataFrame(list(worked(journal, subject, tasks, progress).values()))

@@ -14,11 +14,13 @@ import sys
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from functools import cache
-from importlib.metadata import version
+from importlib.metadata import entry_points, version
+from importlib.util import find_spec
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Protocol, Self
 
+from feeders.outside import GROUP
 from gridsec.errors import GridsecError
 
 if sys.platform == "win32":
@@ -26,7 +28,7 @@ if sys.platform == "win32":
 else:
     import fcntl
 
-__all__ = ["InUse", "Journal", "Keeper", "OtherStudy", "Progress", "Where", "versions", "worked"]
+__all__ = ["InUse", "Journal", "Keeper", "OtherStudy", "Progress", "Where", "remove", "versions", "worked"]
 
 Progress = Callable[[int, int], None]
 """Told how many pieces of work are done, and of how many."""
@@ -65,12 +67,25 @@ def versions() -> dict[str, str]:
 
 @cache
 def edition() -> str:
-    """Digest of this program's own code: a version may have been edited since a journal was begun."""
+    """Digest of the code, others' estimators included: it may be edited while its version stays the same."""
     content = hashlib.sha256()
-    root = Path(__file__).parents[2]
-    for path in sorted(each for name in ("gridsec", "feeders") for each in (root / name).rglob("*.py")):
-        content.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+    for name in sorted(
+        {"gridsec", "feeders"} | {point.module.split(".")[0] for point in entry_points(group=GROUP)}
+    ):
+        content.update(name.encode() + b"\0")
+        for path in _sources(name):
+            content.update(path.name.encode() + b"\0" + path.read_bytes())
     return content.hexdigest()[:16]
+
+
+def _sources(name: str) -> list[Path]:
+    """The files of a package or module, without running it."""
+    found = find_spec(name)
+    if found is None:
+        return []
+    if found.submodule_search_locations is None:
+        return [Path(found.origin)] if found.origin and Path(found.origin).is_file() else []
+    return sorted(path for root in found.submodule_search_locations for path in Path(root).rglob("*.py"))
 
 
 class Journal:
@@ -255,6 +270,23 @@ def _read(handle: int, path: Path, head: str) -> dict[str, Any]:
 def _write(handle: int, line: str) -> None:
     with open(handle, "ab", closefd=False) as file:
         file.write(line.encode() + b"\n")
+
+
+def remove(path: Path) -> None:
+    """Remove a journal, unless somebody is writing it or it cannot be.
+
+    Parameters
+    ----------
+    path
+        The file.
+    """
+    with suppress(InUse, OSError):
+        handle = os.open(path, os.O_RDWR)
+        try:
+            _lock(handle, path)
+            path.unlink()
+        finally:
+            os.close(handle)
 
 
 def _other(found: str, expected: str) -> str:

@@ -88,8 +88,8 @@ def test_wrong_arguments_are_told(
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     for option in ("--out", "--write"):
         code, _, told = run(monkeypatch, capsys, str(folder), *some, option, str(folder))
-        assert code == 2
-        assert option in told
+        assert code == 6
+        assert f"{option} {folder}: " in told
         assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
     code, _, told = run(monkeypatch, capsys, "cigre-lv", "--readings", str(tmp_path / "none.parquet"))
     assert code == 6

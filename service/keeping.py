@@ -1,0 +1,229 @@
+"""What a command has done is kept, unless it is told not to; and what is said when it is interrupted."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Any, Final, Never
+
+import typer
+from rich.markup import escape
+
+from feeders.design_cache import folder as cache_folder
+from feeders.studies.campaign_run import ClusterUnusable, WorkerLost
+from feeders.studies.journal import InUse, Journal, OtherStudy, remove
+from gridsec.errors import GridsecError
+from service import console
+from service.console import complain
+
+__all__ = ["JournalAt", "Keeping", "NoJournal", "keeping"]
+
+JournalAt = Annotated[
+    Path | None,
+    typer.Option(
+        "--journal",
+        help="Keep finished work in this file, and go on from it. [default: a file in the user's folder for "
+        "caches, until the study is done]",
+    ),
+]
+NoJournal = Annotated[
+    bool, typer.Option("--no-journal", help="Keep none: an interruption loses what is done.")
+]
+
+MOST: Final = 64
+"""How many journals of interrupted studies stay in the user's folder for caches."""
+
+
+class Stopped(KeyboardInterrupt):
+    """A signal asks the command to end."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = number
+
+
+@dataclass(slots=True)
+class Keeping:
+    """A command's journals; a `feeders.studies.journal.Keeper`.
+
+    Attributes
+    ----------
+    study, feeder
+        The command's own study, and its feeder as it was given.
+    chosen
+        The file for it that was asked for; further studies of the command have theirs beside it.
+    folder
+        Where journals are otherwise; None: there are none.
+    stay
+        Whether they stay there when the command is done.
+    journals
+        All that were opened, with the name of the study.
+    """
+
+    study: str
+    feeder: str
+    chosen: Path | None
+    folder: Path | None
+    stay: bool = False
+    journals: list[tuple[str, Journal]] = field(default_factory=list)
+    _name: str = ""
+    _warned: bool = False
+
+    def file(self, study: str, digest: str) -> Path | None:
+        """As `Keeper`: the file that was asked for, or one in the folder."""
+        self._name = study
+        if self.chosen is not None:
+            return (
+                self.chosen if study == self.study else self.chosen.with_name(f"{self.chosen.name}.{study}")
+            )
+        if self.folder is None:
+            return None
+        feeder = re.sub(r"[^A-Za-z0-9_]+", "-", Path(self.feeder).stem).strip("-")[:64]
+        return self.folder / f"{study}-{feeder}-{digest}.jsonl"
+
+    def opened(self, journal: Journal) -> None:
+        """As `Keeper`: say where it goes on."""
+        self.journals.append((self._name, journal))
+        if journal.path is not None and journal.done:
+            console.err.print(escape(f"going on from {journal.path}, {_amount(journal)} done"))
+
+    def refused(self, path: Path, why: OSError | OtherStudy | InUse) -> bool:
+        """As `Keeper`: what was not asked for is no reason not to work."""
+        if self.chosen is not None:
+            raise why
+        if isinstance(why, OtherStudy):
+            path.replace(path.with_suffix(".other"))
+            return True
+        if not self._warned:
+            said = f"{why.filename or path}: {why.strerror}" if isinstance(why, OSError) else str(why)
+            complain(f"no journal is kept, an interruption loses what is done: {said}")
+            self._warned = True
+        return False
+
+    def close(self, *, done: bool) -> None:
+        """Let go of all journals; those that are not needed any more are removed.
+
+        Parameters
+        ----------
+        done
+            Whether the command is.
+        """
+        passing = self.chosen is None and not self.stay
+        for _, journal in self.journals:
+            journal.close()
+            if journal.path is not None and (not journal.done or (done and passing)):
+                remove(journal.path)
+
+    def left(self) -> str:
+        """What is done, and where it is kept."""
+        if not self.journals:
+            return "nothing was done yet"
+        study, journal = self.journals[-1]
+        begun = f"{study}: {_amount(journal)} done"
+        if not journal.done:
+            before = [each for _, each in self.journals[:-1] if each.path is not None and each.done]
+            return f"{begun}; what was before it is kept, the same command goes on" if before else begun
+        if journal.path is None:
+            return f"{begun}, and lost: no journal was kept"
+        return f"{begun}, kept in {journal.path}; the same command goes on from there"
+
+
+def _amount(journal: Journal) -> str:
+    if journal.of is not None:
+        return f"{journal.done} of {journal.of}"
+    return f"{journal.done} piece{'s' * (journal.done != 1)} of work"
+
+
+@contextmanager
+def keeping(
+    study: str,
+    feeder: str,
+    journal: Path | None = None,
+    *,
+    without: bool = False,
+    folder: Path | None = None,
+) -> Iterator[Keeping]:
+    """Keep journals of a command's studies; interrupted, it says in one line what is done and how to go on.
+
+    Parameters
+    ----------
+    study, feeder
+        The command's own study, and its feeder as it was given.
+    journal
+        The file that was asked for.
+    without
+        Keep none.
+    folder
+        Where they are and stay; None: in the user's folder for caches, until the command is done.
+
+    Raises
+    ------
+    typer.Exit
+        If it was interrupted.
+    """
+    if without and journal is not None:
+        raise typer.BadParameter("goes without --journal", param_hint="--no-journal")
+    where = None if without else folder or cache_folder() / "journals"
+    kept = Keeping(study, feeder, journal, where, stay=folder is not None)
+    try:
+        with _signals():
+            yield kept
+    except KeyboardInterrupt as stop:
+        number = stop.number if isinstance(stop, Stopped) else signal.SIGINT
+        kept.close(done=False)
+        complain(f"interrupted; {kept.left()}")
+        raise typer.Exit(128 + number) from None
+    except (OSError, WorkerLost, ClusterUnusable):
+        kept.close(done=False)
+        console.err.print(escape(kept.left()))
+        raise
+    except (GridsecError, typer.BadParameter):
+        kept.close(done=True)  # that there is no answer is one, and it would be the same again
+        raise
+    except BaseException:
+        kept.close(done=False)
+        raise
+    kept.close(done=True)
+    if where is not None and folder is None:
+        _prune(where)
+
+
+@contextmanager
+def _signals() -> Iterator[None]:
+    """SIGTERM stops a command as Ctrl-C does, and whoever does that twice does not want to wait."""
+
+    def stop(number: int, _: FrameType | None) -> Never:
+        for each in taken:
+            signal.signal(each, _end)
+        raise Stopped(number)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    # Who ignores a signal, as `nohup` does, goes on doing so.
+    taken = [n for n in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(n) is not signal.SIG_IGN]
+    before: dict[signal.Signals, Any] = {number: signal.signal(number, stop) for number in taken}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _end(number: int, _: FrameType | None) -> Never:
+    console.err.show_cursor()
+    os._exit(128 + number)
+
+
+def _prune(folder: Path) -> None:
+    """Drop the journals that nobody has come back to for longest."""
+    found = sorted(folder.glob("*.jsonl"), key=lambda path: path.stat().st_mtime_ns)
+    for old in found[:-MOST]:
+        remove(old)

@@ -1,0 +1,139 @@
+"""Whether the files and folders of a command can be what it makes of them: seen before the work."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from itertools import permutations
+from pathlib import Path
+from typing import Final
+
+from gridsec.errors import GridsecError
+from service.tables import A_FEEDER, is_feeder
+
+__all__ = ["Unusable", "see"]
+
+Given = Mapping[str, Path | None]
+"""Path by option; None where the option was not given."""
+
+NONE: Final[Given] = {}
+
+
+class Unusable(GridsecError):
+    """Files or folders that a command was given cannot be used; with all that is wrong with them."""
+
+
+def see(
+    *,
+    folders: Given = NONE,
+    new: Given = NONE,
+    files: Given = NONE,
+    replaced: Given = NONE,
+    read: Given = NONE,
+) -> None:
+    """Refuse, all at once, what could not be read or written after the work. Nothing is left behind.
+
+    Parameters
+    ----------
+    folders
+        Into which tables or figures are written; made where they do not exist.
+    new
+        Folders that must not be there yet, or be empty.
+    files
+        That are written as they are; folders above them are made.
+    replaced
+        Files that are replaced as a whole, by others made beside them.
+    read
+        Files that are read.
+
+    Raises
+    ------
+    Unusable
+        If there is something that cannot be used.
+    """
+    written = {**folders, **new, **files, **replaced}
+    checks: list[tuple[Given, Callable[[Path], str | None]]] = [
+        (folders, _folder),
+        (new, _new),
+        (files, _file),
+        (replaced, _replaced),
+        (read, _read),
+    ]
+    problems = [
+        f"{option} {path}: {why}"
+        for given, check in checks
+        for option, path in given.items()
+        if path is not None and (why := _why(check, path))
+    ]
+    problems += _same({**written, **read}, {*files, *replaced})
+    if problems:
+        raise Unusable("\n".join(problems))
+
+
+def _why(check: Callable[[Path], str | None], path: Path) -> str | None:
+    try:
+        return check(path)
+    except OSError as error:
+        return error.strerror or str(error)
+
+
+def _folder(path: Path) -> str | None:
+    if path.exists() and not path.is_dir():
+        return "a file; expected a folder"
+    if path.is_symlink() and not path.exists():
+        return "a link to what does not exist; expected a folder"
+    return A_FEEDER if is_feeder(path) else _room(path)
+
+
+def _new(path: Path) -> str | None:
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        return "already there; expected a new folder"
+    return _room(path)
+
+
+def _file(path: Path) -> str | None:
+    if not path.exists():
+        return _room(path)
+    if path.is_dir():
+        return "a folder; expected a file"
+    with path.open("ab"):
+        return None
+
+
+def _replaced(path: Path) -> str | None:
+    return "a folder; expected a file" if path.is_dir() else _room(path.parent)
+
+
+def _read(path: Path) -> str | None:
+    if not path.exists():
+        return "there is no such file"
+    if path.is_dir():
+        return "a folder; expected a file"
+    with path.open("rb"):
+        return None
+
+
+def _room(path: Path) -> str | None:
+    """Why nothing can be made in a folder, or in one that is made for it."""
+    above = path.absolute()
+    there = next(each for each in (above, *above.parents) if each.exists())
+    if not there.is_dir():
+        return f"{there} is a file"
+    try:
+        with tempfile.TemporaryFile(dir=there):
+            return None
+    except OSError as error:
+        return f"{there} cannot be written: {error.strerror or error}"
+
+
+def _same(given: Given, files: set[str]) -> Iterator[str]:
+    """Files that something else is written into, or read from, as well."""
+    where = {option: Path(os.path.realpath(path)) for option, path in given.items() if path is not None}
+    told = set[frozenset[str]]()
+    for one, other in permutations(where, 2):
+        if one not in files or where[one] not in {where[other], *where[other].parents}:
+            continue
+        if frozenset((one, other)) not in told:
+            told.add(frozenset((one, other)))
+            yield f"{one} {given[one]}: {other} needs it as well"
