@@ -49,6 +49,14 @@ CARRIED: Final = {
 }
 """Tables that are told about row by row."""
 
+MEASURE: Final = "every customer has a meter of the feeder's own kind instead"
+UNLIKE: Final = "has no place in a feeder; the check shows what that does"
+NOTED: Final = {
+    "transformer_tap_regulator": "taps stand as the file has them",
+    "fault": "not part of a power flow",
+}
+"""Tables without a place in the network, and what a feeder does without them."""
+
 STATUS: Final = ("status", "from_status", "to_status", "status_1", "status_2", "status_3")
 TOLERANCES: Final = (1e-11, 1e-9, 1e-7)
 """Largest voltage corrections of the last Newton step, pu; links, almost short circuits, limit them."""
@@ -391,16 +399,13 @@ def _shunts(tables: Tables, solved: Tables, network: Network) -> None:
 
 
 def _rest(tables: Tables, network: Network) -> None:
-    """Name the tables that say nothing about the network itself."""
+    """Name the sources that feed nothing, and the tables that say nothing about the network itself."""
+    for row in _rows(tables, "source"):
+        if not row["status"]:
+            off = Change(f"source {row['id']}", WHOLE, "left out", "switched off in the source")
+            network.of_bus.append((str(row["node"]), off))
     for kind, rows in tables.items():
         if not len(rows) or kind in CARRIED:
             continue
-        if kind.endswith("_sensor"):
-            effect = "every customer has a meter of the feeder's own kind instead"
-        elif kind == "transformer_tap_regulator":
-            effect = "taps stand as the file has them"
-        elif kind == "fault":
-            effect = "not part of a power flow"
-        else:
-            effect = "has no place in a feeder; the check shows what that does"
+        effect = MEASURE if kind.endswith("_sensor") else NOTED.get(kind, UNLIKE)
         network.changes.append(Change(f"{len(rows)} {kind}(s)", WHOLE, "left out", effect))
