@@ -341,6 +341,7 @@ def write_csv(rows: Iterable[Row], path: Path) -> None:
     path
         The file.
     """
+    path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, [each.name for each in fields(Row)])
         writer.writeheader()

@@ -16,6 +16,8 @@ from service import console
 from service.cli_campaign import LoadErrorKvar, LoadErrorKw, MetersAs
 from service.console import Studied
 from service.foreign import converted
+from service.keeping import JournalAt, Keeping, NoJournal, keeping
+from service.places import see
 
 if TYPE_CHECKING:
     from feeders.comparison import Plan, Row
@@ -53,6 +55,8 @@ def compare(
     csv: Csv = None,
     write: Write = None,
     workers: Workers = None,
+    journal: JournalAt = None,
+    no_journal: NoJournal = False,
 ) -> None:
     """Let all estimators watch the same simulated attacks, and tell who did what.
 
@@ -75,21 +79,22 @@ def compare(
         cases=_known(case, tuple(each.name for each in CASES), "--case"),
         workers=workers or os.cpu_count() or 1,
     )
+    see(files={"--csv": csv, "--write": write, "--journal": journal}, read={"--write": write})
     before = None if write is None else write.read_text(encoding="utf-8")
     if before is not None:
         splice(before, "")  # a document without markers is refused before the work, not after it
-    site = load(converted(feeder, None))
-    rows = _compared(site, plan)
-    _show(rows, plan)
-    if csv is not None:
-        write_csv(rows, csv)
-    if write is not None and before is not None:
-        write.write_text(
-            splice(before, f"{_told(feeder, site, plan)}\n\n{markdown(rows, plan)}"), encoding="utf-8"
-        )
+    with keeping("compare", feeder, journal, without=no_journal) as kept:
+        site = load(converted(feeder, None))
+        rows = _compared(site, plan, kept)
+        _show(rows, plan)
+        if csv is not None:
+            write_csv(rows, csv)
+        if write is not None and before is not None:
+            told = f"{_told(feeder, site, plan)}\n\n{markdown(rows, plan)}"
+            write.write_text(splice(before, told), encoding="utf-8")
 
 
-def _compared(site: Site, plan: Plan) -> list[Row]:
+def _compared(site: Site, plan: Plan, kept: Keeping) -> list[Row]:
     """Compare, and show what is being done."""
     from feeders.comparison import compare as study
 
@@ -102,7 +107,9 @@ def _compared(site: Site, plan: Plan) -> list[Row]:
         disable=not console.err.is_terminal,
     ) as bar:
         task = bar.add_task("", total=None)
-        return study(site, plan, progress=lambda what: bar.update(task, description=escape(what)))
+        return study(
+            site, plan, journal=kept, progress=lambda what: bar.update(task, description=escape(what))
+        )
 
 
 def _known(chosen: list[str] | None, known: tuple[str, ...], option: str) -> tuple[str, ...]:

@@ -18,6 +18,8 @@ from service.cli_campaign import Seed
 from service.cli_plan import BusbarUnknown, Silent, Unknown, bar
 from service.console import FAILED, Studied, complain
 from service.foreign import converted
+from service.keeping import keeping
+from service.places import see
 
 if TYPE_CHECKING:
     from service.study_report import Asked
@@ -110,15 +112,18 @@ def _make(asked: Asked, chosen: tuple[str, ...], out: Path, *, made: str, comman
     from feeders.origin import origin
     from feeders.report.book import report as make
     from feeders.report.page import About
-    from service.study_report import outcome, seeds, versions, write
+    from service.study_report import outcome, see_readings, seeds, versions, write
 
     folder = out.with_name(f"{out.stem}-files")
-    studied = converted(asked.feeder, folder)
-    site, source = load(studied), origin(studied)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    outcomes = [outcome(name, site, asked, journals=folder / "journals", bar=bar) for name in chosen]
-    about = About(made, command, versions(), seeds(chosen, asked), folder.name)
-    write(make(site, outcomes, about, source), out, folder)
+    parts = {f"--out, {name}": folder / name for name in ("figures", "tables", "journals")}
+    see(replaced={"--out": out}, folders=parts, read={"--readings": asked.readings})
+    with keeping("report", asked.feeder, folder=folder / "journals") as kept:
+        studied = converted(asked.feeder, folder)
+        site, source = load(studied), origin(studied)
+        see_readings(chosen, site, asked)
+        outcomes = [outcome(name, site, asked, kept=kept, bar=bar) for name in chosen]
+        about = About(made, command, versions(), seeds(chosen, asked), folder.name)
+        write(make(site, outcomes, about, source), out, folder)
     console.out.print(escape(f"{out}: {len(outcomes)} studies; figures and tables in {folder}"))
     failed = [each for each in outcomes if each.result is None]
     for each in failed:

@@ -65,6 +65,8 @@ class Keeping:
         Whether they stay there when the command is done.
     journals
         All that were opened, with the name of the study.
+    resumed
+        Names of studies that went on from before.
     """
 
     study: str
@@ -73,6 +75,7 @@ class Keeping:
     folder: Path | None
     stay: bool = False
     journals: list[tuple[str, Journal]] = field(default_factory=list)
+    resumed: set[str] = field(default_factory=set)
     _name: str = ""
     _warned: bool = False
 
@@ -92,6 +95,7 @@ class Keeping:
         """As `Keeper`: say where it goes on."""
         self.journals.append((self._name, journal))
         if journal.path is not None and journal.done:
+            self.resumed.add(self._name)
             console.err.print(escape(f"going on from {journal.path}, {_amount(journal)} done"))
 
     def refused(self, path: Path, why: OSError | OtherStudy | InUse) -> bool:

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
-import os
 import platform
 import shlex
 import time
@@ -18,13 +15,13 @@ from typing import TYPE_CHECKING, Final
 
 from feeders.report.book import Report
 from feeders.report.sections import Outcome, Result
-from feeders.studies.journal import OtherStudy
 from gridsec.errors import GridsecError
-from service.tables import write_tables
+from service.tables import replace_file, write_tables
 
 if TYPE_CHECKING:
     from feeders.load import Site
-    from feeders.studies.journal import Progress
+    from feeders.studies.journal import Progress, Where
+    from service.keeping import Keeping
 
 __all__ = ["STUDIES", "Asked", "Study", "outcome", "versions", "write"]
 
@@ -86,20 +83,20 @@ class Study:
         Whether it uses the seed.
     """
 
-    run: Callable[[Site, Asked, Path | None, Progress | None], Result]
+    run: Callable[[Site, Asked, Where, Progress | None], Result]
     options: Callable[[Asked], list[str]]
     what: str
     seeded: bool = False
 
 
-def _detectable(site: Site, asked: Asked, journal: Path | None, tell: Progress | None) -> Result:
+def _detectable(site: Site, asked: Asked, journal: Where, tell: Progress | None) -> Result:
     from feeders.studies.detectable import detectable, workers
 
     runner = workers(site, None if asked.workers > 1 else 1)
     return detectable(site, max_attacked=asked.max_attacked, runner=runner, journal=journal, progress=tell)
 
 
-def _protect(site: Site, asked: Asked, journal: Path | None, tell: Progress | None) -> Result:
+def _protect(site: Site, asked: Asked, journal: Where, tell: Progress | None) -> Result:
     from feeders.studies.protect import Goal, protect
 
     return protect(
@@ -114,7 +111,7 @@ def _protect(site: Site, asked: Asked, journal: Path | None, tell: Progress | No
     )
 
 
-def _redundancy(site: Site, asked: Asked, journal: Path | None, tell: Progress | None) -> Result:
+def _redundancy(site: Site, asked: Asked, journal: Where, tell: Progress | None) -> Result:
     from feeders.studies.redundancy import redundancy
 
     return redundancy(
@@ -127,14 +124,14 @@ def _redundancy(site: Site, asked: Asked, journal: Path | None, tell: Progress |
     )
 
 
-def _droop(site: Site, asked: Asked, journal: Path | None, tell: Progress | None) -> Result:
+def _droop(site: Site, asked: Asked, journal: Where, tell: Progress | None) -> Result:
     from feeders.studies.droop import DroopOptions, droop
 
     options = DroopOptions(hosting=asked.hosting)
     return droop(site, options, seed=asked.seed, journal=journal, progress=tell)
 
 
-def _calibrate(site: Site, asked: Asked, journal: Path | None, tell: Progress | None) -> Result:
+def _calibrate(site: Site, asked: Asked, journal: Where, tell: Progress | None) -> Result:
     from feeders.studies.calibrate import calibrate
 
     if asked.readings is None:
@@ -142,7 +139,7 @@ def _calibrate(site: Site, asked: Asked, journal: Path | None, tell: Progress | 
     return calibrate(site, asked.readings, journal=journal, progress=tell)
 
 
-def _campaign(site: Site, asked: Asked, journal: Path | None, tell: Progress | None) -> Result:
+def _campaign(site: Site, asked: Asked, journal: Where, tell: Progress | None) -> Result:
     from feeders.studies.campaign import campaign
     from feeders.studies.campaign_plan import Plan
     from feeders.studies.campaign_run import Here, Processes
@@ -208,7 +205,7 @@ def outcome(
     site: Site,
     asked: Asked,
     *,
-    journals: Path,
+    kept: Keeping,
     bar: Callable[[str], AbstractContextManager[Progress]],
 ) -> Outcome:
     """Run a study; whatever goes wrong with it becomes part of the report.
@@ -219,40 +216,42 @@ def outcome(
         One of STUDIES.
     site, asked
         The feeder, and what was asked.
-    journals
-        Folder in which finished work is kept.
+    kept
+        Keeps finished work.
     bar
         Shows how far it is.
     """
     study = STUDIES[name]
     words = ["gridsec", "study", name, asked.feeder, *study.options(asked)]
-    journal = journals / f"{name}-{_key(site, words)}.jsonl"
-    journals.mkdir(parents=True, exist_ok=True)
-    resumed = journal.exists() and len(journal.read_bytes().splitlines()) > 1
     start = time.perf_counter()
     found: Result | None = None
     problem = ""
     with bar(study.what) as tell:
         try:
-            found = _run(study, site, asked, journal, tell)
+            found = study.run(site, asked, kept, tell)
         except (GridsecError, ValueError) as error:
             problem = str(error)
-    return Outcome(name, found, problem, shlex.join(words), time.perf_counter() - start, resumed)
+    duration = time.perf_counter() - start
+    return Outcome(name, found, problem, shlex.join(words), duration, name in kept.resumed)
 
 
-def _run(study: Study, site: Site, asked: Asked, journal: Path, tell: Progress) -> Result:
-    """Go on from a journal; one that is another study's, of an earlier program, is laid aside."""
-    try:
-        return study.run(site, asked, journal, tell)
-    except OtherStudy:
-        journal.replace(journal.with_suffix(".other"))
-        return study.run(site, asked, journal, tell)
+def see_readings(names: Iterable[str], site: Site, asked: Asked) -> None:
+    """Refuse readings that cannot be compared with before the other studies, and not after them.
 
+    Parameters
+    ----------
+    names, site, asked
+        The studies, the feeder, and what was asked.
 
-def _key(site: Site, words: list[str]) -> str:
-    """Another feeder, other arguments or other versions need another journal."""
-    subject = json.dumps([site.digest, words[4:], versions()], sort_keys=True)
-    return hashlib.sha256(subject.encode()).hexdigest()[:12]
+    Raises
+    ------
+    RecordingInvalid
+        If they are no readings of this feeder.
+    """
+    if "calibrate" in names and asked.readings is not None:
+        from feeders.studies.calibrate_readings import frames
+
+        frames(site, asked.readings)
 
 
 def versions() -> dict[str, str]:
@@ -282,13 +281,12 @@ def write(made: Report, out: Path, folder: Path) -> None:
         If something cannot be written.
     """
     figures = folder / "figures"
+    out.parent.mkdir(parents=True, exist_ok=True)
     figures.mkdir(parents=True, exist_ok=True)
     for name, data in made.pictures.items():
         (figures / name).write_bytes(data)
     write_tables(folder / "tables", made.tables)
-    new = out.with_name(f".{out.name}.new")
-    new.write_text(made.html, encoding="utf-8")
-    os.replace(new, out)
+    replace_file(out, lambda new: new.write_text(made.html, encoding="utf-8"))
 
 
 def seeds(names: Iterable[str], asked: Asked) -> Mapping[str, int]:

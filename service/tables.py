@@ -13,7 +13,7 @@ from feeders.raw import META_FILE
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["A_FEEDER", "is_feeder", "write_tables"]
+__all__ = ["A_FEEDER", "is_feeder", "replace_file", "write_tables"]
 
 A_FEEDER: Final = "a feeder's folder; tables would replace its own files, they go into another folder"
 
@@ -58,14 +58,32 @@ def write_tables(folder: Path | None, tables: Mapping[str, pd.DataFrame]) -> Non
     for name, frame in tables.items():
         if Path(name).name != name or name in ("", ".."):
             raise ValueError(f"{name!r} is no name of a table's file")
-        _replace(folder / f"{name}.csv", partial(frame.to_csv, index=False))
-        _replace(folder / f"{name}.parquet", partial(_for_parquet(frame).to_parquet, index=False))
+        replace_file(folder / f"{name}.csv", partial(frame.to_csv, index=False))
+        replace_file(folder / f"{name}.parquet", partial(_for_parquet(frame).to_parquet, index=False))
 
 
-def _replace(path: Path, write: Callable[[Path], object]) -> None:
+def replace_file(path: Path, write: Callable[[Path], object]) -> None:
+    """Replace a file when its new content is complete; what cannot be completed leaves nothing.
+
+    Parameters
+    ----------
+    path
+        The file.
+    write
+        Writes it, into another file beside it.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written.
+    """
     new = path.with_name(f".{path.name}.new")
-    write(new)
-    os.replace(new, path)
+    try:
+        write(new)
+        os.replace(new, path)
+    except BaseException:
+        new.unlink(missing_ok=True)
+        raise
 
 
 def _for_parquet(frame: pd.DataFrame) -> pd.DataFrame:
