@@ -281,7 +281,12 @@ def _meter(given: _Given, j: int) -> dict[str, Any]:
         "customer": site.feeder.customers[customer],
         "bus": site.feeder.buses[int(site.feeder.bus[customer])],
     }
-    for suffix, count in (("_alone", 1), ("", given.max_attacked)):
+    both = ("_alone", 1), ("", given.max_attacked)
+    fits = {
+        count: largest_lie(given.worst, j, count).bound
+        for count in sorted({times * each for times in (1, 2) for _, each in both})
+    }
+    for suffix, count in both:
         hidden = furthest(given.corridors[False, count], unit, must=j)
         noticed = furthest(given.corridors[True, count], unit, must=j)
         named = max(named_size(given.rule, j, count, claims=given.claims), noticed.bound)
@@ -289,8 +294,8 @@ def _meter(given: _Given, j: int) -> dict[str, Any]:
             "hidden": hidden.size,
             "noticed": noticed.bound,
             "named": named,
-            "fits": largest_lie(given.worst, j, count).bound,
-            "identified": largest_lie(given.worst, j, 2 * count).bound,
+            "fits": fits[count],
+            "identified": fits[2 * count],
         }
         row |= {f"{name}{suffix}": float(volts_of_lie(base, size)) for name, size in sizes.items()}
     return row

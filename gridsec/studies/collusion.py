@@ -19,23 +19,24 @@ docs/theory-studies.md, section 5.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from gridsec.arrays import Floats, Ints
 
-__all__ = ["Corridor", "Shift", "corridor", "furthest"]
+__all__ = ["GAP", "WORK", "Corridor", "Shift", "corridor", "furthest"]
 
 GAP = 1e-6
 """What a set of liars has to be better by to be looked at, relative."""
+
+WORK = 2e8
+"""Entries of tests that a search may look at: beyond, the bound is what was proven until then."""
 
 # A test counts as within its bound up to this.
 _WITHIN = 1e-9
 # Sets of liars that are worked on together, and simplex steps at most for each unknown.
 _TOGETHER, _STEPS = 512, 50
-# Entries of tests that a search may look at: beyond, the bound is what was proven until then.
-_WORK = 2e8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,7 +114,7 @@ def corridor(rows: Floats, liars: int, *, reach: Floats) -> Corridor:
 _ROUNDS, _WORTH = 50, 1e-3
 
 
-def furthest(given: Corridor, along: Floats, *, must: int | None = None) -> Shift:
+def furthest(given: Corridor, along: Floats, *, must: int | None = None, work: float = WORK) -> Shift:
     """Search all sets of at most M liars.
 
     Parameters
@@ -124,8 +125,10 @@ def furthest(given: Corridor, along: Floats, *, must: int | None = None) -> Shif
         g; of several rows, whichever is moved furthest.
     must
         A meter that lies in any case.
+    work
+        Entries of tests that may be looked at.
     """
-    search = _Search(given, np.zeros(given.reach.size))
+    search = _Search(given, np.zeros(given.reach.size), work)
     for row in np.atleast_2d(along):
         search.along(row, must)
     return Shift(search.size, max(search.size * (1.0 + GAP), search.open), search.lies)
@@ -137,9 +140,9 @@ class _Search:
 
     given: Corridor
     lies: Floats
+    work: float
     size: float = 0.0
     open: float = 0.0
-    work: float = field(default=_WORK)
 
     def along(self, g: Floats, must: int | None) -> None:
         p = g.size

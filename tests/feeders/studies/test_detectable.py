@@ -8,7 +8,8 @@ import pandas as pd
 import pytest
 
 from feeders.load import load
-from feeders.studies.detectable import Detectable, detectable
+from feeders.studies.campaign_run import Here, Processes
+from feeders.studies.detectable import Detectable, detectable, workers
 from feeders.studies.rehearsal import Rehearsal, rehearse
 
 CIGRE = load("cigre-lv")
@@ -65,6 +66,17 @@ def test_an_interrupted_study_goes_on(cigre: Detectable, tmp_path: Path) -> None
     again = detectable(CIGRE, max_attacked=2, journal=journal)
     pd.testing.assert_frame_equal(again.meters, cigre.meters)
     pd.testing.assert_frame_equal(again.customers, cigre.customers)
+
+
+def test_processes_find_the_same_to_the_last_bit(cigre: Detectable) -> None:
+    found = detectable(CIGRE, max_attacked=2, runner=Processes(2))
+    pd.testing.assert_frame_equal(found.meters, cigre.meters, check_exact=True)
+    pd.testing.assert_frame_equal(found.customers, cigre.customers, check_exact=True)
+
+
+def test_few_meters_are_no_work_for_processes() -> None:
+    assert workers(CIGRE, None) == Here()
+    assert workers(CIGRE, 3) == Processes(3)
 
 
 def test_arguments_are_checked() -> None:
