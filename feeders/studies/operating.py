@@ -6,18 +6,21 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from feeders.doubts import unread
 from feeders.load import Snapshot, to_frame
 from feeders.studies.hidden import Curves
 from gridsec.arrays import Floats
 from gridsec.detect import busbar_error, reading_error
 from gridsec.network import Power, between
+from gridsec.online import Frame
+from gridsec.studies.false_powers import FalsePowers
 from gridsec.studies.lies import Box
 from gridsec.studies.patterns import from_busbar
 
 if TYPE_CHECKING:
     from feeders.load import Site
 
-__all__ = ["SHARE", "SIGMAS", "box", "squared", "volts_of_lie"]
+__all__ = ["SHARE", "SIGMAS", "box", "false_powers", "squared", "volts_of_lie"]
 
 SHARE: Final = 0.5
 """Share of its peak that every load draws where nothing else is said; nothing is generated."""
@@ -42,12 +45,43 @@ def box(site: Site, *, share: float = SHARE, curves: Curves = Curves.DEADBAND) -
     curves
         Where the inverters work; at nominal voltage that is the deadband.
     """
-    rows = site.tables.customers
-    drawn = np.array([share * (row.load_kw or 0.0) for row in rows])[site.meters]
+    frame = _frame(site, share)
+    return _box(site, curves, frame.p_error, frame.q_error)
+
+
+def false_powers(site: Site, *, share: float = SHARE, curves: Curves = Curves.DEADBAND) -> FalsePowers:
+    """The same where liars report any powers that their customers could draw or feed in.
+
+    Parameters
+    ----------
+    site, share, curves
+        As in `box`.
+    """
+    frame, silent = _frame(site, share), unread(site)
+    p, q = np.maximum(frame.p_error, silent.p_error), np.maximum(frame.q_error, silent.q_error)
+    made, owner = _box(site, curves, p, q), np.full(p.size, -1, dtype=np.intp)
+    owner[site.meters] = np.arange(site.meters.size)
+    alone = made.effect.shape[1] - 2 * p.size
+    wide, narrow = np.concatenate([p, q]), np.concatenate([frame.p_error, frame.q_error])
+    part = np.divide(narrow, wide, out=np.ones_like(wide), where=wide > 0.0)
+    return FalsePowers(
+        made,
+        np.concatenate([owner, owner, np.full(alone, -1, dtype=np.intp)]),
+        np.concatenate([part, np.ones(alone)]),
+    )
+
+
+def _frame(site: Site, share: float) -> Frame:
+    """What honest meters say."""
+    drawn = np.array([share * row.load_kw for row in site.tables.customers])[site.meters]
     nominal = site.customer_volt[site.meters]
-    frame = to_frame(
+    return to_frame(
         site, Snapshot(0.0, nominal, drawn, np.full(drawn.size, np.nan), float(site.feeder.base_volt))
     )
+
+
+def _box(site: Site, curves: Curves, p_error: Floats, q_error: Floats) -> Box:
+    """What powers, off by so much, the busbar and the meters do."""
     R, X = (between(site.feeder, power) for power in Power)
     own = site.droop.customer
     slope = site.droop.slope if curves is Curves.STEEPEST else np.zeros(own.size)
@@ -55,8 +89,8 @@ def box(site: Site, *, share: float = SHARE, curves: Curves = Curves.DEADBAND) -
     loop[:, own] += 2.0 * X[:, own] * slope
     open_loop = np.hstack(
         [
-            2.0 * R * frame.p_error,
-            2.0 * X * frame.q_error,
+            2.0 * R * p_error,
+            2.0 * X * q_error,
             busbar_error(site.accuracy, 1.0, SIGMAS) * from_busbar(site.feeder),
         ]
     )
