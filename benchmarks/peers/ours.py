@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from benchmarks.peers.answer import Answer
@@ -46,29 +48,62 @@ class Flow:
         return self.under @ (self.half * v2) if self.charges else 0.0
 
 
+class Covariance:
+    """``R diag(var_p) R^T + X diag(var_q) X^T`` between the customers, by matrices made once; O(N^2).
+
+    Of any three customers i, j, c of a tree two pairs part at the same bus. With m where i and j part,
+
+        R_ic R_jc = R_ij (R_ic + R_jc) + R_mc^2 - 2 R_ij R_mc
+
+    so that the sum over c takes two products with R, and one number for each bus m.
+    """
+
+    def __init__(self, feeder: Feeder, R: Floats, X: Floats) -> None:
+        self.R, self.X = R, X
+        on_path = np.zeros((len(feeder.buses),) * 2, dtype=np.bool_)
+        on_path[0, 0] = True
+        for k, above in enumerate(feeder.parent, 1):
+            on_path[k] = on_path[above]
+            on_path[k, k] = True
+        # The common bus that comes last is where they part.
+        paths, last = on_path[feeder.bus], len(feeder.buses) - 1
+        self.part = last - np.argmax((paths[:, None] & paths)[:, :, ::-1], axis=2)
+        everywhere = replace(feeder, bus=np.arange(last + 1), customers=feeder.buses)
+        model = lindistflow(everywhere)
+        at_bus = [2.0 * each for each in (model.R, model.X)]
+        self.of_bus = np.hstack(
+            [(each**2 - 2.0 * each.diagonal()[:, None] * each)[:, feeder.bus] for each in at_bus]
+        )
+
+    def __call__(self, var_p: Floats, var_q: Floats, busbar: float) -> Floats:
+        """(N, N); `busbar` is the variance of the squared busbar voltage."""
+        alone = self.R * (self.R @ var_p)[:, None] + self.X * (self.X @ var_q)[:, None]
+        together = self.of_bus @ np.concatenate([var_p, var_q]) + busbar
+        K = together.take(self.part)
+        K += alone
+        K += alone.T
+        return K
+
+
 class Ours:
-    """One feeder, prepared once."""
+    """One feeder, prepared once: matrices of the feeder, nothing of any reading or its noise."""
 
     def __init__(self, here: Scene, lies: Lies | None = None, *, false_powers: bool = True) -> None:
         self.flow, model = Flow(here.feeder), lindistflow(here.feeder)
         self.lies = Lies() if lies is None else lies
         self.R, self.X = (np.ascontiguousarray(2.0 * each) for each in (model.R, model.X))
+        self.covariance = Covariance(here.feeder, self.R, self.X)
         self.false_powers = false_powers
         self.live = np.ones(len(self.R), dtype=np.bool_)
         self.buses = np.arange(len(self.R))
-        self.spread = np.empty((len(self.R), 2 * len(self.R)))
 
     def __call__(self, told: Reading) -> Answer:
         """One snapshot."""
-        v, v0, p, q = told.v, told.v0, told.p, told.q
-        R, X, spread = self.R, self.X, self.spread
-        np.multiply(R, told.std_p, out=spread[:, : v.size])
-        np.multiply(X, told.std_q, out=spread[:, v.size :])
-        K = spread @ spread.T
-        K += (2.0 * v0 * told.std_v) ** 2
+        v, v0, p, q, R, X = told.v, told.v0, told.p, told.q, self.R, self.X
+        var_p, var_q = told.std_p**2, told.std_q**2
+        K = self.covariance(var_p, var_q, (2.0 * v0 * told.std_v) ** 2)
         known = Prior(K, self.buses, K.diagonal())
         noise, v2 = (2.0 * v * told.std_v) ** 2, v**2
-        var_p, var_q = told.std_p**2, told.std_q**2
         # False powers are most of what is claimed.
         false = FalsePowers(R, X, np.abs(p), np.abs(q)) if self.false_powers else None
 

@@ -13,23 +13,24 @@ move more than a lying one contradicts the story. So whose load it is says who l
 choice of one of p customers, not that of |L| of p meters; other sets do not tell stories.
 With ``Q = K^-1`` and ``z = Q m`` of the same explanation without liars,
 
-    J(L, C) - J({}) = ln det(I + C_L Q_LL) - z_L^T (I + C_L Q_LL)^-1 C_L z_L + price
+    J(L, C) - J({}) = ln det C_L + ln det(C_L^-1 + Q_LL) - z_L^T (C_L^-1 + Q_LL)^-1 z_L + price
 
-Sets of the same size are judged at once.
+Sets of the same size are judged at once. No lies, whatever their shape, explain more than
+``z_L^T Q_LL^-1 z_L``: where even that leaves a set far behind the best, nobody asks for its stories.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 from scipy.special import binom
 
-from gridsec.arrays import Bools, Floats, Ints
-from gridsec.sequential.rises import Problem, State
+from gridsec.arrays import Bools, Floats, Ints, frozen, submatrix
+from gridsec.sequential.rises import Lies, Problem, State
 
 __all__ = ["MOST", "Set", "alike", "worth"]
 
@@ -48,6 +49,8 @@ _PLAIN = 2
 _LIKE, _UNUSUAL = 0.5, 2.0
 # Loads this much alike, as a part, are felt alike.
 _SAME = 1e-9
+# Pivots are positive; rounding may make them less.
+_TINY = float(np.finfo(np.float64).tiny)
 
 
 Ranked = list[tuple[float, State]]
@@ -85,14 +88,20 @@ class _Base:
         for j in np.flatnonzero(at.liars).tolist():
             problem.toggle(honest, j)
         # Linearised about the likeliest of them.
-        self.Q, self.z = honest.Q, honest.Q @ m
+        self.Q, self.z, self.diagonal = honest.Q, honest.times(m), honest.diagonal
         self.nobody = float(m @ self.z) + honest.logdet + problem.lies.false * at.counts[1]
         self.known: dict[tuple[int, ...], tuple[float, int]] = {}
         self.told: dict[tuple[int, ...], Set] = {}
         self.felt: dict[int, Floats] = {}
 
+    @property
+    def limit(self) -> float:
+        """What costs more neither is reported nor gone on from."""
+        lowest = min((cost for cost, _ in self.known.values()), default=np.inf)
+        return float(lowest + max(_NEAR, 2.0 * np.log(self.problem.lies.like)))
+
     def costs(self, sets: Iterable[tuple[int, ...]]) -> None:
-        """Learn J of some sets, and the likeliest shape of each."""
+        """Learn J of some sets, and the likeliest shape of each; of hopeless ones a bound of it."""
         by_size: dict[int, list[tuple[int, ...]]] = {}
         for each in sets:
             if each not in self.known:
@@ -102,13 +111,24 @@ class _Base:
                 self.known[()] = (self.nobody, 0)
                 continue
             L = np.array(some)
-            J = self._judged(L, self._plain(L))[0] + self._prices(size)
-            stories = self._stories(L) if size > 1 and self.problem.false is not None else None
-            if stories is not None:
-                J = np.concatenate([J, stories], axis=1)
-            best = np.argmin(J, axis=1)
-            for each, k, cost in zip(some, best.tolist(), J.min(axis=1).tolist(), strict=True):
-                self.known[each] = (self.nobody + cost, k)
+            J, least = self._plain(L)
+            for each, cost, k in zip(some, J.min(axis=0).tolist(), J.argmin(axis=0).tolist(), strict=True):
+                self.known[each] = (cost, k)
+            if size > 1 and self.problem.false is not None:
+                # Whatever story it tells.
+                left = np.flatnonzero(least + self._chosen(size) <= self.limit)
+                if left.size:
+                    self._tell(L[left])
+
+    def _tell(self, L: Ints) -> None:
+        """What some sets cost that tell a story, where that is less."""
+        stories = self._stories(L)
+        if stories is None:
+            return
+        best, costs = np.argmin(stories, axis=1).tolist(), (self.nobody + stories.min(axis=1)).tolist()
+        for each, k, cost in zip(map(tuple, L.tolist()), best, costs, strict=True):
+            if cost < self.known[each][0]:
+                self.known[each] = (cost, _PLAIN + k)
 
     def explained(self, liars: tuple[int, ...]) -> Set:
         """All about a set whose cost is known."""
@@ -117,35 +137,37 @@ class _Base:
         cost, k = self.known[liars]
         out, lies, weights = np.zeros(self.z.size, dtype=np.bool_), np.zeros(self.z.size), self.z
         if liars:
-            L = np.array([liars])
-            C = self._plain(L)[:, k : k + 1] if k < _PLAIN else self._told_of(L, L[:, k - _PLAIN])
-            _, by = self._judged(L, C)
-            out[L[0]], lies[L[0]] = True, by[0, 0]
-            weights = self.z - self.Q[:, L[0]] @ by[0, 0]
+            L, u, shapes = np.array(liars), np.ones(len(liars)), _shapes(self.problem.lies, len(liars))
+            if k >= _PLAIN:
+                u = self._moved(L[None], L[None, k - _PLAIN])[0]
+            M = shapes.inverse[min(k, 1)] + submatrix(self.Q, L, L) * np.multiply.outer(u, u)
+            out[L], lies[L] = True, u * np.linalg.solve(M, u * self.z[L])
+            weights = self.z - lies[L] @ self.Q[L]
         self.told[liars] = Set(out, self.powers, cost, weights, lies)
         return self.told[liars]
 
-    def _plain(self, L: Ints) -> Floats:
-        """C of each set where lies are independent, and where they are all the same, (b, 1 or 2, k, k)."""
-        lies, (count, k) = self.problem.lies, L.shape
-        C = lies.size**2 * np.eye(k)[None]
-        if k > 1:
-            C = np.stack([C[0], lies.amplitude**2 * (1.0 + lies.differ**2 * np.eye(k))])
-        return np.broadcast_to(C, (count, *C.shape))
+    def _plain(self, L: Ints) -> tuple[Floats, Floats]:
+        """J of each set where lies are independent and where all are the same, (1 or 2, b).
 
-    def _prices(self, k: int) -> Floats:
-        """What both cost a set of k beside their freedom, (1 or 2,)."""
-        lies, price = self.problem.lies, float(self.problem.prices[k])
-        apart = price + lies.apart * (k - 1)
-        return np.array([apart, price + lies.pair + lies.more * (k - 2)][: min(k, _PLAIN)])
+        And no less than which it is for lies of any shape, (b,), without what the choice of the set costs.
+        """
+        k, shapes = L.shape[1], _shapes(self.problem.lies, L.shape[1])
+        gain, freedom = self._judged(L, np.ones(1), np.concatenate([shapes.inverse, np.zeros((1, k, k))]))
+        some = min(k, _PLAIN)
+        J = freedom[:some] + shapes.logdet[:some, None] - gain[:some]
+        J += (self.problem.prices[k] + shapes.price[:some] + self.nobody)[:, None]
+        return J, self.nobody + self.problem.prices[k] - gain.max(axis=0)
 
-    def _told_of(self, L: Ints, c: Ints) -> Floats:
-        """C of each set as the story of one customer, (b, 1, k, k)."""
-        lies, false = self.problem.lies, self.problem.false
+    def _chosen(self, k: int) -> float:
+        """What a story costs at least: there is one customer whose story it is, and one way to tell it."""
+        p = self.problem.size
+        return self.problem.lies.story + 2.0 * float(np.log(p / binom(p, k)))
+
+    def _moved(self, L: Ints, c: Ints) -> Floats:
+        """How far one customer's load moves each of a set, its own voltage by one, (b, k)."""
+        false = self.problem.false
         assert false is not None  # noqa: S101  # the callers have looked
-        u = false.R[L, c[:, None]] / false.R[c, c][:, None]
-        about = 1.0 + lies.differ**2 * np.eye(L.shape[1])
-        return np.asarray(lies.amplitude**2 * about * u[:, :, None] * u[:, None, :])[:, None]
+        return np.asarray(false.R[L, c[:, None]] / false.R[c, c][:, None])
 
     def _stories(self, L: Ints) -> Floats | None:
         """Rise of J with the price where each of a set is whom the story is about, (b, k); inf for none."""
@@ -167,8 +189,9 @@ class _Base:
         own = R[c, c] <= high
         ties = (R[:, c] >= low).sum(axis=0) - more - own
         choices = np.log(p * binom(ties, k - more - own)) - np.log(binom(p, k))
-        out = np.full(L.shape, np.inf)
-        J = self._judged(L[rows], self._told_of(L[rows], c))[0][:, 0]
+        out, shapes = np.full(L.shape, np.inf), _shapes(problem.lies, k)
+        gain, freedom = self._judged(L[rows], self._moved(L[rows], c).T, shapes.inverse[1:])
+        J = freedom[0] + shapes.logdet[1] - gain[0]
         out[rows, of] = J + problem.prices[k] + problem.lies.story + 2.0 * choices
         return out
 
@@ -182,13 +205,51 @@ class _Base:
             known[new] = np.partition(false.R[:, new], p - k, axis=0)[p - k]
         return np.asarray(known[c])
 
-    def _judged(self, L: Ints, C: Floats) -> tuple[Any, Any]:
-        """Rise of J without the price, (b, shapes), and the lies, (b, shapes, k)."""
-        M = C @ self.Q[L[:, :, None], L[:, None, :]][:, None]
-        M += np.eye(L.shape[1])
-        z = self.z[L][:, None]
-        by = np.linalg.solve(M, C @ z[..., None])[..., 0]
-        return np.linalg.slogdet(M)[1] - np.einsum("...k,...k", z, by), by
+    def _judged(self, L: Ints, u: Floats, inverse: Floats) -> tuple[Floats, Floats]:
+        """``z^T (C^-1 + Q_LL)^-1 z`` and ``ln det(E^-1 + U Q_LL U)`` of many sets, (s, b) each.
+
+        ``C = U E U`` with U = diag(u), (k, b), and ``E^-1`` one of `inverse`, (s, k, k). By elimination: the
+        matrix is bordered by z, and what is left in the corner is what z explains.
+        """
+        b, k = L.shape
+        T = np.empty((k + 1, k + 1, len(inverse), b))
+        at = L.T
+        T[:k, :k] = (self.Q[at[:, None], at] * u[:, None] * u)[:, :, None]
+        T[:k, :k] += inverse.transpose(1, 2, 0)[..., None]
+        T[k, :k] = T[:k, k] = (self.z[at] * u)[:, None]
+        T[k, k] = 0.0
+        for i in range(k):
+            T[i + 1 :, i + 1 :] -= T[i + 1 :, i, None] * (T[i, i + 1 :] / T[i, i])
+        return -T[k, k], np.log(np.maximum(np.einsum("iisb->isb", T)[:k], _TINY)).sum(axis=0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Shapes:
+    """E of so many lies, without the direction of a story: independent, and alike.
+
+    Attributes
+    ----------
+    inverse : (2, k, k)
+        ``E^-1``: ``1 / A^2``, and that of ``s^2 (1 1^T + d^2)``.
+    logdet : (2,)
+        ``ln det E``.
+    price : (2,)
+        What lies cost beside their freedom and the price of the set, where all are the same.
+    """
+
+    inverse: Floats
+    logdet: Floats
+    price: Floats
+
+
+@cache
+def _shapes(lies: Lies, k: int) -> _Shapes:
+    one, d2, s2 = np.eye(k), lies.differ**2, lies.amplitude**2
+    inverse = np.stack([one / lies.size**2, (one - 1.0 / (d2 + k)) / (s2 * d2)])
+    alike = k * np.log(s2) + (k - 1) * np.log(d2) + np.log(d2 + k)
+    logdet = np.array([2.0 * k * np.log(lies.size), alike])
+    price = np.array([lies.apart * (k - 1), lies.pair + lies.more * (k - 2)])
+    return _Shapes(frozen(inverse), frozen(logdet), frozen(price))
 
 
 def worth(problem: Problem, ranked: Ranked) -> bool:
@@ -206,7 +267,7 @@ def worth(problem: Problem, ranked: Ranked) -> bool:
     count = best.counts[0]
     if not 0 < count <= MOST:
         return False
-    if ((best.g**2 > least(problem, count + 1) * best.Q.diagonal()) & ~best.liars).any():
+    if ((best.g**2 > least(problem, count + 1) * best.diagonal) & ~best.liars).any():
         return True
     if count > 1 and (problem.meters(best)[best.liars] <= _WORSE).any():
         return True
@@ -217,9 +278,9 @@ def worth(problem: Problem, ranked: Ranked) -> bool:
 
 def _like_all(problem: Problem, best: State) -> bool:
     """Whether somebody else reads about as far off as the liars do on average."""
-    others = np.flatnonzero((best.g**2 > _UNUSUAL * best.Q.diagonal()) & ~best.liars)
+    others = np.flatnonzero((best.g**2 > _UNUSUAL * best.diagonal) & ~best.liars)
     expected = problem.a2 * float(best.g[best.liars].mean())
-    off = best.g[others] / best.Q[others, others]
+    off = best.g[others] / best.diagonal[others]
     return bool((off * expected >= _LIKE * expected**2).any())
 
 
@@ -232,14 +293,14 @@ def _continued(problem: Problem, best: State) -> bool:
     # Several tell a story already, and one more has no choice; one alone does not.
     price = float(problem.prices[k] - problem.prices[k - 1]) - 2.0 * float(np.log((p - k + 1.0) / k))
     price += problem.lies.story if k == 2 else 0.0
-    odd = np.flatnonzero((best.g**2 > max(price, 0.0) * best.Q.diagonal()) & ~best.liars)
+    odd = np.flatnonzero((best.g**2 > max(price, 0.0) * best.diagonal) & ~best.liars)
     liars = np.flatnonzero(best.liars)
     liars = liars[R[liars, liars] > 0.0]
     if not odd.size or not liars.size:
         return False
     column = R[:, liars]
     told = column >= np.partition(column, p - k, axis=0)[p - k] * (1.0 - _SAME)
-    off = best.g[odd] / best.Q[odd, odd]
+    off = best.g[odd] / best.diagonal[odd]
     expected = column[odd] * (problem.a2 * best.g[liars] / R[liars, liars])
     like = off[:, None] * expected >= _LIKE * expected**2
     return bool((told[best.liars].all(axis=0) & (told[odd] & like).any(axis=0)).any())
@@ -293,7 +354,7 @@ def _stories(base: _Base) -> Iterator[tuple[int, ...]]:
     """Stories about one of the likeliest liars, about as long as that explanation."""
     if base.problem.false is None:
         return
-    R, size = base.problem.false.R, base.z**2 / base.Q.diagonal()
+    R, size = base.problem.false.R, base.z**2 / base.diagonal
     liars = min(base.known, key=lambda each: base.known[each][0])
     for c in (c for c in liars if R[c, c] > 0.0):
         felt = np.round(R[:, c] / R[c, c], 9)
@@ -305,7 +366,7 @@ def _stories(base: _Base) -> Iterator[tuple[int, ...]]:
 
 def _strongest(base: _Base) -> list[int]:
     """Meters whose readings fit worst while nobody is accused."""
-    size = base.z**2 / base.Q.diagonal()
+    size = base.z**2 / base.diagonal
     far = np.flatnonzero(size > least(base.problem, 2))
     return [int(j) for j in np.sort(far[np.argsort(-size[far])[:_PAIRED]])]
 
@@ -348,8 +409,6 @@ def _neighbours(base: _Base, at: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
 
 def _left(base: _Base, at: tuple[int, ...]) -> Floats:
     """Variance of the weights of an explanation, (p,): the diagonal of its Q, its liars left out."""
-    L = list(at)
-    QL = base.Q[:, L]
-    return np.asarray(
-        base.Q.diagonal() - np.einsum("jk,jk->j", QL, np.linalg.solve(base.Q[np.ix_(L, L)], QL.T).T)
-    )
+    L = np.array(at)
+    Q = base.Q[L]
+    return np.asarray(base.diagonal - np.einsum("kj,kj->j", Q, np.linalg.solve(Q[:, L], Q)))

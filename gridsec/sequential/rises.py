@@ -10,11 +10,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
+from math import log
 
 import numpy as np
 from scipy.special import chdtri, ndtri
 
-from gridsec.arrays import Bools, Floats, Ints, frozen
+from gridsec.arrays import Bools, Floats, Ints, frozen, submatrix
 
 # Determinants are positive; rounding may make them less.
 _TINY = float(np.finfo(np.float64).tiny)
@@ -88,33 +89,68 @@ class FalsePowers:
     q: Floats
 
     def columns(self, who: Ints) -> Floats:
-        """B of some customers, (p, k, 2)."""
-        B = np.empty((len(self.R), who.size, 2))
-        np.multiply(self.R[:, who], self.p[who], out=B[:, :, 0])
-        np.multiply(self.X[:, who], self.q[who], out=B[:, :, 1])
+        """B of some customers, (2, k, p)."""
+        B = np.empty((2, who.size, len(self.R)))
+        np.multiply(self.R[:, who].T, self.p[who, None], out=B[0])
+        np.multiply(self.X[:, who].T, self.q[who, None], out=B[1])
         return B
 
     def of(self, live: Ints) -> FalsePowers:
         """For some of the meters alone."""
-        both = np.ix_(live, live)
-        return FalsePowers(self.R[both], self.X[both], self.p[live], self.q[live])
+        R, X = (submatrix(each, live, live) for each in (self.R, self.X))
+        return FalsePowers(R, X, self.p[live], self.q[live])
 
 
 @dataclass(slots=True, eq=False)
 class State:
-    """An explanation under way: L, F and what follows from them."""
+    """An explanation under way: L, F and what follows from them. p meters.
+
+    Q itself is never needed: every change takes a matrix of rank one off it,
+
+        Q = W^T W - V^T U
+
+    so that a change costs O(p) beside one product with Q, and a copy almost nothing.
+
+    Attributes
+    ----------
+    liars, powers : (p,)
+        L and F.
+    m : (p,)
+        Readings minus what the model explains.
+    W : (p, p)
+        Whitens the readings where nobody lies.
+    g, diagonal : (p,)
+        ``Q m``, and the diagonal of Q.
+    logdet
+        ``ln det K`` beside that of nobody.
+    fit
+        ``m^T Q m``.
+    U, V : (r, p)
+        What was taken off; each row of V is the same of U times a number.
+    """
 
     liars: Bools
     powers: Bools
     m: Floats
-    Q: Floats
+    W: Floats
     g: Floats
+    diagonal: Floats
     logdet: float
     fit: float
+    U: Floats
+    V: Floats
+
+    @classmethod
+    def nobody(cls, m: Floats, W: Floats) -> State:
+        """Everybody is believed."""
+        none, white = np.zeros(m.size, dtype=np.bool_), W @ m
+        diagonal, nothing = np.einsum("ij,ij->j", W, W), np.empty((0, m.size))
+        fit = float(white @ white)
+        return cls(none, none.copy(), m, W, white @ W, diagonal, 0.0, fit, nothing, nothing)
 
     def copy(self) -> State:
         """A state that can be changed without changing this one."""
-        return replace(self, liars=self.liars.copy(), powers=self.powers.copy(), Q=self.Q.copy())
+        return replace(self, liars=self.liars.copy(), powers=self.powers.copy())
 
     @property
     def key(self) -> bytes:
@@ -126,24 +162,47 @@ class State:
         """|L| and |F|."""
         return int(np.count_nonzero(self.liars)), int(np.count_nonzero(self.powers))
 
+    @property
+    def Q(self) -> Floats:  # noqa: N802  # its name in the theory
+        """Inverse covariance of the readings, (p, p)."""
+        return np.asarray(self.W.T @ self.W - self.V.T @ self.U)
+
+    def times(self, x: Floats) -> Floats:
+        """Q x, (p,)."""
+        return np.asarray((self.W @ x) @ self.W - (self.V @ x) @ self.U)
+
+    def column(self, j: int) -> Floats:
+        """Q e_j, (p,)."""
+        return np.asarray(self.W[:, j] @ self.W - self.V[:, j] @ self.U)
+
+    def change(self, q: Floats, delta: float, u_q: float, u_g: float) -> None:
+        """Add ``delta u u^T`` to K, by q = Q u, ``u^T q`` and ``u^T g``."""
+        pivot = max(1.0 + delta * u_q, _TINY)
+        by = q * (delta / pivot)
+        self.fit -= delta * u_g**2 / pivot
+        self.logdet += log(pivot)
+        self.g = self.g - u_g * by
+        self.diagonal = self.diagonal - by * q
+        self.U, self.V = np.concatenate((self.U, q[None])), np.concatenate((self.V, by[None]))
+
 
 class Problem:
     """Readings, and what may be wrong with them."""
 
-    def __init__(
-        self, lies: Lies, diagonal: Floats, false: FalsePowers | None, curved: Curved | None
-    ) -> None:
+    def __init__(self, lies: Lies, start: State, false: FalsePowers | None, curved: Curved | None) -> None:
         self.lies, self.false, self.curved = lies, false, curved
-        self.size = p = diagonal.size
-        self.a2 = lies.size**2
-        self.prices = _prices(p, *lies.seen) + lies.each * np.arange(p + 1)
+        diagonal, self.W = start.diagonal, start.W
+        self.size, self.a2 = diagonal.size, lies.size**2
+        # Of customers that were asked about: B, and what follows from it while everybody is believed.
+        self.known: dict[int, tuple[Floats, Floats, Floats]] = {}
+        prices, least, self.rare = _charges(lies, self.size)
         # The meter that the others know least well is accused for the least freedom.
-        least = ndtri(lies.rate * (1.0 - _OF_PAIRS) / (2.0 * p)) ** 2 - self.prices[1]
-        self.prices[1:] += max(0.0, float(least - np.log1p(self.a2 * diagonal.min())))
-        self.rare = float(chdtri(3, lies.rate * _OF_PAIRS / p))
+        anybody = max(0.0, least - float(prices[1]) - float(np.log1p(self.a2 * diagonal.min())))
+        self.prices = prices + anybody
+        self.prices[0] = 0.0
 
     def quiet(self, g: Floats, diagonal: Floats) -> bool:
-        """Whether nobody would be accused or doubted, from the diagonal of Q alone."""
+        """Whether nobody would be accused or doubted."""
         pivot = 1.0 + self.a2 * diagonal
         accused = self.a2 * g**2 / pivot > np.log(pivot) + self.prices[1]
         return not (accused.any() or (self.false is not None and suspicious(g, diagonal).any()))
@@ -158,45 +217,63 @@ class Problem:
 
     def meters(self, at: State) -> Floats:
         """Rise of J by accusing each meter, or by trusting it again, (p,)."""
-        on = at.liars
-        delta = np.where(on, -self.a2, self.a2)
-        pivot = np.maximum(1.0 + delta * at.Q.diagonal(), _TINY)
         k, _ = at.counts
         now = self.prices[k]
-        more, less = self.prices[min(k + 1, self.size)] - now, self.prices[max(k - 1, 0)] - now
-        rise = np.log(pivot) - delta * at.g**2 / pivot + np.where(on, less, more)
-        # Powers are false only where the meter lies.
-        return np.where(at.powers, np.inf, rise)
+        pivot = 1.0 + self.a2 * at.diagonal
+        rise = np.log(pivot) - self.a2 * at.g**2 / pivot + (self.prices[min(k + 1, self.size)] - now)
+        if k:
+            on = np.flatnonzero(at.liars)
+            pivot = np.maximum(1.0 - self.a2 * at.diagonal[on], _TINY)
+            less = np.log(pivot) + self.a2 * at.g[on] ** 2 / pivot + (self.prices[k - 1] - now)
+            # Powers are false only where the meter lies.
+            rise[on] = np.where(at.powers[on], np.inf, less)
+        return np.asarray(rise)
 
     def pairs(self, at: State, who: Ints) -> tuple[Floats, Floats]:
         """Rise of J by false powers of some customers, and how much they explain, (k,) each.
 
         Their meters are accused with them where they are trusted.
         """
-        QB, M, h = self._against(at, who)
-        # The meter first, which changes Q and g by rank one; then its customer's powers.
-        own = np.where(at.liars[who], 0.0, self.a2)
-        pivot = 1.0 + own * at.Q[who, who]
-        row, g, by = QB[who, np.arange(who.size)], at.g[who], own / pivot
-        M -= by[:, None, None] * row[:, :, None] * row[:, None]
-        det, gain = _by_two(M, h - (by * g)[:, None] * row, 1.0)
         k, _ = at.counts
-        more = np.where(at.liars[who], 0.0, self.prices[min(k + 1, self.size)] - self.prices[k])
-        gain += by * g**2
-        rise = np.log(pivot * det) - gain + more + self.lies.false
-        return np.where(at.powers[who], np.inf, rise), gain
+        accused = float(self.prices[min(k + 1, self.size)] - self.prices[k])
+        out = np.empty((2, who.size))
+        # Few are asked about: numbers are faster than short arrays.
+        for n, c in enumerate(who.tolist()):
+            (a, b, d), (s, t), (h, i) = self._against(at, c)
+            pivot, rise, gain = 1.0, self.lies.false, 0.0
+            if not at.liars[c]:
+                # The meter first, which changes Q and g by rank one; then its customer's powers.
+                g, pivot = float(at.g[c]), 1.0 + self.a2 * float(at.diagonal[c])
+                by = self.a2 / pivot
+                a, b, d = a - by * s * s, b - by * s * t, d - by * t * t
+                h, i = h - by * g * s, i - by * g * t
+                rise, gain = rise + accused, by * g * g
+            det, more = _by_two(a + 1.0, b, d + 1.0, h, i)
+            gain += more
+            out[:, n] = np.inf if at.powers[c] else log(pivot * det) - gain + rise, gain
+        return out[0], out[1]
 
     def believed(self, at: State, who: Ints) -> Floats:
         """Rise of J by believing the powers of some customers again, (k,)."""
-        _, M, h = self._against(at, who)
-        det, gain = _by_two(M, h, -1.0)
-        return np.log(det) - gain - self.lies.false
+        out = np.empty(who.size)
+        for n, c in enumerate(who.tolist()):
+            (a, b, d), _, (h, i) = self._against(at, c)
+            det, gain = _by_two(a - 1.0, b, d - 1.0, h, i)
+            out[n] = log(det) - gain - self.lies.false
+        return out
 
-    def _against(self, at: State, who: Ints) -> tuple[Floats, Floats, Floats]:
-        """Q B, B^T Q B and B^T g of some customers."""
-        B = self._columns(who)
-        QB = (at.Q @ B.reshape(self.size, -1)).reshape(B.shape)
-        return QB, np.einsum("jci,jck->cik", B, QB), (at.g @ B.reshape(self.size, -1)).reshape(-1, 2)
+    def _against(self, at: State, c: int) -> tuple[list[float], list[float], list[float]]:
+        """``B^T Q B``, its three numbers, ``e^T Q B`` of the customer's own meter, and ``B^T g``."""
+        if c not in self.known:
+            B = self._columns(np.array([c]))[:, 0]
+            white = B @ self.W.T
+            self.known[c] = B, white @ white.T, white @ self.W[:, c]
+        B, M, own = self.known[c]
+        if len(at.U):
+            off, by = at.U @ B.T, B @ at.V.T
+            M, own = M - by @ off, own - by @ at.U[:, c]
+        (a, b), (_, d) = M.tolist()
+        return [a, b, d], own.tolist(), (B @ at.g).tolist()
 
     def _columns(self, who: Ints) -> Floats:
         if self.false is None:
@@ -209,38 +286,32 @@ class Problem:
             return
         for _ in range(_PASSES):
             at.m = self.curved(at.g, at.powers)
-            at.g = at.Q @ at.m
+            at.g = at.times(at.m)
         at.fit = float(at.m @ at.g)
 
     def toggle(self, at: State, j: int) -> None:
         """Accuse a meter, or trust it again."""
-        delta = -self.a2 if at.liars[j] else self.a2
-        q = at.Q[:, j].copy()
-        pivot = max(1.0 + delta * q[j], _TINY)
-        at.fit -= delta * at.g[j] ** 2 / pivot
-        at.logdet += float(np.log(pivot))
-        at.g = at.g - q * (delta * at.g[j] / pivot)
-        at.Q -= np.multiply.outer(q, q * (delta / pivot))
+        at.change(at.column(j), -self.a2 if at.liars[j] else self.a2, float(at.diagonal[j]), float(at.g[j]))
         at.liars[j] = not at.liars[j]
 
     def powers(self, at: State, c: int, sign: float = 1.0) -> None:
         """Doubt a customer's powers, or with `sign` -1 believe them again."""
-        u = self._columns(np.array([c]))[:, 0]
-        Qu, h = at.Q @ u, u.T @ at.g
-        (a, b), (_, d) = sign * np.eye(2) + u.T @ Qu
-        det = max(a * d - b * b, _TINY)
-        inverse = np.array([[d, -b], [-b, a]]) / det
-        by = Qu @ inverse
-        at.fit -= float(h @ inverse @ h)
-        at.logdet += float(np.log(det))
-        at.g = at.g - by @ h
-        at.Q -= by @ Qu.T
+        for u in self._columns(np.array([c]))[:, 0]:
+            q = at.times(u)
+            at.change(q, sign, float(u @ q), float(u @ at.g))
         at.powers[c] = sign > 0
 
 
 @cache
+def _charges(lies: Lies, meters: int) -> tuple[Floats, float, float]:
+    """What naming 0, 1, 2, … of so many meters costs, and what evidence is rare of one and of a pair."""
+    prices = frozen(_prices(meters, *lies.seen) + lies.each * np.arange(meters + 1))
+    least = float(ndtri(lies.rate * (1.0 - _OF_PAIRS) / (2.0 * meters)) ** 2)
+    return prices, least, float(chdtri(3, lies.rate * _OF_PAIRS / meters))
+
+
 def _prices(meters: int, liars: float, honest: float) -> Floats:
-    """What naming 0, 1, 2, … of so many meters costs, but always rising."""
+    """The same by the prior over sets alone, but always rising."""
     k = np.arange(meters)
     each = np.maximum(2.0 * np.log((meters - 1 - k + honest) / (k + liars)), 0.0)
     return frozen(np.concatenate([[0.0], np.cumsum(each)]))
@@ -251,8 +322,7 @@ def suspicious(g: Floats, diagonal: Floats) -> Bools:
     return np.asarray(g**2 > _SUSPICIOUS**2 * diagonal)
 
 
-def _by_two(M: Floats, h: Floats, sign: float) -> tuple[Floats, Floats]:
-    """``det(sign I + M)`` and ``h^T (sign I + M)^-1 h`` of many, (k, 2, 2) and (k, 2)."""
-    a, b, c = M[:, 0, 0] + sign, M[:, 0, 1], M[:, 1, 1] + sign
-    det = np.maximum(a * c - b * b, _TINY)
-    return det, (c * h[:, 0] ** 2 - 2.0 * b * h[:, 0] * h[:, 1] + a * h[:, 1] ** 2) / det
+def _by_two(a: float, b: float, d: float, h: float, i: float) -> tuple[float, float]:
+    """Determinant of ``[[a, b], [b, d]]``, and ``[h, i]`` times its inverse times ``[h, i]``."""
+    det = max(a * d - b * b, _TINY)
+    return det, (d * h * h - 2.0 * b * h * i + a * i * i) / det

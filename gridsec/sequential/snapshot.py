@@ -128,16 +128,10 @@ def identify(
         d, y, K = noise[at], m[at], submatrix(prior.of_meters, prior.meters[at], at)
         false = None if false is None else false.of(at)
     K.ravel()[:: d.size + 1] += d
-    W = _whitening(K)
-    white = W @ y
-    g, diagonal = white @ W, np.einsum("ij,ij->j", W, W)
-    problem = Problem(lies, diagonal, false, curved)
-    none = np.zeros(d.size, dtype=np.bool_)
-    start = State(none, none.copy(), y, W, g, 0.0, float(white @ white))
-    if problem.quiet(g, diagonal):
-        return _reported(problem, [start], live, lies)
-    start.Q = W.T @ W
-    found = _explanations(problem, start, false is not None)
+    start = State.nobody(y, _whitening(K))
+    problem = Problem(lies, start, false, curved)
+    quiet = problem.quiet(start.g, start.diagonal)
+    found = [start] if quiet else _explanations(problem, start, false is not None)
     return _reported(problem, found, live, lies)
 
 
@@ -193,7 +187,7 @@ def _doubtful(problem: Problem, at: State, *, anybody: bool) -> list[int]:
         rise, _ = problem.pairs(at, who)
         worth = rise < single[who]
     else:
-        who = np.flatnonzero(suspicious(at.g, at.Q.diagonal()))
+        who = np.flatnonzero(suspicious(at.g, at.diagonal))
         if not who.size:
             return []
         rise, gain = problem.pairs(at, who)

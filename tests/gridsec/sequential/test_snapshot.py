@@ -156,9 +156,8 @@ def test_who_tells_a_story_and_how_many_could(size: int, seed: int) -> None:
         on_path[k] += on_path[above[k]]
     R = on_path @ np.diag(rng.uniform(0.01, 0.05, P)) @ on_path.T
     false = FalsePowers(R, R, np.ones(P), np.ones(P))
-    problem = Problem(LIES, np.ones(P), false, None)
-    nobody = State(np.zeros(P, dtype=np.bool_), np.zeros(P, dtype=np.bool_), *([np.zeros(P)] * 4), 0.0)
-    nobody.Q = np.eye(P)
+    nobody = State.nobody(np.zeros(P), np.eye(P))
+    problem = Problem(LIES, nobody, false, None)
     base = _Base(problem, nobody, np.zeros(P))
     L = np.array(list(combinations(range(P), size)))
     found = base._stories(L)
