@@ -4,9 +4,17 @@ from __future__ import annotations
 
 import typer
 
-from service import cli_calibrate, cli_campaign, cli_compare, cli_droop, cli_plan, cli_report
+from service import cli_calibrate, cli_campaign, cli_compare, cli_droop, cli_plan, cli_report, keeping
 
-app = typer.Typer(no_args_is_help=True, help="Study feeders and estimators.")
+app = typer.Typer(no_args_is_help=True)
+
+
+@app.callback()
+def study(context: typer.Context) -> None:
+    """Study feeders and estimators."""
+    context.call_on_close(keeping.idle())
+
+
 app.command("redundancy")(cli_plan.redundancy)
 app.command("protect")(cli_plan.protect)
 app.command("detectable")(cli_plan.detectable)

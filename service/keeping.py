@@ -5,25 +5,27 @@ from __future__ import annotations
 import os
 import re
 import signal
+import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Any, Final, Never
+from typing import TYPE_CHECKING, Annotated, Any, Final, Never
 
 import typer
 from rich.markup import escape
 
-from feeders.design_cache import folder as cache_folder
-from feeders.studies.campaign_run import ClusterUnusable, WorkerLost
-from feeders.studies.journal import InUse, Journal, OtherStudy, remove
 from gridsec.errors import GridsecError
 from service import console
 from service.console import complain
 
-__all__ = ["JournalAt", "Keeping", "NoJournal", "keeping"]
+if TYPE_CHECKING:
+    from feeders.studies.journal import InUse, Journal, OtherStudy
+
+__all__ = ["JournalAt", "Keeping", "NoJournal", "idle", "keeping"]
 
 JournalAt = Annotated[
     Path | None,
@@ -36,6 +38,8 @@ JournalAt = Annotated[
 NoJournal = Annotated[
     bool, typer.Option("--no-journal", help="Keep none: an interruption loses what is done.")
 ]
+
+SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 
 MOST: Final = 64
 """How many journals of interrupted studies stay in the user's folder for caches."""
@@ -100,6 +104,8 @@ class Keeping:
 
     def refused(self, path: Path, why: OSError | OtherStudy | InUse) -> bool:
         """As `Keeper`: what was not asked for is no reason not to work."""
+        from feeders.studies.journal import OtherStudy
+
         if self.chosen is not None:
             raise why
         if isinstance(why, OtherStudy):
@@ -119,6 +125,8 @@ class Keeping:
         done
             Whether the command is.
         """
+        from feeders.studies.journal import remove
+
         passing = self.chosen is None and not self.stay
         for _, journal in self.journals:
             journal.close()
@@ -174,6 +182,9 @@ def keeping(
     """
     if without and journal is not None:
         raise typer.BadParameter("goes without --journal", param_hint="--no-journal")
+    from feeders.design_cache import folder as cache_folder
+    from feeders.studies.campaign_run import ClusterUnusable, WorkerLost
+
     where = None if without else folder or cache_folder() / "journals"
     kept = Keeping(study, feeder, journal, where, stay=folder is not None)
     try:
@@ -199,26 +210,40 @@ def keeping(
         _prune(where)
 
 
+def idle() -> Callable[[], object]:
+    """Let a signal end the program with one line while no work is in hand; returns what undoes that."""
+
+    def stop(number: int, _: FrameType | None) -> Never:
+        complain("interrupted; no work was in hand")
+        sys.exit(128 + number)
+
+    return partial(_handle, _handle(dict.fromkeys(SIGNALS, stop)))
+
+
 @contextmanager
 def _signals() -> Iterator[None]:
     """SIGTERM stops a command as Ctrl-C does, and whoever does that twice does not want to wait."""
 
     def stop(number: int, _: FrameType | None) -> Never:
-        for each in taken:
-            signal.signal(each, _end)
+        _handle(dict.fromkeys(SIGNALS, _end))
         raise Stopped(number)
 
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    # Who ignores a signal, as `nohup` does, goes on doing so.
-    taken = [n for n in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(n) is not signal.SIG_IGN]
-    before: dict[signal.Signals, Any] = {number: signal.signal(number, stop) for number in taken}
+    before = _handle(dict.fromkeys(SIGNALS, stop))
     try:
         yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        _handle(before)
+
+
+def _handle(handlers: Mapping[signal.Signals, Any]) -> dict[signal.Signals, Any]:
+    """Set handlers and return those before. Who ignores a signal, as `nohup` does, goes on doing so."""
+    if threading.current_thread() is not threading.main_thread():
+        return {}
+    return {
+        number: signal.signal(number, handler)
+        for number, handler in handlers.items()
+        if signal.getsignal(number) is not signal.SIG_IGN
+    }
 
 
 def _end(number: int, _: FrameType | None) -> Never:
@@ -228,6 +253,8 @@ def _end(number: int, _: FrameType | None) -> Never:
 
 def _prune(folder: Path) -> None:
     """Drop the journals that nobody has come back to for longest."""
+    from feeders.studies.journal import remove
+
     found = sorted(folder.glob("*.jsonl"), key=lambda path: path.stat().st_mtime_ns)
     for old in found[:-MOST]:
         remove(old)
