@@ -43,6 +43,9 @@ CONSTANT_POWER: Final = (
     "batchedit load..* model=1 vminpu=0.01 vlowpu=0.005 vmaxpu=10",
     "batchedit generator..* model=1 vminpu=0.01 vmaxpu=10",
 )
+UNNAMED_KV: Final = (0.208, 0.48, 12.47, 24.9, 34.5, 115.0, 230.0)
+"""Voltage bases of a circuit whose file names none."""
+
 DEAD: Final = 1e-4
 """Voltage, pu, below which nothing energises a phase: only open lines end there."""
 
@@ -144,7 +147,7 @@ def _read(dss: Any, path: Path) -> Network:
     if not dss.Basic.NumCircuits():
         raise GridsecError(f"{path}: OpenDSS finds no circuit in it; expected 'new circuit...'")
     problems: list[str] = []
-    _run(dss, SOLVER)
+    _run(dss, (*_voltage_bases(dss), *SOLVER))
     found = _solved(dss)
     if not found:
         raise GridsecError(f"{path}: OpenDSS's own power flow does not converge")
@@ -196,6 +199,13 @@ def _solved(dss: Any) -> dict[str, Phasors]:
                 v[node - 1] = complex(real, imaginary)
         volts[bus] = v
     return volts
+
+
+def _voltage_bases(dss: Any) -> tuple[str, ...]:
+    """Return what is missing where a file names its voltage bases and does not take them, as saved ones."""
+    named = set(dss.Settings.VoltageBases()) != set(UNNAMED_KV)
+    bare = any(not volt > 0 for volt in _nominal(dss, []).values())
+    return ("calcvoltagebases",) if named and bare else ()
 
 
 def _nominal(dss: Any, problems: list[str]) -> dict[str, float]:

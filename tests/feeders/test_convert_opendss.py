@@ -400,6 +400,20 @@ def test_no_circuit_and_no_file(tmp_path: Path) -> None:
         convert(str(tmp_path / "absent.dss"), tmp_path / "x")
 
 
+def test_a_circuit_as_opendss_saves_it(tmp_path: Path) -> None:
+    """It names its voltage bases there, and takes them only when it is told so."""
+    from opendssdirect import dss
+
+    engine = dss.NewContext()
+    engine.Text.Command(f'redirect "{master(tmp_path, "")}"')
+    engine.Text.Command(f'save circuit dir="{tmp_path / "saved"}"')
+    engine.Basic.ClearAll()
+    done = convert(str(tmp_path / "saved" / "Master.dss"), tmp_path / "x")
+    assert done.check is not None
+    assert done.check.exact
+    assert read(tmp_path / "x").customers[0].load_kw == 15.0
+
+
 def test_another_engine_and_the_folder_are_left_alone(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
