@@ -96,7 +96,8 @@ class Trial:
     duration_s, step_s
         Length and interval of the frames, s.
     load_error, meters
-        What nobody knows, and what meters make of the truth.
+        What nobody knows, and what meters make of the truth. No `load_error`: registers, power factors and
+        what comes and go beside them err as the feeder's files say, and frames are those of `to_frame`.
     lie
         Who lies; None: nobody.
     profile_s
@@ -111,7 +112,7 @@ class Trial:
     seed: int = 0
     duration_s: float = 120.0
     step_s: float = 1.0
-    load_error: LoadError = field(default_factory=LoadError)
+    load_error: LoadError | None = field(default_factory=LoadError)
     meters: Meters = Meters.WHITE
     lie: Lie | None = None
     profile_s: float = SUNNY_NOON_S
@@ -121,16 +122,18 @@ class Trial:
     @property
     def stated(self) -> Site:
         """The feeder whose files say what the trial does: errors of meters and loads, and the interval."""
-        meta, error = self.site.tables.meta, self.load_error
-        rows = tuple(
-            replace(row, p_std_kw=error.p_kw, q_std_kvar=error.q_kvar, p_error_percent=None)
-            if row.meter
-            else row
-            for row in self.site.tables.customers
-        )
-        load = replace(meta.load, correlation_s=error.correlation_s)
+        meta, rows, error = self.site.tables.meta, self.site.tables.customers, self.load_error
+        load, registers = meta.load, meta.meters
+        if error is not None:
+            rows = tuple(
+                replace(row, p_std_kw=error.p_kw, q_std_kvar=error.q_kvar, p_error_percent=None)
+                if row.meter
+                else row
+                for row in rows
+            )
+            load = replace(load, correlation_s=error.correlation_s)
+            registers = replace(registers, p_error_percent=0.0, p_resolution_kw=0.0)
         monitor = replace(meta.monitor, tick_s=self.step_s)
-        registers = replace(meta.meters, p_error_percent=0.0, p_resolution_kw=0.0)
         meta = replace(meta, load=load, monitor=monitor, meters=registers)
         if self.meters is not Meters.SITE:
             rows = tuple(
@@ -156,17 +159,18 @@ class Trial:
     @property
     def scenario(self) -> Scenario:
         """What is played on `stated`."""
+        error, told = self.load_error, self.site.tables.meta.load.correlation_s
         honest = Scenario(
             seed=self.seed,
             duration_s=self.duration_s,
             dt_s=self.step_s,
             profile_s=self.profile_s,
-            errors=MeterErrors(power=0.0, report_q=self.report_q),
+            errors=MeterErrors(power=1.0 if error is None else 0.0, report_q=self.report_q),
             variation=replace(
                 self.variation,
-                hidden_kw=self.load_error.p_kw,
-                hidden_kvar=self.load_error.q_kvar,
-                hidden_correlation_s=self.load_error.correlation_s,
+                hidden_kw=None if error is None else error.p_kw,
+                hidden_kvar=None if error is None else error.q_kvar,
+                hidden_correlation_s=told if error is None else error.correlation_s,
             ),
         )
         attacks, inverter_attacks = manipulations(self.site, self.lie, honest)
@@ -213,7 +217,8 @@ def frames(
     ------
     Frame, Truth
         One pair per tick. Frames hold the powers of the profiles (as falsified where the lie says so), and
-        intervals of `LoadError.half_width`, of customers with a meter; the others' are those of `to_frame`.
+        intervals of `LoadError.half_width`, of customers with a meter; the others', and all where there is
+        no `load_error`, are those of `to_frame`.
 
     Raises
     ------
@@ -231,13 +236,15 @@ def frames(
     fake_kw, fake_kvar = _fake_load(site, scenario, t)
     told = zip(demand.p_kw + fake_kw, demand.q_kvar + fake_kvar, strict=True)
     for sample, snapshot, (p_kw, q_kvar) in zip(samples, snapshots(samples), told, strict=True):
-        frame = _powers(trial, site, to_frame(site, snapshot), p_kw, q_kvar)
+        frame = to_frame(site, snapshot)
+        if trial.load_error is not None:
+            frame = _powers(trial.load_error, site, frame, p_kw, q_kvar)
         yield frame, _truth(site, scenario, sample)
 
 
-def _powers(trial: Trial, site: Site, frame: Frame, p_kw: Floats, q_kvar: Floats) -> Frame:
+def _powers(error: LoadError, site: Site, frame: Frame, p_kw: Floats, q_kvar: Floats) -> Frame:
     """The frame with powers as told; those that nobody would believe, or meters, stay what they are."""
-    base, error = site.feeder.base_kva, trial.load_error
+    base = site.feeder.base_kva
     believed = np.zeros(frame.p.size, dtype=np.bool_)
     believed[site.meters] = (np.abs(p_kw) <= site.loads.credible * base)[site.meters]
     p_error = np.full(frame.p.size, error.half_width * error.p_kw / base)

@@ -84,7 +84,8 @@ class Variation:
         There is one tap event in each interval of this length, at a random time in it, s.
     hidden_kw, hidden_kvar, hidden_correlation_s
         Standard deviations and correlation time, s, of what every customer with a meter draws beyond the
-        power that its readings show: readings that are forecasts rather than metered.
+        power that its readings show: readings that are forecasts rather than metered. None: as the feeder's
+        files say (`p_std_kw`, `q_std_kvar`), and nothing where they do not.
     """
 
     load_scale: float = 1.0
@@ -99,8 +100,8 @@ class Variation:
     busbar_unbalance_pu: float = 0.002
     tap_step_pu: float = 0.0125
     tap_interval_s: float = 7200.0
-    hidden_kw: float = 0.0
-    hidden_kvar: float = 0.0
+    hidden_kw: float | None = 0.0
+    hidden_kvar: float | None = 0.0
     hidden_correlation_s: float = 600.0
 
 
@@ -243,7 +244,9 @@ class Customers:
         self._unbalance = None
         if isinstance(site.feeder, InPhases):
             self._unbalance = Fluctuation(seed, Stream.UNBALANCE, 3, variation.busbar_correlation_s)
-        self._metered = np.array([bool(row.meter) for row in site.tables.customers])
+        rows, metered = site.tables.customers, np.array([bool(row.meter) for row in site.tables.customers])
+        self._hidden_kw = metered * _told(variation.hidden_kw, [row.p_std_kw for row in rows])
+        self._hidden_kvar = metered * _told(variation.hidden_kvar, [row.q_std_kvar for row in rows])
         self._hidden_p = Fluctuation(seed, Stream.HIDDEN_P, count, variation.hidden_correlation_s)
         self._hidden_q = Fluctuation(seed, Stream.HIDDEN_Q, count, variation.hidden_correlation_s)
 
@@ -258,10 +261,10 @@ class Customers:
 
     def hidden(self, t: Floats) -> tuple[Floats | float, Floats | float]:
         """What is drawn at times t (T,) beyond `at`, kW and kvar, (T, N) each; 0.0 where nothing is."""
-        kw, kvar = self._variation.hidden_kw, self._variation.hidden_kvar
+        kw, kvar = self._hidden_kw, self._hidden_kvar
         return (
-            kw * self._metered * self._hidden_p.at(t) if kw else 0.0,
-            kvar * self._metered * self._hidden_q.at(t) if kvar else 0.0,
+            kw * self._hidden_p.at(t) if kw.any() else 0.0,
+            kvar * self._hidden_q.at(t) if kvar.any() else 0.0,
         )
 
     def _loads(self, t: Floats) -> Floats:
@@ -315,6 +318,11 @@ class Customers:
         """When in its interval an event falls (0 to 1), and the position after it."""
         random = generator(self._seed, Stream.TAP, number)
         return float(random.random()), int(random.integers(-1, 2))
+
+
+def _told(size: float | None, files: list[float | None]) -> Floats:
+    """A standard deviation for all, or what the files say of each."""
+    return np.array([0.0 if told is None else told for told in files] if size is None else [size])
 
 
 def _curve(library: dict[str, Floats], name: str) -> Floats:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     from feeders.load import Site
     from feeders.studies.campaign import Campaign
+    from feeders.trials import LoadError
 
 __all__ = ["campaign"]
 
@@ -67,11 +68,16 @@ def campaign(_: Site, found: Campaign) -> Section:
             f"{plan.scenarios} scenarios of {plan.duration_s:g} s at {plan.step_s:g} s on days of profiles, "
             f"seed {plan.seed}; the truth is full AC power flow with the inverters in closed loop.",
             f"Watched by the {plan.estimator} monitor, set for {rate:g} false alarms a year; powers known "
-            f"within {plan.load_error.p_kw:g} kW and {plan.load_error.q_kvar:g} kvar (1 sigma); "
-            f"errors of meters: {plan.meters}.",
+            f"{_known(plan.load_error)}; errors of meters: {plan.meters}.",
             "A simulated attack is one that somebody thought of: others may fare differently.",
         ),
     )
+
+
+def _known(error: LoadError | None) -> str:
+    if error is None:
+        return "as well as the feeder's files say, of registers, power factors and customers without a meter"
+    return f"within {error.p_kw:g} kW and {error.q_kvar:g} kvar (1 sigma)"
 
 
 def _figures(found: Campaign, rate: float) -> tuple[Figure, ...]:

@@ -33,7 +33,7 @@ CLEAN: Final = "clean"
 
 
 LEARN_STEP_S: Final = 10.0
-"""Interval of the readings from which meters' fixed errors are learned, s."""
+"""Interval of the readings from which meters' fixed errors are learned, s, unless readings are rarer."""
 
 
 class Place(StrEnum):
@@ -103,6 +103,17 @@ class Kind:
         if (self.volts or self.together) and self.trick is not Trick.BIAS:
             raise ValueError(f"kind {self.name!r}: sizes in volts of each meter are for {Trick.BIAS}")
 
+    def every(self, step_s: float) -> Kind:
+        """The same where readings come every so many seconds: ages and rates are counted in readings.
+
+        Parameters
+        ----------
+        step_s
+            Interval of the readings, s.
+        """
+        factor = {Trick.REPLAY: step_s, Trick.CLOCK_SHIFT: step_s, Trick.DRIFT: 1.0 / step_s}
+        return replace(self, sizes=tuple(size * factor.get(self.trick, 1.0) for size in self.sizes))
+
 
 KINDS: Final = (
     Kind("bias", Trick.BIAS, (1.0, 2.0, 3.0, 5.0)),
@@ -159,7 +170,7 @@ class Case:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A campaign. The defaults are 160 scenarios of ten minutes.
+    """A campaign. The defaults are 160 scenarios of ten minutes; `Plan.of` takes what it can from the files.
 
     Attributes
     ----------
@@ -185,11 +196,11 @@ class Plan:
         False alarms that the estimator may raise in a year; every case is watched once for each.
     learn_s
         How long the estimator has learned its meters' fixed errors before each scene, from honest readings
-        every LEARN_STEP_S; 0: not at all.
+        every `learn_step_s`; 0: not at all.
     settings
         Other settings of the feeder's `[monitor]`, by name.
     meters, load_error, variation, report_q
-        As in `feeders.trials.Trial`.
+        As in `feeders.trials.Trial`; no `load_error`: as the feeder's files say.
     """
 
     scenes: int = 10
@@ -210,7 +221,7 @@ class Plan:
     learn_s: float = 0.0
     settings: tuple[tuple[str, float], ...] = ()
     meters: Meters = Meters.SITE
-    load_error: LoadError = field(default_factory=lambda: LoadError(0.1, 0.05))
+    load_error: LoadError | None = field(default_factory=lambda: LoadError(0.1, 0.05))
     variation: Variation = field(default_factory=Variation)
     report_q: bool = False
 
@@ -227,7 +238,10 @@ class Plan:
             ("kinds of lies need different names", len({k.name for k in self.kinds}) < len(self.kinds)),
             ("a false-alarm rate is missing or not positive", min(self.alarms_per_year, default=0.0) <= 0.0),
             ("step_s and lying_s must be positive", min(self.step_s, self.lying_s) <= 0.0),
-            (f"learn_s must be 0 or from {LEARN_STEP_S:g} s on", 0.0 != self.learn_s < LEARN_STEP_S),
+            (
+                f"learn_s must be 0 or from {self.learn_step_s:g} s on",
+                0.0 != self.learn_s < self.learn_step_s,
+            ),
             (
                 "lies must begin after the first frame and before the last",
                 not self.step_s <= self.onset_s[0] <= self.onset_s[1] <= self.duration_s - self.step_s,
@@ -240,10 +254,45 @@ class Plan:
             if wrong:
                 raise ValueError(problem)
 
+    @classmethod
+    def of(cls, site: Site, **chosen: Any) -> Plan:
+        """A campaign as the feeder's files say, but for what is chosen.
+
+        Estimator, interval of readings and false alarms are those of `[monitor]`, and powers are known as in
+        service. Times are counted in readings: where these come every second, those of `Plan()`.
+
+        Parameters
+        ----------
+        site
+            The feeder.
+        chosen
+            Attributes by name. With a `duration_s`, lies begin after 0.1 to 0.3 of it and last for half.
+        """
+        monitor, usual = site.tables.meta.monitor, cls()
+        step_s = float(chosen.get("step_s", monitor.tick_s))
+        duration_s = float(chosen.get("duration_s", usual.duration_s * step_s))
+        files: dict[str, Any] = {
+            "step_s": step_s,
+            "duration_s": duration_s,
+            "onset_s": (0.1 * duration_s, 0.3 * duration_s),
+            "lying_s": 0.5 * duration_s,
+            "settling_s": usual.settling_s * step_s,
+            "kinds": tuple(kind.every(step_s) for kind in usual.kinds),
+            "estimator": monitor.estimator,
+            "alarms_per_year": (monitor.alarms_per_year,),
+            "load_error": None,
+        }
+        return cls(**(files | chosen))
+
     @property
     def scenarios(self) -> int:
         """How many scenarios there are."""
         return self.scenes * self.together
+
+    @property
+    def learn_step_s(self) -> float:
+        """Interval of the readings from which fixed errors are learned, s."""
+        return max(LEARN_STEP_S, self.step_s)
 
     @property
     def _combined(self) -> list[tuple[Kind, float, int, Place]]:

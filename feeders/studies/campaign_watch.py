@@ -18,7 +18,7 @@ from feeders.inverters import NoEquilibrium
 from feeders.powerflow import PowerFlowDiverged
 from feeders.scenario import Scenario
 from feeders.studies.campaign_lies import attacks
-from feeders.studies.campaign_plan import CLEAN, LEARN_STEP_S, Case, Plan
+from feeders.studies.campaign_plan import CLEAN, Case, Plan
 from feeders.trials import Trial, Truth, frames
 from gridsec.arrays import Bools, Floats
 from gridsec.attack import Attack, Coordinated, Reports, apply_all, manipulated, reach
@@ -76,7 +76,7 @@ def prepare(site: Site, plan: Plan) -> Prepared:
     """
     scene = plan.trial(site, plan.moment(0))
     watchers = _designed(plan, scene.stated)
-    learners = _designed(plan, replace(scene, step_s=LEARN_STEP_S).stated) if plan.learn_s else {}
+    learners = _designed(plan, replace(scene, step_s=plan.learn_step_s).stated) if plan.learn_s else {}
     if any(watcher.learner is None for watcher in learners.values()):
         raise ValueError(f"{plan.estimator} does not learn its meters' fixed errors")
     return Prepared(site, plan, scene.stated, watchers, learners)
@@ -169,18 +169,18 @@ class _Seen:
 
 def _learned(given: Prepared, trial: Trial, honest: Scenario) -> dict[float, Commission]:
     """What estimators learn of their meters in the honest time before a scene."""
-    learn_s = given.plan.learn_s
+    learn_s, step_s = given.plan.learn_s, given.plan.learn_step_s
     # One frame more than what is asked for, and quasi-static inverters: they settle between two readings.
     before = replace(
         honest,
-        start=honest.start - learn_s - LEARN_STEP_S,
-        profile_s=honest.profile_s - learn_s - LEARN_STEP_S,
-        duration_s=learn_s + LEARN_STEP_S,
-        dt_s=LEARN_STEP_S,
-        substep_s=LEARN_STEP_S,
+        start=honest.start - learn_s - step_s,
+        profile_s=honest.profile_s - learn_s - step_s,
+        duration_s=learn_s + step_s,
+        dt_s=step_s,
+        substep_s=step_s,
     )
     states = {rate: watcher.init(before.start) for rate, watcher in given.learners.items()}
-    for frame, _ in frames(replace(trial, step_s=LEARN_STEP_S), before):
+    for frame, _ in frames(replace(trial, step_s=step_s), before):
         for rate, watcher in given.learners.items():
             states[rate], _, _ = watcher.step(states[rate], frame)
     found = {}
