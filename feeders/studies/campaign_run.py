@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import signal
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -22,6 +21,7 @@ from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]  # h
 
 from feeders.studies.journal import versions
 from gridsec.errors import GridsecError
+from gridsec.processes import deaf, listen, stop
 
 __all__ = [
     "ClusterUnusable",
@@ -111,7 +111,8 @@ class Processes:
             while waiting or running:
                 # What is worked on, and one for each to go on with: little is lost with a process.
                 while waiting and len(running) < 2 * self.count:
-                    running[pool.submit(_single, work, waiting[0])] = waiting[0]
+                    with deaf():
+                        running[pool.submit(_single, work, waiting[0])] = waiting[0]
                     waiting.popleft()
                 done = wait(running, return_when=FIRST_COMPLETED).done
                 for future in done:
@@ -122,7 +123,7 @@ class Processes:
         except BrokenProcessPool:
             pass  # while a piece was handed over; it is still waiting
         except BaseException:
-            _stop(pool)
+            stop(pool)
             raise
         pool.shutdown()
         return sorted(running.values())
@@ -142,7 +143,7 @@ def cores(count: int | None = None) -> Runner:
 
 def _begin() -> None:
     """Prepare a process: an interruption of the first one is not its own, but the end of that one is."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    listen()
     Thread(target=_follow, daemon=True).start()
 
 
@@ -158,14 +159,6 @@ def _single(work: Work, piece: int) -> Any:
     """Work on a piece in a process of its own, with one thread: only now are all libraries loaded."""
     threadpool_limits(limits=1)
     return work(piece)
-
-
-def _stop(pool: ProcessPoolExecutor) -> None:
-    """End processes at once: what they have in hand is not wanted any more."""
-    processes = list(pool._processes.values()) if pool._processes else []
-    pool.shutdown(wait=False, cancel_futures=True)
-    for process in processes:
-        process.terminate()
 
 
 @dataclass(frozen=True, slots=True)

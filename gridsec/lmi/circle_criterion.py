@@ -35,6 +35,7 @@ from gridsec.gains import (
 )
 from gridsec.lmi.solver import cvxpy_late, solver_warnings_as_status
 from gridsec.lure import Lure
+from gridsec.processes import deaf, listen, stop
 
 __all__ = ["BACKOFF", "circle", "contraction", "prove", "settle", "solve_many"]
 
@@ -227,13 +228,16 @@ def solve_many(
         count = min(workers, len(chunks))
         pool = ProcessPoolExecutor(count, mp_context=context, initializer=_one_thread)
         try:
-            jobs: dict[Future[list[CircleGains] | _Failure], Sequence[int]] = {
-                pool.submit(_solve_chunk, bare, options, group): indices for indices, group in chunks
-            }
+            with deaf():
+                jobs: dict[Future[list[CircleGains] | _Failure], Sequence[int]] = {
+                    pool.submit(_solve_chunk, bare, options, group): indices for indices, group in chunks
+                }
             for job in as_completed(jobs):
                 collect(jobs[job], job.result())
-        finally:
-            pool.shutdown(cancel_futures=True)
+        except BaseException:
+            stop(pool)
+            raise
+        pool.shutdown()
     return tuple(results[index] for index in range(len(subsets)))
 
 
@@ -262,6 +266,7 @@ def _chunks(subsets: Sequence[Sequence[int]]) -> list[tuple[list[int], list[Ints
 
 def _one_thread() -> None:
     """Pin the linear algebra of a worker; several processes with several threads each only fight."""
+    listen()
     import scipy.linalg  # noqa: F401  # loads the libraries that are to be limited
     from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]  # has no stubs
 
