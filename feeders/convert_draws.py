@@ -98,6 +98,20 @@ def is_even(power: Phasors) -> bool:
     return size > 0 and float(np.abs(power - power.mean()).max()) <= EVEN * size
 
 
+def as_it_stands(power: Phasors) -> str:
+    """Return in words what becomes of something that draws or feeds in by rules of its own.
+
+    Parameters
+    ----------
+    power : (3,)
+        What it takes from each phase at the source's operating point, kVA.
+    """
+    p, q = (round(float(part), 6) + 0.0 for part in (power.sum().real, power.sum().imag))
+    if p < 0:
+        return f"a customer that feeds in {-p:.4g} kW and draws {q:.4g} kvar in the check"
+    return f"a customer that draws {p:.4g} kW and {q:.4g} kvar"
+
+
 def customers_of(
     draws: Iterable[Draw],
     nominal: Mapping[str, float],

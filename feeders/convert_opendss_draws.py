@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from feeders.convert_changes import Change
-from feeders.convert_draws import Draw, is_even
+from feeders.convert_draws import Draw, as_it_stands, is_even
 from feeders.convert_network import Network
 from gridsec.arrays import Phasors
 
@@ -130,7 +130,7 @@ def add_draw(dss: Any, each: Element, network: Network) -> None:
         told += _sunlight(dss, each, peak)
     elif each.kind != "load":
         rating = 0.0 if each.kind in GENERATORS else None
-        told.append(Change(each.label, "control", "changed", _as_it_stands(power)))
+        told.append(Change(each.label, "control", "changed", as_it_stands(power)))
     network.of_bus.extend((bus, change) for change in told)
     phases = "".join("abc"[node - 1] for node in sorted(used))
     noun = "" if each.kind in {"load", *GENERATORS} else each.kind
@@ -159,13 +159,6 @@ def _sunlight(dss: Any, each: Element, peak: float) -> Iterator[Change]:
             f"feeds in {now:.4g} kW at this moment, as in the check; pv_kw is its rated peak of {peak:.6g}"
         )
         yield Change(each.label, f"irradiance {sun:g}", "changed", effect)
-
-
-def _as_it_stands(power: Phasors) -> str:
-    p, q = (round(float(part), 6) + 0.0 for part in (power.sum().real, power.sum().imag))
-    if p < 0:
-        return f"a customer that feeds in {-p:.4g} kW and draws {q:.4g} kvar in the check"
-    return f"a customer that draws {p:.4g} kW and {q:.4g} kvar"
 
 
 def _properties(dss: Any, each: Element) -> dict[str, str]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from feeders.convert_changes import WHOLE, Change
 from feeders.convert_customers import rounded
-from feeders.convert_draws import Draw
+from feeders.convert_draws import Draw, as_it_stands
 from feeders.convert_lines import ALL, by_sequence, capacitor, charging_cells, open_end
 from feeders.convert_network import Network
 from feeders.convert_pandapower_flow import between_phases, flow_into, phase_powers, solve, unbalanced
@@ -370,8 +370,7 @@ def _fixed(net: Any, solved: Any, buses: dict[int, str], network: Network) -> No
                 continue
             plant = table == "gen" and power.real.sum() < 0
             network.draws.append(Draw(label, bus, power, rating_kva=0.0 if plant else None, noun="customer"))
-            effect = f"a customer that draws {power.real.sum():.4g} kW and {power.imag.sum():.4g} kvar"
-            network.of_bus.append((bus, Change(label, "control", "changed", effect)))
+            network.of_bus.append((bus, Change(label, "control", "changed", as_it_stands(power))))
     for table in ("asymmetric_sgen", "sgen"):
         names = ids(net[table], table)
         for i, row in net[table].iterrows():

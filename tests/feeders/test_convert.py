@@ -198,7 +198,7 @@ def test_everything_is_carried_over_or_named() -> None:
         "connection of shunt condenser; 12 kvar",
         "conductance of shunt condenser; 1 kW",
         "left out: impedance 0",
-        "control of gen gen-0; a customer that draws -10 kW",
+        "control of gen gen-0; a customer that feeds in 10 kW",
         "control of storage storage-0; a customer that draws 1 kW",
         "line across; open towards what the busbar does not feed",
         "left out: 3 buses; above the busbar, behind a transformer or without supply",
