@@ -22,6 +22,7 @@ from gridsec.errors import DesignInfeasible, FeederInvalid, GridsecError, NotObs
 from service import cli_feeders, cli_reproduce, cli_serve, cli_study, console
 from service.cli_serve import Endpoints
 from service.console import ADDRESS, DATABASE, FAILED, FEEDER, FILE, USAGE, Feeder, complain
+from service.places import Unusable, see
 
 if TYPE_CHECKING:
     from feeders.load import Site
@@ -69,7 +70,6 @@ def exit_code(error: GridsecError) -> int:
     from feeders.recording import RecordingInvalid
     from service.app import AddressUnavailable
     from service.bus import BusUnavailable
-    from service.places import Unusable
     from service.settings import SettingsInvalid
     from service.store import StoreUnavailable
 
@@ -209,8 +209,13 @@ def simulate(
     """
     from feeders.load import load
     from feeders.meters import Channel, MeterErrors
+    from feeders.recording import record, truth_path
     from feeders.scenario import Scenario
 
+    if out is not None:
+        if not duration:
+            raise typer.BadParameter("a recording has an end", param_hint="--duration")
+        see(replaced={"--out": out, "--out, its truth": truth_path(out)})
     site = load(feeder)
     tick = dt or site.tables.meta.monitor.tick_s
     first = math.ceil(time.time() / tick) * tick if start is None else start
@@ -226,8 +231,7 @@ def simulate(
     scenario = _with_attacks(site, scenario, attack or [])
     scenario = _with_inverter_attacks(site, scenario, inverter_attack or [])
     if out is not None:
-        from feeders.recording import record
-
+        out.parent.mkdir(parents=True, exist_ok=True)
         recording = record(site, scenario, out)
         console.out.print(f"{recording.path}: {recording.count} readings of {site.feeder.name}")
         return

@@ -15,6 +15,7 @@ from rich.table import Table
 from gridsec.errors import FeederInvalid
 from service.console import FEEDER, Feeder, complain, err, out
 from service.foreign import show_check
+from service.places import see
 
 if TYPE_CHECKING:
     from feeders.convert import Conversion
@@ -176,6 +177,7 @@ def convert(
     """
     from feeders.convert import convert as run
 
+    see(over={"FOLDER": folder})
     done = run(
         source,
         folder,

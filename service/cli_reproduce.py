@@ -14,6 +14,7 @@ from rich.table import Table
 
 from service import console
 from service.console import FAILED, complain
+from service.places import see
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -39,6 +40,7 @@ def reproduce(
     papers = _chosen(paper)
     drawing = draw.available()
     if drawing:
+        see(over={"--out": out})
         out.mkdir(parents=True, exist_ok=True)
     failed: list[Claim] = []
     count = 0

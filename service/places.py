@@ -27,6 +27,7 @@ class Unusable(GridsecError):
 def see(
     *,
     folders: Given = NONE,
+    over: Given = NONE,
     new: Given = NONE,
     files: Given = NONE,
     replaced: Given = NONE,
@@ -37,7 +38,9 @@ def see(
     Parameters
     ----------
     folders
-        Into which tables or figures are written; made where they do not exist.
+        Into which tables are written; made where they do not exist.
+    over
+        Other folders into which something is written, be it over a feeder.
     new
         Folders that must not be there yet, or be empty.
     files
@@ -52,9 +55,10 @@ def see(
     Unusable
         If there is something that cannot be used.
     """
-    written = {**folders, **new, **files, **replaced}
+    written = {**folders, **over, **new, **files, **replaced}
     checks: list[tuple[Given, Callable[[Path], str | None]]] = [
         (folders, _folder),
+        (over, _over),
         (new, _new),
         (files, _file),
         (replaced, _replaced),
@@ -79,11 +83,15 @@ def _why(check: Callable[[Path], str | None], path: Path) -> str | None:
 
 
 def _folder(path: Path) -> str | None:
+    return _over(path) or (A_FEEDER if is_feeder(path) else None)
+
+
+def _over(path: Path) -> str | None:
     if path.exists() and not path.is_dir():
         return "a file; expected a folder"
     if path.is_symlink() and not path.exists():
         return "a link to what does not exist; expected a folder"
-    return A_FEEDER if is_feeder(path) else _room(path)
+    return _room(path)
 
 
 def _new(path: Path) -> str | None:
