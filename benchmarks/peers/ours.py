@@ -93,7 +93,8 @@ class Ours:
         self.lies = Lies() if lies is None else lies
         self.R, self.X = (np.ascontiguousarray(2.0 * each) for each in (model.R, model.X))
         self.covariance = Covariance(here.feeder, self.R, self.X)
-        self.false_powers = false_powers
+        none = np.zeros(len(self.R))
+        self.false = FalsePowers(self.R, self.X, none, none).claimed(none, none) if false_powers else None
         self.live = np.ones(len(self.R), dtype=np.bool_)
         self.buses = np.arange(len(self.R))
 
@@ -105,7 +106,7 @@ class Ours:
         known = Prior(K, self.buses, K.diagonal())
         noise, v2 = (2.0 * v * told.std_v) ** 2, v**2
         # False powers are most of what is claimed.
-        false = FalsePowers(R, X, np.abs(p), np.abs(q)) if self.false_powers else None
+        false = None if self.false is None else self.false.claimed(np.abs(p), np.abs(q))
 
         def curved(weights: Floats, powers: Bools) -> Floats:
             dp = (var_p + powers * p**2) * (weights @ R)

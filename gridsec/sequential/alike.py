@@ -15,8 +15,7 @@ With ``Q = K^-1`` and ``z = Q m`` of the same explanation without liars,
 
     J(L, C) - J({}) = ln det C_L + ln det(C_L^-1 + Q_LL) - z_L^T (C_L^-1 + Q_LL)^-1 z_L + price
 
-Sets of the same size are judged at once. No lies, whatever their shape, explain more than
-``z_L^T Q_LL^-1 z_L``: where even that leaves a set far behind the best, nobody asks for its stories.
+All shapes of many sets are judged at once.
 """
 
 from __future__ import annotations
@@ -24,18 +23,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
-from itertools import combinations
+from itertools import chain, combinations
 
 import numpy as np
 from scipy.special import binom
 
 from gridsec.arrays import Bools, Floats, Ints, frozen, submatrix
-from gridsec.sequential.rises import Lies, Problem, State
+from gridsec.sequential.rises import MOST, Lies, Problem, State
 
 __all__ = ["MOST", "Set", "alike", "worth"]
 
-# Larger sets are left as they are: what is gained is little, and there are too many of them.
-MOST = 8
 # So many sets, no more than so much worse than the best, are gone on from.
 _WIDTH, _NEAR = 2, 6.0
 _ROUNDS = 6
@@ -43,12 +40,12 @@ _ROUNDS = 6
 _WORSE = 30.0
 # Any two of so many meters may be where a search begins.
 _PAIRED = 8
-# Independent, all the same: other shapes are stories.
-_PLAIN = 2
+# Shapes of lies: independent, all the same; others are stories, by the number of the customer.
+_ALONE, _SAME = -1, -2
 # Who is not off by this part of what liars have in common, or not unusually, by the square, is none of them.
 _LIKE, _UNUSUAL = 0.5, 2.0
 # Loads this much alike, as a part, are felt alike.
-_SAME = 1e-9
+_ALIKE = 1e-9
 # Pivots are positive; rounding may make them less.
 _TINY = float(np.finfo(np.float64).tiny)
 
@@ -84,84 +81,81 @@ class _Base:
 
     def __init__(self, problem: Problem, at: State, m: Floats) -> None:
         self.problem, self.powers = problem, at.powers
-        honest = at.copy() if at.liars.any() else at
+        self.honest = honest = at.copy() if at.liars.any() else at
         for j in np.flatnonzero(at.liars).tolist():
             problem.toggle(honest, j)
         # Linearised about the likeliest of them.
-        self.Q, self.z, self.diagonal = honest.Q, honest.times(m), honest.diagonal
+        self.z, self.diagonal = honest.times(m), honest.diagonal
         self.nobody = float(m @ self.z) + honest.logdet + problem.lies.false * at.counts[1]
         self.known: dict[tuple[int, ...], tuple[float, int]] = {}
         self.told: dict[tuple[int, ...], Set] = {}
-        self.felt: dict[int, Floats] = {}
-
-    @property
-    def limit(self) -> float:
-        """What costs more neither is reported nor gone on from."""
-        lowest = min((cost for cost, _ in self.known.values()), default=np.inf)
-        return float(lowest + max(_NEAR, 2.0 * np.log(self.problem.lies.like)))
+        # Rows of Q are made where somebody asks. Place 0 is nobody, who fills up the smaller sets.
+        self.place: dict[int, int] = {}
+        self.rows, self.Q, self.at = np.empty((0, self.z.size)), np.zeros((1, 1)), np.zeros(1)
 
     def costs(self, sets: Iterable[tuple[int, ...]]) -> None:
-        """Learn J of some sets, and the likeliest shape of each; of hopeless ones a bound of it."""
-        by_size: dict[int, list[tuple[int, ...]]] = {}
-        for each in sets:
-            if each not in self.known:
-                by_size.setdefault(len(each), []).append(each)
-        for size, some in by_size.items():
-            if not size:
-                self.known[()] = (self.nobody, 0)
-                continue
-            L = np.array(some)
-            J, least = self._plain(L)
-            for each, cost, k in zip(some, J.min(axis=0).tolist(), J.argmin(axis=0).tolist(), strict=True):
-                self.known[each] = (cost, k)
-            if size > 1 and self.problem.false is not None:
-                # Whatever story it tells.
-                left = np.flatnonzero(least + self._chosen(size) <= self.limit)
-                if left.size:
-                    self._tell(L[left])
-
-    def _tell(self, L: Ints) -> None:
-        """What some sets cost that tell a story, where that is less."""
-        stories = self._stories(L)
-        if stories is None:
+        """Learn J of some sets, and the likeliest shape of each."""
+        new = [each for each in dict.fromkeys(sets) if each not in self.known]
+        if () in new:
+            new.remove(())
+            self.known[()] = self.nobody, _ALONE
+        if not new:
             return
-        best, costs = np.argmin(stories, axis=1).tolist(), (self.nobody + stories.min(axis=1)).tolist()
-        for each, k, cost in zip(map(tuple, L.tolist()), best, costs, strict=True):
-            if cost < self.known[each][0]:
-                self.known[each] = (cost, _PLAIN + k)
+        for k, shape, cost in zip(*(each.tolist() for each in self.shapes(new)), strict=True):
+            if cost < self.known.get(new[k], (np.inf, 0))[0]:
+                self.known[new[k]] = cost, shape
+
+    def shapes(self, sets: list[tuple[int, ...]]) -> tuple[Ints, Ints, Floats]:
+        """J of all shapes that some sets' lies may have: which set, which shape, and J, (s,) each."""
+        at, sizes = self._places(sets), np.array([len(each) for each in sets])
+        both, several = np.arange(sizes.size), np.flatnonzero(sizes > 1)
+        shape = np.repeat([_ALONE, _SAME], [both.size, several.size])
+        of, price, u = np.concatenate([both, several]), np.zeros(shape.size), np.ones((shape.size, 1))
+        if several.size and self.problem.false is not None:
+            who = np.array([[*each, *each[:1] * (at.shape[1] - len(each))] for each in sets])
+            rows, about, chosen = self._stories(who, sizes)
+            if rows.size:
+                of, shape = np.concatenate([of, rows]), np.concatenate([shape, about])
+                u = np.concatenate([np.ones((price.size, at.shape[1])), self._moved(who[rows], about)])
+                price = np.concatenate([price, chosen])
+        table, like, sizes = _table(self.problem.lies, at.shape[1]), np.minimum(shape, 0), sizes[of]
+        gain, freedom = self._judged(at[of], u, table.inverse[sizes, like])
+        J = self.nobody + self.problem.prices[sizes] + table.cost[sizes, like] + price + freedom - gain
+        return of, shape, J
 
     def explained(self, liars: tuple[int, ...]) -> Set:
         """All about a set whose cost is known."""
         if liars in self.told:
             return self.told[liars]
-        cost, k = self.known[liars]
+        cost, shape = self.known[liars]
         out, lies, weights = np.zeros(self.z.size, dtype=np.bool_), np.zeros(self.z.size), self.z
         if liars:
-            L, u, shapes = np.array(liars), np.ones(len(liars)), _shapes(self.problem.lies, len(liars))
-            if k >= _PLAIN:
-                u = self._moved(L[None], L[None, k - _PLAIN])[0]
-            M = shapes.inverse[min(k, 1)] + submatrix(self.Q, L, L) * np.multiply.outer(u, u)
+            L, at, u = np.array(liars), self._places([liars])[0], np.ones(len(liars))
+            if shape >= 0:
+                u = self._moved(L[None], np.array([shape]))[0]
+            inverse = _table(self.problem.lies, L.size).inverse[L.size, min(shape, 0)]
+            M = inverse + submatrix(self.Q, at, at) * np.multiply.outer(u, u)
             out[L], lies[L] = True, u * np.linalg.solve(M, u * self.z[L])
-            weights = self.z - lies[L] @ self.Q[L]
+            weights = self.z - lies[L] @ self.rows[at - 1]
         self.told[liars] = Set(out, self.powers, cost, weights, lies)
         return self.told[liars]
 
-    def _plain(self, L: Ints) -> tuple[Floats, Floats]:
-        """J of each set where lies are independent and where all are the same, (1 or 2, b).
+    def left(self, liars: tuple[int, ...]) -> Floats:
+        """Variance of the weights of an explanation, (p,): the diagonal of its Q, its liars left out."""
+        Q = self.rows[self._places([liars])[0] - 1]
+        return np.asarray(self.diagonal - np.einsum("kj,kj->j", Q, np.linalg.solve(Q[:, liars], Q)))
 
-        And no less than which it is for lies of any shape, (b,), without what the choice of the set costs.
-        """
-        k, shapes = L.shape[1], _shapes(self.problem.lies, L.shape[1])
-        gain, freedom = self._judged(L, np.ones(1), np.concatenate([shapes.inverse, np.zeros((1, k, k))]))
-        some = min(k, _PLAIN)
-        J = freedom[:some] + shapes.logdet[:some, None] - gain[:some]
-        J += (self.problem.prices[k] + shapes.price[:some] + self.nobody)[:, None]
-        return J, self.nobody + self.problem.prices[k] - gain.max(axis=0)
-
-    def _chosen(self, k: int) -> float:
-        """What a story costs at least: there is one customer whose story it is, and one way to tell it."""
-        p = self.problem.size
-        return self.problem.lies.story + 2.0 * float(np.log(p / binom(p, k)))
+    def _places(self, sets: list[tuple[int, ...]]) -> Ints:
+        """Where the members of each set have their row of Q, (b, k), 0 where a set is smaller."""
+        new = [j for j in dict.fromkeys(chain.from_iterable(sets)) if j not in self.place]
+        if new:
+            self.place |= {j: k for k, j in enumerate(new, len(self.place) + 1)}
+            self.rows = np.concatenate([self.rows, self.honest.rows(np.array(new))])
+            members = list(self.place)
+            self.Q = np.zeros((len(members) + 1, len(members) + 1))
+            self.Q[1:, 1:], self.at = self.rows[:, members], np.append(0.0, self.z[members])
+        k = max(map(len, sets))
+        return np.array([[*(self.place[j] for j in each), *[0] * (k - len(each))] for each in sets])
 
     def _moved(self, L: Ints, c: Ints) -> Floats:
         """How far one customer's load moves each of a set, its own voltage by one, (b, k)."""
@@ -169,87 +163,74 @@ class _Base:
         assert false is not None  # noqa: S101  # the callers have looked
         return np.asarray(false.R[L, c[:, None]] / false.R[c, c][:, None])
 
-    def _stories(self, L: Ints) -> Floats | None:
-        """Rise of J with the price where each of a set is whom the story is about, (b, k); inf for none."""
-        problem, (p, k) = self.problem, (self.problem.size, L.shape[1])
+    def _stories(self, L: Ints, sizes: Ints) -> tuple[Ints, Ints, Floats]:
+        """Which of some sets tell a story, whose, and what that costs, (s,) each.
+
+        `L` are the sets, (b, k), the smaller ones filled up with their first member.
+        """
+        problem, p = self.problem, self.problem.size
         assert problem.false is not None  # noqa: S101  # the caller has looked
-        R = problem.false.R
+        R, real = problem.false.R, np.arange(L.shape[1]) < sizes[:, None]
         among = R[L[:, :, None], L[:, None, :]]
         weakest = among.min(axis=1)
         # Whom the load does not move, as at the busbar, or moves the other way tells nothing of it.
-        rows, of = np.nonzero((weakest >= self._felt(k, L) * (1.0 - _SAME)) & (weakest > 0.0))
-        low, high = (weakest[rows, of] * (1.0 + side) for side in (-_SAME, _SAME))
-        c, more = L[rows, of], (among[rows, :, of] > high[:, None]).sum(axis=1)
-        # Others who feel it as little as some of a set may be many, but none of them feels it more.
-        tells = (R[:, c] > high).sum(axis=0) == more
-        rows, of, c, more, low, high = (each[tells] for each in (rows, of, c, more, low, high))
+        enough = weakest >= problem.felt[sizes[:, None] - 1, L] * (1.0 - _ALIKE)
+        rows, of = np.nonzero(enough & real & (weakest > 0.0) & (sizes > 1)[:, None])
         if not rows.size:
-            return None
+            return rows, rows, weakest[rows, of]
+        low, high = (weakest[rows, of] * (1.0 + side) for side in (-_ALIKE, _ALIKE))
+        c, more = L[rows, of], ((among[rows, :, of] > high[:, None]) & real[rows]).sum(axis=1)
+        # Others who feel it as little as some of a set may be many, but none of them feels it more.
+        tells = (problem.felt[:, c] > high).sum(axis=0) == more
+        rows, c, more, low, high = (each[tells] for each in (rows, c, more, low, high))
         # Of those that would feel it alike, some are chosen; whose story it is belongs to it.
-        own = R[c, c] <= high
+        own, k = R[c, c] <= high, sizes[rows]
         ties = (R[:, c] >= low).sum(axis=0) - more - own
         choices = np.log(p * binom(ties, k - more - own)) - np.log(binom(p, k))
-        out, shapes = np.full(L.shape, np.inf), _shapes(problem.lies, k)
-        gain, freedom = self._judged(L[rows], self._moved(L[rows], c).T, shapes.inverse[1:])
-        J = freedom[0] + shapes.logdet[1] - gain[0]
-        out[rows, of] = J + problem.prices[k] + problem.lies.story + 2.0 * choices
-        return out
+        return rows, c, problem.lies.story + 2.0 * choices
 
-    def _felt(self, k: int, c: Ints) -> Floats:
-        """How much at least the k meters feel some customers' loads that feel them most, the shape of c."""
-        false, p = self.problem.false, self.problem.size
-        assert false is not None  # noqa: S101  # the callers have looked
-        known = self.felt.setdefault(k, np.full(p, np.nan))
-        new = np.unique(c[np.isnan(known[c])])
-        if new.size:
-            known[new] = np.partition(false.R[:, new], p - k, axis=0)[p - k]
-        return np.asarray(known[c])
+    def _judged(self, at: Ints, u: Floats, inverse: Floats) -> tuple[Floats, Floats]:
+        """``z^T (C^-1 + Q_LL)^-1 z`` and ``ln det(E^-1 + U Q_LL U)`` of many sets, (s,) each.
 
-    def _judged(self, L: Ints, u: Floats, inverse: Floats) -> tuple[Floats, Floats]:
-        """``z^T (C^-1 + Q_LL)^-1 z`` and ``ln det(E^-1 + U Q_LL U)`` of many sets, (s, b) each.
-
-        ``C = U E U`` with U = diag(u), (k, b), and ``E^-1`` one of `inverse`, (s, k, k). By elimination: the
-        matrix is bordered by z, and what is left in the corner is what z explains.
+        By their places, (s, k); ``C = U E U`` with U = diag(u), and `inverse` is ``E^-1``, (s, k, k). By
+        elimination: the matrix is bordered by z, and what is left in the corner is what z explains.
         """
-        b, k = L.shape
-        T = np.empty((k + 1, k + 1, len(inverse), b))
-        at = L.T
-        T[:k, :k] = (self.Q[at[:, None], at] * u[:, None] * u)[:, :, None]
-        T[:k, :k] += inverse.transpose(1, 2, 0)[..., None]
-        T[k, :k] = T[:k, k] = (self.z[at] * u)[:, None]
-        T[k, k] = 0.0
+        L, u, k = at.T, u.T, at.shape[1]
+        T = np.zeros((k + 1, k + 1, len(at)))
+        T[:k, :k] = self.Q[L[:, None], L] * (u[:, None] * u) + inverse.T
+        T[k, :k] = T[:k, k] = self.at[L] * u
         for i in range(k):
             T[i + 1 :, i + 1 :] -= T[i + 1 :, i, None] * (T[i, i + 1 :] / T[i, i])
-        return -T[k, k], np.log(np.maximum(np.einsum("iisb->isb", T)[:k], _TINY)).sum(axis=0)
+        return -T[k, k], np.log(np.maximum(np.einsum("iis->is", T)[:k], _TINY)).sum(axis=0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Shapes:
-    """E of so many lies, without the direction of a story: independent, and alike.
+class _Table:
+    """E of sets of 0, 1, … k lies, by their shape: a story, independent, all the same.
 
     Attributes
     ----------
-    inverse : (2, k, k)
-        ``E^-1``: ``1 / A^2``, and that of ``s^2 (1 1^T + d^2)``.
-    logdet : (2,)
-        ``ln det E``.
-    price : (2,)
-        What lies cost beside their freedom and the price of the set, where all are the same.
+    inverse : (k + 1, 3, k, k)
+        ``E^-1``: ``1 / A^2``, or that of ``s^2 (1 1^T + d^2)``; of those there are not, 1.
+    cost : (k + 1, 3)
+        ``ln det E`` with what lies cost beside the price of the set.
     """
 
     inverse: Floats
-    logdet: Floats
-    price: Floats
+    cost: Floats
 
 
 @cache
-def _shapes(lies: Lies, k: int) -> _Shapes:
-    one, d2, s2 = np.eye(k), lies.differ**2, lies.amplitude**2
-    inverse = np.stack([one / lies.size**2, (one - 1.0 / (d2 + k)) / (s2 * d2)])
-    alike = k * np.log(s2) + (k - 1) * np.log(d2) + np.log(d2 + k)
-    logdet = np.array([2.0 * k * np.log(lies.size), alike])
-    price = np.array([lies.apart * (k - 1), lies.pair + lies.more * (k - 2)])
-    return _Shapes(frozen(inverse), frozen(logdet), frozen(price))
+def _table(lies: Lies, most: int) -> _Table:
+    d2, s2, sizes = lies.differ**2, lies.amplitude**2, np.arange(most + 1)
+    inverse = np.tile(np.eye(most), (most + 1, 3, 1, 1))
+    for k in range(1, most + 1):
+        alone, same = np.eye(k) / lies.size**2, (np.eye(k) - 1.0 / (d2 + k)) / (s2 * d2)
+        inverse[k, :, :k, :k] = same, same, alone
+    alike = sizes * np.log(s2) + (sizes - 1) * np.log(d2) + np.log(d2 + sizes)
+    alone = 2.0 * sizes * np.log(lies.size) + lies.apart * (sizes - 1)
+    cost = np.column_stack([alike, alike + lies.pair + lies.more * (sizes - 2), alone])
+    return _Table(frozen(inverse), frozen(cost))
 
 
 def worth(problem: Problem, ranked: Ranked) -> bool:
@@ -299,7 +280,7 @@ def _continued(problem: Problem, best: State) -> bool:
     if not odd.size or not liars.size:
         return False
     column = R[:, liars]
-    told = column >= np.partition(column, p - k, axis=0)[p - k] * (1.0 - _SAME)
+    told = column >= problem.felt[k - 1, liars] * (1.0 - _ALIKE)
     off = best.g[odd] / best.diagonal[odd]
     expected = column[odd] * (problem.a2 * best.g[liars] / R[liars, liars])
     like = off[:, None] * expected >= _LIKE * expected**2
@@ -334,12 +315,15 @@ def alike(problem: Problem, ranked: Ranked) -> list[Set]:
             likely.setdefault(at.powers.tobytes(), []).append(at)
     for key, some in likely.items():
         same = [at for _, at in ranked if at.powers.tobytes() == key]
-        bases[key] = _Base(problem, min(same, key=lambda at: at.counts[0]), some[0].m)
-        bases[key].costs(_members(at.liars) for at in some)
+        base = bases[key] = _Base(problem, min(same, key=lambda at: at.counts[0]), some[0].m)
+        sets = [_members(at.liars) for at in some]
+        if not base.powers.any():
+            # Likely the best ones; they are asked for at once.
+            sets += [*combinations(_strongest(base), 2), *_stories(base, sets[0])]
+        base.costs(sets)
     best = min(bases.values(), key=lambda base: min(base.known.values())[0])
     if not best.powers.any():
-        best.costs(combinations(_strongest(best), 2))
-        best.costs(_stories(best))
+        best.costs(_stories(best, min(best.known, key=lambda each: best.known[each][0])))
     _descend(best)
     within = min(best.known.values())[0] + 2.0 * np.log(problem.lies.like)
     return [
@@ -350,12 +334,11 @@ def alike(problem: Problem, ranked: Ranked) -> list[Set]:
     ]
 
 
-def _stories(base: _Base) -> Iterator[tuple[int, ...]]:
+def _stories(base: _Base, liars: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
     """Stories about one of the likeliest liars, about as long as that explanation."""
     if base.problem.false is None:
         return
     R, size = base.problem.false.R, base.z**2 / base.diagonal
-    liars = min(base.known, key=lambda each: base.known[each][0])
     for c in (c for c in liars if R[c, c] > 0.0):
         felt = np.round(R[:, c] / R[c, c], 9)
         felt[c] = np.inf
@@ -392,7 +375,7 @@ def _neighbours(base: _Base, at: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
     if not at:
         return
     now = base.explained(at)
-    beyond = now.weights**2 > least(base.problem, len(at) + 1) * _left(base, at)
+    beyond = now.weights**2 > least(base.problem, len(at) + 1) * base.left(at)
     beyond[list(at)] = False
     others = np.flatnonzero(beyond).tolist()
     free = [i for i in at if not base.powers[i]]
@@ -405,10 +388,3 @@ def _neighbours(base: _Base, at: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
     if len(at) < min(MOST, base.z.size):
         for j in others:
             yield tuple(sorted([*at, j]))
-
-
-def _left(base: _Base, at: tuple[int, ...]) -> Floats:
-    """Variance of the weights of an explanation, (p,): the diagonal of its Q, its liars left out."""
-    L = np.array(at)
-    Q = base.Q[L]
-    return np.asarray(base.diagonal - np.einsum("kj,kj->j", Q, np.linalg.solve(Q[:, L], Q)))

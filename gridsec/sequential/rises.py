@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from math import log
 
 import numpy as np
@@ -19,6 +19,8 @@ from gridsec.arrays import Bools, Floats, Ints, frozen, submatrix
 
 # Determinants are positive; rounding may make them less.
 _TINY = float(np.finfo(np.float64).tiny)
+# So many liars may be alike: of larger sets there are too many, and what is gained is little.
+MOST = 8
 Curved = Callable[[Floats, Bools], Floats]
 # How often an explanation is linearised about itself.
 _PASSES = 2
@@ -81,19 +83,38 @@ class FalsePowers:
         Squared voltages by active and reactive powers, 2R and 2X of the feeder.
     p, q : (p,)
         How false the powers of each may be, standard deviations, pu.
+    felt : (MOST, p)
+        Entries of each column of R that are largest, the largest first: how much those feel a customer's
+        load who feel it most. Made where it is not given; `claimed` hands it on.
+
+    Raises
+    ------
+    ValueError
+        If these are not all of the same p meters.
     """
 
     R: Floats
     X: Floats
     p: Floats
     q: Floats
+    felt: Floats | None = None
 
-    def columns(self, who: Ints) -> Floats:
-        """B of some customers, (2, k, p)."""
-        B = np.empty((2, who.size, len(self.R)))
-        np.multiply(self.R[:, who].T, self.p[who, None], out=B[0])
-        np.multiply(self.X[:, who].T, self.q[who, None], out=B[1])
-        return B
+    def __post_init__(self) -> None:
+        count = self.p.size
+        square = self.R.shape == self.X.shape == (count, count)
+        felt = self.felt is None or self.felt.shape == (min(MOST, count), count)
+        if not (square and self.q.shape == self.p.shape and felt):
+            raise ValueError("R, X, p, q and felt must be of the same meters")
+
+    def claimed(self, p: Floats, q: Floats) -> FalsePowers:
+        """For the same meters, other powers: what depends on the feeder alone is prepared once for all.
+
+        Parameters
+        ----------
+        p, q : (p,)
+            As the attributes.
+        """
+        return FalsePowers(self.R, self.X, p, q, strongest(self.R) if self.felt is None else self.felt)
 
     def of(self, live: Ints) -> FalsePowers:
         """For some of the meters alone."""
@@ -127,6 +148,10 @@ class State:
         ``m^T Q m``.
     U, V : (r, p)
         What was taken off; each row of V is the same of U times a number.
+    counts
+        |L| and |F|.
+    rise : (p,)
+        `Problem.meters`, once somebody has asked for it.
     """
 
     liars: Bools
@@ -139,6 +164,8 @@ class State:
     fit: float
     U: Floats
     V: Floats
+    counts: tuple[int, int] = (0, 0)
+    rise: Floats | None = None
 
     @classmethod
     def nobody(cls, m: Floats, W: Floats) -> State:
@@ -157,16 +184,6 @@ class State:
         """L and F as a key of dictionaries."""
         return self.liars.tobytes() + self.powers.tobytes()
 
-    @property
-    def counts(self) -> tuple[int, int]:
-        """|L| and |F|."""
-        return int(np.count_nonzero(self.liars)), int(np.count_nonzero(self.powers))
-
-    @property
-    def Q(self) -> Floats:  # noqa: N802  # its name in the theory
-        """Inverse covariance of the readings, (p, p)."""
-        return np.asarray(self.W.T @ self.W - self.V.T @ self.U)
-
     def times(self, x: Floats) -> Floats:
         """Q x, (p,)."""
         return np.asarray((self.W @ x) @ self.W - (self.V @ x) @ self.U)
@@ -174,6 +191,10 @@ class State:
     def column(self, j: int) -> Floats:
         """Q e_j, (p,)."""
         return np.asarray(self.W[:, j] @ self.W - self.V[:, j] @ self.U)
+
+    def rows(self, who: Ints) -> Floats:
+        """Rows of Q of some meters, (k, p)."""
+        return np.asarray(self.W[:, who].T @ self.W - self.V[:, who].T @ self.U)
 
     def change(self, q: Floats, delta: float, u_q: float, u_g: float) -> None:
         """Add ``delta u u^T`` to K, by q = Q u, ``u^T q`` and ``u^T g``."""
@@ -184,6 +205,7 @@ class State:
         self.g = self.g - u_g * by
         self.diagonal = self.diagonal - by * q
         self.U, self.V = np.concatenate((self.U, q[None])), np.concatenate((self.V, by[None]))
+        self.rise = None
 
 
 class Problem:
@@ -201,6 +223,13 @@ class Problem:
         self.prices = prices + anybody
         self.prices[0] = 0.0
 
+    @cached_property
+    def felt(self) -> Floats:
+        """How much those feel each customer's load who feel it most; see `FalsePowers`."""
+        if self.false is None:
+            raise ValueError("there are no false powers")
+        return strongest(self.false.R) if self.false.felt is None else self.false.felt
+
     def quiet(self, g: Floats, diagonal: Floats) -> bool:
         """Whether nobody would be accused or doubted."""
         pivot = 1.0 + self.a2 * diagonal
@@ -216,7 +245,9 @@ class Problem:
         return at.fit + at.logdet + self.charge(*at.counts)
 
     def meters(self, at: State) -> Floats:
-        """Rise of J by accusing each meter, or by trusting it again, (p,)."""
+        """Rise of J by accusing each meter, or by trusting it again, (p,); to be read only."""
+        if at.rise is not None:
+            return at.rise
         k, _ = at.counts
         now = self.prices[k]
         pivot = 1.0 + self.a2 * at.diagonal
@@ -227,7 +258,8 @@ class Problem:
             less = np.log(pivot) + self.a2 * at.g[on] ** 2 / pivot + (self.prices[k - 1] - now)
             # Powers are false only where the meter lies.
             rise[on] = np.where(at.powers[on], np.inf, less)
-        return np.asarray(rise)
+        at.rise = rise
+        return rise
 
     def pairs(self, at: State, who: Ints) -> tuple[Floats, Floats]:
         """Rise of J by false powers of some customers, and how much they explain, (k,) each.
@@ -265,7 +297,7 @@ class Problem:
     def _against(self, at: State, c: int) -> tuple[list[float], list[float], list[float]]:
         """``B^T Q B``, its three numbers, ``e^T Q B`` of the customer's own meter, and ``B^T g``."""
         if c not in self.known:
-            B = self._columns(np.array([c]))[:, 0]
+            B = self._columns(c)
             white = B @ self.W.T
             self.known[c] = B, white @ white.T, white @ self.W[:, c]
         B, M, own = self.known[c]
@@ -275,10 +307,11 @@ class Problem:
         (a, b), (_, d) = M.tolist()
         return [a, b, d], own.tolist(), (B @ at.g).tolist()
 
-    def _columns(self, who: Ints) -> Floats:
+    def _columns(self, c: int) -> Floats:
+        """B of a customer, a row for each power, (2, p)."""
         if self.false is None:
             raise ValueError("there are no false powers")
-        return self.false.columns(who)
+        return np.stack([self.false.R[:, c] * self.false.p[c], self.false.X[:, c] * self.false.q[c]])
 
     def settle(self, at: State) -> None:
         """Linearise about what this explanation says of the powers."""
@@ -287,19 +320,21 @@ class Problem:
         for _ in range(_PASSES):
             at.m = self.curved(at.g, at.powers)
             at.g = at.times(at.m)
-        at.fit = float(at.m @ at.g)
+        at.fit, at.rise = float(at.m @ at.g), None
 
     def toggle(self, at: State, j: int) -> None:
         """Accuse a meter, or trust it again."""
         at.change(at.column(j), -self.a2 if at.liars[j] else self.a2, float(at.diagonal[j]), float(at.g[j]))
         at.liars[j] = not at.liars[j]
+        at.counts = at.counts[0] + (1 if at.liars[j] else -1), at.counts[1]
 
     def powers(self, at: State, c: int, sign: float = 1.0) -> None:
         """Doubt a customer's powers, or with `sign` -1 believe them again."""
-        for u in self._columns(np.array([c]))[:, 0]:
+        for u in self.known[c][0] if c in self.known else self._columns(c):
             q = at.times(u)
             at.change(q, sign, float(u @ q), float(u @ at.g))
         at.powers[c] = sign > 0
+        at.counts = at.counts[0], at.counts[1] + int(sign)
 
 
 @cache
@@ -320,6 +355,17 @@ def _prices(meters: int, liars: float, honest: float) -> Floats:
 def suspicious(g: Floats, diagonal: Floats) -> Bools:
     """Which meters' leave-one-out residuals are large enough to doubt their customers' powers."""
     return np.asarray(g**2 > _SUSPICIOUS**2 * diagonal)
+
+
+def strongest(R: Floats) -> Floats:
+    """The largest entries of each column, the largest first, (MOST, p) or all of fewer.
+
+    Parameters
+    ----------
+    R : (p, p)
+        As in `FalsePowers`.
+    """
+    return frozen(-np.sort(-R, axis=0)[:MOST])
 
 
 def _by_two(a: float, b: float, d: float, h: float, i: float) -> tuple[float, float]:

@@ -223,18 +223,13 @@ def _best(problem: Problem, at: State, false: bool) -> State | None:
     rise = problem.meters(at)
     j = int(np.argmin(rise))
     least, move = float(rise[j]), "meter"
-    if false and at.liars.any():
-        doubted = np.flatnonzero(at.powers)
-        if doubted.size:
-            rises = problem.believed(at, doubted)
-            c = int(np.argmin(rises))
-            if rises[c] < least:
-                j, least, move = int(doubted[c]), float(rises[c]), "believe"
-        who = np.flatnonzero(at.liars)
-        doubts, _ = problem.pairs(at, who)
-        c = int(np.argmin(doubts))
-        if doubts[c] < least:
-            j, least, move = int(who[c]), float(doubts[c]), "powers"
+    if false and at.counts[0]:
+        doubted, who = np.flatnonzero(at.powers), np.flatnonzero(at.liars & ~at.powers)
+        rises, doubts = problem.believed(at, doubted), problem.pairs(at, who)[0]
+        for some, those, what in ((rises, doubted, "believe"), (doubts, who, "powers")):
+            if some.size and some.min() < least:
+                c = int(np.argmin(some))
+                j, least, move = int(those[c]), float(some[c]), what
     if least >= -_LEAST:
         return None
     if move == "powers":
@@ -255,7 +250,7 @@ def _exchange(problem: Problem, at: State, known: dict[bytes, State], false: boo
         if after.powers[j]:
             problem.powers(after, j, -1.0)
         problem.toggle(after, j)
-        rise = problem.meters(after)
+        rise = problem.meters(after).copy()
         rise[j] = np.inf
         k = int(np.argmin(rise))
         cost = problem.cost(after) + rise[k]
