@@ -38,6 +38,28 @@ CurvesAt = Annotated[str, typer.Option(help="Where inverters work: steepest or d
 Out = Annotated[Path | None, typer.Option(help="Write the tables into this folder, as CSV and Parquet.")]
 
 
+GoalOf = Annotated[
+    str | None,
+    typer.Option(
+        help="identify: liars are named; notice: some lie is; bound: lies stay small, powers being true; "
+        "contain: powers being false too. [default: identify where liars can stay invisible, or contain]"
+    ),
+]
+LieVolt = Annotated[
+    float | None,
+    typer.Option(
+        help="For bound and contain: largest unnoticed lie, V of the busbar's level. "
+        "[contain: half of what company and false powers add]"
+    ),
+]
+
+NO_ANSWER = (
+    "It counts lies that fit exactly to powers that are known exactly, and none does. How large lies are "
+    "that fit within honest errors: --goal contain. What hides behind a load that nobody knows: --unknown "
+    "CUSTOMER. Lies that inverters forget within seconds: --attack any."
+)
+
+
 def redundancy(
     feeder: Studied = "simbench-lv-rural1",
     *,
@@ -79,13 +101,8 @@ def protect(
     feeder: Studied = "simbench-lv-rural1",
     *,
     max_attacked: Annotated[int, typer.Option(help="How many of the other meters lie at most.", min=1)] = 2,
-    goal: Annotated[
-        str, typer.Option(help="identify: liars are named; notice: some lie is; bound: lies stay small.")
-    ] = "identify",
-    lie_volt: Annotated[
-        float | None,
-        typer.Option(help="For bound: largest unnoticed lie, V of the busbar's level."),
-    ] = None,
+    goal: GoalOf = None,
+    lie_volt: LieVolt = None,
     attack: Annotated[str, typer.Option(help="Attacks that count: persistent or any.")] = "persistent",
     unknown: Unknown = None,
     busbar_unknown: BusbarUnknown = False,
@@ -105,7 +122,7 @@ def protect(
     from feeders.studies.protect import Goal
     from feeders.studies.protect import protect as study
 
-    kinds = {"--goal": (goal, tuple(Goal)), "--attack": (attack, tuple(Attack))}
+    kinds = {"--goal": (goal or Goal.CONTAIN, tuple(Goal)), "--attack": (attack, tuple(Attack))}
     for option, (name, known) in kinds.items():
         if name not in known:
             raise typer.BadParameter(f"{name!r}: expected one of {', '.join(known)}", param_hint=option)
@@ -116,7 +133,7 @@ def protect(
             found = study(
                 site,
                 max_attacked=max_attacked,
-                goal=Goal(goal),
+                goal=Goal(goal) if goal else None,
                 lie_volt=math.nan if lie_volt is None else lie_volt,
                 attack=Attack(attack),
                 unknown=unknown,
@@ -131,13 +148,20 @@ def protect(
 
 
 def _tell_protection(found: Protect, of: int) -> None:
-    from feeders.studies.protect import Goal
-
     count = len(found.meters)
+    if found.no_answer:
+        console.out.print(escape(f"{found.feeder}: {found.goal} asks for nothing here, which is no safety"))
+        console.out.print(NO_ANSWER)
+        return
     proof = "no fewer suffice" if not found.gap else f"at least {found.least} are needed"
-    measure = "largest hidden lie, V" if found.goal is Goal.BOUND else "fewest liars that stay invisible"
+    measure = "largest hidden lie, V" if found.goal.in_volts else "fewest liars that stay invisible"
     console.out.print(escape(f"{found.feeder}: protect {count} of {of} meters; {proof}"))
     console.out.print(f"{measure}: {_cell(found.before)} before, {_cell(found.after)} after")
+    if found.goal.in_volts:
+        console.out.print(
+            f"asked for ({found.goal}): at most {_cell(found.lie_volt)}; "
+            f"one meter hides {_cell(found.alone)} by itself, with true powers, whoever else is protected"
+        )
     if count:
         show("Protect", found.meters)
         show("Attacks that ask for them", found.attacks)

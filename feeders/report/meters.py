@@ -52,21 +52,21 @@ def detectable(site: Site, found: Detectable) -> Section:
     site, found
         The feeder, and what was found.
     """
-    liars, sure = found.max_attacked, f"{100.0 * (1.0 - found.risk):.6g} %"
+    liars, sure = found.max_attacked, _sure(found.risk)
     (meters, unit), (customers, _) = (_comparable(site, each) for each in (found.meters, found.customers))
     return Section(
         title="How large a lie must be",
         answers={
             Question.LIES: _sizes(found.meters, liars, sure),
-            Question.PICTURE: _picture(site, found.customers, liars),
+            Question.PICTURE: _picture(site, found.customers, liars, _sure(2.0 * found.risk)),
         },
         figures=(
             Figure(
                 "detectable-sizes",
                 "What becomes of a lie, by its size",
                 f"Each meter lying together with at most {liars - 1} more. Left: nobody is named. "
-                "Middle: it depends on the honest errors of the moment. From the end of the last bar on the "
-                f"lying meter is named.{_largest_only(meters)}",
+                "Middle: it depends on the honest errors of the moment. From the end of the last bar on no "
+                f"other explanation than the lying meter is left.{_largest_only(meters)}",
                 partial(_sizes_chart, meters, unit=unit),
             ),
             Figure(
@@ -88,12 +88,14 @@ def detectable(site: Site, found: Detectable) -> Section:
         columns={
             "hidden": f"up to this, V, with probability {sure} at any one moment, nobody is named",
             "noticed": "beyond this somebody is beyond a limit, with that probability",
-            "named": "beyond this the lying meter is named, whoever else lies",
+            "named": "beyond this no other explanation is a rival, whoever else lies, with probability "
+            f"{_sure(2.0 * found.risk)} at any one moment",
             "fits": "up to this the readings are those of some honest feeder, all errors at their worst: "
             "no test without false alarms can object",
             "identified": "beyond this every explanation by so few liars accuses the meter",
             "… alone": "the same without accomplices",
-            "error": "largest error of the monitor's reconstructed voltage, V",
+            "error": "largest error of the monitor's reconstructed voltage, V, with probability "
+            f"{_sure(2.0 * found.risk)} for each customer at any one moment",
             "error fits": "how far apart two voltages can be that fit to the same readings, V",
         },
         assumptions=(
@@ -102,10 +104,20 @@ def detectable(site: Site, found: Detectable) -> Section:
             "Sequential monitor, before it has learned the fixed errors of its meters; "
             f"{'balanced' if single_phase(site) else 'three-phase'} model; "
             "inverters in their deadbands; nominal voltage.",
+            f"Sizes for the monitor hold with {sure} at any one moment: honest errors Gaussian or uniform "
+            f"with the deviations of the files, and every load draws {100.0 * found.share:g} % of its peak. "
+            "Powers of customers without a meter are unknown within what they can draw and feed in.",
+            "Proofs are for the linear effect of errors of loads; AC power flow was only simulated.",
+            "That the monitor, once it looks, finds the liar, and that it goes on to, is not proved but was "
+            "checked by simulation (gridsec study detectable --trials, and campaigns).",
             "Where the search for the worst collusion was cut short, sizes are what was proved until there: "
             "on the safe side.",
         ),
     )
+
+
+def _sure(risk: float) -> str:
+    return f"{100.0 * (1.0 - risk):.6g} %"
 
 
 def _comparable(site: Site, table: pd.DataFrame) -> tuple[pd.DataFrame, str]:
@@ -138,8 +150,8 @@ def _sizes(meters: pd.DataFrame, liars: int, sure: str) -> Finding:
         )
         return Finding(Standing.PART, (lead, noticed))
     noticed = (
-        "Larger lies may go unnoticed, depending on the honest errors of the moment; somebody is surely "
-        "noticed from ",
+        "Larger lies may go unnoticed, depending on the honest errors of the moment; somebody is beyond a "
+        "limit, as surely, from ",
         least(meters, name, "noticed", "V", side=Side.ABOVE),
         f" ({_extreme(meters, 'meter', 'noticed', smallest=True)}) to ",
         most(meters, name, "noticed", "V", side=Side.ABOVE),
@@ -149,16 +161,17 @@ def _sizes(meters: pd.DataFrame, liars: int, sure: str) -> Finding:
         named: Sentence = ("Not every liar is proved to be named, however large the lie.",)
         return Finding(Standing.PART, (lead, noticed, named))
     named = (
-        "The lying meter itself is surely named from ",
+        "No explanation but the lying meter is left from ",
         least(meters, name, "named", "V", side=Side.ABOVE),
         " to ",
         most(meters, name, "named", "V", side=Side.ABOVE),
-        " on.",
+        " on. That much is proved; that the monitor's search then finds and names it is not, but was "
+        "checked by simulation.",
     )
-    return Finding(Standing.PROVED, (lead, noticed, named))
+    return Finding(Standing.PART, (lead, noticed, named))
 
 
-def _picture(site: Site, customers: pd.DataFrame, liars: int) -> Finding:
+def _picture(site: Site, customers: pd.DataFrame, liars: int, sure: str) -> Finding:
     name = "detectable-customers"
     who = "a single lying meter" if liars == 1 else f"{liars} meters that lie together"
     lead: Sentence = (
@@ -166,7 +179,8 @@ def _picture(site: Site, customers: pd.DataFrame, liars: int) -> Finding:
         least(customers, name, "error", "V", side=Side.ABOVE),
         f" (at {_extreme(customers, 'customer', 'error', smallest=True)}) to ",
         most(customers, name, "error", "V", side=Side.ABOVE),
-        f" (at {_extreme(customers, 'customer', 'error')}), honest errors included. "
+        f" (at {_extreme(customers, 'customer', 'error')}), honest errors included, with {sure} for each "
+        "customer at any one moment. "
         f"Nominal voltage is {told(site.nominal_volt)}{_percent(site)}.",
     )
     if not all(math.isfinite(v) for v in customers["error"]):
@@ -176,7 +190,8 @@ def _picture(site: Site, customers: pd.DataFrame, liars: int) -> Finding:
         most(customers, name, "error_fits", "V", side=Side.ABOVE),
         " apart can fit to the same readings.",
     )
-    return Finding(Standing.PROVED, (lead, whoever))
+    how: Sentence = ("Proved for the linear effect of errors of loads, and checked by AC power flow.",)
+    return Finding(Standing.PART, (lead, whoever, how))
 
 
 def _percent(site: Site) -> str:
@@ -250,6 +265,8 @@ def protect(site: Site, found: Protect) -> Section:
                 "Meters to protect",
                 f"Shields: {listed(sorted(chosen))}."
                 if chosen
+                else "What was asked says nothing of this feeder."
+                if found.no_answer
                 else "None needs protection for what was asked.",
                 partial(_protect_map, site, chosen),
             ),
@@ -257,8 +274,9 @@ def protect(site: Site, found: Protect) -> Section:
         tables=found.tables,
         columns={
             "before, after": "largest hidden lie, V of the busbar's level"
-            if found.goal is Goal.BOUND
+            if found.goal.in_volts
             else "fewest liars that stay invisible, without and with protection",
+            **({"alone": ALONE, "lie volt": "what was asked, V"} if found.goal.in_volts else {}),
             "least": "no fewer protected meters suffice",
             "attacks": "in how many of the listed attacks the meter takes part",
             "liars": "meters whose attack rules out anything cheaper",
@@ -266,15 +284,35 @@ def protect(site: Site, found: Protect) -> Section:
         assumptions=(
             f"At most {found.max_attacked} of the other meters lie; a protected meter cannot.",
             *(
-                ("All errors at their worst, inverters in their deadbands.",)
-                if found.goal is Goal.BOUND
+                ("All errors at their worst, inverters in their deadbands, linear model at nominal voltage.",)
+                if found.goal.in_volts
                 else (f"Attacks that count: {found.attack}. Loads of metered customers are known.",)
             ),
         ),
     )
 
 
+ALONE = "largest lie, V, that one meter hides by itself within honest errors, its powers being true"
+
+
+def _no_protection(found: Protect) -> Finding:
+    """A goal that asks nothing of this feeder."""
+    what = "identified" if found.goal is Goal.IDENTIFY else "noticed"
+    lead: Sentence = (
+        f"No answer by this criterion, and no safety: that liars be {what} is asked of lies that fit exactly "
+        "to powers that are known exactly, and none does, however small and however many lie.",
+    )
+    instead: Sentence = (
+        "Lies that fit within honest errors were not looked at; to bound these, --goal contain. What hides "
+        "behind a load that nobody knows: --unknown CUSTOMER. Lies that inverters forget within seconds: "
+        "--attack any.",
+    )
+    return Finding(Standing.OPEN, (lead, instead))
+
+
 def _protection(site: Site, found: Protect) -> Finding:
+    if found.no_answer:
+        return _no_protection(found)
     count, liars = len(found.meters), found.max_attacked
     others = f"any {liars} liars" if liars > 1 else "any single liar"
     among = " among the other meters" if count else ""
@@ -283,9 +321,12 @@ def _protection(site: Site, found: Protect) -> Finding:
     purpose = {
         Goal.IDENTIFY: f"{others}{among} would be identified",
         Goal.NOTICE: f"the lies of {others}{among} would be noticed",
-        Goal.BOUND: f"no lie above {number(found.lie_volt)} V{there} of {others} fits to an honest feeder",
+        Goal.BOUND: f"no lie above {number(found.lie_volt)} V{there} of {others} fits to an honest feeder, "
+        "if all powers are reported truly",
+        Goal.CONTAIN: f"no lie above {number(found.lie_volt)} V{there} of {others} fits to an honest feeder, "
+        "whatever powers they report",
     }[found.goal]
-    scope = "" if found.goal is Goal.BOUND else " by someone who knows all other loads and errors exactly"
+    scope = "" if found.goal.in_volts else " by someone who knows all other loads and errors exactly"
     if not count:
         lead: Sentence = (f"None for this purpose: even without protection, {purpose}{scope}.",)
     else:
@@ -297,15 +338,23 @@ def _protection(site: Site, found: Protect) -> Finding:
             f"Then {purpose}{scope}.",
         )
     effect: Sentence = (
-        "Largest lie that can hide: " if found.goal is Goal.BOUND else "Fewest liars that stay invisible: ",
+        "Largest lie that can hide: " if found.goal.in_volts else "Fewest liars that stay invisible: ",
         _cell(found.before, "protect-summary:before:row 0", found.goal),
         " before, ",
         _cell(found.after, "protect-summary:after:row 0", found.goal),
         " after.",
     )
+    if not math.isnan(found.alone):
+        effect += (
+            " A meter hides up to ",
+            _cell(found.alone, "protect-summary:alone:row 0", found.goal),
+            " by itself with its powers true, whatever others are protected.",
+        )
     proof: Sentence = ("No fewer suffice; other choices of as many may be as good.",)
+    # What is proved in volts is proved for the linear effect of errors.
+    sure = Standing.PART if found.gap or found.goal.in_volts else Standing.PROVED
     if not count and not math.isnan(found.before):
-        return Finding(Standing.PROVED, (lead,) if math.isinf(found.before) else (lead, effect))
+        return Finding(sure, (lead, effect))
     if found.gap:
         needed = Value(found.least, str(found.least), "protect-summary:least:row 0")
         proof = (
@@ -313,13 +362,13 @@ def _protection(site: Site, found: Protect) -> Finding:
             needed,
             " are needed.",
         )
-    return Finding(Standing.PART if found.gap else Standing.PROVED, (lead, effect, proof))
+    return Finding(sure, (lead, effect, proof))
 
 
 def _cell(value: float, source: str, goal: Goal) -> Value:
     if math.isnan(value):
         return Value(value, "not known", source)
-    if goal is Goal.BOUND:
+    if goal.in_volts:
         return Value(value, f"{number(value, 2, Side.ABOVE)} V", source)
     return Value(value, "none, however many" if math.isinf(value) else number(value), source)
 

@@ -54,7 +54,7 @@ class Detectable:
         The feeder's name, and its content.
     max_attacked
         M.
-    risk
+    risk, share
         As in `detectable`.
     meters
         One row for each meter, `alone` or in collusion with M - 1 others of the attacker's choice:
@@ -79,6 +79,7 @@ class Detectable:
     risk: float
     meters: pd.DataFrame
     customers: pd.DataFrame
+    share: float = SHARE
 
     @property
     def tables(self) -> dict[str, pd.DataFrame]:
@@ -162,6 +163,7 @@ def detectable(
         risk,
         pd.DataFrame(rows[: site.meters.size]),
         pd.DataFrame(rows[site.meters.size :]),
+        share,
     )
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from feeders.doubts import unread
 from feeders.load import Snapshot, to_frame
-from feeders.studies.hidden import Curves
+from feeders.studies.hidden import Curves, customer_indices
 from gridsec.arrays import Floats
 from gridsec.detect import busbar_error, reading_error
 from gridsec.network import Power, between
@@ -49,21 +50,37 @@ def box(site: Site, *, share: float = SHARE, curves: Curves = Curves.DEADBAND) -
     return _box(site, curves, frame.p_error, frame.q_error)
 
 
-def false_powers(site: Site, *, share: float = SHARE, curves: Curves = Curves.DEADBAND) -> FalsePowers:
+def false_powers(
+    site: Site,
+    *,
+    unknown: Sequence[str] | None = None,
+    share: float = SHARE,
+    curves: Curves = Curves.DEADBAND,
+) -> FalsePowers:
     """The same where liars report any powers that their customers could draw or feed in.
 
     Parameters
     ----------
     site, share, curves
         As in `box`.
+    unknown
+        Customers whose powers nobody knows, whoever lies, besides those without a meter.
+
+    Raises
+    ------
+    ValueError
+        If there is no such customer.
     """
     frame, silent = _frame(site, share), unread(site)
     p, q = np.maximum(frame.p_error, silent.p_error), np.maximum(frame.q_error, silent.q_error)
     made, owner = _box(site, curves, p, q), np.full(p.size, -1, dtype=np.intp)
     owner[site.meters] = np.arange(site.meters.size)
+    open_ = customer_indices(site, unknown or ())
+    owner[open_] = -1
     alone = made.effect.shape[1] - 2 * p.size
     wide, narrow = np.concatenate([p, q]), np.concatenate([frame.p_error, frame.q_error])
     part = np.divide(narrow, wide, out=np.ones_like(wide), where=wide > 0.0)
+    part[np.concatenate([open_, p.size + open_])] = 1.0
     return FalsePowers(
         made,
         np.concatenate([owner, owner, np.full(alone, -1, dtype=np.intp)]),

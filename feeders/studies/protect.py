@@ -1,4 +1,4 @@
-"""Which meters to protect: the fewest such that liars are identified, are noticed, or stay small.
+"""Which meters to protect: the fewest such that liars are identified, are noticed, or can only lie a little.
 
 References
 ----------
@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,10 +19,11 @@ import pandas as pd
 
 from feeders.studies.hidden import Attack, Curves, knowledge, meter_mask
 from feeders.studies.journal import Journal, Where
-from feeders.studies.operating import SHARE, box, squared, volts_of_lie
+from feeders.studies.operating import SHARE, box, false_powers, squared, volts_of_lie
 from gridsec.arrays import Bools, Ints
 from gridsec.errors import DesignInfeasible
-from gridsec.studies.lies import largest_lie
+from gridsec.studies.false_powers import FalsePowers, largest_of
+from gridsec.studies.lies import Box, largest_lie
 from gridsec.studies.patterns import Patterns, fewest_meters
 from gridsec.studies.protect import Attacker, Unprotectable, fewest_protected, hides, lies_beyond
 
@@ -37,6 +39,12 @@ class Goal(StrEnum):
     IDENTIFY = "identify"
     NOTICE = "notice"
     BOUND = "bound"
+    CONTAIN = "contain"
+
+    @property
+    def in_volts(self) -> bool:
+        """Whether it is about sizes of lies, and not about whether they can be seen at all."""
+        return self in {Goal.BOUND, Goal.CONTAIN}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,7 +56,11 @@ class Protect:
     feeder, digest
         The feeder's name, and its content.
     goal, max_attacked, attack, lie_volt
-        What was asked: M, which attacks count, and the bound of lies (NaN where the goal is none).
+        What was asked, or chosen where nothing was: M, which attacks count, and the bound of lies (NaN where
+        the goal is none).
+    alone
+        Where lies are bounded: the largest that one meter hides by itself, with its powers true, V. No
+        protection of others lowers it.
     before, after
         Without and with protection: the fewest liars that stay invisible, or the largest hidden lie, V; it
         too as the busbar's level has it.
@@ -67,6 +79,7 @@ class Protect:
     max_attacked: int
     attack: Attack
     lie_volt: float
+    alone: float
     before: float
     after: float
     least: int
@@ -79,10 +92,23 @@ class Protect:
         return len(self.meters) - self.least
 
     @property
+    def no_answer(self) -> bool:
+        """Whether the goal asks nothing of this feeder, which is no safety.
+
+        Liars who are to be identified or noticed hide behind powers that nobody knows. Where all are known,
+        no lie fits exactly, however small; how large lies are that fit within honest errors is not asked.
+        """
+        return not self.goal.in_volts and math.isinf(self.before)
+
+    @property
     def tables(self) -> dict[str, pd.DataFrame]:
         """All tables by name; `summary` is one row: what was asked, how many, what that does."""
         asked = {"goal": str(self.goal), "max_attacked": self.max_attacked}
-        asked |= {"lie_volt": self.lie_volt} if self.goal is Goal.BOUND else {"attack": str(self.attack)}
+        asked |= (
+            {"lie_volt": self.lie_volt, "alone": self.alone}
+            if self.goal.in_volts
+            else {"attack": str(self.attack)}
+        )
         found = {
             "protected": len(self.meters),
             "least": self.least,
@@ -100,7 +126,7 @@ def protect(
     site: Site,
     *,
     max_attacked: int,
-    goal: Goal = Goal.IDENTIFY,
+    goal: Goal | None = None,
     lie_volt: float = math.nan,
     attack: Attack = Attack.PERSISTENT,
     unknown: Sequence[str] | None = None,
@@ -122,16 +148,21 @@ def protect(
         M: how many of the other meters lie at most.
     goal
         `IDENTIFY`: the liars follow from the readings. `NOTICE`: some lie is noticed. Both as in
-        `feeders.studies.redundancy`. `BOUND`: no lie larger than `lie_volt` fits to an honest feeder.
+        `feeders.studies.redundancy`. `BOUND`: no lie larger than `lie_volt` fits to an honest feeder while
+        all report their powers truly. `CONTAIN`: nor does one while liars report any powers that their
+        customers could have. By default `IDENTIFY` if liars can stay invisible at all and there is no bound,
+        otherwise `CONTAIN`.
     lie_volt
         Bound of the lie, V, at nominal voltage; behind a transformer to another level, where volts do not
-        compare with the busbar's, the same part of the nominal voltage there.
+        compare with the busbar's, the same part of the nominal voltage there. For `CONTAIN` by default such
+        that half of what company and false powers add to the lie of a meter is gone.
     attack, unknown, busbar_known
-        For `IDENTIFY` and `NOTICE`: which attacks count, and what nobody knows.
+        For `IDENTIFY` and `NOTICE`: which attacks count, and what nobody knows. `CONTAIN` takes the unknown
+        powers too, and needs the busbar's voltage.
     curves
-        Where inverters work. By default on the steepest part for the first two, in the deadband for `BOUND`.
+        Where inverters work. By default on the steepest part for the first two, in the deadband in volts.
     share
-        For `BOUND`: share of its peak that every load draws.
+        For `BOUND` and `CONTAIN`: share of its peak that every load draws.
     never
         Meters that cannot be protected.
     exact
@@ -154,15 +185,27 @@ def protect(
     """
     if max_attacked < 1:
         raise ValueError(f"max_attacked is {max_attacked}; it must be at least 1")
-    if goal is Goal.BOUND and not lie_volt > 0.0:
+    if (goal is Goal.BOUND and math.isnan(lie_volt)) or lie_volt <= 0.0:
         raise ValueError(f"lie_volt is {lie_volt}; to bound lies it must be a positive number of volts")
-    where = curves or (Curves.DEADBAND if goal is Goal.BOUND else Curves.STEEPEST)
+    if goal is Goal.CONTAIN and not busbar_known:
+        raise ValueError("to bound lies the busbar's voltage must be known")
+    know = partial(knowledge, site, unknown=unknown, silent=(), busbar_known=busbar_known)
+    if goal is None:
+        bounded = busbar_known and (
+            lie_volt > 0.0 or _nobody_hides(know(curves=curves or Curves.STEEPEST).found[attack])
+        )
+        goal = Goal.CONTAIN if bounded else Goal.IDENTIFY
+    where = curves or (Curves.DEADBAND if goal.in_volts else Curves.STEEPEST)
+    if goal.in_volts:
+        asked = _in_volts(site, goal, max_attacked, lie_volt, unknown=unknown, share=share, curves=where)
+    else:
+        asked = _hidden(know(curves=where).found[attack], max_attacked, goal)
     subject = {
         "study": "protect",
         "digest": site.digest,
         "goal": str(goal),
         "max_attacked": max_attacked,
-        "lie_part": lie_volt / site.tables.meta.voltage_volt if goal is Goal.BOUND else None,
+        "lie_part": asked.lie_volt / site.tables.meta.voltage_volt if goal.in_volts else None,
         "attack": str(attack),
         "unknown": None if unknown is None else sorted(unknown),
         "busbar_known": busbar_known,
@@ -170,14 +213,11 @@ def protect(
         "share": share,
     }
     count, fixed = site.meters.size, meter_mask(site, never)
-    if goal is Goal.BOUND:
-        asked, measure = _bounded(site, max_attacked, lie_volt, share, where)
-    else:
-        known = knowledge(site, unknown=unknown, silent=(), busbar_known=busbar_known, curves=where)
-        asked, measure = _hidden(known.found[attack], max_attacked, goal)
     try:
         with Journal(journal, subject) as kept:
-            found = fewest_protected(_kept(asked, kept), count, never=fixed, exact=exact, progress=progress)
+            found = fewest_protected(
+                _kept(asked.attacker, kept), count, never=fixed, exact=exact, progress=progress
+            )
     except Unprotectable as error:
         who = ", ".join(site.meter_ids[j] for j in error.liars)
         raise DesignInfeasible(
@@ -192,37 +232,70 @@ def protect(
         goal=goal,
         max_attacked=max_attacked,
         attack=attack,
-        lie_volt=lie_volt if goal is Goal.BOUND else math.nan,
-        before=measure(np.zeros(count, dtype=np.bool_)),
-        after=measure(protected),
+        lie_volt=asked.lie_volt,
+        alone=asked.alone,
+        before=asked.before,
+        after=asked.measure(protected) if protected.any() else asked.before,
         least=found.least,
         meters=_meters(site, found.meters, found.attacks),
         attacks=pd.DataFrame({"liars": [" ".join(site.meter_ids[j] for j in a) for a in found.attacks]}),
     )
 
 
-Measure = Callable[[Bools], float]
+@dataclass(frozen=True, slots=True, eq=False)
+class _Asked:
+    """What is asked of a protection: who succeeds in spite of it, and what it is worth. See `Protect`."""
+
+    attacker: Attacker
+    measure: Callable[[Bools], float]
+    before: float
+    lie_volt: float = math.nan
+    alone: float = math.nan
 
 
-def _hidden(given: Patterns, max_attacked: int, goal: Goal) -> tuple[Attacker, Measure]:
+def _nobody_hides(given: Patterns) -> bool:
+    try:
+        return math.isinf(fewest_meters(given).count)
+    except DesignInfeasible:  # the search gave up
+        return False
+
+
+def _hidden(given: Patterns, max_attacked: int, goal: Goal) -> _Asked:
     """Who imitates a pattern, and the fewest who do."""
+
+    def fewest(protected: Bools) -> float:
+        return fewest_meters(given, honest=protected).count
+
     liars = 2 * max_attacked if goal is Goal.IDENTIFY else max_attacked
-    return hides(given, liars), lambda protected: fewest_meters(given, honest=protected).count
+    return _Asked(hides(given, liars), fewest, fewest_meters(given).count)
 
 
-def _bounded(
-    site: Site, max_attacked: int, lie_volt: float, share: float, curves: Curves
-) -> tuple[Attacker, Measure]:
+def _in_volts(  # what is asked, and of what
+    site: Site,
+    goal: Goal,
+    max_attacked: int,
+    lie_volt: float,
+    *,
+    unknown: Sequence[str] | None,
+    share: float,
+    curves: Curves,
+) -> _Asked:
     """Whose lie is too large, and the largest there is, V; every level counted in volts of the busbar's."""
-    given = box(site, share=share, curves=curves)
+    count, nobody = site.meters.size, np.zeros(site.meters.size, dtype=np.bool_)
     # Around a tap or a transformer, 1 pu of a customer is so many volts where the busbar's level is nominal.
     base = (site.customer_volt / site.customer_nominal)[site.meters] * site.tables.meta.voltage_volt
+    told = false_powers(site, unknown=unknown, share=share, curves=curves)
+    given: Box | FalsePowers = told if goal is Goal.CONTAIN else box(site, share=share, curves=curves)
 
     def largest(protected: Bools) -> float:
-        sizes = [largest_lie(given, j, max_attacked, honest=protected).bound for j in range(protected.size)]
+        sizes = [largest_of(given, j, max_attacked, honest=protected).bound for j in range(count)]
         return float(volts_of_lie(base, np.array(sizes)).max())
 
-    return lies_beyond(given, max_attacked, squared(base, lie_volt)), largest
+    sizes = np.array([largest_lie(told.told(nobody), j, 1).bound for j in range(count)])
+    alone, before = float(volts_of_lie(base, sizes).max()), largest(nobody)
+    if math.isnan(lie_volt):
+        lie_volt = math.ceil(50.0 * (alone + before)) / 100.0
+    return _Asked(lies_beyond(given, max_attacked, squared(base, lie_volt)), largest, before, lie_volt, alone)
 
 
 def _kept(attacker: Attacker, journal: Journal) -> Attacker:

@@ -23,7 +23,7 @@ from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import DesignInfeasible
 from gridsec.studies.lies import Box, Fit, largest_lie
 
-__all__ = ["FalsePowers", "largest_story"]
+__all__ = ["FalsePowers", "largest_of", "largest_story"]
 
 # What is this little beyond an honest share is the solver's rounding.
 _HONEST = 1e-6
@@ -82,6 +82,19 @@ def largest_story(given: FalsePowers, meter: int, liars: int, *, honest: Bools |
     false = free & (np.abs(found.unknowns) > given.honest + _HONEST)
     who = np.union1d(found.liars, given.owner[false]).astype(np.intp)
     return replace(found, bound=max(found.size, bound), liars=who)
+
+
+def largest_of(given: Box | FalsePowers, meter: int, liars: int, *, honest: Bools | None = None) -> Fit:
+    """`largest_lie` of a box, and `largest_story` where powers may be false as well.
+
+    Parameters
+    ----------
+    given, meter, liars, honest
+        As there.
+    """
+    if isinstance(given, FalsePowers):
+        return largest_story(given, meter, liars, honest=honest)
+    return largest_lie(given, meter, liars, honest=honest)
 
 
 def _choose(given: FalsePowers, meter: int, liars: int, honest: Bools) -> tuple[Bools, float]:

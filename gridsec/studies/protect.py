@@ -19,8 +19,8 @@ from scipy.optimize import Bounds, LinearConstraint, linprog, milp
 
 from gridsec.arrays import Bools, Floats, Ints, frozen_ints
 from gridsec.errors import DesignInfeasible
-from gridsec.studies.false_powers import FalsePowers, largest_story
-from gridsec.studies.lies import Box, Fit, largest_lie
+from gridsec.studies.false_powers import FalsePowers, largest_of
+from gridsec.studies.lies import Box
 from gridsec.studies.patterns import Patterns, fewest_meters
 
 __all__ = ["Attacker", "Protection", "Unprotectable", "fewest_protected", "hides", "lies_beyond"]
@@ -102,20 +102,14 @@ def lies_beyond(box: Box | FalsePowers, liars: int, size: Floats | float) -> Att
     """
     p = (box.box if isinstance(box, FalsePowers) else box).meters.size
     limit = np.broadcast_to(size, p)
-
-    def largest(j: int, protected: Bools | None = None) -> Fit:
-        if isinstance(box, FalsePowers):
-            return largest_story(box, j, liars, honest=protected)
-        return largest_lie(box, j, liars, honest=protected)
-
     # Protection only lowers lies: whoever is below the bound without any need not be asked again, and who
     # is furthest above it refutes soonest.
-    alone = np.array([largest(j).bound for j in range(p)]) - limit
+    alone = np.array([largest_of(box, j, liars).bound for j in range(p)]) - limit
     order = [int(j) for j in np.argsort(-alone) if alone[j] > 0.0]
 
     def attack(protected: Bools) -> Ints | None:
         for j in order:
-            found = largest(j, protected)
+            found = largest_of(box, j, liars, honest=protected)
             if found.bound > limit[j]:
                 return found.liars
         return None

@@ -52,6 +52,22 @@ def test_protect_tells_the_meters_and_what_they_are_worth(
     assert pd.read_csv(tmp_path / "out" / "meters.csv")["meter"].tolist() == ["m08"]
 
 
+def test_the_usual_question_has_an_answer_where_all_powers_are_known(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, told, _ = run(monkeypatch, capsys, "protect", "--out", str(tmp_path / "out"))
+    assert code == 0
+    assert "protect 1 of 13 meters; no fewer suffice" in told
+    row = pd.read_csv(tmp_path / "out" / "summary.csv").iloc[0]
+    assert row["goal"] == "contain"
+    assert row["alone"] < row["after"] <= row["lie_volt"] < row["before"] < 8.0
+    for goal in ("identify", "notice"):
+        code, told, _ = run(monkeypatch, capsys, "protect", "--goal", goal)
+        assert code == 0
+        assert f"{goal} asks for nothing here, which is no safety" in told
+        assert "suffice" not in told
+
+
 def test_an_infeasible_protection_is_an_error(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -60,7 +76,7 @@ def test_an_infeasible_protection_is_an_error(
     assert "m08 succeed together whatever else is protected" in " ".join(told.split())
     code, _, told = run(monkeypatch, capsys, "protect", "--goal", "all")
     assert code == 2
-    assert "expected one of identify, notice, bound" in " ".join(told.replace("│", " ").split())
+    assert "expected one of identify, notice, bound, contain" in " ".join(told.replace("│", " ").split())
 
 
 def test_detectable_tells_sizes_and_keeps_its_word(
@@ -84,6 +100,7 @@ def test_feeders_in_three_phases_are_studied(
     meters = pd.read_csv(tmp_path / "meters.csv")
     assert meters["bus"].str[-2:].isin([".a", ".b", ".c"]).all()
     assert pd.read_csv(tmp_path / "summary.csv")["index"].tolist() == [float("inf"), 53.0]
-    code, told, _ = run(monkeypatch, capsys, "protect", "ieee-european-lv")
+    code, told, _ = run(monkeypatch, capsys, "protect", "ieee-european-lv", "--goal", "identify")
     assert code == 0
-    assert "protect 0 of 55 meters; no fewer suffice" in told
+    assert "identify asks for nothing here, which is no safety" in told
+    assert "--goal contain" in told

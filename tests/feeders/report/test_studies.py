@@ -27,7 +27,7 @@ from feeders.studies.detectable import Detectable
 from feeders.studies.droop import DroopStudy
 from feeders.studies.droop_safety import Kept
 from feeders.studies.droop_verdict import Verdict
-from feeders.studies.protect import Goal, Protect
+from feeders.studies.protect import Goal, Protect, protect
 from feeders.studies.redundancy import Redundancy
 from tests.feeders import stations
 
@@ -158,6 +158,30 @@ def test_a_search_that_gave_up_is_not_an_all_clear(site: Site, outcomes: list[Ou
     assert any(getattr(mark, "text", "") == "not known" for mark in drawing.marks)
 
 
+def test_what_is_not_proved_of_sizes_is_not_called_proved(site: Site, outcomes: list[Outcome]) -> None:
+    """That the search names who lies is simulated only, and what is proved has a probability, and a share."""
+    found = result(outcomes, "detectable")
+    assert isinstance(found, Detectable)
+    section = sizes(site, found)
+    for question in (Question.LIES, Question.PICTURE):
+        assert section.answers[question].standing is Standing.PART
+    assert "99.9 % at any one moment" in told(section, Question.LIES)
+    assert "checked by simulation" in told(section, Question.LIES)
+    assert "with 99.8 % for each customer" in told(section, Question.PICTURE)
+    assumed = " ".join(section.assumptions)
+    assert "hold with 99.9 %" in assumed
+    assert "every load draws 50 % of its peak" in assumed
+    assert "is not proved" in assumed
+
+
+def test_protection_against_false_powers_is_told(site: Site) -> None:
+    found = protect(site, max_attacked=2)
+    text = told(protection(site, found), Question.PROTECT)
+    assert text.startswith("Protect 2 of 6 meters: m03 and m06.")
+    assert "whatever powers they report" in text
+    assert "by itself with its powers true" in text
+
+
 def test_protection_with_a_gap_is_not_called_the_fewest(site: Site, outcomes: list[Outcome]) -> None:
     found = result(outcomes, "protect")
     assert isinstance(found, Protect)
@@ -168,7 +192,10 @@ def test_protection_with_a_gap_is_not_called_the_fewest(site: Site, outcomes: li
     none = replace(
         found, meters=found.meters.head(0), goal=Goal.NOTICE, before=math.inf, after=math.inf, least=0
     )
-    assert told(protection(site, none), Question.PROTECT).startswith("None for this purpose")
+    section = protection(site, none)
+    assert section.answers[Question.PROTECT].standing is Standing.OPEN
+    assert told(section, Question.PROTECT).startswith("No answer by this criterion, and no safety")
+    assert "None needs protection" not in section.figures[0].text
 
 
 def test_attacks_that_could_not_be_played_are_told(site: Site, played: Campaign) -> None:
