@@ -7,11 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from feeders.doubts import unread
 from feeders.load import from_tables, load
+from feeders.powerflow import PowerFlow
 from feeders.studies.hidden import Attack
-from feeders.studies.operating import box, squared, volts_of_lie
+from feeders.studies.operating import box, false_powers, squared, volts_of_lie
 from feeders.studies.protect import Goal, protect
 from gridsec.errors import DesignInfeasible
+from gridsec.studies.false_powers import largest_story
 from gridsec.studies.lies import largest_lie
 from tests.feeders import stations
 
@@ -89,3 +92,68 @@ def test_attacks_are_kept_in_the_journal(tmp_path: Path) -> None:
     whole = protect(RURAL, **arguments)
     assert again.meters.equals(whole.meters)
     assert again.attacks.equals(whole.attacks)
+
+
+# ------------------------------------------------------------------------------------ false powers
+
+
+def test_the_usual_goal_is_what_says_something_of_the_feeder() -> None:
+    """Who cannot stay invisible may lie within honest errors; who can is to be identified."""
+    assert protect(RURAL, max_attacked=2, unknown=UNKNOWN).goal is Goal.IDENTIFY
+    assert protect(RURAL, max_attacked=1, busbar_known=False).goal is Goal.IDENTIFY
+    found = protect(RURAL, max_attacked=2)
+    assert found.goal is Goal.CONTAIN
+    assert not found.no_answer
+    # Half of what company and false powers add is gone.
+    assert found.alone < found.after <= found.lie_volt < found.before
+    assert found.lie_volt == pytest.approx(0.5 * (found.alone + found.before), abs=0.01)
+    assert protect(RURAL, max_attacked=2, lie_volt=6.0).lie_volt == 6.0
+    for goal in (Goal.IDENTIFY, Goal.NOTICE):
+        nothing = protect(RURAL, max_attacked=2, goal=goal)
+        assert nothing.no_answer
+        assert (len(nothing.meters), nothing.before) == (0, np.inf)
+    with pytest.raises(ValueError, match="busbar"):
+        protect(RURAL, max_attacked=1, goal=Goal.CONTAIN, busbar_known=False)
+    with pytest.raises(ValueError, match="lie_volt is -1"):
+        protect(RURAL, max_attacked=1, lie_volt=-1.0)
+
+
+def test_containment_is_the_fewest_by_trying_all_on_a_small_feeder() -> None:
+    """Oracle: all 64 protections of six meters; false powers only make lies larger."""
+    site = load("cigre-lv")
+    given = false_powers(site)
+    found = protect(site, max_attacked=2)
+    enough = []
+    for bits in range(64):
+        honest = (bits >> np.arange(6)) % 2 == 1
+        sizes = [largest_story(given, j, 2, honest=honest).bound for j in range(6)]
+        if volts_of_lie(site.customer_volt, np.array(sizes)).max() <= found.lie_volt:
+            enough.append(int(honest.sum()))
+    assert len(found.meters) == found.least == min(enough)
+    true = protect(site, max_attacked=2, goal=Goal.BOUND, lie_volt=found.lie_volt)
+    assert true.before < found.before
+    assert true.before == pytest.approx(found.alone, rel=1e-5)
+
+
+def test_a_lie_with_false_powers_is_told_by_an_honest_feeder() -> None:
+    """Two AC power flows at both ends of the unknowns: all meters but the liar read the same within errors.
+
+    One is the truth, the other what is told. The linear model is off by some percent of what loads do.
+    """
+    site = load("cigre-lv")
+    given, middle, flow = false_powers(site), unread(site), PowerFlow(site)
+    j, base, count = site.meter_ids.index("m03"), site.feeder.base_kva, site.feeder.bus.size
+    found = largest_story(given, j, 1)
+    assert found.liars.tolist() == [j]
+    off = found.unknowns * np.where(given.owner == j, 1.0, given.honest)
+    ends = []
+    for sign in (1.0, -1.0):
+        p = middle.p + sign * off[:count] * middle.p_error
+        q = middle.q + sign * off[count : 2 * count] * middle.q_error
+        v0 = np.sqrt(1.0 + sign * off[-1] * given.box.effect[0, -1])
+        ends.append(flow.solve(-base * p, -base * q, site.feeder.base_volt * v0)[0])
+    apart = np.abs(ends[0] - ends[1]) / site.customer_volt
+    # Squares are twice as far apart; what the meter's own error adds to the lie is not in the voltages.
+    assert apart[j] == pytest.approx(0.5 * found.size - given.box.reading[j], rel=0.1)
+    assert (np.delete(apart - 1.1 * given.box.reading, j) <= 0.0).all()
+    assert apart[j] > 3.0 * given.box.reading[j]
