@@ -15,6 +15,7 @@ from service.console import Studied
 from service.foreign import converted
 from service.keeping import JournalAt, Keeping, NoJournal, keeping
 from service.places import see
+from service.planned import planned, sources
 from service.tables import write_tables
 
 if TYPE_CHECKING:
@@ -54,9 +55,18 @@ Places = Annotated[
     typer.Option(help="random, street, sensitive or colluding; may be repeated. [default: all]"),
 ]
 Seasons = Annotated[list[str] | None, typer.Option(help="May be repeated. [default: all four]")]
-Duration = Annotated[float, typer.Option(help="Length of a scenario, s.", min=30.0)]
+Duration = Annotated[
+    float | None, typer.Option(help="Length of a scenario, s. [default: 600 readings]", min=30.0)
+]
+Step = Annotated[
+    float | None,
+    typer.Option(help="Interval of the readings, s. [default: as the feeder's files say]", min=0.1),
+]
 DesignOf = Annotated[str, typer.Option(help="factorial or random combinations.")]
-Estimator = Annotated[str, typer.Option(help="Who watches; see `gridsec feeders estimators`.")]
+Estimator = Annotated[
+    str | None,
+    typer.Option(help="Who watches; see `gridsec feeders estimators`. [default: as the feeder's files say]"),
+]
 Settings = Annotated[
     list[str] | None,
     typer.Option(
@@ -65,7 +75,9 @@ Settings = Annotated[
 ]
 AlarmsPerYear = Annotated[
     list[float] | None,
-    typer.Option(help="False alarms it may raise in a year; may be repeated, for a curve. [default: 1]"),
+    typer.Option(
+        help="False alarms it may raise in a year; may be repeated, for a curve. [default: as the files say]"
+    ),
 ]
 Learned = Annotated[
     float, typer.Option(help="Hours over which it has learned its meters' fixed errors before.", min=0.0)
@@ -75,6 +87,22 @@ LoadErrorKw = Annotated[
     float, typer.Option(help="What nobody knows of each customer's active power, 1 sigma.", min=0.0)
 ]
 LoadErrorKvar = Annotated[float, typer.Option(help="The same of its reactive power, 1 sigma.", min=0.0)]
+KnownKw = Annotated[
+    float | None,
+    typer.Option(
+        help="What nobody knows of each metered customer's active power, 1 sigma; comes and goes within ten "
+        "minutes. [default: what the files say of registers; with --load-error-kvar, none]",
+        min=0.0,
+    ),
+]
+KnownKvar = Annotated[
+    float | None,
+    typer.Option(
+        help="The same of its reactive power. [default: what the files say of power factors; with "
+        "--load-error-kw, none]",
+        min=0.0,
+    ),
+]
 Workers = Annotated[int | None, typer.Option(help="Processes. [default: all cores]", min=1)]
 DaskAt = Annotated[str | None, typer.Option(help="Address of a Dask scheduler, in place of processes here.")]
 
@@ -90,15 +118,16 @@ def campaign(
     liars: Liars = None,
     place: Places = None,
     season: Seasons = None,
-    duration: Duration = 600.0,
+    duration: Duration = None,
+    step: Step = None,
     design: DesignOf = "factorial",
-    estimator: Estimator = "sequential",
+    estimator: Estimator = None,
     setting: Settings = None,
     alarms_per_year: AlarmsPerYear = None,
     learned: Learned = 0.0,
     meters: MetersAs = "site",
-    load_error_kw: LoadErrorKw = 0.1,
-    load_error_kvar: LoadErrorKvar = 0.05,
+    load_error_kw: KnownKw = None,
+    load_error_kvar: KnownKvar = None,
     workers: Workers = None,
     dask: DaskAt = None,
     journal: JournalAt = None,
@@ -109,31 +138,40 @@ def campaign(
     from feeders.load import load
     from feeders.profiles import Season
     from feeders.studies.campaign import campaign as study
-    from feeders.studies.campaign_plan import KINDS, Design, Place, Plan
-    from feeders.trials import LoadError, Meters
+    from feeders.studies.campaign_plan import Design, Place
+    from feeders.trials import Meters
 
     see(folders={"--out": out}, files={"--journal": journal})
     site, count = load(converted(feeder, out)), min(scenarios, together)
     with said(), keeping("campaign", feeder, journal, without=no_journal) as kept:
-        plan = Plan(
+        plan = planned(
+            site,
+            step=step,
+            duration=duration,
+            load_error_kw=load_error_kw,
+            load_error_kvar=load_error_kvar,
             scenes=-(-scenarios // count),
             together=count,
             seed=seed,
-            kinds=tuple(_kind(each) for each in kind or ()) or KINDS,
+            kinds=tuple(_kind(each, step or site.tables.meta.monitor.tick_s) for each in kind or ()) or None,
             liars=tuple(liars or (1, 3)),
             places=_each(place, Place, "--place"),
             design=_each([design], Design, "--design")[0],
-            duration_s=duration,
-            onset_s=(0.1 * duration, 0.3 * duration),
-            lying_s=0.5 * duration,
             seasons=_each(season, Season, "--season"),
             estimator=estimator,
-            alarms_per_year=tuple(sorted(set(alarms_per_year or (1.0,)))),
+            alarms_per_year=tuple(sorted(set(alarms_per_year))) if alarms_per_year else None,
             learn_s=3600.0 * learned,
             settings=tuple(_setting(each) for each in setting or ()),
             meters=_each([meters], Meters, "--meters")[0],
-            load_error=LoadError(load_error_kw, load_error_kvar),
         )
+        given = {
+            "--step": step,
+            "--estimator": estimator,
+            "--alarms-per-year": alarms_per_year,
+            "--load-error-kw": load_error_kw,
+            "--load-error-kvar": load_error_kvar,
+        }
+        console.out.print(escape(sources(site, plan, given)))
         if promised:
             plan = _with_promised(site, plan, plan.kinds if kind else (), kept)
         with bar("scenarios") as tell:
@@ -183,14 +221,14 @@ def _each(chosen: list[str] | None, known: type[Choice], option: str) -> tuple[C
     return tuple(known(name) for name in dict.fromkeys(chosen))
 
 
-def _kind(text: str) -> Kind:
+def _kind(text: str, step_s: float) -> Kind:
     from feeders.lies import Trick
     from feeders.studies.campaign_plan import KINDS, Kind
 
     name, _, sizes = text.partition(":")
     (trick,) = _each([name], Trick, "--kind")
     if not sizes:
-        usual = [kind for kind in KINDS if kind.trick is trick]
+        usual = [kind.every(step_s) for kind in KINDS if kind.trick is trick]
         sizes = ",".join(str(size) for kind in usual for size in kind.sizes)
     try:
         return Kind(name, trick, tuple(float(size) for size in sizes.split(",")))

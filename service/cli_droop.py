@@ -98,10 +98,10 @@ def droop(
     """Is the volt/VAR fleet stable, with what margins; does it keep the band; how much more is hosted."""
     from feeders.load import load
     from feeders.studies.droop import DroopOptions
-    from feeders.studies.droop_fleets import Who
+    from feeders.studies.droop_fleets import NOTHING, NoInverters, Who
 
     fleets = hosting_preset or ["none", "ieee1547-b"]
-    _see([who], tuple(Who), "--who")
+    see_choice([who], tuple(Who), "--who")
     _see_presets(preset, compare, fleets)
     usual = DroopOptions()
     options = DroopOptions(
@@ -127,7 +127,13 @@ def droop(
     see(folders={"--out": out}, files={"--journal": journal})
     with keeping("droop", feeder, journal, without=no_journal) as kept:
         site, others = load(converted(feeder, out)), [load(converted(name, None)) for name in also or ()]
-        found = _studied(site, others, options, seed, kept)
+        try:
+            found = _studied(site, others, options, seed, kept)
+        except NoInverters:
+            if hosting:
+                raise
+            console.out.print(escape(f"{site.feeder.name}: {NOTHING} (--preset equips customers with some)"))
+            return
         _tell(found, options)
         write_tables(out, found.tables)
 
@@ -152,12 +158,19 @@ def _studied(
 def _see_presets(preset: str | None, compare: Sequence[str] | None, hosting: Sequence[str]) -> None:
     from gridsec.droop import PRESETS
 
-    _see([preset] if preset else [], PRESETS, "--preset")
-    _see(compare or [], PRESETS, "--compare")
-    _see(hosting, ("none", *PRESETS), "--hosting-preset")
+    see_choice([preset] if preset else [], PRESETS, "--preset")
+    see_choice(compare or [], PRESETS, "--compare")
+    see_choice(hosting, ("none", *PRESETS), "--hosting-preset")
 
 
-def _see(names: Sequence[str], known: tuple[str, ...], option: str) -> None:
+def see_choice(names: Sequence[str], known: Sequence[str], option: str) -> None:
+    """Refuse names that do not exist.
+
+    Parameters
+    ----------
+    names, known, option
+        What was given, what there is, and for which option.
+    """
     for name in names:
         if name not in known:
             raise typer.BadParameter(f"{name!r}: expected one of {', '.join(known)}", param_hint=option)

@@ -14,7 +14,8 @@ import typer
 from rich.markup import escape
 
 from service import console
-from service.cli_campaign import Seed
+from service.cli_campaign import Estimator, KnownKvar, KnownKw, Seed, Step
+from service.cli_droop import Allowed, Preset, see_choice
 from service.cli_plan import BusbarUnknown, Silent, Unknown, bar
 from service.console import FAILED, Studied, complain
 from service.foreign import converted
@@ -43,6 +44,9 @@ Scenarios = Annotated[int, typer.Option(help="How many attacks are simulated.", 
 Workers = Annotated[
     int | None, typer.Option(help="Processes for simulated attacks. [default: all cores]", min=1)
 ]
+BusbarLimits = Annotated[
+    tuple[float, float] | None, typer.Option(help="Limits of the busbar's voltage, pu. [default: 1 1]")
+]
 Hosting = Annotated[bool, typer.Option("--hosting", help="Look for hosting capacities too.")]
 Readings = Annotated[
     Path | None, typer.Option(help="A recording (Parquet or CSV) to compare the files with.")
@@ -67,6 +71,13 @@ def report(
     scenarios: Scenarios = 160,
     seed: Seed = 0,
     workers: Workers = None,
+    step: Step = None,
+    estimator: Estimator = None,
+    load_error_kw: KnownKw = None,
+    load_error_kvar: KnownKvar = None,
+    preset: Preset = None,
+    busbar: BusbarLimits = None,
+    band: Allowed = None,
     hosting: Hosting = False,
     readings: Readings = None,
     at: At = None,
@@ -75,10 +86,14 @@ def report(
 
     Interrupted, the same command goes on where it was. What a study cannot answer, the report says.
     """
+    from feeders.columns import ESTIMATORS
+    from gridsec.droop import PRESETS
     from service.study_report import STUDIES, Asked
 
     chosen = _studies(studies, tuple(STUDIES), recorded=readings is not None)
     _see_goal(goal, lie_volt)
+    see_choice([preset] if preset else [], PRESETS, "--preset")
+    see_choice([estimator] if estimator else [], ESTIMATORS, "--estimator")
     made = _moment(at)
     asked = Asked(
         feeder=feeder,
@@ -91,6 +106,13 @@ def report(
         scenarios=scenarios,
         seed=seed,
         workers=workers or os.cpu_count() or 1,
+        step=step,
+        estimator=estimator,
+        load_error_kw=load_error_kw,
+        load_error_kvar=load_error_kvar,
+        preset=preset,
+        busbar=busbar,
+        band=band,
         hosting=hosting,
         readings=readings,
     )
@@ -112,7 +134,7 @@ def _make(asked: Asked, chosen: tuple[str, ...], out: Path, *, made: str, comman
     from feeders.origin import origin
     from feeders.report.book import report as make
     from feeders.report.page import About
-    from service.study_report import outcome, see_readings, seeds, versions, write
+    from service.study_report import attacks, outcome, see_readings, seeds, versions, write
 
     folder = out.with_name(f"{out.stem}-files")
     parts = {f"--out, {name}": folder / name for name in ("figures", "tables", "journals")}
@@ -121,11 +143,16 @@ def _make(asked: Asked, chosen: tuple[str, ...], out: Path, *, made: str, comman
         studied = converted(asked.feeder, folder)
         site, source = load(studied), origin(studied)
         see_readings(chosen, site, asked)
+        if "campaign" in chosen:
+            console.out.print(escape(attacks(site, asked)))
         outcomes = [outcome(name, site, asked, kept=kept, bar=bar) for name in chosen]
         about = About(made, command, versions(), seeds(chosen, asked), folder.name)
         write(make(site, outcomes, about, source), out, folder)
     console.out.print(escape(f"{out}: {len(outcomes)} studies; figures and tables in {folder}"))
-    failed = [each for each in outcomes if each.result is None]
+    for each in outcomes:
+        if each.absent:
+            console.out.print(escape(f"{each.study}: {each.problem}"))
+    failed = [each for each in outcomes if each.result is None and not each.absent]
     for each in failed:
         complain(f"{each.study}: {each.problem}")
     if failed:
@@ -174,6 +201,8 @@ def _command(asked: Asked, out: Path, studies: str | None) -> str:
         option = f"--{each.name.replace('_', '-')}"
         if value is True:
             words.append(option)
+        elif each.name in ("busbar", "band"):
+            words += [option, *(f"{limit:g}" for limit in value)]
         elif isinstance(value, tuple):
             words += [word for name in value for word in (option, name)]
         else:

@@ -15,11 +15,14 @@ from typing import TYPE_CHECKING, Final
 
 from feeders.report.book import Report
 from feeders.report.sections import Outcome, Result
+from feeders.studies.droop_fleets import NOTHING, NoInverters
 from gridsec.errors import GridsecError
+from service.planned import planned, sources
 from service.tables import replace_file, write_tables
 
 if TYPE_CHECKING:
     from feeders.load import Site
+    from feeders.studies.campaign_plan import Plan
     from feeders.studies.journal import Progress, Where
     from service.keeping import Keeping
 
@@ -47,6 +50,11 @@ class Asked:
         What nobody knows; meters that are missing.
     scenarios, seed, workers
         Of simulated attacks; the seed is for all that is random.
+    step, estimator, load_error_kw, load_error_kvar
+        Of simulated attacks: interval of the readings, s, who watches, and what nobody knows of powers; None:
+        as the feeder's files say.
+    preset, busbar, band
+        Of the inverters' study, as in `DroopOptions`; None: as there.
     hosting
         Whether to look for hosting capacities.
     readings
@@ -63,6 +71,13 @@ class Asked:
     scenarios: int = 160
     seed: int = 0
     workers: int = 1
+    step: float | None = None
+    estimator: str | None = None
+    load_error_kw: float | None = None
+    load_error_kvar: float | None = None
+    preset: str | None = None
+    busbar: tuple[float, float] | None = None
+    band: tuple[float, float] | None = None
     hosting: bool = False
     readings: Path | None = None
 
@@ -127,7 +142,11 @@ def _redundancy(site: Site, asked: Asked, journal: Where, tell: Progress | None)
 def _droop(site: Site, asked: Asked, journal: Where, tell: Progress | None) -> Result:
     from feeders.studies.droop import DroopOptions, droop
 
-    options = DroopOptions(hosting=asked.hosting)
+    low, high = asked.busbar or (1.0, 1.0)
+    least, most = asked.band or (None, None)
+    options = DroopOptions(
+        preset=asked.preset, v0_low=low, v0_high=high, v_min=least, v_max=most, hosting=asked.hosting
+    )
     return droop(site, options, seed=asked.seed, journal=journal, progress=tell)
 
 
@@ -141,20 +160,46 @@ def _calibrate(site: Site, asked: Asked, journal: Where, tell: Progress | None) 
 
 def _campaign(site: Site, asked: Asked, journal: Where, tell: Progress | None) -> Result:
     from feeders.studies.campaign import campaign
-    from feeders.studies.campaign_plan import Plan
-    from feeders.studies.campaign_run import Here, Processes
+    from feeders.studies.campaign_run import cores
 
-    usual = Plan()
-    together = min(asked.scenarios, usual.together)
-    plan = Plan(
+    return campaign(site, plan(site, asked), runner=cores(asked.workers), journal=journal, progress=tell)
+
+
+def plan(site: Site, asked: Asked) -> Plan:
+    """The simulated attacks of a report.
+
+    Parameters
+    ----------
+    site, asked
+        The feeder, and what was asked.
+    """
+    from feeders.studies.campaign_plan import Plan
+
+    together = min(asked.scenarios, Plan().together)
+    return planned(
+        site,
+        step=asked.step,
+        load_error_kw=asked.load_error_kw,
+        load_error_kvar=asked.load_error_kvar,
         scenes=-(-asked.scenarios // together),
         together=together,
         seed=asked.seed,
         liars=tuple(sorted({1, asked.max_attacked})),
+        estimator=asked.estimator,
         settings=(("max_attacked", asked.max_attacked),),
     )
-    runner = Processes(asked.workers) if asked.workers > 1 else Here()
-    return campaign(site, plan, runner=runner, journal=journal, progress=tell)
+
+
+def attacks(site: Site, asked: Asked) -> str:
+    """What the simulated attacks of a report take from the feeder's files, and what from options.
+
+    Parameters
+    ----------
+    site, asked
+        The feeder, and what was asked.
+    """
+    names = ("step", "estimator", "load_error_kw", "load_error_kvar")
+    return sources(site, plan(site, asked), {option(name): getattr(asked, name) for name in names})
 
 
 def _liars(asked: Asked) -> list[str]:
@@ -174,11 +219,35 @@ def _protection(asked: Asked) -> list[str]:
 def _campaigned(asked: Asked) -> list[str]:
     count = [word for number in sorted({1, asked.max_attacked}) for word in ("--liars", str(number))]
     setting = ["--setting", f"max_attacked={asked.max_attacked}"]
-    return ["--scenarios", str(asked.scenarios), "--seed", str(asked.seed), *count, *setting]
+    watched = _given(asked, "step", "estimator", "load_error_kw", "load_error_kvar")
+    return ["--scenarios", str(asked.scenarios), "--seed", str(asked.seed), *count, *setting, *watched]
 
 
 def _fleet(asked: Asked) -> list[str]:
-    return ["--seed", str(asked.seed)] + ["--hosting"] * asked.hosting
+    words = _given(asked, "preset", "busbar", "band")
+    return ["--seed", str(asked.seed), *words] + ["--hosting"] * asked.hosting
+
+
+def _given(asked: Asked, *names: str) -> list[str]:
+    """Options whose values are not the usual ones."""
+    words = []
+    for name in names:
+        value = getattr(asked, name)
+        if value is not None:
+            values = value if isinstance(value, tuple) else (value,)
+            words += [option(name), *(f"{one:g}" if isinstance(one, float) else one for one in values)]
+    return words
+
+
+def option(name: str) -> str:
+    """What an attribute of `Asked` is called on the command line.
+
+    Parameters
+    ----------
+    name
+        The attribute.
+    """
+    return f"--{name.replace('_', '-')}"
 
 
 STUDIES: Final[dict[str, Study]] = {
@@ -225,14 +294,19 @@ def outcome(
     words = ["gridsec", "study", name, asked.feeder, *study.options(asked)]
     start = time.perf_counter()
     found: Result | None = None
-    problem = ""
+    problem, absent = "", False
     with bar(study.what) as tell:
         try:
             found = study.run(site, asked, kept, tell)
+        except NoInverters as error:
+            absent = not asked.hosting
+            problem = NOTHING if absent else str(error)
         except (GridsecError, ValueError) as error:
             problem = str(error)
     duration = time.perf_counter() - start
-    return Outcome(name, found, problem, shlex.join(words), duration, name in kept.resumed)
+    return Outcome(
+        name, found, problem, shlex.join(words), duration, resumed=name in kept.resumed, absent=absent
+    )
 
 
 def see_readings(names: Iterable[str], site: Site, asked: Asked) -> None:

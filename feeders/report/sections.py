@@ -52,6 +52,8 @@ class Outcome:
         How long it took.
     resumed
         Whether some of the work was kept from before, and is not in `seconds`.
+    absent
+        Whether there is nothing on this feeder that it could study; `problem` says what.
     """
 
     study: str
@@ -60,6 +62,7 @@ class Outcome:
     command: str = ""
     seconds: float = 0.0
     resumed: bool = False
+    absent: bool = False
 
 
 SECTIONS: Final[dict[str, Callable[[Site, Any], Section]]] = {
@@ -102,12 +105,15 @@ def section(site: Site, outcome: Outcome) -> Section:
         The feeder, and what became of the study.
     """
     if outcome.result is None:
+        questions = ANSWERS.get(outcome.study, (Question.OTHER,))
+        if outcome.absent:
+            nothing = Finding(Standing.ABSENT, ((f"{outcome.problem[:1].upper()}{outcome.problem[1:]}.",),))
+            return Section(_title(outcome.study), dict.fromkeys(questions, nothing))
         problem = outcome.problem or "it ended without a result"
         finding = Finding(
             Standing.FAILED,
             ((f"No answer: {problem}. ", "This says nothing about whether there is a danger."),),
         )
-        questions = ANSWERS.get(outcome.study, (Question.OTHER,))
         return Section(_title(outcome.study), dict.fromkeys(questions, finding))
     make = SECTIONS.get(outcome.study, _generic(outcome.study))
     return make(site, outcome.result)

@@ -206,7 +206,7 @@ def droop(
 
     Raises
     ------
-    FeederInvalid
+    NoInverters
         If the feeder has no inverters and no preset is given.
     ValueError
         If options are out of range.

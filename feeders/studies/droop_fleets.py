@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "KVA_PER_KW",
+    "NOTHING",
+    "NoInverters",
     "Who",
     "box",
     "chosen_fleet",
@@ -36,6 +38,13 @@ KVA_PER_KW: Final = 1.1
 
 SMALLEST_KVA: Final = 5.0
 """Rating of inverters given to customers without generation, kVA."""
+
+NOTHING: Final = "no inverters: nothing to be stable"
+"""What there is to say of a feeder without them."""
+
+
+class NoInverters(FeederInvalid):
+    """There is no droop inverter on a feeder, and so nothing that could be unstable."""
 
 
 class Who(StrEnum):
@@ -131,13 +140,15 @@ def chosen_fleet(site: Site, preset: str | None, who: Who = Who.PV) -> Droop:
 
     Raises
     ------
-    FeederInvalid
+    NoInverters
         If there is none.
+    FeederInvalid
+        If a preset has nobody to equip.
     """
     if preset is not None:
         return equip(site, preset, who)
     if not site.droop.tau.size:
-        raise FeederInvalid(
+        raise NoInverters(
             [
                 f"{site.feeder.name} has no droop inverters: fill the columns inverter_kva and droop of its "
                 "customers.csv, or give a preset (--preset ieee1547-b) to equip customers with generation, "
