@@ -80,16 +80,22 @@ class Case:
     root: str | None = None
 
 
-def cases(folder: Path) -> Iterator[Case]:
-    """All feeders; those of the other tools are written to a folder first."""
+def cases(folder: Path, words: list[str]) -> Iterator[Case]:
+    """All feeders that contain one of some words; those of the other tools are written to a folder first."""
     for tool, networks in (("pandapower", PANDAPOWER), ("simbench", SIMBENCH)):
         for name, roots in networks.items():
-            for root in roots.split(","):
+            for root in roots.split(",") if _wanted(f"{tool}:{name}", words) else ():
                 yield Case(f"{name}{f', {root}' if root else ''}", tool, f"{tool}:{name}", root or None)
     for name in SAVED:
         tables = load(name).tables
-        yield Case(name, "OpenDSS", str(opendss(folder / f"{name}-dss", tables)))
-        yield Case(name, "power-grid-model", str(power_grid_model(folder / f"{name}.json", tables)))
+        if _wanted(f"OpenDSS:{name}", words):
+            yield Case(name, "OpenDSS", str(opendss(folder / f"{name}-dss", tables)))
+        if _wanted(f"power-grid-model:{name}", words):
+            yield Case(name, "power-grid-model", str(power_grid_model(folder / f"{name}.json", tables)))
+
+
+def _wanted(source: str, words: list[str]) -> bool:
+    return not words or any(word in source for word in words)
 
 
 def ends(tables: FeederTables) -> Iterator[LineRow]:
@@ -187,7 +193,13 @@ def left_out(changes: tuple[Change, ...]) -> str:
             noun = rest if first.isdigit() else first
             kind = {"buses": "bus", "table": each.element.partition(",")[0]}.get(noun, noun)
             found[kind if each.prop == WHOLE else f"{each.prop} of {kind}"] += count
-    return ", ".join(f"{count} {what}" for what, count in found.items()) or "nothing"
+    return ", ".join(_counted(what, count) for what, count in found.items()) or "nothing"
+
+
+def _counted(what: str, count: int) -> str:
+    if " " in what:  # a table, or a property
+        return what if count == 1 else f"{what} ({count})"
+    return f"{count} {what}{'' if count == 1 else 'es' if what.endswith('s') else 's'}"
 
 
 def line_of(case: Case, done: Conversion, customers: int) -> str:
@@ -210,9 +222,7 @@ def main(words: list[str]) -> int:
     )
     print("|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as scratch:
-        for case in cases(Path(scratch)):
-            if words and not any(word in f"{case.source} {case.tool}" for word in words):
-                continue
+        for case in cases(Path(scratch), words):
             tried += 1
             folder = Path(scratch) / "feeder"
             try:
