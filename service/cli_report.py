@@ -16,7 +16,7 @@ from rich.markup import escape
 from service import console
 from service.cli_campaign import Estimator, KnownKvar, KnownKw, Seed, Step
 from service.cli_droop import Allowed, Preset, see_choice
-from service.cli_plan import BusbarUnknown, Silent, Unknown, bar
+from service.cli_plan import BusbarUnknown, GoalOf, LieVolt, Silent, Unknown, bar
 from service.console import FAILED, Studied, complain
 from service.foreign import converted
 from service.keeping import keeping
@@ -34,12 +34,6 @@ Studies = Annotated[
     typer.Option(help="Names of studies, with commas between them. [default: all there is data for]"),
 ]
 MaxAttacked = Annotated[int, typer.Option(help="M: how many meters lie together at most.", min=1)]
-GoalOf = Annotated[
-    str, typer.Option(help="Protect so that liars are named: identify; noticed: notice; small: bound.")
-]
-LieVolt = Annotated[
-    float | None, typer.Option(help="For bound: largest unnoticed lie, V of the busbar's level.")
-]
 Scenarios = Annotated[int, typer.Option(help="How many attacks are simulated.", min=1)]
 Workers = Annotated[
     int | None, typer.Option(help="Processes for simulated attacks. [default: all cores]", min=1)
@@ -63,7 +57,7 @@ def report(
     out: Page = Path("report.html"),
     studies: Studies = None,
     max_attacked: MaxAttacked = 2,
-    goal: GoalOf = "identify",
+    goal: GoalOf = None,
     lie_volt: LieVolt = None,
     unknown: Unknown = None,
     silent: Silent = None,
@@ -119,13 +113,17 @@ def report(
     _make(asked, chosen, out, made=made, command=_command(asked, out, studies))
 
 
-def _see_goal(goal: str, lie_volt: float | None) -> None:
+def _see_goal(goal: str | None, lie_volt: float | None) -> None:
     from feeders.studies.protect import Goal
 
+    if goal is None:
+        return
     if goal not in tuple(Goal):
         raise typer.BadParameter(f"{goal!r}: expected one of {', '.join(Goal)}", param_hint="--goal")
-    if (goal == Goal.BOUND) != (lie_volt is not None):
-        raise typer.BadParameter("goes with --goal bound, and that with it", param_hint="--lie-volt")
+    if goal == Goal.BOUND and lie_volt is None:
+        raise typer.BadParameter("--goal bound asks for it", param_hint="--lie-volt")
+    if not Goal(goal).in_volts and lie_volt is not None:
+        raise typer.BadParameter("goes with --goal bound and contain", param_hint="--lie-volt")
 
 
 def _make(asked: Asked, chosen: tuple[str, ...], out: Path, *, made: str, command: str) -> None:

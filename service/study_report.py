@@ -45,7 +45,7 @@ class Asked:
     max_attacked
         M.
     goal, lie_volt
-        What protection is for, and the bound of a lie, V, if it is for that.
+        What protection is for, by default as the study has it, and the bound of a lie, V.
     unknown, silent, busbar_unknown
         What nobody knows; meters that are missing.
     scenarios, seed, workers
@@ -63,7 +63,7 @@ class Asked:
 
     feeder: str
     max_attacked: int = 2
-    goal: str = "identify"
+    goal: str | None = None
     lie_volt: float = math.nan
     unknown: tuple[str, ...] | None = None
     silent: tuple[str, ...] = ()
@@ -117,7 +117,7 @@ def _protect(site: Site, asked: Asked, journal: Where, tell: Progress | None) ->
     return protect(
         site,
         max_attacked=asked.max_attacked,
-        goal=Goal(asked.goal),
+        goal=None if asked.goal is None else Goal(asked.goal),
         lie_volt=asked.lie_volt,
         unknown=asked.unknown,
         busbar_known=not asked.busbar_unknown,
@@ -213,7 +213,8 @@ def _known(asked: Asked) -> list[str]:
 
 def _protection(asked: Asked) -> list[str]:
     bound = [] if math.isnan(asked.lie_volt) else ["--lie-volt", f"{asked.lie_volt:g}"]
-    return [*_liars(asked), "--goal", asked.goal, *bound, *_known(asked)]
+    goal = [] if asked.goal is None else ["--goal", asked.goal]
+    return [*_liars(asked), *goal, *bound, *_known(asked)]
 
 
 def _campaigned(asked: Asked) -> list[str]:

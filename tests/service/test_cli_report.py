@@ -107,9 +107,9 @@ def test_what_a_study_cannot_answer_is_in_the_report(
     [
         (("--studies", "protect,palmistry"), "'palmistry': expected some of"),
         (("--studies", "calibrate"), "calibrate needs --readings"),
-        (("--goal", "all"), "expected one of identify, notice, bound"),
-        (("--goal", "bound"), "goes with --goal bound"),
-        (("--lie-volt", "3"), "goes with --goal bound"),
+        (("--goal", "all"), "expected one of identify, notice, bound, contain"),
+        (("--goal", "bound"), "--goal bound asks for it"),
+        (("--goal", "notice", "--lie-volt", "3"), "goes with --goal bound and contain"),
         (("--at", "tomorrow"), "expected a date and time of ISO 8601"),
     ],
 )
