@@ -392,7 +392,7 @@ def _shunts(net: Any, buses: dict[int, str], network: Network) -> None:
         if not row.in_service:
             network.of_bus.append((bus, Change(label, WHOLE, "left out", "switched off in the source")))
             continue
-        p, q = (float(row[name]) * float(row.step) for name in ("p_mw", "q_mvar"))
+        p, q = _at_its_step(net, row)
         if p != 0:
             network.of_bus.append((bus, Change(label, "conductance", "left out", f"{1e3 * p:.4g} kW")))
         if q > 0:
@@ -401,6 +401,16 @@ def _shunts(net: Any, buses: dict[int, str], network: Network) -> None:
             network.lines.append(capacitor(label, bus, -q / float(row.vn_kv) ** 2))
             effect = f"{-1e3 * q:.4g} kvar as the charging of a line to nowhere"
             network.of_bus.append((bus, Change(label, "connection", "changed", effect)))
+
+
+def _at_its_step(net: Any, row: Any) -> tuple[float, float]:
+    """Powers of a shunt at nominal voltage, MW and Mvar: so many steps, or what a table has for its step."""
+    by_table = row.get("step_dependency_table")  # NaN in files of older versions
+    if isinstance(by_table, bool | np.bool_) and by_table and "shunt_characteristic_table" in net:
+        table = net.shunt_characteristic_table
+        hits = table[(table.id_characteristic == row.id_characteristic_table) & (table.step == row.step)]
+        return float(hits.p_mw.sum()), float(hits.q_mvar.sum())
+    return float(row.p_mw) * float(row.step), float(row.q_mvar) * float(row.step)
 
 
 def _rest(net: Any, buses: dict[int, str], network: Network) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pandapower as pp
+import pandas as pd
 import pytest
 from pandapower.control import ConstControl
 from power_grid_model import ComponentType
@@ -188,6 +189,20 @@ def test_in_star_is_what_flows_between_the_phases() -> None:
     ab, ca = np.conj(pairs[0] / (volts[0] - volts[1])), np.conj(pairs[2] / (volts[2] - volts[0]))
     np.testing.assert_allclose(in_star(pairs, volts), volts * np.conj([ab - ca, -ab, ca]), rtol=1e-12)
     assert in_star(pairs, volts).sum() == pytest.approx(pairs.sum())
+
+
+def test_a_capacitor_takes_what_its_table_has_for_its_step() -> None:
+    net = village()
+    pp.create_shunt(net, 3, -0.001, step=2, step_dependency_table=True, id_characteristic_table=0)
+    net["shunt_characteristic_table"] = pd.DataFrame(
+        {"id_characteristic": [0, 0, 1], "step": [1, 2, 2], "q_mvar": [-0.004, -0.007, -9.0], "p_mw": 0.0}
+    )
+    converted = from_pandapower(net, "x", root="root")
+    assert converted.state is not None
+    assert compare(converted.state, converted.tables).exact
+    assert not [fate for fate in fates(converted) if "characteristic" in fate]
+    row = next(row for row in converted.tables.lines if row.line == "shunt shunt-0")
+    assert row.b_us == pytest.approx(1e6 * 0.007 / 0.4**2)
 
 
 def test_batteries_and_plants_that_draw() -> None:
