@@ -88,6 +88,8 @@ def report(
     _see_goal(goal, lie_volt)
     see_choice([preset] if preset else [], PRESETS, "--preset")
     see_choice([estimator] if estimator else [], ESTIMATORS, "--estimator")
+    _see_limits(busbar, "--busbar")
+    _see_limits(band, "--band", apart=True)
     made = _moment(at)
     asked = Asked(
         feeder=feeder,
@@ -124,6 +126,17 @@ def _see_goal(goal: str | None, lie_volt: float | None) -> None:
         raise typer.BadParameter("--goal bound asks for it", param_hint="--lie-volt")
     if not Goal(goal).in_volts and lie_volt is not None:
         raise typer.BadParameter("goes with --goal bound and contain", param_hint="--lie-volt")
+
+
+def _see_limits(limits: tuple[float, float] | None, option: str, *, apart: bool = False) -> None:
+    """Refuse limits before the work that the droop study would refuse."""
+    if limits is None:
+        return
+    low, high = limits
+    if not 0.0 < low <= high < math.inf or (apart and low == high):
+        raise typer.BadParameter(
+            f"expected two ascending numbers, not {low:g} and {high:g}", param_hint=option
+        )
 
 
 def _make(asked: Asked, chosen: tuple[str, ...], out: Path, *, made: str, command: str) -> None:
