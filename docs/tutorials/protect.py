@@ -1,6 +1,6 @@
-"""Protect: the fewest meters to seal, so that liars among the others are identified.
+"""Protect: the fewest meters to seal, so that the others can only lie a little, or are identified.
 
-SimBench rural 1, where nobody knows what two customers draw.
+SimBench rural 1, and then where nobody knows what two customers draw.
 """
 
 from __future__ import annotations
@@ -10,6 +10,12 @@ from feeders.studies.protect import Goal, protect
 from gridsec.errors import GridsecError
 
 site = load("simbench-lv-rural1")
+
+# Any two meters, whatever voltages and powers they report.
+usual = protect(site, max_attacked=2)
+print(f"{usual.goal}: protect {usual.meters['meter'].tolist()}")
+print(f"lies of {usual.before:.2f} V fit to an honest feeder before, of {usual.after:.2f} V after")
+
 unknown = ["LV1.101 Load 4", "LV1.101 Load 8"]
 found = protect(site, max_attacked=2, unknown=unknown)
 print(f"{len(found.meters)} to protect, and no fewer than {found.least} suffice")

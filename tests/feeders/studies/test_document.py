@@ -46,6 +46,10 @@ def test_numbers_of_protect() -> None:
     some = protect(RURAL, max_attacked=2, unknown=["LV1.101 Load 4", "LV1.101 Load 8"])
     for row in some.meters.to_dict("records"):
         assert cells(row["meter"]) == [row["customer"], row["bus"], str(row["attacks"])]
+    usual = protect(RURAL, max_attacked=2)
+    assert usual.meters["meter"].tolist() == ["m13"]
+    assert f"largest hidden lie, V: {usual.before:.4g} before, {usual.after:.4g} after" in PAGE
+    assert f"(contain): at most {usual.lie_volt:.4g}; one meter hides {usual.alone:.4g}" in PAGE
     found = protect(RURAL, max_attacked=2, goal=Goal.BOUND, lie_volt=4.5)
     assert f"largest hidden lie, V: {found.before:.4g} before, {found.after:.4g} after" in PAGE
 
