@@ -14,7 +14,7 @@ from feeders.campaign import NoSuchAttack
 from feeders.doubts import load_doubt
 from feeders.estimators import FAMILIES, Family, Watcher, choose, design
 from feeders.lies import Lie, Trick, manipulations
-from feeders.load import Site, load
+from feeders.load import Site, from_tables, load
 from feeders.scenario import START, simulate
 from feeders.trials import LoadError, Meters, Trial, Truth, frames, judge
 from feeders.variation import Customers
@@ -123,6 +123,40 @@ def test_intervals_give_the_standard_deviation_back_and_the_files_state_it() -> 
     assert (doubt.time_s, doubt.common_q) == (300.0, 0.0)
     wide, _ = played(load_error=LoadError(0.5, 0.1, half_width=3.0))[0]
     np.testing.assert_allclose(wide.p_error * base, 1.5)
+
+
+def test_without_load_errors_frames_are_those_of_service_and_hold_the_truth() -> None:
+    """Registers and power factors err as the files say, by as much as the intervals have, all the time."""
+    made = trial(load_error=None, meters=Meters.SITE)
+    assert made.stated.tables.customers == small().tables.customers
+    assert made.stated.tables.meta == small().tables.meta
+    samples, base = list(simulate(small(), made.scenario)), small().feeder.base_kva
+    off = []
+    for sample, (frame, _) in zip(samples, frames(made), strict=True):
+        p, q = np.zeros((2, frame.p.size))
+        p[:], q[:] = -sample.p_kw / base, -sample.q_kvar / base
+        q[small().droop.customer] -= sample.x_kvar / base
+        assert (np.abs(p - frame.p) <= frame.p_error + 1e-12).all()
+        assert (np.abs(q - frame.q) <= frame.q_error + 1e-12).all()
+        off.append((q - frame.q) / frame.q_error)
+    # They last: what a power factor is wrong by stays, customer by customer, and is no small part.
+    mean = np.mean(off, axis=0)
+    assert np.std(np.array(off) - mean) < 0.2 * np.std(mean)
+    assert 0.2 < np.std(mean) < 1.0
+
+
+def test_what_the_files_say_to_come_and_go_does() -> None:
+    tables = small().tables
+    told = tuple(replace(row, p_std_kw=0.5, q_std_kvar=0.25) for row in tables.customers[:4])
+    site = from_tables(replace(tables, customers=(*told, *tables.customers[4:])))
+    made = Trial(site, seed=3, duration_s=20_000.0, step_s=20.0, load_error=None, meters=Meters.SITE)
+    p, q = Customers(site, made.scenario.variation, 3, START, made.profile_s).hidden(
+        START + 20.0 * np.arange(1000.0)
+    )
+    metered = np.array([bool(row.meter) for row in tables.customers])
+    std = np.where(metered & (np.arange(metered.size) < 4), 0.5, 0.0)
+    np.testing.assert_allclose(np.std(p, axis=0), std, rtol=0.5)
+    np.testing.assert_allclose(np.std(q, axis=0), 0.5 * std, rtol=0.5)
 
 
 @pytest.mark.parametrize(("meters", "fixed", "jitter"), [("white", 0.0, 0.2), ("real", 0.5, 0.05)])

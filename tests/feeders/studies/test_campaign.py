@@ -24,7 +24,7 @@ from feeders.load import Site, from_tables, load
 from feeders.profiles import Season
 from feeders.studies.campaign import Campaign, NothingPlayed, campaign
 from feeders.studies.campaign_lies import attacks, liars
-from feeders.studies.campaign_plan import CLEAN, Case, Kind, Place
+from feeders.studies.campaign_plan import CLEAN, Case, Kind, Place, Plan
 from feeders.studies.campaign_run import (
     ClusterUnusable,
     Dask,
@@ -59,31 +59,57 @@ def same(one: Campaign, other: Campaign) -> None:
 # ------------------------------------------------------------------------------------------------ truth
 
 
-def test_every_row_is_what_the_full_play_of_its_case_shows(here: Campaign) -> None:
+def test_a_plan_of_the_files_counts_in_readings() -> None:
+    assert replace(Plan.of(SITE), load_error=Plan().load_error) == Plan()
+    meta = SITE.tables.meta
+    monitor = replace(
+        meta.monitor, tick_s=900.0, silence_s=9000.0, estimator="set-search", alarms_per_year=3.0
+    )
+    rare = from_tables(replace(SITE.tables, meta=replace(meta, monitor=monitor)))
+    plan = Plan.of(rare, seed=5, learn_s=3600.0)
+    assert (plan.step_s, plan.duration_s, plan.estimator, plan.alarms_per_year, plan.seed) == (
+        *(900.0, 540_000.0, "set-search", (3.0,), 5),
+    )
+    assert plan.learn_step_s == 900.0
+    assert plan.load_error is None
+    sizes = {kind.name: kind.sizes for kind in plan.kinds}
+    assert sizes["replay"] == (54_000.0,)
+    # Ten readings later a drift is as large as it is after ten seconds.
+    np.testing.assert_allclose(np.array(sizes["drift"]) * 900.0, [1.0, 3.0])
+    assert sizes["bias"] == (1.0, 2.0, 3.0, 5.0)
+    assert Plan.of(rare, duration_s=9000.0).onset_s == (900.0, 2700.0)
+
+
+def test_rows_are_what_full_plays_show_where_powers_are_those_of_the_files() -> None:
+    plan = replace(PLAN, scenes=2, load_error=None, alarms_per_year=(1.0,))
+    assert full_plays_show_every_row(campaign(SITE, plan)) > {CLEAN, "coordinated-power"}
+
+
+def full_plays_show_every_row(found: Campaign) -> set[str]:
     """Nothing is shared in the oracle: each case is simulated and watched from its first frame on."""
-    seen = set()
-    for scene in range(PLAN.scenes):
-        moment = PLAN.moment(scene)
-        trial = PLAN.trial(SITE, moment)
+    plan, seen = found.plan, set()
+    for scene in range(plan.scenes):
+        moment = plan.moment(scene)
+        trial = plan.trial(SITE, moment)
         honest = replace(trial.scenario, season=moment.season)
-        for case in PLAN.cases(scene):
-            told, wrong = attacks(trial.stated, PLAN, case, honest) if case.kind != CLEAN else ((), ())
+        for case in plan.cases(scene):
+            told, wrong = attacks(trial.stated, plan, case, honest) if case.kind != CLEAN else ((), ())
             played = list(frames(trial, replace(honest, attacks=told, inverter_attacks=wrong)))
-            for rate in PLAN.alarms_per_year:
-                watcher = design(PLAN.watched(trial.stated, rate))
-                full = judge(watcher, trial, played=played, settling_s=PLAN.settling_s)
-                rows = here.scenarios
+            for rate in plan.alarms_per_year:
+                watcher = design(plan.watched(trial.stated, rate))
+                full = judge(watcher, trial, played=played, settling_s=plan.settling_s)
+                rows = found.scenarios
                 (row,) = rows[(rows["scenario"] == case.number) & (rows["alarms_per_year"] == rate)].to_dict(
                     "records"
                 )
-                each = here.liars[
-                    (here.liars["scenario"] == case.number) & (here.liars["alarms_per_year"] == rate)
+                each = found.liars[
+                    (found.liars["scenario"] == case.number) & (found.liars["alarms_per_year"] == rate)
                 ]
                 delays = np.concatenate([full.delay_s, full.inverter_delay_s])
                 assert each["delay_s"].tolist() == delays.tolist()
                 assert row["named"] == np.isfinite(delays).sum()
                 # Honest frames before the onset are those of the clean case.
-                before = round(case.onset_s / PLAN.step_s) if case.kind != CLEAN else 0
+                before = round(case.onset_s / plan.step_s) if case.kind != CLEAN else 0
                 assert row["undecided_s"] == full.undecided[before:].sum()
                 assert row["clean_lying_s"] == full.clean_while_lying.sum()
                 if case.kind not in (CLEAN, "inverter"):
@@ -92,7 +118,11 @@ def test_every_row_is_what_the_full_play_of_its_case_shows(here: Campaign) -> No
                 blamed = full.accused.any() or full.accused_inverters.any()
                 assert row["exact"] == (full.missed == 0 and not blamed)
                 seen.add(case.kind)
-    assert seen == {CLEAN, *(kind.name for kind in PLAN.kinds)}
+    return seen
+
+
+def test_every_row_is_what_the_full_play_of_its_case_shows(here: Campaign) -> None:
+    assert full_plays_show_every_row(here) == {CLEAN, *(kind.name for kind in PLAN.kinds)}
 
 
 def test_lies_are_as_large_as_they_are_said_to_be(here: Campaign) -> None:
