@@ -244,10 +244,12 @@ def _element(dss: Any, full: str, problems: list[str]) -> Element:
     nodes = tuple(tuple(order[k * conductors : (k + 1) * conductors]) for k in range(len(buses)))
     parts = np.array(element.Powers()).reshape(-1, 2) if live else np.empty((0, 2))
     flat = parts[:, 0] + 1j * parts[:, 1]
+    # The other half of an autotransformer's conductors is what its windings have between them.
+    own = conductors // 2 if kind == "autotrans" else conductors
     powers = []
     for k, here in enumerate(nodes):
         power = np.zeros(PHASES, dtype=np.complex128)
-        for node, kva in zip(here, flat[k * conductors : (k + 1) * conductors], strict=True):
+        for node, kva in zip(here[:own], flat[k * conductors : k * conductors + own], strict=True):
             if 1 <= node <= PHASES:
                 power[node - 1] += kva
         powers.append(power)

@@ -346,6 +346,16 @@ def test_what_has_no_place_in_a_feeder_is_named(body: str, tmp_path: Path) -> No
     assert (f"{body.partition('.')[0].removeprefix('new ')} x", "left out") in said
 
 
+def test_what_flows_into_an_autotransformer(tmp_path: Path) -> None:
+    pytest.importorskip("opendssdirect", reason="the extra `convert` is not installed")
+    body = "new autotrans.x windings=2 buses=(B1,B2) kvs=(0.4,0.23)\nnew load.z bus1=B2 phases=3 kv=0.23 kw=2"
+    done = convert(master(tmp_path, body), tmp_path / "x")
+    assert done.check is not None
+    assert done.check.exact
+    rows = {row.customer: row.load_kw for row in read(tmp_path / "x").customers}
+    assert rows["autotrans x"] == pytest.approx(2.0, rel=0.01)
+
+
 # --- power-grid-model ---------------------------------------------------------------------------
 
 
