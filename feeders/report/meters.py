@@ -284,7 +284,10 @@ def protect(site: Site, found: Protect) -> Section:
         assumptions=(
             f"At most {found.max_attacked} of the other meters lie; a protected meter cannot.",
             *(
-                ("All errors at their worst, inverters in their deadbands, linear model at nominal voltage.",)
+                (
+                    f"All errors at their worst, every load at {100.0 * found.share:g} % of its peak, "
+                    "inverters in their deadbands, linear model at nominal voltage.",
+                )
                 if found.goal.in_volts
                 else (f"Attacks that count: {found.attack}. Loads of metered customers are known.",)
             ),

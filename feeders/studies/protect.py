@@ -71,6 +71,8 @@ class Protect:
         below it takes part).
     attacks
         Attacks that rule out anything cheaper: `liars`.
+    share
+        Share of its peak that every load draws.
     """
 
     feeder: str
@@ -85,6 +87,7 @@ class Protect:
     least: int
     meters: pd.DataFrame
     attacks: pd.DataFrame
+    share: float = SHARE
 
     @property
     def gap(self) -> int:
@@ -239,6 +242,7 @@ def protect(
         least=found.least,
         meters=_meters(site, found.meters, found.attacks),
         attacks=pd.DataFrame({"liars": [" ".join(site.meter_ids[j] for j in a) for a in found.attacks]}),
+        share=share,
     )
 
 

@@ -119,7 +119,8 @@ def _choose(given: FalsePowers, meter: int, liars: int, honest: Bools) -> tuple[
         + [LinearConstraint(np.concatenate([np.zeros(k), np.ones(p)])[None, :], ub=float(liars))],
         bounds=Bounds(np.concatenate([-most[:k], least]), most),
         integrality=np.concatenate([np.zeros(k), np.ones(p)]),
-        options={"mip_rel_gap": 1e-6},
+        # Nothing in it can be left out, and what HiGHS finds without presolve needs no translation back.
+        options={"mip_rel_gap": 1e-6, "presolve": False},
     )
     if found.x is None:
         raise DesignInfeasible("largest lie with false powers that fits to an honest feeder", found.message)
