@@ -23,7 +23,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
-from itertools import chain, combinations
+from itertools import combinations
+from math import comb, log
 
 import numpy as np
 from scipy.special import binom
@@ -90,8 +91,14 @@ class _Base:
         self.known: dict[tuple[int, ...], tuple[float, int]] = {}
         self.told: dict[tuple[int, ...], Set] = {}
         # Rows of Q are made where somebody asks. Place 0 is nobody, who fills up the smaller sets.
-        self.place: dict[int, int] = {}
+        self.place, self.members = np.zeros(self.z.size, dtype=np.intp), np.zeros(0, dtype=np.intp)
         self.rows, self.Q, self.at = np.empty((0, self.z.size)), np.zeros((1, 1)), np.zeros(1)
+
+    @property
+    def limit(self) -> float:
+        """What costs more is neither reported nor gone on from."""
+        lowest, _ = min(self.known.values())
+        return lowest + max(_NEAR, 2.0 * log(self.problem.lies.like))
 
     def costs(self, sets: Iterable[tuple[int, ...]]) -> None:
         """Learn J of some sets, and the likeliest shape of each."""
@@ -107,20 +114,20 @@ class _Base:
 
     def shapes(self, sets: list[tuple[int, ...]]) -> tuple[Ints, Ints, Floats]:
         """J of all shapes that some sets' lies may have: which set, which shape, and J, (s,) each."""
-        at, sizes = self._places(sets), np.array([len(each) for each in sets])
-        both, several = np.arange(sizes.size), np.flatnonzero(sizes > 1)
-        shape = np.repeat([_ALONE, _SAME], [both.size, several.size])
-        of, price, u = np.concatenate([both, several]), np.zeros(shape.size), np.ones((shape.size, 1))
-        if several.size and self.problem.false is not None:
-            who = np.array([[*each, *each[:1] * (at.shape[1] - len(each))] for each in sets])
-            rows, about, chosen = self._stories(who, sizes)
+        sizes = np.array([len(each) for each in sets])
+        L = np.array([each + each[:1] * (sizes.max() - len(each)) for each in sets])
+        at, every, plain = self._places(L, sizes), np.arange(sizes.size), np.zeros(2 * sizes.size)
+        of, shape = np.concatenate((every, every)), np.repeat((_ALONE, _SAME), sizes.size)
+        price, u = plain, np.ones((1, 1))
+        if self.problem.false is not None and L.shape[1] > 1:
+            rows, about, chosen = self._stories(L, sizes)
             if rows.size:
-                of, shape = np.concatenate([of, rows]), np.concatenate([shape, about])
-                u = np.concatenate([np.ones((price.size, at.shape[1])), self._moved(who[rows], about)])
-                price = np.concatenate([price, chosen])
-        table, like, sizes = _table(self.problem.lies, at.shape[1]), np.minimum(shape, 0), sizes[of]
-        gain, freedom = self._judged(at[of], u, table.inverse[sizes, like])
-        J = self.nobody + self.problem.prices[sizes] + table.cost[sizes, like] + price + freedom - gain
+                of, shape = np.concatenate((of, rows)), np.concatenate((shape, about))
+                price, u = np.concatenate((plain, chosen)), np.ones((of.size, L.shape[1]))
+                u[plain.size :] = self._moved(L[rows], about)
+        table, like, size = _table(self.problem.lies, L.shape[1]), np.minimum(shape, 0), sizes[of]
+        gain, freedom = self._judged(at[of], u, table.inverse[size, like])
+        J = self.nobody + self.problem.prices[size] + table.cost[size, like] + price + freedom - gain
         return of, shape, J
 
     def explained(self, liars: tuple[int, ...]) -> Set:
@@ -130,7 +137,8 @@ class _Base:
         cost, shape = self.known[liars]
         out, lies, weights = np.zeros(self.z.size, dtype=np.bool_), np.zeros(self.z.size), self.z
         if liars:
-            L, at, u = np.array(liars), self._places([liars])[0], np.ones(len(liars))
+            L, u = np.array(liars), np.ones(len(liars))
+            at = self.place[L]
             if shape >= 0:
                 u = self._moved(L[None], np.array([shape]))[0]
             inverse = _table(self.problem.lies, L.size).inverse[L.size, min(shape, 0)]
@@ -140,22 +148,40 @@ class _Base:
         self.told[liars] = Set(out, self.powers, cost, weights, lies)
         return self.told[liars]
 
-    def left(self, liars: tuple[int, ...]) -> Floats:
-        """Variance of the weights of an explanation, (p,): the diagonal of its Q, its liars left out."""
-        Q = self.rows[self._places([liars])[0] - 1]
-        return np.asarray(self.diagonal - np.einsum("kj,kj->j", Q, np.linalg.solve(Q[:, liars], Q)))
+    def without(self, liars: tuple[int, ...]) -> tuple[Floats, Floats]:
+        """What follows of a set where its lies are free: a bound of J without each, and variances.
 
-    def _places(self, sets: list[tuple[int, ...]]) -> Ints:
+        With ``H = Q_LL^-1`` no lies explain more than ``z^T H z``, and without the i-th ``(H z)_i^2 / H_ii``
+        less, (k,). The variances are those of everybody's weights, (p,): the diagonal of Q without the set.
+        """
+        lies, L, k = self.problem.lies, list(liars), len(liars) - 1
+        Q = self.rows[self.place[L] - 1]
+        H = np.linalg.inv(Q[:, L])
+        by, own = H @ self.z[L], H.diagonal()
+        gain = float(self.z[L] @ by) - by**2 / own
+        # Some one of them is free by as much at least as the others leave open.
+        freedom = float(np.log1p(min(lies.size, lies.amplitude) ** 2 / own.max()))
+        least = self.nobody + self.problem.prices[k] + freedom + self._extra(k) - gain
+        return least, np.asarray(self.diagonal - np.einsum("kj,kj->j", H @ Q, Q))
+
+    def _extra(self, k: int) -> float:
+        """What the shape of k lies costs at least beside their freedom and the price of the set."""
+        lies, p = self.problem.lies, self.problem.size
+        if k < 2:
+            return 0.0
+        told = lies.story + 2.0 * (log(p) - log(comb(p, k)))
+        return min(lies.apart * (k - 1), lies.pair + lies.more * (k - 2), told)
+
+    def _places(self, L: Ints, sizes: Ints) -> Ints:
         """Where the members of each set have their row of Q, (b, k), 0 where a set is smaller."""
-        new = [j for j in dict.fromkeys(chain.from_iterable(sets)) if j not in self.place]
-        if new:
-            self.place |= {j: k for k, j in enumerate(new, len(self.place) + 1)}
-            self.rows = np.concatenate([self.rows, self.honest.rows(np.array(new))])
-            members = list(self.place)
-            self.Q = np.zeros((len(members) + 1, len(members) + 1))
-            self.Q[1:, 1:], self.at = self.rows[:, members], np.append(0.0, self.z[members])
-        k = max(map(len, sets))
-        return np.array([[*(self.place[j] for j in each), *[0] * (k - len(each))] for each in sets])
+        new = np.unique(L[self.place[L] == 0])
+        if new.size:
+            members = self.members = np.concatenate((self.members, new))
+            self.place[members] = np.arange(1, members.size + 1)
+            self.rows = np.concatenate((self.rows, self.honest.rows(new)))
+            self.Q, self.at = np.zeros((members.size + 1, members.size + 1)), np.append(0.0, self.z[members])
+            self.Q[1:, 1:] = self.rows[:, members]
+        return self.place[L] * (np.arange(L.shape[1]) < sizes[:, None])
 
     def _moved(self, L: Ints, c: Ints) -> Floats:
         """How far one customer's load moves each of a set, its own voltage by one, (b, k)."""
@@ -228,8 +254,9 @@ def _table(lies: Lies, most: int) -> _Table:
         alone, same = np.eye(k) / lies.size**2, (np.eye(k) - 1.0 / (d2 + k)) / (s2 * d2)
         inverse[k, :, :k, :k] = same, same, alone
     alike = sizes * np.log(s2) + (sizes - 1) * np.log(d2) + np.log(d2 + sizes)
+    same = np.where(sizes > 1, alike + lies.pair + lies.more * (sizes - 2), np.inf)
     alone = 2.0 * sizes * np.log(lies.size) + lies.apart * (sizes - 1)
-    cost = np.column_stack([alike, alike + lies.pair + lies.more * (sizes - 2), alone])
+    cost = np.column_stack([alike, same, alone])
     return _Table(frozen(inverse), frozen(cost))
 
 
@@ -313,16 +340,21 @@ def alike(problem: Problem, ranked: Ranked) -> list[Set]:
     for cost, at in ranked:
         if cost - ranked[0][0] <= _WORSE and at.counts[0] <= MOST:
             likely.setdefault(at.powers.tobytes(), []).append(at)
+    first = ranked[0][1]
     for key, some in likely.items():
+        # Other powers matter where they say something else about who lies.
+        if not any(at is first or _differs(problem, first, at) for at in some):
+            continue
         same = [at for _, at in ranked if at.powers.tobytes() == key]
         base = bases[key] = _Base(problem, min(same, key=lambda at: at.counts[0]), some[0].m)
         sets = [_members(at.liars) for at in some]
-        if not base.powers.any():
+        if not (base.powers.any() or ranked[0][1].counts[1]):
             # Likely the best ones; they are asked for at once.
             sets += [*combinations(_strongest(base), 2), *_stories(base, sets[0])]
         base.costs(sets)
     best = min(bases.values(), key=lambda base: min(base.known.values())[0])
     if not best.powers.any():
+        best.costs(combinations(_strongest(best), 2))
         best.costs(_stories(best, min(best.known, key=lambda each: best.known[each][0])))
     _descend(best)
     within = min(best.known.values())[0] + 2.0 * np.log(problem.lies.like)
@@ -332,6 +364,15 @@ def alike(problem: Problem, ranked: Ranked) -> list[Set]:
         for liars, (cost, _) in base.known.items()
         if cost <= within
     ]
+
+
+def _differs(problem: Problem, first: State, at: State) -> bool:
+    """Whether another explanation may be likelier than the first, or close to it, with other liars."""
+    if at.counts[0] > 1:
+        return not np.array_equal(at.liars, first.liars)
+    # One lie is like no other.
+    most = problem.cost(first) + problem.lies.apart * (first.counts[0] - 1)
+    return problem.cost(at) <= most + max(_NEAR, 2.0 * np.log(problem.lies.like))
 
 
 def _stories(base: _Base, liars: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
@@ -374,15 +415,15 @@ def _descend(base: _Base) -> None:
 def _neighbours(base: _Base, at: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
     if not at:
         return
-    now = base.explained(at)
-    beyond = now.weights**2 > least(base.problem, len(at) + 1) * base.left(at)
+    now, (least_without, left) = base.explained(at), base.without(at)
+    beyond = now.weights**2 > least(base.problem, len(at) + 1) * left
     beyond[list(at)] = False
     others = np.flatnonzero(beyond).tolist()
-    free = [i for i in at if not base.powers[i]]
-    for i in free:
-        rest = [k for k in at if k != i]
-        if rest:
-            yield tuple(rest)
+    for i, cost in zip(at, least_without.tolist(), strict=True):
+        rest = tuple(k for k in at if k != i)
+        if rest and not base.powers[i]:
+            if cost <= base.limit:
+                yield rest
             for j in others:
                 yield tuple(sorted([*rest, j]))
     if len(at) < min(MOST, base.z.size):

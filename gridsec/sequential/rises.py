@@ -251,7 +251,7 @@ class Problem:
         k, _ = at.counts
         now = self.prices[k]
         pivot = 1.0 + self.a2 * at.diagonal
-        rise = np.log(pivot) - self.a2 * at.g**2 / pivot + (self.prices[min(k + 1, self.size)] - now)
+        rise: Floats = np.log(pivot) - self.a2 * at.g**2 / pivot + (self.prices[min(k + 1, self.size)] - now)
         if k:
             on = np.flatnonzero(at.liars)
             pivot = np.maximum(1.0 - self.a2 * at.diagonal[on], _TINY)
