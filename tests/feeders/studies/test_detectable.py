@@ -74,6 +74,12 @@ def test_processes_find_the_same_to_the_last_bit(cigre: Detectable) -> None:
     pd.testing.assert_frame_equal(found.customers, cigre.customers, check_exact=True)
 
 
+def test_no_solver_writes_into_the_output(capfd: pytest.CaptureFixture[str]) -> None:
+    """HiGHS does, whatever its options, where large constants spoil a solution that is taken back."""
+    detectable(load("kerber-landnetz"), max_attacked=2)
+    assert capfd.readouterr() == ("", "")
+
+
 def test_few_meters_are_no_work_for_processes() -> None:
     assert workers(CIGRE, None) == Here()
     assert workers(CIGRE, 3) == Processes(3)
