@@ -7,7 +7,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.special import betaincinv
 
+from benchmarks.peers import served
 from benchmarks.peers.answer import Answer, Method
 from benchmarks.peers.grid_model import Greedy, GreedyChi
 from benchmarks.peers.ours import Ours
@@ -15,7 +17,10 @@ from benchmarks.peers.panda import Panda
 from benchmarks.peers.scene import ATTACKS, Cell, Scene, Snapshot, mean, reading, scene, snapshot
 
 NOISES = ((0.001, 0.1), (0.005, 0.3))
-OURS, PANDA = "ours", "pandapower"
+OURS, SERVED, PANDA = "ours", "served", "pandapower"
+# Of clean snapshots, at most this part may name somebody.
+FALSE = 0.01
+_CONFIDENCE = 0.95
 # No parameter of any method was chosen on these random numbers.
 _SEED = 2026
 PEERS = (PANDA, "pgm 3.0", "pgm 3.5", "pgm chi2")
@@ -112,6 +117,32 @@ def votes(cell: Cell, here: Scene, method: Method, *, trials: int, seconds: int)
         _count(score, Answer(named), told)
     score.ms = float(np.median(times)) * 1e3
     return score
+
+
+def watched(cell: Cell, here: Scene, *, trials: int, seconds: int) -> Score:
+    """The served monitor, fed with the same readings one after the other; `Score.ms` is a second's time."""
+    score, times = Score(), []
+    for trial in range(trials):
+        told = snapshot(here, cell, np.random.default_rng([_SEED, trial, cell.liars]), seconds)
+        start = time.perf_counter()
+        named = served.suspects(here, told)
+        times.append((time.perf_counter() - start) / seconds)
+        _count(score, Answer(named), told)
+    score.ms = float(np.median(times)) * 1e3
+    return score
+
+
+def limits(count: int, trials: int) -> tuple[float, float]:
+    """What part it may be where `count` of so many were seen, each end at 95 % (Clopper and Pearson)."""
+    low = betaincinv(count, trials - count + 1, 1.0 - _CONFIDENCE) if count else 0.0
+    high = betaincinv(count + 1, trials - count, _CONFIDENCE) if count < trials else 1.0
+    return float(low), float(high)
+
+
+def too_many(scores: dict[Cell, dict[str, Score]]) -> list[Cell]:
+    """Clean cells in which ours names somebody in more snapshots than allowed, and not by chance."""
+    clean = ((cell, here[OURS]) for cell, here in scores.items() if cell.attack == "clean" and OURS in here)
+    return [cell for cell, ours in clean if limits(ours.false, ours.trials)[0] > FALSE]
 
 
 def _count(score: Score, answer: Answer, told: Snapshot) -> None:

@@ -8,11 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.peers.measure import OURS, Score
+from benchmarks.peers.measure import OURS, SERVED, Score, limits
 from benchmarks.peers.scene import Cell
 
 Scores = dict[Cell, dict[str, Score]]
 
+_OWN = (OURS, SERVED)
 _NAMES = {"rural1-behind": "rural1, 13 customers", "rural3-behind": "rural3, 118 customers"}
 
 
@@ -56,7 +57,7 @@ def _exact(scores: Scores) -> str:
         if cell.attack == "clean":
             continue
         ours = here[OURS]
-        row = [_percent(here[name].exact, here[name]) for name in names if name != OURS]
+        row = [_percent(here[name].exact, here[name]) for name in names if name not in _OWN]
         own = f"**{_percent(ours.exact, ours)}**"
         rows.append(
             [
@@ -65,16 +66,18 @@ def _exact(scores: Scores) -> str:
                 own,
                 _percent(ours.among, ours),
                 _paired(here),
+                *([_percent(here[SERVED].exact, here[SERVED])] if SERVED in names else []),
             ]
         )
     head = [
         "feeder",
         "noise",
         "attack",
-        *(n for n in names if n != OURS),
+        *(n for n in names if n not in _OWN),
         "ours",
         "ours, among explanations",
         "ours - best peer (only ours : only the peer)",
+        *([SERVED] if SERVED in names else []),
     ]
     return "Named exactly the liars, % of snapshots:\n\n" + _rows(head, rows)
 
@@ -84,7 +87,7 @@ def _paired(here: dict[str, Score]) -> str:
     pairs = [
         (sum(ours and not its for ours, its in both), sum(its and not ours for ours, its in both), len(both))
         for name, peer in here.items()
-        if name != OURS and (both := list(zip(here[OURS].hits, peer.hits, strict=False)))
+        if name not in _OWN and (both := list(zip(here[OURS].hits, peer.hits, strict=False)))
     ]
     if not pairs:
         return ""
@@ -98,13 +101,18 @@ def _clean(scores: Scores) -> str:
         [
             *_place(cell)[:2],
             *(f"{100.0 * s.false / s.trials:.1f}" if s.trials else "-" for s in here.values()),
+            _limits(here[OURS]),
         ]
         for cell, here in scores.items()
         if cell.attack == "clean"
     ]
     return "Somebody is named although nobody lies, % of clean snapshots:\n\n" + _rows(
-        ["feeder", "noise", *names], rows
+        ["feeder", "noise", *names, "ours, limits at 95 %"], rows
     )
+
+
+def _limits(score: Score) -> str:
+    return " to ".join(f"{100.0 * part:.1f}" for part in limits(score.false, score.trials))
 
 
 def _details(scores: Scores) -> str:
@@ -117,7 +125,7 @@ def _details(scores: Scores) -> str:
                 continue
             seen = _percent(s.seen, s) if s.seen >= 0 else ""
             numbers = [_percent(count, s) for count in (s.exact, s.missed, s.false, s.failed)]
-            rows.append([*_place(cell), name, str(s.trials), *numbers, seen, f"{s.ms:.2f}"])
+            rows.append([*_place(cell), name, str(s.trials), *numbers, seen])
     head = [
         "feeder",
         "noise",
@@ -129,9 +137,8 @@ def _details(scores: Scores) -> str:
         "somebody else named",
         "no result",
         "chi-square test sees it",
-        "ms",
     ]
-    return "All numbers, % of snapshots, and the median time of one:\n\n" + _rows(head, rows)
+    return "All numbers, % of snapshots:\n\n" + _rows(head, rows)
 
 
 def save(path: Path, single: Scores, minute: Scores) -> None:

@@ -372,7 +372,7 @@ def _differs(problem: Problem, first: State, at: State) -> bool:
         return not np.array_equal(at.liars, first.liars)
     # One lie is like no other.
     most = problem.cost(first) + problem.lies.apart * (first.counts[0] - 1)
-    return problem.cost(at) <= most + max(_NEAR, 2.0 * np.log(problem.lies.like))
+    return bool(problem.cost(at) <= most + max(_NEAR, 2.0 * log(problem.lies.like)))
 
 
 def _stories(base: _Base, liars: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
