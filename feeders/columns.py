@@ -323,6 +323,8 @@ META_COLUMNS: dict[str, tuple[Column, ...]] = {
             above=0.0,
             high=1e7,
         ),
+        Column("forecast", Kind.TEXT, "where unread powers are from", "none", choices=("none", "profiles")),
+        Column("utc_offset_h", Kind.NUMBER, "local time less UTC, h", 0.0, low=-14.0, high=14.0),
     ),
     "monitor": (
         Column("estimator", Kind.TEXT, "estimator family", "sequential", choices=ESTIMATORS),
@@ -409,9 +411,8 @@ def _outside(column: Column, value: Any) -> str | None:
         return next((f"{shown(item)} is not known" for item in given if item not in column.choices), None)
     if not isinstance(value, (int, float)) or isinstance(value, bool):
         return None
-    if column.above is not None and value <= column.above:
-        return f"{value:g} is {'negative' if value < 0 else 'too small'}"
-    if column.low is not None and value < column.low:
+    low, above = (-math.inf if limit is None else limit for limit in (column.low, column.above))
+    if value < low or (value <= above and column.above is not None):
         return f"{value:g} is {'negative' if value < 0 else 'too small'}"
     if column.high is not None and value > column.high:
         return f"{value:g} is too large"
@@ -467,10 +468,8 @@ def _whole(cell: object) -> tuple[Any, str | None]:
 def _truth(cell: object) -> tuple[Any, str | None]:
     if isinstance(cell, bool):
         return cell, None
-    if isinstance(cell, str) and cell.lower() in ("true", "1"):
-        return True, None
-    if isinstance(cell, str) and cell.lower() in ("false", "0"):
-        return False, None
+    if isinstance(cell, str) and cell.lower() in ("true", "1", "false", "0"):
+        return cell.lower() in ("true", "1"), None
     return BAD, f"{shown(cell)} is neither true nor false"
 
 

@@ -6,6 +6,7 @@ from typing import Final
 
 import numpy as np
 
+from feeders.forecast import always
 from feeders.load import Site, Snapshot, to_frame
 from gridsec.arrays import Floats
 from gridsec.online import Frame
@@ -27,7 +28,8 @@ def load_doubt(site: Site) -> LoadDoubt:
     the same direction all the time. Without a meter powers are uniform in the range that `to_frame` has for
     them, so that design and frames say the same. `p_std_kw` and `q_std_kvar` say it directly, and then of
     errors that come and go within `correlation_s`; they are believed as they are: with a meter as the error
-    of what it reports, without one as the distance from the middle of the range.
+    of what it reports, without one as the distance from the middle of the range. Where powers are forecast it
+    is the distance from the forecast, and that of the library where the files say nothing.
 
     Parameters
     ----------
@@ -40,8 +42,8 @@ def load_doubt(site: Site) -> LoadDoubt:
     q = (0.5 * (loads.tan_max - loads.tan_min) * typical + loads.q_floor) / np.sqrt(3.0)
     frame, unmetered = unread(site), np.ones(p.size, dtype=np.bool_)
     unmetered[site.meters] = False
-    p = np.where(unmetered, frame.p_error / np.sqrt(3.0), p)
-    q = np.where(unmetered, frame.q_error / np.sqrt(3.0), q)
+    p = np.where(unmetered, _usual(frame.p_error, frame.p_std), p)
+    q = np.where(unmetered, _usual(frame.q_error, frame.q_std), q)
     told_p = np.array([np.nan if row.p_std_kw is None else row.p_std_kw for row in rows])
     told_q = np.array([np.nan if row.q_std_kvar is None else row.q_std_kvar for row in rows])
     by_limits = bool(np.isnan(told_q).any() or np.isnan(told_p).any())
@@ -59,13 +61,22 @@ def load_doubt(site: Site) -> LoadDoubt:
 def unread(site: Site) -> Frame:
     """A frame without readings of meters: all that is known of powers is their range.
 
+    Intervals about forecasts are those that hold at any time.
+
     Parameters
     ----------
     site
         The feeder.
     """
     none = np.full(site.meters.size, np.nan)
-    return to_frame(site, Snapshot(0.0, none, none, none, np.nan))
+    frame = to_frame(site, Snapshot(0.0, none, none, none, np.nan))
+    return always(site.forecast, frame, np.ones(frame.p.size, dtype=np.bool_))
+
+
+def _usual(half_width: Floats, std: Floats | None) -> Floats:
+    """Standard deviation of what is uniform in an interval, or as stated beside it."""
+    uniform = half_width / np.sqrt(3.0)
+    return uniform if std is None else np.where(np.isnan(std), uniform, std)
 
 
 def from_history(error_p: Floats, error_q: Floats, step_s: float) -> LoadDoubt:

@@ -19,6 +19,7 @@ from gridsec.arrays import Bools, Floats
 from gridsec.certificates import certify
 from gridsec.errors import FeederInvalid
 from gridsec.families import decoders, partial, set_search, ticks, unknown_input, windowed
+from gridsec.frames import usual
 from gridsec.gains import CircleOptions, options_for
 from gridsec.lure import Lure, close_loop
 from gridsec.network import linear
@@ -238,6 +239,13 @@ def _sequential(site: Site, _: Job) -> sequential.SequentialDesign:
     return sequential.design(plant(site), doubt=load_doubt(site), step_s=settings.tick_s, options=options)
 
 
+def _sequential_step(
+    design: sequential.SequentialDesign, state: sequential.SequentialState, frame: Frame
+) -> tuple[sequential.SequentialState, Estimate, Verdict]:
+    """Its step takes deviations from the intervals, as those of what is uniform in them."""
+    return sequential.step(design, state, usual(frame))
+
+
 def _direct_bank(site: Site, _: Job) -> monitor.MonitorDesign:
     settings = site.tables.meta.monitor
     return monitor.design(plant(site), max_attacked=settings.max_attacked, step_s=settings.tick_s)
@@ -376,7 +384,7 @@ def _ticks(name: str, summary: str, decoder: Decoder) -> Family:
         )
 
     return Family(
-        name, summary, make, sequential.init, sequential.step, lambda d: int(d.observers), _certificate
+        name, summary, make, sequential.init, _sequential_step, lambda d: int(d.observers), _certificate
     )
 
 
@@ -416,7 +424,7 @@ FAMILIES: Final = Families(
             "one switched observer, correlated loads, evidence on several time scales",
             _sequential,
             sequential.init,
-            sequential.step,
+            _sequential_step,
             lambda d: int(d.observers),
             _certificate,
             lambda d: int(d.most),

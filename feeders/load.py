@@ -24,6 +24,7 @@ from feeders.equipment import (
     names,
     positions,
 )
+from feeders.forecast import Forecast, forecast
 from feeders.load_phases import spanned
 from feeders.schema import CustomerRow, FeederTables, validate
 from feeders.taps import Referred, refer
@@ -91,6 +92,8 @@ class Site:
     digest
         SHA-256 of the content: key of design caches. It changes with every value and with the order of
         the rows (which is the order of all arrays), not with layout, comments or unknown columns.
+    forecast
+        Of powers that nobody reads; None: all that is known of them is their range.
     """
 
     tables: FeederTables
@@ -105,6 +108,7 @@ class Site:
     base_volt: Floats
     nominal_volt: Floats
     digest: str
+    forecast: Forecast | None = None
 
     @property
     def customer_volt(self) -> Floats:
@@ -218,7 +222,7 @@ def from_tables(tables: FeederTables) -> Site:
         [Edge(row.line, row.from_bus, row.to_bus, row.r_ohm == row.x_ohm == 0.0) for row in closed],
     )
     base = refer(tables, closed, found)
-    feeder = _feeder(tables, base, found)
+    feeder, loads = _feeder(tables, base, found), load_model(tables)
     metered = metered_customers(tables)
     return Site(
         tables=tables,
@@ -229,10 +233,11 @@ def from_tables(tables: FeederTables) -> Site:
         accuracy=accuracy(tables, base.customer, base.customer_nominal),
         bus_of_file=found.group,
         xy=positions(tables, found),
-        loads=load_model(tables),
+        loads=loads,
         base_volt=frozen(base.bus[:, 0]),
         nominal_volt=frozen(base.nominal),
         digest=digest(tables),
+        forecast=forecast(tables, loads),
     )
 
 
@@ -282,6 +287,7 @@ def _in_phases(tables: FeederTables) -> Site:
         "feeder": feeder,
         "base_volt": frozen(found.base_volt.ravel()),
         "nominal_volt": frozen(np.repeat(found.nominal_volt, len(PHASES))),
+        "forecast": forecast(found.tables, found.loads),
     }
     return Site(**parts | places)
 
@@ -315,7 +321,9 @@ def to_frame(site: Site, snapshot: Snapshot) -> Frame:
     and a connection limits what it can pretend. Where there is no reading, or one that is not finite or
     beyond anything the customer could draw, all that is known is the interval from full generation without
     load to full load without generation. Its middle is p; `p_std_kw` of a customer without a meter says how
-    far from that the truth is, and the half-width is `sqrt(3)` of it if that is less.
+    far from that the truth is, and the half-width is `sqrt(3)` of it if that is less. With
+    `forecast = "profiles"` p and q are those of `feeders.forecast`, with the whole range as interval about
+    them.
 
     Reactive power of the load (the inverter's is the observer's business): with net import P, the load
     alone lies in ``[max(P, 0), max(P, min(P + pv, load_kw))]``, each end widened by the error of P;
@@ -353,7 +361,7 @@ def to_frame(site: Site, snapshot: Snapshot) -> Frame:
     q_net[site.meters] = -snapshot.q_kvar / base_kva
     q_net[~(np.abs(q_net) <= model.credible)] = np.nan
     size = np.where(np.isnan(q_net), 0.0, np.abs(q_net))
-    return Frame(
+    frame = Frame(
         t=snapshot.t,
         y=y,
         seen=seen,
@@ -366,6 +374,7 @@ def to_frame(site: Site, snapshot: Snapshot) -> Frame:
         q_net_error=np.maximum(model.q_error, model.q_fraction * size),
         v0_phases=v0_phases,
     )
+    return frame if site.forecast is None else site.forecast.fill(frame, ~known)
 
 
 def _busbar(v0_volt: Floats | float, base_volt: float) -> tuple[float, Floats | None]:

@@ -11,6 +11,7 @@ from functools import cache
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -18,6 +19,9 @@ from gridsec.online import Floats
 
 ENVELOPES = "envelopes.csv"
 TIME = "t_s"
+
+PROFILE_STEP_S: Final = 900.0
+"""Interval between two samples, s."""
 
 
 class Season(StrEnum):
@@ -109,6 +113,19 @@ def _read(season: Season) -> Profiles:
         {name[:-2]: column for name, column in columns.items() if name.endswith("_q")},
         {name: column for name, column in columns.items() if name.startswith("PV")},
     )
+
+
+def profile(curves: dict[str, Floats], name: str) -> Floats:
+    """One profile; without a name the mean of all of them.
+
+    Parameters
+    ----------
+    curves
+        `Profiles.load_p`, `load_q` or `pv`.
+    name
+        Which.
+    """
+    return curves[name] if name else np.asarray(np.mean(list(curves.values()), axis=0))
 
 
 def load_names() -> tuple[str, ...]:

@@ -33,6 +33,8 @@ from feeders.records import Parsed, Record
 from gridsec.errors import FeederInvalid
 
 MAX_PROBLEMS = 1000
+SELDOM = frozenset({"forecast", "utc_offset_h"})
+"""Keys of [load] that are written only where they say something."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,6 +148,8 @@ class LoadDefaults:
     power_factor_max: float = 1.0
     q_floor_percent: float = 2.0
     correlation_s: float = 600.0
+    forecast: str = "none"
+    utc_offset_h: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,10 +266,13 @@ def from_json(obj: object) -> FeederTables:
 def to_json(tables: FeederTables) -> dict[str, Any]:
     """Return the JSON form: the same names as in the files, a list of rows per table.
 
-    Matrices, taps of single phases and voltages behind transformers are left out where there are none.
+    Matrices, taps of single phases, voltages behind transformers and forecasts are left out where there are
+    none.
     """
     meta = asdict(tables.meta)
     meta["accept"] = list(tables.meta.accept)
+    load, usual = meta["load"], asdict(LoadDefaults())
+    meta["load"] = {key: load[key] for key in load if key not in SELDOM or load[key] != usual[key]}
     meta["busbar_xy"] = None if tables.meta.busbar_xy is None else list(tables.meta.busbar_xy)
     return {
         "feeder": _plain(meta),
@@ -438,7 +445,8 @@ def _toml(meta: dict[str, Any]) -> str:
     for section, columns in META_COLUMNS.items():
         if section:
             lines += ["", f"[{section}]"]
-            lines += [f"{column.name} = {_toml_value(meta[section][column.name])}" for column in columns]
+            there = (column.name for column in columns if column.name in meta[section])
+            lines += [f"{name} = {_toml_value(meta[section][name])}" for name in there]
     return "\n".join(lines) + "\n"
 
 

@@ -230,6 +230,9 @@ def frames(
     known = Customers(
         site, scenario.variation, scenario.seed, scenario.start, scenario.profile_s, season=scenario.season
     )
+    if site.forecast is not None:
+        origin = scenario.start - scenario.profile_s
+        site = replace(site, forecast=site.forecast.played(origin, scenario.season))
     samples = list(simulate(site, scenario))
     t = np.array([sample.t for sample in samples])
     demand = known.at(t)
@@ -250,12 +253,18 @@ def _powers(error: LoadError, site: Site, frame: Frame, p_kw: Floats, q_kvar: Fl
     p_error = np.full(frame.p.size, error.half_width * error.p_kw / base)
     # Registers are exact here, so that what a frame does not believe of them is what no connection carries.
     p_error[site.meters] = np.maximum(p_error[site.meters], frame.p_error[site.meters])
+    forecast = (
+        None if std is None else np.where(believed, np.nan, std) for std in (frame.p_std, frame.q_std)
+    )
+    p_std, q_std = forecast
     return replace(
         frame,
         p=np.where(believed, -p_kw / base, frame.p),
         p_error=np.where(believed, p_error, frame.p_error),
         q=np.where(believed, -q_kvar / base, frame.q),
         q_error=np.where(believed, error.half_width * error.q_kvar / base, frame.q_error),
+        p_std=p_std,
+        q_std=q_std,
     )
 
 

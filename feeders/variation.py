@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from scipy.signal import lfilter
 
-from feeders.profiles import Season, library
+from feeders.profiles import Season, library, profile
 from gridsec.arrays import Floats
 from gridsec.network import InPhases
 
@@ -326,6 +326,6 @@ def _told(size: float | None, files: list[float | None]) -> Floats:
 
 
 def _curve(library: dict[str, Floats], name: str) -> Floats:
-    """One profile with its first sample repeated at its end; without a name the mean of all of them."""
-    values = library[name] if name else np.mean(list(library.values()), axis=0)
+    """One profile with its first sample repeated at its end."""
+    values = profile(library, name)
     return np.append(values, values[0])

@@ -117,6 +117,28 @@ def known(frame: Frame) -> Frame:
     return replace(frame, p=p, p_error=p_error, q=q, q_error=q_error, q_net=q_net)
 
 
+def usual(frame: Frame) -> Frame:
+    """The frame for estimators that take deviations from intervals: each as wide as is usual.
+
+    Reactive power that is reported, although the active one is not, keeps the whole interval: readings are
+    to be compared with everything that is possible.
+
+    Parameters
+    ----------
+    frame
+        Everything known at one tick.
+    """
+    if frame.p_std is None or frame.q_std is None:
+        return frame
+    p_std, q_std = frame.p_std, np.where(np.isnan(frame.q_net), frame.q_std, np.nan)
+    root = np.sqrt(3.0)
+    return replace(
+        frame,
+        p_error=np.where(np.isnan(p_std), frame.p_error, root * p_std),
+        q_error=np.where(np.isnan(q_std), frame.q_error, root * q_std),
+    )
+
+
 def _power(power: Floats, error: Floats) -> tuple[Floats, Floats]:
     good, sure = np.abs(power) <= NO_POWER, (error >= 0.0) & (error <= NO_POWER)
     if bool((good & sure).all()):

@@ -112,6 +112,9 @@ class Frame:
         Half-width for `q_net`, pu; ignored where `q_net` is NaN.
     v0_phases : (3,) or None
         Squared busbar voltage of each phase, pu, NaN where there is none; None on a balanced feeder.
+    p_std, q_std : (N,) or None
+        Standard deviation of the truth about `p` and `q` where it is known apart from the intervals, as that
+        of forecasts is, pu; NaN, or None for all, where it is that of a uniform distribution in the interval.
     """
 
     t: float
@@ -125,6 +128,8 @@ class Frame:
     q_net: Floats
     q_net_error: Floats
     v0_phases: Floats | None = None
+    p_std: Floats | None = None
+    q_std: Floats | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from feeders.doubts import unread
+from feeders.forecast import always
 from feeders.load import Snapshot, to_frame
 from feeders.studies.hidden import Curves, customer_indices
 from gridsec.arrays import Floats
@@ -92,9 +93,12 @@ def _frame(site: Site, share: float) -> Frame:
     """What honest meters say."""
     drawn = np.array([share * row.load_kw for row in site.tables.customers])[site.meters]
     nominal = site.customer_volt[site.meters]
-    return to_frame(
+    frame = to_frame(
         site, Snapshot(0.0, nominal, drawn, np.full(drawn.size, np.nan), float(site.feeder.base_volt))
     )
+    unmetered = np.ones(frame.p.size, dtype=np.bool_)
+    unmetered[site.meters] = False
+    return always(site.forecast, frame, unmetered)
 
 
 def _box(site: Site, curves: Curves, p_error: Floats, q_error: Floats) -> Box:
