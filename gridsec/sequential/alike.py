@@ -30,6 +30,7 @@ import numpy as np
 from scipy.special import binom
 
 from gridsec.arrays import Bools, Floats, Ints, frozen, submatrix
+from gridsec.sequential.conditional import solved
 from gridsec.sequential.rises import MOST, Lies, Problem, State
 
 __all__ = ["MOST", "Set", "alike", "worth"]
@@ -143,7 +144,7 @@ class _Base:
                 u = self._moved(L[None], np.array([shape]))[0]
             inverse = _table(self.problem.lies, L.size).inverse[L.size, min(shape, 0)]
             M = inverse + submatrix(self.Q, at, at) * np.multiply.outer(u, u)
-            out[L], lies[L] = True, u * np.linalg.solve(M, u * self.z[L])
+            out[L], lies[L] = True, u * solved(M.T, u * self.z[L])
             weights = self.z - lies[L] @ self.rows[at - 1]
         self.told[liars] = Set(out, self.powers, cost, weights, lies)
         return self.told[liars]
@@ -174,8 +175,9 @@ class _Base:
 
     def _places(self, L: Ints, sizes: Ints) -> Ints:
         """Where the members of each set have their row of Q, (b, k), 0 where a set is smaller."""
-        new = np.unique(L[self.place[L] == 0])
-        if new.size:
+        unknown = self.place[L] == 0
+        if unknown.any():
+            new = np.unique(L[unknown])
             members = self.members = np.concatenate((self.members, new))
             self.place[members] = np.arange(1, members.size + 1)
             self.rows = np.concatenate((self.rows, self.honest.rows(new)))

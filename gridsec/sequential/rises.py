@@ -253,11 +253,13 @@ class Problem:
         pivot = 1.0 + self.a2 * at.diagonal
         rise: Floats = np.log(pivot) - self.a2 * at.g**2 / pivot + (self.prices[min(k + 1, self.size)] - now)
         if k:
-            on = np.flatnonzero(at.liars)
+            on = at.liars.nonzero()[0]
             pivot = np.maximum(1.0 - self.a2 * at.diagonal[on], _TINY)
             less = np.log(pivot) + self.a2 * at.g[on] ** 2 / pivot + (self.prices[k - 1] - now)
             # Powers are false only where the meter lies.
-            rise[on] = np.where(at.powers[on], np.inf, less)
+            rise[on] = less
+            if at.counts[1]:
+                rise[at.powers] = np.inf
         at.rise = rise
         return rise
 
@@ -298,7 +300,7 @@ class Problem:
         """``B^T Q B``, its three numbers, ``e^T Q B`` of the customer's own meter, and ``B^T g``."""
         if c not in self.known:
             B = self._columns(c)
-            white = B @ self.W.T
+            white = np.array([self.W @ u for u in B])
             self.known[c] = B, white @ white.T, white @ self.W[:, c]
         B, M, own = self.known[c]
         if len(at.U):

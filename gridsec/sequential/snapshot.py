@@ -221,15 +221,16 @@ def _descend(problem: Problem, at: State, known: dict[bytes, State], false: bool
 def _best(problem: Problem, at: State, false: bool) -> State | None:
     """The state after the move that lowers J most, or None where none does."""
     rise = problem.meters(at)
-    j = int(np.argmin(rise))
+    j = int(rise.argmin())
     least, move = float(rise[j]), "meter"
     if false and at.counts[0]:
-        doubted, who = np.flatnonzero(at.powers), np.flatnonzero(at.liars & ~at.powers)
-        rises, doubts = problem.believed(at, doubted), problem.pairs(at, who)[0]
-        for some, those, what in ((rises, doubted, "believe"), (doubts, who, "powers")):
-            if some.size and some.min() < least:
-                c = int(np.argmin(some))
-                j, least, move = int(those[c]), float(some[c]), what
+        # Whose powers are false, and who might be next.
+        for who, what in ((at.powers, "believe"), (at.liars & ~at.powers, "powers")):
+            if (some := who.nonzero()[0]).size:
+                rise = problem.believed(at, some) if what == "believe" else problem.pairs(at, some)[0]
+                c = int(rise.argmin())
+                if rise[c] < least:
+                    j, least, move = int(some[c]), float(rise[c]), what
     if least >= -_LEAST:
         return None
     if move == "powers":
@@ -245,21 +246,31 @@ def _best(problem: Problem, at: State, false: bool) -> State | None:
 def _exchange(problem: Problem, at: State, known: dict[bytes, State], false: bool) -> None:
     """Trust each liar again, and see what explains the readings instead."""
     least, within = problem.cost(at), 2.0 * np.log(problem.lies.like)
-    for j in np.flatnonzero(at.liars).tolist():
-        after = at.copy()
-        if after.powers[j]:
-            problem.powers(after, j, -1.0)
-        problem.toggle(after, j)
+    for j in at.liars.nonzero()[0].tolist():
+        after = _without(problem, at, j, known)
         rise = problem.meters(after).copy()
         rise[j] = np.inf
-        k = int(np.argmin(rise))
-        cost = problem.cost(after) + rise[k]
-        after.liars[k] ^= True
-        new = after.key not in known
-        after.liars[k] ^= True
-        if new and cost - least <= within:
+        k = int(rise.argmin())
+        if problem.cost(after) + rise[k] - least <= within:
+            after = after.copy()
             problem.toggle(after, k)
-            _descend(problem, after, known, false)
+            if after.key not in known:
+                _descend(problem, after, known, false)
+
+
+def _without(problem: Problem, at: State, j: int, known: dict[bytes, State]) -> State:
+    """The explanation that trusts a liar and its customer's powers again."""
+    after = at.copy()
+    if at.counts[1]:
+        if at.powers[j]:
+            problem.powers(after, j, -1.0)
+    else:
+        after.liars[j] = False
+        if after.key in known:
+            return known[after.key]
+        after.liars[j] = True
+    problem.toggle(after, j)
+    return after
 
 
 def _more(problem: Problem, at: State, known: dict[bytes, State], false: bool) -> None:
