@@ -107,12 +107,35 @@ def busbar_error(accuracy: MeterAccuracy, v0_squared: float, sigmas: float) -> f
     sigmas
         As in `reading_error`.
     """
-    if accuracy.busbar_class >= 1.0:
-        return float("inf")  # such a reading says nothing
-    v = float(np.sqrt(max(v0_squared, 0.0)))
-    e = accuracy.busbar_class * v + 0.5 * accuracy.busbar_resolution + sigmas * accuracy.busbar_jitter
-    e /= 1.0 - accuracy.busbar_class
-    return e * (2.0 * v + e)
+    part, even = accuracy.busbar_class, 0.5 * accuracy.busbar_resolution + sigmas * accuracy.busbar_jitter
+    return float(_told_error(np.array(part), np.array(even), np.array(v0_squared)))
+
+
+def told_error(accuracy: MeterAccuracy, y: Floats, sigmas: float) -> Floats:
+    """Largest distance of the truth from a squared reading, per meter: `busbar_error` for the others.
+
+    Parameters
+    ----------
+    accuracy
+        The meters.
+    y : (p,)
+        The squared readings, pu.
+    sigmas
+        As in `reading_error`.
+
+    Returns
+    -------
+    (p,)
+        Bounds, squared pu; infinite where a class says nothing.
+    """
+    return _told_error(accuracy.class_fraction, 0.5 * accuracy.resolution + sigmas * accuracy.jitter, y)
+
+
+def _told_error(part: Floats, even: Floats, y: Floats) -> Floats:
+    v = np.sqrt(np.maximum(y, 0.0))
+    told = part < 1.0  # a class of 100 % says nothing
+    e = np.where(told, (part * v + even) / np.where(told, 1.0 - part, 1.0), np.inf)
+    return np.asarray(e * (2.0 * v + e))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -378,6 +378,27 @@ def model_error_bound(feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats |
     return _remainder(feeder, _linear_flows(feeder, p, q, v0_squared))
 
 
+def reach(feeder: Feeder, p: Floats, q: Floats) -> Floats:
+    """Largest change of the squared voltages that powers of some sizes can make: ``2 |R| p + 2 |X| q``; O(b).
+
+    Parameters
+    ----------
+    feeder
+        The feeder.
+    p, q : (…, N)
+        Sizes of the customers' active and reactive powers, not negative, pu.
+
+    Returns
+    -------
+    (…, b + 1)
+        Of every bus, pu.
+    """
+    both = np.empty((2, *np.broadcast(p, q).shape))
+    both[0], both[1] = p, q
+    P, Q = below(feeder, _at_buses(feeder, both))[..., 1:]
+    return from_root(feeder, 2.0 * (np.abs(feeder.r) * P + np.abs(feeder.x) * Q))
+
+
 def _remainder(feeder: Feeder, flows: _Flows) -> Floats:
     with np.errstate(all="ignore"):
         current = (flows.P**2 + flows.charged**2) / flows.v2[..., 1:]

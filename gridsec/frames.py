@@ -194,7 +194,7 @@ def clean(setting: Setting, past: Past, frame: Frame) -> Inputs:
     q_error[at] = np.where(told, frame.q_net_error[at], q_error[at])
     v0 = given if busbar else np.where(there, given, past.v0_squared)
     here = _of_customers(plant.feeder, v0)
-    correction, rest = _losses(plant, frame.p, q_all, v0, p_error=frame.p_error, q_error=q_error)
+    correction, rest = losses(plant, frame.p, q_all, v0, p_error=frame.p_error, q_error=q_error)
     base = setting.errors.R2 @ frame.p_error + setting.errors.X2 @ q_error + rest
     rise = 2.0 * (model.R @ frame.p + model.X @ q_all) + correction[plant.feeder.bus]
     reading = detect.reading_error(plant.accuracy, here[at] + rise[at] + base[at] + _ROOM, options.sigmas)
@@ -275,10 +275,27 @@ def injections(plant: Plant, frame: Frame, x: Floats, told: Bools) -> Floats:
     return np.asarray(q)
 
 
-def _losses(
+def losses(
     plant: Plant, p: Floats, q: Floats, v0: Floats | float, *, p_error: Floats, q_error: Floats
 ) -> tuple[Floats, Floats]:
-    """Loss correction (n,), and how far it can be from the truth at each customer (N,)."""
+    """Loss correction, and how far it can be from the truth for powers within intervals.
+
+    Parameters
+    ----------
+    plant
+        The feeder, and how often the linear model is corrected.
+    p, q : (N,)
+        Net injections, pu.
+    v0
+        Squared busbar voltage, pu; in three phases one or (3,).
+    p_error, q_error : (N,)
+        How far the injections may be off, pu.
+
+    Returns
+    -------
+    (n,), (N,)
+        What is to be added to the linear model at every place, and the bound at every customer, squared pu.
+    """
     feeder, steps = plant.feeder, plant.loss_correction
     if isinstance(feeder, Feeder):
         # The correction is nearly quadratic in the loads: its ends are where all of them err the same way.

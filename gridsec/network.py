@@ -131,6 +131,21 @@ def model_error_bound(feeder: Network, p: Floats, q: Floats, v0_squared: Floats 
     return places.model_error_bound(feeder, p, q, v0_squared)
 
 
+def reach(feeder: Network, p: Floats, q: Floats) -> Floats:
+    """Largest change of the squared voltages that powers of some sizes can make: ``2 |R| p + 2 |X| q``, (n,).
+
+    Parameters
+    ----------
+    feeder
+        The feeder.
+    p, q : (N,)
+        Sizes of the customers' active and reactive powers, not negative, pu.
+    """
+    if isinstance(feeder, Feeder):
+        return balanced.reach(feeder, p, q)
+    return np.asarray(2.0 * (np.abs(feeder.R) @ p + np.abs(feeder.X) @ q))
+
+
 def linear(feeder: Network) -> LinDistFlow:
     """Matrices of the linear power flow, rows for places in `R_bus` and `X_bus`.
 

@@ -14,7 +14,8 @@ import numpy as np
 from gridsec.arrays import Bools, Floats
 from gridsec.judge import Situation, decide
 from gridsec.network import busbar_places, one_busbar
-from gridsec.online import Cause, Decision, Estimate, Explanation, Verdict
+from gridsec.online import Cause, Decision, Estimate, Explanation, Frame, Verdict
+from gridsec.sequential.bounds import Bounded, Grounds, Powers, doubted
 from gridsec.sequential.conditional import judge
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.examine import Examined
@@ -23,10 +24,16 @@ from gridsec.sequential.state import SequentialState
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tick:
-    """What one tick brought. p meters, n buses.
+    """What one tick brought. N customers, p meters, n buses.
 
     Attributes
     ----------
+    frame
+        With powers that can be.
+    q : (N,)
+        Net reactive injections that the model was given, pu.
+    told : (N,)
+        Whose are metered and used.
     y : (p,)
         Squared voltages; any finite value where there is none.
     live : (p,)
@@ -43,6 +50,9 @@ class Tick:
         Explanations about as likely as the one that was found.
     """
 
+    frame: Frame
+    q: Floats
+    told: Bools
     y: Floats
     live: Bools
     v0_squared: Floats | float
@@ -113,17 +123,19 @@ def _estimate(design: SequentialDesign, state: SequentialState, tick: Tick) -> E
     v2_bus = tick.v2_bus + w
     first = busbar_places(plant.feeder)
     v2_bus[first] = np.where(tick.busbar, tick.v0_squared, v2_bus[first])
-    v2, std = v2_bus[plant.feeder.bus], np.sqrt(variance[plant.feeder.bus])
-    far = float(np.max(state.model_error + tick.transient, initial=0.0))
-    return Estimate(
-        t=state.t,
-        v2=v2,
-        bound=design.sigmas[0] * std + far,
-        v2_bus=v2_bus,
-        trusted=state.trust.trusted & tick.live,
-        x=np.zeros(0) if state.x is None else state.x,
-        std=std,
+    trusted = state.trust.trusted & tick.live
+    p_error, q_error = doubted(design, tick.frame, state.trust.trusted, state.doubts.sizes, tick.told)
+    grounds = Grounds(
+        plant=plant,
+        powers=Powers(tick.frame.p, tick.q, p_error, q_error, tick.told, tick.v0_squared),
+        injected=state.lag.error,
+        model=tick.v2_bus[plant.feeder.bus],
+        busbar=tick.busbar,
+        y=tick.y,
+        trusted=trusted,
+        sigmas=design.sigmas[0],
     )
+    return Bounded.on(grounds, state.t, v2_bus, variance, np.zeros(0) if state.x is None else state.x)
 
 
 _Said = tuple[Decision, Cause, str]

@@ -14,7 +14,7 @@ from scipy.stats import norm
 
 from gridsec.arrays import Floats, Ints
 from gridsec.certificates import Certificate, certify, verify
-from gridsec.detect import busbar_error
+from gridsec.detect import busbar_error, curve_mismatch
 from gridsec.errors import DesignInfeasible, NotObservable
 from gridsec.lmi import contraction
 from gridsec.lure import Lure, close_loop
@@ -124,6 +124,8 @@ class SequentialDesign:
         What all inverters between their limits can do to the voltage at each meter, squared pu.
     meter_of : (m,)
         Meter that drives each inverter; -1 for none.
+    mismatch : (m,)
+        How far a real curve, linear in v, can be from the model's, linear in z, pu.
     book
         What else but meters can be wrong: every customer's active power, then every inverter.
     shapes
@@ -157,6 +159,7 @@ class SequentialDesign:
     allowed: Floats
     reach: Floats
     meter_of: Ints
+    mismatch: Floats
     book: Dictionary = field(repr=False)
     shapes: Shapes = field(repr=False)
     most: int
@@ -235,6 +238,7 @@ def design(
         allowed=slope * accuracy.class_fraction,
         reach=np.abs(lure.C) @ (2.0 * plant.droop.limit),
         meter_of=_meter_of(plant),
+        mismatch=curve_mismatch(plant.droop),
         book=_suspicions(plant, effects, options),
         shapes=_shapes(plant, effects, options.alarms_per_year, step_s, lengths),
         most=meters.size // 3 if max_attacked is None else max_attacked,

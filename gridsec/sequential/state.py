@@ -8,6 +8,8 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.online import Estimate, Verdict
+from gridsec.sequential.bounds import Lag
+from gridsec.sequential.bounds import start as no_lag
 from gridsec.sequential.commission import Commission, Learned, Learning, fresh
 from gridsec.sequential.commission import renew as learn_anew
 from gridsec.sequential.conditional import Fit, Prior
@@ -102,6 +104,8 @@ class SequentialState:
         Injections, pu; None before the first frame.
     free
         What was prepared for inverters without a trusted meter; None while there were none.
+    lag
+        How far the injections may be from the true ones.
     v0_squared
         Last squared busbar voltage, pu; in three phases (3,).
     unmetered
@@ -133,6 +137,7 @@ class SequentialState:
     ticks: int
     x: Floats | None
     free: Free | None
+    lag: Lag
     v0_squared: Floats | float
     unmetered: Ints | int
     window: Window
@@ -179,6 +184,7 @@ def init(
         ticks=0,
         x=None,
         free=None,
+        lag=no_lag(design.plant, np.zeros(m)),
         v0_squared=design.plant.droop.vbar**2,
         unmetered=0,
         window=empty(design.lengths, p),

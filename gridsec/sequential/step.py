@@ -10,6 +10,8 @@ from gridsec.arrays import Bools, Floats, Ints
 from gridsec.frames import NO_VOLTAGE, nothing_new
 from gridsec.network import InPhases, bus_voltages, by_place, model_error_bound
 from gridsec.online import Estimate, Explanation, Frame, Verdict
+from gridsec.sequential.bounds import Lag, Powers, doubted, follow
+from gridsec.sequential.bounds import start as begin
 from gridsec.sequential.commission import conclude as learn
 from gridsec.sequential.commission import gather, ripe
 from gridsec.sequential.conclude import Tick, conclude
@@ -68,7 +70,7 @@ def step(
     kinds = listen(design.shapes, state.kinds, heard.y, heard.live)
     copies = suspicious(kinds) & (design.decoder is None)
     begun = _distrust(state.trust, copies)
-    x, free = _inverters(design, state, frame, heard)
+    x, free, lag = _inverters(design, state, frame, heard, doubts.sizes)
     q, v2_bus = _voltages(design, frame, heard, x)
     residual = heard.y - v2_bus[at] - state.learned.bias
     window = push(_remembered(design, state, heard.busbar), design.lengths, residual, heard.live)
@@ -93,6 +95,7 @@ def step(
         ticks=state.ticks + 1,
         x=x,
         free=free,
+        lag=lag,
         v0_squared=heard.v0_squared,
         unmetered=np.where(heard.busbar, 0, state.unmetered + 1),
         window=window,
@@ -102,7 +105,19 @@ def step(
         kinds=_kinds(design, state, kinds, seen, window, v2_bus[at]),
     )
     after = _learn(design, after, residual, heard.live, frame.t - state.t)
-    tick = Tick(heard.y, heard.live, heard.v0_squared, heard.busbar, v2_bus, transient, seen, rivals)
+    tick = Tick(
+        frame,
+        q,
+        heard.told,
+        heard.y,
+        heard.live,
+        heard.v0_squared,
+        heard.busbar,
+        v2_bus,
+        transient,
+        seen,
+        rivals,
+    )
     estimate, verdict = conclude(design, after, tick)
     return replace(after, last=(estimate, verdict)), estimate, verdict
 
@@ -356,24 +371,37 @@ def _factor(error: Floats, std: Floats, old: Floats) -> Floats:
 
 
 def _inverters(
-    design: SequentialDesign, state: SequentialState, frame: Frame, heard: _Heard
-) -> tuple[Floats, Free | None]:
-    """The injections at this frame: at rest at the first one, a step later at every other."""
+    design: SequentialDesign, state: SequentialState, frame: Frame, heard: _Heard, sizes: Floats
+) -> tuple[Floats, Free | None, Lag]:
+    """The injections at this frame, at rest at the first one and a step later at any other; their errors."""
     droop, meter = design.plant.droop, design.meter_of
     believed = state.trust.trusted & heard.live
     driven = (meter >= 0) & believed[meter]
     here = by_place(design.plant.feeder, heard.v0_squared)[design.plant.feeder.bus[droop.customer]]
     y = np.where(driven, heard.y[meter], here) if meter.size else np.zeros(0)
     if state.x is None:
-        return np.asarray(droop(droop.vbar**2 - y)), None
-    w = None
+        return np.asarray(droop(droop.vbar**2 - y)), None, begin(design.plant, y)
+    w, follows, h = None, None, frame.t - state.t
     if not driven.all():
+        now = _linear(design, frame, state.x, heard)
         v2 = _linear(design, frame, np.zeros(droop.tau.size), heard)
         if state.last is not None:
             # What losses took off at the last frame is close enough for inverters without a meter.
-            v2 += state.last[0].v2 - _linear(design, frame, state.x, heard)
-        w = droop.vbar**2 - v2
-    return drive(design, state.x, y, driven, w, frame.t - state.t, state.free)
+            v2 += state.last[0].v2 - now
+        w, y = droop.vbar**2 - v2, np.where(driven, y, now[droop.customer])
+        follows = ~driven, _given(design, state, frame, heard, sizes)
+    lag = follow(design, state.lag, heard.y, y, follows, h)
+    return *drive(design, state.x, y, driven, w, h, state.free), lag
+
+
+def _given(
+    design: SequentialDesign, state: SequentialState, frame: Frame, heard: _Heard, sizes: Floats
+) -> Powers:
+    """The powers that inverters follow which follow the model."""
+    x, customer = np.zeros(0) if state.x is None else state.x, design.plant.droop.customer
+    errors = doubted(design, frame, state.trust.trusted, sizes, heard.told)
+    q = heard.q + np.where(heard.told, 0.0, np.bincount(customer, weights=x, minlength=heard.q.size))
+    return Powers(frame.p, q, *errors, heard.told, heard.v0_squared)
 
 
 def _linear(design: SequentialDesign, frame: Frame, x: Floats, heard: _Heard) -> Floats:

@@ -1,0 +1,308 @@
+"""How far honest errors can lead, whatever they are within what was stated: intervals, no probabilities.
+
+All else in this package calls an offset unlikely. But classes and power factors err in the same direction for
+years, and all of them may err together; what then still holds is a sum of worst cases:
+
+    |v2 - model| <= 2 |R| dp + 2 |X| (dq + e) + losses + busbar      everywhere
+    |v2 - y|     <= error of the reading                             at trusted meters
+
+with e the error of the observed injections. Every ``|e_i|`` is a first-order lag of what drives it,
+
+    tau_i |e_i|' <= -|e_i| + min(span_i, d_i (error of what it is given + hold) + mismatch),
+
+where `hold` is what the inverter's voltage changed from frame to frame: saturation keeps it finite, whatever
+happens. An inverter that follows a trusted meter is given a reading, any other the model. Powers told by
+customers whose meters are not trusted may be false, by as much as the book of the search allows for. The
+busbar voltage is metered, or what the trusted meters leave of it: it is eliminated, not assumed.
+
+References
+----------
+docs/theory-sequential.md, section 7; docs/theory-detection.md for the lag and for `mismatch`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats
+from gridsec.detect import told_error
+from gridsec.frames import NO_VOLTAGE, busbar_errors, losses
+from gridsec.network import by_place, hangs_on, reach
+from gridsec.online import Estimate, Frame
+from gridsec.plant import Plant
+from gridsec.sequential.design import SequentialDesign
+
+# A false power is told with any power factor down to this: reactive power per active power.
+_FALSE_Q = 0.5
+# The monotone map of the free inverters is applied so often from above.
+_ROUNDS = 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lag:
+    """How far the observed injections may be from the true ones. m inverters.
+
+    Attributes
+    ----------
+    error : (m,)
+        Half-widths, pu.
+    given : (m,)
+        Squared voltage that each was given at the last frame, pu.
+    span : (m,)
+        Distance between the saturated values of each curve, pu: no error is larger.
+    """
+
+    error: Floats
+    given: Floats
+    span: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Powers:
+    """The powers of one frame and how far they may be off. N customers.
+
+    Attributes
+    ----------
+    p, q : (N,)
+        Net injections that the model was given, observed ones of inverters included, pu.
+    p_error, q_error : (N,)
+        Half-widths, those of the inverters excluded, pu.
+    told : (N,)
+        Whose net reactive power is metered and used: observed injections do not matter there.
+    v0_squared
+        Squared busbar voltage, pu; in three phases (3,).
+    """
+
+    p: Floats
+    q: Floats
+    p_error: Floats
+    q_error: Floats
+    told: Bools
+    v0_squared: Floats | float
+
+    def spread(self, plant: Plant, injected: Floats) -> tuple[Floats, Floats]:
+        """Half-width of each customer's squared voltage for a known busbar voltage, and its loss correction.
+
+        Parameters
+        ----------
+        plant
+            The feeder.
+        injected : (N,)
+            How far the inverters' injections may be off, pu.
+        """
+        q_error, at = self.q_error + np.where(self.told, 0.0, injected), plant.feeder.bus
+        correction, lost = losses(
+            plant, self.p, self.q, self.v0_squared, p_error=self.p_error, q_error=q_error
+        )
+        linear = reach(plant.feeder, self.p_error, q_error)[at]
+        return np.minimum(linear + lost, NO_VOLTAGE), correction[at]
+
+
+def doubted(
+    design: SequentialDesign, frame: Frame, trusted: Bools, sizes: Floats, told: Bools
+) -> tuple[Floats, Floats]:
+    """How far the powers may be off when those told by distrusted meters' customers may be false, (N,) each.
+
+    Parameters
+    ----------
+    design, frame
+        The design, and the frame.
+    trusted : (p,)
+        Which meters are believed.
+    sizes : (k,)
+        How much there may be of whatever is in the book, pu.
+    told : (N,)
+        Whose metered net reactive power is used.
+    """
+    p_error, q_error = frame.p_error, np.where(told, frame.q_net_error, frame.q_error)
+    if not trusted.all():
+        liars = design.plant.meters[~trusted]
+        p_error, q_error = p_error.copy(), q_error.copy()
+        p_error[liars] += sizes[liars]
+        q_error[liars] += np.abs(frame.q[liars]) + _FALSE_Q * sizes[liars]
+    return p_error, q_error
+
+
+def start(plant: Plant, given: Floats) -> Lag:
+    """Nothing is known of the injections but where they saturate.
+
+    Parameters
+    ----------
+    plant
+        The inverters.
+    given : (m,)
+        Squared voltage that each is given, pu.
+    """
+    span = plant.droop.q[:, 0] - plant.droop.q[:, 3]
+    return Lag(span, given, span)
+
+
+def follow(  # noqa: PLR0917  # the lag, what drives it, and for how long
+    design: SequentialDesign,
+    before: Lag,
+    y: Floats,
+    given: Floats,
+    free: tuple[Bools, Powers] | None,
+    h: float,
+) -> Lag:
+    """The errors a time h later.
+
+    Parameters
+    ----------
+    design, before
+        The design, and the errors at the last frame.
+    y : (p,)
+        Squared readings, pu; any finite value where there is none.
+    given : (m,)
+        Squared voltage that each inverter is given: its meter's reading or the model's, pu.
+    free
+        Which inverters follow the model, (m,), and what the frame says of powers; None where all follow their
+        meters.
+    h
+        Step, s.
+    """
+    plant, droop, span = design.plant, design.plant.droop, before.span
+    hold = np.abs(given - before.given)
+    reading = np.minimum(told_error(plant.accuracy, y, design.sigmas[0]), NO_VOLTAGE)
+    seen = reading[design.meter_of] if y.size else hold
+    target = np.minimum(span, droop.slope * (seen + hold) + design.mismatch)
+    if free is not None:
+        which, powers = free
+        # The map is monotone: from above its images stay above the error.
+        top = np.where(which, span, np.maximum(before.error, target))
+        for _ in range(_ROUNDS):
+            wide = powers.spread(plant, _of_customers(plant, top))[0][droop.customer]
+            image = np.minimum(span, droop.slope * (wide + hold) + design.mismatch)
+            target = np.where(which, image, target)
+            top = np.where(which, np.maximum(before.error, image), top)
+    return Lag(target + np.exp(-h / droop.tau) * (before.error - target), given, span)
+
+
+def _of_customers(plant: Plant, of_inverters: Floats) -> Floats:
+    size = plant.feeder.bus.size
+    return np.bincount(plant.droop.customer, weights=of_inverters, minlength=size).astype(np.float64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Grounds:
+    """What the bound of one estimate rests on. N customers, p meters.
+
+    Attributes
+    ----------
+    plant
+        The feeder.
+    powers
+        The frame's, and how far they may be off.
+    injected : (m,)
+        How far the observed injections may be off, pu.
+    model : (N,)
+        What the model makes of it, squared pu.
+    busbar
+        Whether its voltage is metered; in three phases (3,).
+    y, trusted : (p,)
+        Squared readings, and which of them count.
+    sigmas
+        Standard deviations of jitter that an honest reading may be off.
+    """
+
+    plant: Plant
+    powers: Powers
+    injected: Floats
+    model: Floats
+    busbar: Bools | bool
+    y: Floats
+    trusted: Bools
+    sigmas: float
+
+    def half_width(self, v2: Floats) -> Floats:
+        """Largest distance of the truth from some squared voltages, pu.
+
+        Parameters
+        ----------
+        v2 : (N,)
+            The squared voltages.
+        """
+        plant, at = self.plant, self.plant.meters
+        spread, correction = self.powers.spread(plant, _of_customers(plant, self.injected))
+        reading = told_error(plant.accuracy, self.y, self.sigmas)
+        low, high = (by_place(plant.feeder, end)[plant.feeder.bus] for end in self._busbar(spread, reading))
+        # What losses take off is that of the assumed busbar voltage.
+        moved = np.minimum(np.maximum(np.abs(low), np.abs(high)), NO_VOLTAGE)
+        base = by_place(plant.feeder, self.powers.v0_squared)[plant.feeder.bus]
+        spread = spread + np.abs(correction) * moved / np.maximum(base - moved, _LEAST)
+        low, high = self.model + low - spread, self.model + high + spread
+        own = np.where(self.trusted, reading, np.inf)
+        low[at], high[at] = _both(low[at], high[at], self.y - own, self.y + own)
+        return np.minimum(np.maximum(high - v2, v2 - low), NO_VOLTAGE)
+
+    def _busbar(self, spread: Floats, reading: Floats) -> tuple[Floats, Floats]:
+        """How far squared busbar voltages may be from those assumed: by their meters, and by all others."""
+        plant, at = self.plant, self.plant.meters
+        known = np.atleast_1d(busbar_errors(plant, self.powers.v0_squared, self.sigmas))
+        known = np.where(self.busbar, known, np.inf)
+        off, room = self.y - self.model[at], np.where(self.trusted, reading + spread[at], np.inf)
+        heard = np.where(hangs_on(plant.feeder)[at] > 0.0, room[:, None], np.inf)
+        low = (off[:, None] - heard).max(axis=0, initial=-np.inf)
+        high = (off[:, None] + heard).min(axis=0, initial=np.inf)
+        return _both(-known, known, low, high)
+
+
+# No supply is lower, squared pu.
+_LEAST = 0.1
+
+
+def _both(low: Floats, high: Floats, other_low: Floats, other_high: Floats) -> tuple[Floats, Floats]:
+    """What two intervals have in common; where they have nothing, all that is between their ends."""
+    below, above = np.maximum(low, other_low), np.minimum(high, other_high)
+    apart = below > above
+    return (
+        np.where(apart, np.minimum(low, other_low), below),
+        np.where(apart, np.maximum(high, other_high), above),
+    )
+
+
+# In place of a bound that nobody has asked for yet.
+_LATER: Floats = np.zeros(0)
+
+
+class Bounded(Estimate):
+    """An estimate whose bound is worked out when it is first asked for: that takes half as long as a step."""
+
+    __slots__ = ("_grounds",)
+    _grounds: Grounds
+
+    @classmethod
+    def on(cls, grounds: Grounds, t: float, v2_bus: Floats, variance: Floats, x: Floats) -> Bounded:
+        """Put an estimate together.
+
+        Parameters
+        ----------
+        grounds
+            What its bound rests on.
+        t
+            Unix time, s.
+        v2_bus, variance : (n,)
+            Squared voltage of every place and its variance, pu.
+        x : (m,)
+            Observed injections, pu.
+        """
+        bus = grounds.plant.feeder.bus
+        made = cls(t, v2_bus[bus], _LATER, v2_bus, grounds.trusted, x, np.sqrt(variance[bus]))
+        object.__setattr__(made, "_grounds", grounds)
+        return made
+
+    @property
+    def bound(self) -> Floats:
+        """Half-width of the interval around `v2` that holds the truth while errors are as stated, (N,)."""
+        slot = Estimate.__dict__["bound"]
+        found: Floats = slot.__get__(self)
+        if found is _LATER:
+            found = self._grounds.half_width(self.v2)
+            slot.__set__(self, found)
+        return found
+
+    @bound.setter
+    def bound(self, value: Floats) -> None:
+        Estimate.__dict__["bound"].__set__(self, value)
