@@ -195,6 +195,8 @@ class Verdict:
         do not ask.
     explanations
         Where several explanations fit the data about equally well, those, the likeliest first.
+    unjudged : (m,)
+        Inverters about which the data say nothing though inverters are judged; (0,) for none.
     """
 
     decision: Decision
@@ -208,3 +210,4 @@ class Verdict:
     inverter_attack: Floats = field(default_factory=_nothing)
     kinds: tuple[Kind | None, ...] = ()
     explanations: tuple[Explanation, ...] = ()
+    unjudged: Bools = field(default_factory=_none)

@@ -41,7 +41,8 @@ def reason_of(site: Site, tick: Tick, max_attacked: int, verdict: Verdict) -> st
             for e in verdict.explanations
         ]
         more = f" or {len(ways) - _SHOWN} more" if len(ways) > _SHOWN else ""
-        return f"Several explanations fit: {' or else '.join(ways[:_SHOWN])}{more}."
+        begin = "Several explanations fit" if len(ways) > 1 else "Only this explains the readings"
+        return f"{begin}: {' or else '.join(ways[:_SHOWN])}{more}."
     if verdict.cause is Cause.TOO_MANY_SUSPECTS and suspects:
         return (
             f"{len(suspects)} meters disagree with the feeder ({named}), and at most {max_attacked} can be "

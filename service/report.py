@@ -333,11 +333,12 @@ def _inverters(site: Site, estimate: Estimate | None, verdict: Verdict | None) -
     judged = verdict is not None and verdict.inverters.size > 0
     out = []
     for i, row in enumerate(site.tables.customers[int(c)] for c in site.droop.customer):
-        named = verdict is not None and judged and bool(verdict.inverters[i])
-        wrong = base * verdict.inverter_attack[i] if verdict is not None and judged else math.nan
+        asked = verdict is not None and judged and not (verdict.unjudged.size and verdict.unjudged[i])
+        named = verdict is not None and asked and bool(verdict.inverters[i])
+        wrong = base * verdict.inverter_attack[i] if verdict is not None and asked else math.nan
         x = math.nan if estimate is None else base * estimate.x[i]
         out.append(
-            InverterReport(row.customer, row.bus, row.meter or None, judged, named, finite(x), finite(wrong))
+            InverterReport(row.customer, row.bus, row.meter or None, asked, named, finite(x), finite(wrong))
         )
     return tuple(out)
 

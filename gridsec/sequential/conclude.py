@@ -97,10 +97,13 @@ def conclude(design: SequentialDesign, state: SequentialState, tick: Tick) -> tu
     said = _contradicted(design, beyond & ~trust.named, trust.named, said)
     said = _unvouched(design, tick.busbar, live, said)
     decision, cause, reason = _beside_meters(design, state, tick, amounts, said)
+    inverters = trust.inverters | state.curves.named(design)
     injected = np.zeros(plant.droop.tau.size)
     for k, amount in amounts.items():
         if k >= design.customers:
             injected[k - design.customers] = amount
+    metered = state.curves.amounts(design)
+    injected = np.where(metered != 0.0, metered, injected)
     verdict = Verdict(
         decision,
         cause,
@@ -109,10 +112,11 @@ def conclude(design: SequentialDesign, state: SequentialState, tick: Tick) -> tu
         score,
         threshold,
         attack,
-        inverters=trust.inverters,
-        inverter_attack=np.where(trust.inverters, injected, 0.0),
+        inverters=inverters,
+        inverter_attack=np.where(inverters, injected, 0.0),
         kinds=state.kinds.kinds,
-        explanations=tick.rivals,
+        explanations=tick.rivals or (state.curves.explanations(design) if cause is Cause.AMBIGUOUS else ()),
+        unjudged=~(design.visible | state.curves.heard | inverters),
     )
     return estimate, verdict
 
@@ -180,7 +184,7 @@ def _beside_meters(
 ) -> _Said:
     """The answer, with what was found besides meters."""
     decision, cause, reason = said
-    plant, inverters = design.plant, state.trust.inverters
+    plant, inverters = design.plant, state.trust.inverters | state.curves.named(design)
     owners = ", ".join(plant.feeder.customers[c] for c in plant.droop.customer[inverters])
     if owners and cause is Cause.RESIDUALS:
         return decision, cause, f"{reason[:-1]}; and the inverters of {owners}."
@@ -192,8 +196,9 @@ def _beside_meters(
         )
         return Decision.ATTACKED, Cause.RESIDUALS, sentence
     sentence = ""
-    if tick.rivals:
-        sentence = _ways(design, tick.rivals)
+    ways = tick.rivals or state.curves.explanations(design)
+    if ways:
+        sentence = _ways(design, ways)
     elif amounts:
         sentence = _doubt(design, *next(iter(amounts.items())))
     return (Decision.UNDECIDED, Cause.AMBIGUOUS, sentence) if sentence else said
@@ -217,6 +222,8 @@ _SHOWN = 5
 def _ways(design: SequentialDesign, explanations: tuple[Explanation, ...]) -> str:
     """What may be the case, in one sentence."""
     ways = [_way(design, each) for each in explanations[:_SHOWN]]
+    if len(explanations) == 1:
+        return f"Wrong is {ways[0]}; nothing else explains the readings."
     more = len(explanations) - len(ways)
     each = "both explain" if len(explanations) == 2 else "each of these explains"
     return (

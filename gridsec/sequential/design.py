@@ -10,9 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.linalg import lapack
 from scipy.stats import norm
 
-from gridsec.arrays import Floats, Ints
+from gridsec.arrays import Bools, Floats, Ints
 from gridsec.certificates import Certificate, certify, verify
 from gridsec.detect import busbar_error, curve_mismatch
 from gridsec.errors import DesignInfeasible, NotObservable
@@ -126,6 +127,8 @@ class SequentialDesign:
         Meter that drives each inverter; -1 for none.
     mismatch : (m,)
         How far a real curve, linear in v, can be from the model's, linear in z, pu.
+    visible : (m,)
+        Inverters whose whole range moves the voltages enough to be noticed there, while all meters report.
     book
         What else but meters can be wrong: every customer's active power, then every inverter.
     shapes
@@ -160,6 +163,7 @@ class SequentialDesign:
     reach: Floats
     meter_of: Ints
     mismatch: Floats
+    visible: Bools
     book: Dictionary = field(repr=False)
     shapes: Shapes = field(repr=False)
     most: int
@@ -221,24 +225,29 @@ def design(
     busbar = busbar_error(plant.accuracy, plant.droop.vbar**2, 2.0) / 2.0
     lengths = _lengths(options.scales_s, step_s)
     accuracy, slope = plant.accuracy, 2.0 * _HIGH * plant.droop.vbar
+    white = slope**2 * (accuracy.jitter**2 + accuracy.resolution**2 / 12.0)
+    fixed = slope**2 * accuracy.class_fraction**2 / 3.0
+    known = prior(plant.feeder, plant.feeder.bus[meters], doubt, busbar=busbar, inverters=injections)
+    suspect = float(norm.isf(0.5 * options.suspect / meters.size))
     return SequentialDesign(
         plant=plant,
         names=tuple(plant.feeder.customers[c] for c in meters),
         loop=lure.H,
         certificate=_proof(lure),
         doubt=doubt,
-        prior=prior(plant.feeder, plant.feeder.bus[meters], doubt, busbar=busbar, inverters=injections),
+        prior=known,
         injections=injections,
         busbar=busbar,
         lengths=lengths,
         sigmas=tuple(_sigmas(options.alarms_per_year, meters.size, n, step_s, lengths) for n in lengths),
-        suspect=float(norm.isf(0.5 * options.suspect / meters.size)),
-        white=slope**2 * (accuracy.jitter**2 + accuracy.resolution**2 / 12.0),
-        fixed=slope**2 * accuracy.class_fraction**2 / 3.0,
+        suspect=suspect,
+        white=white,
+        fixed=fixed,
         allowed=slope * accuracy.class_fraction,
         reach=np.abs(lure.C) @ (2.0 * plant.droop.limit),
         meter_of=_meter_of(plant),
         mismatch=curve_mismatch(plant.droop),
+        visible=_visible(plant, effects, known, fixed + white / lengths[-1], suspect),
         book=_suspicions(plant, effects, options),
         shapes=_shapes(plant, effects, options.alarms_per_year, step_s, lengths),
         most=meters.size // 3 if max_attacked is None else max_attacked,
@@ -247,6 +256,23 @@ def design(
         step_s=step_s,
         options=options,
     )
+
+
+# Standard deviations that chance may take off what shows.
+_CHANCE = 2.0
+
+
+def _visible(plant: Plant, effects: Effects, known: Prior, noise: Floats, suspect: float) -> Bools:
+    """Inverters whose whole range is evidence against them: ``span sqrt(c^T Q c)`` is beyond all limits."""
+    whole: Floats = known.among(np.arange(noise.size))
+    whole[np.diag_indices_from(whole)] += noise
+    moved = effects.columns(Power.REACTIVE, plant.droop.customer)[known.meters]
+    failed = lapack.dpotrf(whole, lower=True, clean=False, overwrite_a=True)[1]
+    half, _ = lapack.dtrtrs(whole, moved, lower=True)
+    if failed:
+        raise np.linalg.LinAlgError("the matrix is not positive definite")
+    span = plant.droop.q[:, 0] - plant.droop.q[:, 3]
+    return np.asarray(span * np.sqrt((half * half).sum(axis=0)) > suspect + _CHANCE)
 
 
 # Powers that alone would move a squared voltage by this, pu, are none; nor are any beyond so many pu.

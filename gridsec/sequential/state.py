@@ -13,6 +13,8 @@ from gridsec.sequential.bounds import start as no_lag
 from gridsec.sequential.commission import Commission, Learned, Learning, fresh
 from gridsec.sequential.commission import renew as learn_anew
 from gridsec.sequential.conditional import Fit, Prior
+from gridsec.sequential.curves import Curves
+from gridsec.sequential.curves import empty as no_curves
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.drive import Free
 from gridsec.sequential.kinds import Kinds
@@ -126,6 +128,8 @@ class SequentialState:
         What the model may be off at each meter, squared pu.
     swing
         By how much powers changed a squared voltage at most when that was bounded, pu.
+    curves
+        What metered reactive powers say of the inverters.
     kinds
         The past, and what the named meters' manipulations look like.
     last
@@ -148,6 +152,7 @@ class SequentialState:
     learned: Learned
     model_error: Floats
     swing: float
+    curves: Curves
     kinds: Kinds
     last: tuple[Estimate, Verdict] | None
 
@@ -206,6 +211,7 @@ def init(
         learned=known.learned,
         model_error=np.zeros(p),
         swing=0.0,
+        curves=no_curves(p, m),
         kinds=no_kinds(p),
         last=None,
     )

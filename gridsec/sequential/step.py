@@ -15,6 +15,7 @@ from gridsec.sequential.bounds import start as begin
 from gridsec.sequential.commission import conclude as learn
 from gridsec.sequential.commission import gather, ripe
 from gridsec.sequential.conclude import Tick, conclude
+from gridsec.sequential.curves import CONFIRM, Evidence, compare
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.drive import Free, drive
 from gridsec.sequential.examine import Examined, ended, examine
@@ -33,6 +34,7 @@ class _Heard:
     y: Floats  # (p,) 0 where not live
     q: Floats  # (N,) of the loads, or metered net where told
     told: Bools  # (N,)
+    reported: Bools  # (N,) who tells the net reactive power
     v0_squared: Floats | float  # in three phases (3,), and so whether it is metered
     busbar: Bools | bool
 
@@ -88,6 +90,7 @@ def step(
     trust = _distrust(trust, copies)
     rivals = rivals or _undecided(design, state, trust)
     seen = replace(seen, trust=trust)
+    reports = _reports(design, heard, frame, seen, x, lag)
     after = replace(
         state,
         t=frame.t,
@@ -102,6 +105,7 @@ def step(
         trust=trust,
         fits=seen.fits,
         doubts=doubts,
+        curves=compare(design, state.curves, reports),
         kinds=_kinds(design, state, kinds, seen, window, v2_bus[at]),
     )
     after = _learn(design, after, residual, heard.live, frame.t - state.t)
@@ -188,6 +192,17 @@ def _distrust(trust: Trust, copies: Bools) -> Trust:
         still=trust.still | copies,
         named=trust.named | copies,
     )
+
+
+def _reports(  # noqa: PLR0917  # everything known of the injections
+    design: SequentialDesign, heard: _Heard, frame: Frame, seen: Examined, x: Floats, lag: Lag
+) -> Evidence:
+    """What the metered reactive powers are compared with the curves by."""
+    believed = heard.live & seen.trust.trusted & (seen.trust.age == 0)
+    s = sum(length <= CONFIRM for length in design.lengths) - 1
+    view = seen.views[s]
+    judged = None if view is None else view.judged
+    return Evidence(frame, heard.reported, heard.told, believed, x, lag, seen.fits[s], judged)
 
 
 def _kinds(  # noqa: PLR0917  # everything that lies are compared with
@@ -281,6 +296,7 @@ def _clean(design: SequentialDesign, state: SequentialState, frame: Frame) -> _H
         y=np.clip(np.where(live, frame.y, 0.0), 0.0, NO_VOLTAGE),
         q=np.where(told, frame.q_net, frame.q),
         told=told,
+        reported=reported,
         v0_squared=v0_squared,
         busbar=busbar,
     )

@@ -1,0 +1,134 @@
+"""Metered reactive power against the droop curves: no honest error looks wrong, nothing wrong looks clean."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from feeders.estimators import design
+from feeders.load import load, names, to_frame
+from feeders.trials import Lie, LoadError, Meters, Trial, Trick, frames
+from gridsec import sequential
+from gridsec.online import Cause, Decision, Frame, Verdict
+from tests.feeders.test_adversarial import HIGH, LOW, Ends, World, default
+
+WITH_INVERTERS = [name for name in names() if load(name).droop.tau.size]
+
+
+class Reporting(World):
+    """A feeder whose meters report the net reactive power too, as wrong as they may."""
+
+    def snapshot(self, lies: dict[int, float], wrong: float = 1.0) -> object:
+        base, at, model = self.site.feeder.base_kva, self.site.meters, self.site.loads
+        injected = np.bincount(self.site.droop.customer, self.now.x, self.q.size) * base
+        net = (self.q - injected)[at]
+        floor = np.broadcast_to(model.q_error, self.q.size)[at] * base
+        error = np.maximum(floor, model.q_fraction / (1.0 + model.q_fraction) * np.abs(net))
+        return replace(super().snapshot(lies), q_kvar=net + wrong * error)
+
+
+@pytest.mark.parametrize("name", WITH_INVERTERS)
+@pytest.mark.parametrize("step_s", [1.0, 900.0])
+def test_honest_errors_at_their_ends_never_accuse_an_inverter(name: str, step_s: float) -> None:
+    made = default(name, step_s)
+    for ends in (HIGH, LOW, Ends(1, 1, 1, 1)):
+        for v0, load_, sun in ((0.95, 1.0, 0.0), (1.05, 0.1, 1.0)):
+            for wrong in (-1.0, 1.0):
+                world = Reporting(name, ends, v0=v0, load=load_, sun=sun)
+                state = sequential.init(made, world.t)
+                for _ in range(9 if step_s == 1.0 else 7):
+                    world.run(step_s)
+                    frame = to_frame(world.site, world.snapshot({}, wrong))  # type: ignore[arg-type]
+                    assert np.isfinite(frame.q_net[world.site.meters]).all()
+                    state, estimate, verdict = sequential.step(made, state, frame)
+                    assert verdict.cause in {Cause.AGREEMENT, Cause.SETTLING}
+                    true = (world.now.v_volt / world.volt) ** 2
+                    assert (np.abs(estimate.v2 - true) <= estimate.bound).all()
+
+
+def watched(
+    name: str, *, seed: int = 0, meters: Meters = Meters.SITE, error: LoadError | None = None
+) -> Iterator[tuple[Frame, Verdict, int]]:
+    """A minute in which one inverter leaves its curve by its rating after 30 s: frames, verdicts, whose."""
+    trial = Trial(
+        load(name),
+        seed,
+        duration_s=60.0,
+        load_error=LoadError(0.1, 0.05) if error is None else error,
+        meters=meters,
+        lie=Lie(Trick.INVERTER, 1, 100.0),
+        report_q=True,
+    )
+    watcher = design(trial.stated)
+    state = watcher.init(0.0)
+    for frame, truth in frames(trial):
+        state, _, verdict = watcher.step(state, frame)
+        yield frame, verdict, int(np.argmax(truth.inverters)) if truth.inverters.any() else -1
+
+
+@pytest.mark.parametrize("name", [name for name in WITH_INVERTERS if name != "kerber-vorstadtnetz"])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_an_inverter_off_its_curve_is_never_clean_and_nobody_else_is_accused(name: str, seed: int) -> None:
+    site, since = load(name), 0
+    for _, verdict, which in watched(name, seed=seed):
+        assert not verdict.suspects.any()
+        assert not np.delete(verdict.inverters, max(which, 0)).any()
+        since += which >= 0
+        if since <= 6:
+            continue
+        assert verdict.decision is not Decision.CLEAN
+        owner = int(site.droop.customer[which])
+        assert not verdict.unjudged[which]
+        for way in verdict.explanations:
+            assert not way.meters.any()
+            accused = set(site.droop.customer[way.inverters].tolist()) | set(
+                np.flatnonzero(way.powers).tolist()
+            )
+            assert accused == {owner}
+    assert since > 20
+
+
+def test_the_voltages_say_that_it_is_the_inverter_where_they_can() -> None:
+    answers = list(watched("cigre-lv", meters=Meters.WHITE, error=LoadError(0.01, 0.01)))
+    _, verdict, which = answers[-1]
+    assert verdict.decision is Decision.ATTACKED
+    assert np.flatnonzero(verdict.inverters).tolist() == [which]
+    droop, site = load("cigre-lv").droop, load("cigre-lv")
+    rating = site.tables.customers[int(droop.customer[which])].inverter_kva / site.feeder.base_kva
+    assert abs(verdict.inverter_attack[which]) == pytest.approx(rating, rel=0.3)
+
+
+@pytest.mark.parametrize("meters", [Meters.SITE, Meters.WHITE])
+def test_a_false_report_is_never_clean_and_names_no_inverter(meters: Meters) -> None:
+    """The inverter does as it should; what the meter says of the reactive power is off by its rating."""
+    site = load("cigre-lv")
+    error = LoadError(0.01, 0.01) if meters is Meters.WHITE else LoadError(0.1, 0.05)
+    trial = Trial(site, 3, duration_s=60.0, load_error=error, meters=meters, report_q=True)
+    c = int(site.droop.customer[0])
+    false = site.tables.customers[c].inverter_kva / site.feeder.base_kva
+    watcher, late = design(trial.stated), []
+    state = watcher.init(0.0)
+    for k, (frame, _) in enumerate(frames(trial)):
+        q_net = frame.q_net.copy()
+        q_net[c] += false * (k >= 20)
+        state, _, verdict = watcher.step(state, replace(frame, q_net=q_net))
+        assert not verdict.inverters.any()
+        assert not verdict.suspects.any()
+        late += [verdict] * (k >= 26)
+    assert all(verdict.decision is Decision.UNDECIDED for verdict in late)
+    assert all(verdict.cause is Cause.AMBIGUOUS for verdict in late)
+    assert all(np.flatnonzero(way.powers).tolist() in ([], [c]) for v in late for way in v.explanations)
+
+
+def test_inverters_that_nobody_hears_and_that_move_nothing_are_not_judged() -> None:
+    trial = Trial(load("simbench-lv-rural1"), 0, duration_s=3.0)
+    for heard in (False, True):
+        told = replace(trial, report_q=heard)
+        watcher = design(told.stated)
+        state = watcher.init(0.0)
+        for frame, _ in frames(told):
+            state, _, verdict = watcher.step(state, frame)
+        assert verdict.unjudged.any() != heard
