@@ -139,7 +139,7 @@ def feeders_design(
         )
     settings = site.tables.meta.monitor
     out.print(
-        f"{escape(site.feeder.name)}: {settings.estimator}, M = {settings.max_attacked}, "
+        f"{escape(site.feeder.name)}: {settings.estimator}, M = {finished.max_attacked}, "
         f"{finished.observers} observers, {time.monotonic() - started:.2f} s"
     )
     if finished.proof:
