@@ -77,7 +77,7 @@ class InverterState(BaseModel):
     customer: str
     bus: str
     meter: str | None = Field(description="The customer's meter, if there is one.")
-    judged: bool = Field(description="The estimator says something about inverters.")
+    judged: bool = Field(description="The estimator can tell whether it is manipulated.")
     suspect: bool = Field(description="The verdict names this inverter as manipulated.")
     q_kvar_estimated: Number = Field(description="Reactive power that it injects, kvar.")
     attack_kvar_estimated: Number = Field(description="What its curve does not ask for of it, kvar.")

@@ -116,7 +116,7 @@ class InverterReport:
     meter
         The customer's meter; None without one.
     judged
-        Whether the estimator says anything about inverters.
+        Whether the estimator can tell: the data say enough of this inverter.
     suspect
         Whether the verdict names it as manipulated.
     q_kvar_estimated
