@@ -107,8 +107,12 @@ def busbar_error(accuracy: MeterAccuracy, v0_squared: float, sigmas: float) -> f
     sigmas
         As in `reading_error`.
     """
-    part, even = accuracy.busbar_class, 0.5 * accuracy.busbar_resolution + sigmas * accuracy.busbar_jitter
-    return float(_told_error(np.array(part), np.array(even), np.array(v0_squared)))
+    if accuracy.busbar_class >= 1.0:
+        return float("inf")  # such a reading says nothing
+    v = float(np.sqrt(max(v0_squared, 0.0)))
+    e = accuracy.busbar_class * v + 0.5 * accuracy.busbar_resolution + sigmas * accuracy.busbar_jitter
+    e /= 1.0 - accuracy.busbar_class
+    return e * (2.0 * v + e)
 
 
 def told_error(accuracy: MeterAccuracy, y: Floats, sigmas: float) -> Floats:
@@ -126,16 +130,56 @@ def told_error(accuracy: MeterAccuracy, y: Floats, sigmas: float) -> Floats:
     Returns
     -------
     (p,)
-        Bounds, squared pu; infinite where a class says nothing.
+        Bounds, squared pu; beyond any voltage where a class says nothing.
     """
-    return _told_error(accuracy.class_fraction, 0.5 * accuracy.resolution + sigmas * accuracy.jitter, y)
+    return ToldError.over(accuracy, np.arange(y.size), sigmas).of(y)
 
 
-def _told_error(part: Floats, even: Floats, y: Floats) -> Floats:
-    v = np.sqrt(np.maximum(y, 0.0))
-    told = part < 1.0  # a class of 100 % says nothing
-    e = np.where(told, (part * v + even) / np.where(told, 1.0 - part, 1.0), np.inf)
-    return np.asarray(e * (2.0 * v + e))
+# Error of a voltage whose class says nothing, pu.
+_NOTHING = 4.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ToldError:
+    """How far the truth may be from readings of some meters, prepared; k meters.
+
+    Attributes
+    ----------
+    slope, floor : (k,)
+        Error of a voltage, pu: `slope v + floor` for a reading v.
+    """
+
+    slope: Floats
+    floor: Floats
+
+    @classmethod
+    def over(cls, accuracy: MeterAccuracy, which: Ints, sigmas: float) -> ToldError:
+        """Prepare some meters.
+
+        Parameters
+        ----------
+        accuracy, sigmas
+            As in `told_error`.
+        which : (k,)
+            The meters, each as often as wanted.
+        """
+        part = accuracy.class_fraction[which]
+        even = 0.5 * accuracy.resolution[which] + sigmas * accuracy.jitter[which]
+        told = part < 1.0
+        rest = np.where(told, 1.0 - part, 1.0)
+        return cls(np.where(told, part / rest, 0.0), np.where(told, even / rest, _NOTHING))
+
+    def of(self, y: Floats) -> Floats:
+        """Bounds for squared readings, squared pu.
+
+        Parameters
+        ----------
+        y : (k,)
+            The squared readings, not negative.
+        """
+        v = np.sqrt(y)
+        e = self.slope * v + self.floor
+        return np.asarray(e * (2.0 * v + e))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -61,26 +61,30 @@ class Lag:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Powers:
-    """The powers of one frame and how far they may be off. N customers.
+    """The powers of one frame and how far they may be off. N customers, p meters.
 
     Attributes
     ----------
-    p, q : (N,)
-        Net injections that the model was given, observed ones of inverters included, pu.
-    p_error, q_error : (N,)
-        Half-widths, those of the inverters excluded, pu.
+    frame
+        With powers that can be.
+    q : (N,)
+        Net reactive injections that the model was given, observed ones of inverters included, pu.
     told : (N,)
         Whose net reactive power is metered and used: observed injections do not matter there.
     v0_squared
         Squared busbar voltage, pu; in three phases (3,).
+    trusted : (p,)
+        Which meters are believed: powers that customers of the others tell may be false.
+    sizes : (k,)
+        How much there may be of whatever is in the book of the design, pu.
     """
 
-    p: Floats
+    frame: Frame
     q: Floats
-    p_error: Floats
-    q_error: Floats
     told: Bools
     v0_squared: Floats | float
+    trusted: Bools
+    sizes: Floats
 
     def spread(self, plant: Plant, injected: Floats) -> tuple[Floats, Floats]:
         """Half-width of each customer's squared voltage for a known busbar voltage, and its loss correction.
@@ -92,37 +96,21 @@ class Powers:
         injected : (N,)
             How far the inverters' injections may be off, pu.
         """
-        q_error, at = self.q_error + np.where(self.told, 0.0, injected), plant.feeder.bus
-        correction, lost = losses(
-            plant, self.p, self.q, self.v0_squared, p_error=self.p_error, q_error=q_error
-        )
-        linear = reach(plant.feeder, self.p_error, q_error)[at]
+        p_error, q_error = self._errors(plant)
+        q_error, at = q_error + np.where(self.told, 0.0, injected), plant.feeder.bus
+        p, v0 = self.frame.p, self.v0_squared
+        correction, lost = losses(plant, p, self.q, v0, p_error=p_error, q_error=q_error)
+        linear = reach(plant.feeder, p_error, q_error)[at]
         return np.minimum(linear + lost, NO_VOLTAGE), correction[at]
 
-
-def doubted(
-    design: SequentialDesign, frame: Frame, trusted: Bools, sizes: Floats, told: Bools
-) -> tuple[Floats, Floats]:
-    """How far the powers may be off when those told by distrusted meters' customers may be false, (N,) each.
-
-    Parameters
-    ----------
-    design, frame
-        The design, and the frame.
-    trusted : (p,)
-        Which meters are believed.
-    sizes : (k,)
-        How much there may be of whatever is in the book, pu.
-    told : (N,)
-        Whose metered net reactive power is used.
-    """
-    p_error, q_error = frame.p_error, np.where(told, frame.q_net_error, frame.q_error)
-    if not trusted.all():
-        liars = design.plant.meters[~trusted]
-        p_error, q_error = p_error.copy(), q_error.copy()
-        p_error[liars] += sizes[liars]
-        q_error[liars] += np.abs(frame.q[liars]) + _FALSE_Q * sizes[liars]
-    return p_error, q_error
+    def _errors(self, plant: Plant) -> tuple[Floats, Floats]:
+        """How far the powers may be off, inverters excluded, (N,) each."""
+        frame = self.frame
+        p_error, q_error = frame.p_error.copy(), np.where(self.told, frame.q_net_error, frame.q_error)
+        liars = plant.meters[~self.trusted]
+        p_error[liars] += self.sizes[liars]
+        q_error[liars] += np.abs(frame.q[liars]) + _FALSE_Q * self.sizes[liars]
+        return p_error, q_error
 
 
 def start(plant: Plant, given: Floats) -> Lag:
@@ -139,10 +127,9 @@ def start(plant: Plant, given: Floats) -> Lag:
     return Lag(span, given, span)
 
 
-def follow(  # noqa: PLR0917  # the lag, what drives it, and for how long
+def follow(
     design: SequentialDesign,
     before: Lag,
-    y: Floats,
     given: Floats,
     free: tuple[Bools, Powers] | None,
     h: float,
@@ -153,8 +140,6 @@ def follow(  # noqa: PLR0917  # the lag, what drives it, and for how long
     ----------
     design, before
         The design, and the errors at the last frame.
-    y : (p,)
-        Squared readings, pu; any finite value where there is none.
     given : (m,)
         Squared voltage that each inverter is given: its meter's reading or the model's, pu.
     free
@@ -165,9 +150,7 @@ def follow(  # noqa: PLR0917  # the lag, what drives it, and for how long
     """
     plant, droop, span = design.plant, design.plant.droop, before.span
     hold = np.abs(given - before.given)
-    reading = np.minimum(told_error(plant.accuracy, y, design.sigmas[0]), NO_VOLTAGE)
-    seen = reading[design.meter_of] if y.size else hold
-    target = np.minimum(span, droop.slope * (seen + hold) + design.mismatch)
+    target = np.minimum(span, droop.slope * (design.heard.of(given) + hold) + design.mismatch)
     if free is not None:
         which, powers = free
         # The map is monotone: from above its images stay above the error.

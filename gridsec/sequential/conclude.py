@@ -15,7 +15,7 @@ from gridsec.arrays import Bools, Floats
 from gridsec.judge import Situation, decide
 from gridsec.network import busbar_places, one_busbar
 from gridsec.online import Cause, Decision, Estimate, Explanation, Frame, Verdict
-from gridsec.sequential.bounds import Bounded, Grounds, Powers, doubted
+from gridsec.sequential.bounds import Bounded, Grounds, Powers
 from gridsec.sequential.conditional import judge
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.examine import Examined
@@ -97,13 +97,7 @@ def conclude(design: SequentialDesign, state: SequentialState, tick: Tick) -> tu
     said = _contradicted(design, beyond & ~trust.named, trust.named, said)
     said = _unvouched(design, tick.busbar, live, said)
     decision, cause, reason = _beside_meters(design, state, tick, amounts, said)
-    inverters = trust.inverters | state.curves.named(design)
-    injected = np.zeros(plant.droop.tau.size)
-    for k, amount in amounts.items():
-        if k >= design.customers:
-            injected[k - design.customers] = amount
-    metered = state.curves.amounts(design)
-    injected = np.where(metered != 0.0, metered, injected)
+    inverters = _inverters(design, state)
     verdict = Verdict(
         decision,
         cause,
@@ -113,12 +107,32 @@ def conclude(design: SequentialDesign, state: SequentialState, tick: Tick) -> tu
         threshold,
         attack,
         inverters=inverters,
-        inverter_attack=np.where(inverters, injected, 0.0),
+        inverter_attack=_injected(design, state, inverters, amounts),
         kinds=state.kinds.kinds,
         explanations=tick.rivals or (state.curves.explanations(design) if cause is Cause.AMBIGUOUS else ()),
-        unjudged=~(design.visible | state.curves.heard | inverters),
+        unjudged=design.unseen & ~(state.curves.heard | inverters),
     )
     return estimate, verdict
+
+
+def _inverters(design: SequentialDesign, state: SequentialState) -> Bools:
+    """Inverters named, by the voltages or by what is metered of them, (m,)."""
+    named = state.trust.inverters
+    return named if state.curves.idle else named | state.curves.named(design)
+
+
+def _injected(
+    design: SequentialDesign, state: SequentialState, inverters: Bools, amounts: dict[int, float]
+) -> Floats:
+    """What named inverters inject that their curves do not ask for, as metered where that is so, (m,)."""
+    out = np.zeros(inverters.size)
+    if inverters.any():
+        for k, amount in amounts.items():
+            if k >= design.customers:
+                out[k - design.customers] = amount
+        metered = state.curves.amounts(design)
+        out = np.where(inverters, np.where(metered != 0.0, metered, out), 0.0)
+    return out
 
 
 def _estimate(design: SequentialDesign, state: SequentialState, tick: Tick) -> Estimate:
@@ -128,10 +142,11 @@ def _estimate(design: SequentialDesign, state: SequentialState, tick: Tick) -> E
     first = busbar_places(plant.feeder)
     v2_bus[first] = np.where(tick.busbar, tick.v0_squared, v2_bus[first])
     trusted = state.trust.trusted & tick.live
-    p_error, q_error = doubted(design, tick.frame, state.trust.trusted, state.doubts.sizes, tick.told)
     grounds = Grounds(
         plant=plant,
-        powers=Powers(tick.frame.p, tick.q, p_error, q_error, tick.told, tick.v0_squared),
+        powers=Powers(
+            tick.frame, tick.q, tick.told, tick.v0_squared, state.trust.trusted, state.doubts.sizes
+        ),
         injected=state.lag.error,
         model=tick.v2_bus[plant.feeder.bus],
         busbar=tick.busbar,
@@ -184,7 +199,7 @@ def _beside_meters(
 ) -> _Said:
     """The answer, with what was found besides meters."""
     decision, cause, reason = said
-    plant, inverters = design.plant, state.trust.inverters | state.curves.named(design)
+    plant, inverters = design.plant, _inverters(design, state)
     owners = ", ".join(plant.feeder.customers[c] for c in plant.droop.customer[inverters])
     if owners and cause is Cause.RESIDUALS:
         return decision, cause, f"{reason[:-1]}; and the inverters of {owners}."
@@ -269,17 +284,18 @@ def _amounts(design: SequentialDesign, state: SequentialState, seen: Examined) -
 def _reconstructed(design: SequentialDesign, state: SequentialState, seen: Examined) -> tuple[Floats, Floats]:
     """What the trusted meters add to the model at every bus, and its variance, on the best scale."""
     prior_ = state.doubts.prior
-    best, at, mean = prior_.variance, -1, np.inf
+    whole, at, least, moved = float(prior_.variance.sum()), -1, np.inf, 0.0
     for s, (now, length) in enumerate(zip(state.fits, design.lengths, strict=True)):
         if now is None:
             continue
         lag = min(1.0, length * design.step_s / design.doubt.time_s) * (length > 1)
-        variance = now.variance + lag * prior_.variance
-        if variance.sum() < mean:
-            best, at, mean = variance, s, float(variance.sum())
+        total = float(now.variance.sum()) + lag * whole
+        if total < least:
+            at, least, moved = s, total, lag
     now, view = (None, None) if at < 0 else (state.fits[at], seen.views[at])
     if now is None:
-        return np.zeros_like(best), best
+        return np.zeros_like(prior_.variance), prior_.variance
+    best = now.variance + moved * prior_.variance
     m = state.window.sums[at] / np.maximum(state.window.counts[at], 1)
     return (judge(now, m).w if view is None else view.judged.w), best + _hidden(state)
 
@@ -294,16 +310,13 @@ def _hidden(state: SequentialState) -> Floats:
 
 def _worst(design: SequentialDesign, seen: Examined, p: int) -> tuple[Floats, Floats, Bools]:
     """Offset and limit of each meter on the scale that speaks most against it; who was judged."""
-    score, threshold = np.full(p, np.nan), np.full(p, design.options.widest)
-    ratio = np.full(p, -1.0)
-    judged = np.zeros(p, dtype=np.bool_)
-    for view in seen.views:
-        if view is None:
-            continue
-        judged |= view.enough
-        offset = np.abs(view.judged.offset)
-        now = np.where(view.enough, offset / view.limit, -1.0)
-        more = now > ratio
-        score, threshold = np.where(more, offset, score), np.where(more, view.limit, threshold)
-        ratio = np.maximum(ratio, now)
-    return np.where(judged, score, np.nan), threshold, judged
+    views = [view for view in seen.views if view is not None]
+    if not views:
+        return np.full(p, np.nan), np.full(p, design.options.widest), np.zeros(p, dtype=np.bool_)
+    offset = np.abs([view.judged.offset for view in views])
+    limit, enough = np.array([view.limit for view in views]), np.array([view.enough for view in views])
+    ratio = np.where(enough, offset / limit, -1.0)
+    worst, each = ratio.argmax(axis=0), np.arange(p)
+    judged = np.asarray(enough.any(axis=0))
+    score = np.where(judged, offset[worst, each], np.nan)
+    return score, np.where(judged, limit[worst, each], design.options.widest), judged

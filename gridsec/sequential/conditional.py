@@ -81,6 +81,8 @@ class Fit:
         Directions that were loosened, each times the standard deviation it was given.
     changes
         Changes of rank one since the last factorisation.
+    pivot, std : (p,) or None
+        Diagonal of Q, 1 where not trusted, and the standard deviation of each offset; None until asked for.
     """
 
     prior: Prior
@@ -90,6 +92,8 @@ class Fit:
     variance: Floats
     loose: Floats
     changes: int = 0
+    pivot: Floats | None = None
+    std: Floats | None = None
 
     @property
     def Q(self) -> Floats:  # noqa: N802  # its name in the theory
@@ -329,10 +333,11 @@ def judge(now: Fit, m: Floats) -> Judged:
 
 def _judged(now: Fit, m: Floats, weights: Floats, w: Floats) -> Judged:
     trusted, at = now.trusted, now.prior.meters
-    pivot = np.where(trusted, now.diagonal(), 1.0)
-    offset = np.where(trusted, weights / pivot, m - w[at])
-    variance = np.where(trusted, 1.0 / pivot, now.variance[at] + now.noise)
-    return Judged(weights, offset, np.sqrt(variance), w, float(m @ weights))
+    if now.pivot is None or now.std is None:
+        now.pivot = np.where(trusted, now.diagonal(), 1.0)
+        now.std = np.sqrt(np.where(trusted, 1.0 / now.pivot, now.variance[at] + now.noise))
+    offset = np.where(trusted, weights / now.pivot, m - w[at])
+    return Judged(weights, offset, now.std, w, float(m @ weights))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -421,6 +426,7 @@ def _change(now: Fit, move: Move) -> None:
     now.variance -= move.factor * move.spread * move.spread
     np.maximum(now.variance, 0.0, out=now.variance)
     now.changes += 1
+    now.pivot = now.std = None
 
 
 def follow(now: Fit, m: Floats, judged: Judged, move: Move) -> Judged:

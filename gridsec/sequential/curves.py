@@ -59,6 +59,11 @@ class Curves:
     sure: Bools
     heard: Bools
 
+    @property
+    def idle(self) -> bool:
+        """Whether nobody's reports are compared with anything."""
+        return not (self.heard.any() or self.count.any())
+
     def named(self, design: SequentialDesign) -> Bools:
         """Inverters that do not follow their curves, (m,)."""
         return (design.meter_of >= 0) & self.sure[design.meter_of] if self.sure.size else self.heard
@@ -71,7 +76,7 @@ class Curves:
     def explanations(self, design: SequentialDesign) -> tuple[Explanation, ...]:
         """What may be the case where the voltages do not decide: that of the strangest customer."""
         open_ = self.off & ~self.sure
-        if not open_.any():
+        if self.idle or not open_.any():
             return ()
         j = int(np.argmax(np.where(open_, np.abs(self.amount), -1.0)))
         nobody, none = np.zeros_like(self.off), np.zeros_like(self.heard)
@@ -145,6 +150,8 @@ def compare(design: SequentialDesign, before: Curves, now: Evidence) -> Curves:
     now
         One tick.
     """
+    if before.idle and not now.reported.any():
+        return before
     droop, at, size = design.plant.droop, design.plant.meters, design.customers
     own = np.bincount(droop.customer, minlength=size) > 0
     asked = now.reported[at] & now.trusted & own[at]

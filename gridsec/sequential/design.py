@@ -15,7 +15,7 @@ from scipy.stats import norm
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.certificates import Certificate, certify, verify
-from gridsec.detect import busbar_error, curve_mismatch
+from gridsec.detect import ToldError, busbar_error, curve_mismatch
 from gridsec.errors import DesignInfeasible, NotObservable
 from gridsec.lmi import contraction
 from gridsec.lure import Lure, close_loop
@@ -125,10 +125,12 @@ class SequentialDesign:
         What all inverters between their limits can do to the voltage at each meter, squared pu.
     meter_of : (m,)
         Meter that drives each inverter; -1 for none.
+    heard : (m,)
+        How far the truth may be from what each inverter's meter reads.
     mismatch : (m,)
         How far a real curve, linear in v, can be from the model's, linear in z, pu.
-    visible : (m,)
-        Inverters whose whole range moves the voltages enough to be noticed there, while all meters report.
+    unseen : (m,)
+        Inverters whose whole range does not move the voltages enough to be noticed there.
     book
         What else but meters can be wrong: every customer's active power, then every inverter.
     shapes
@@ -162,8 +164,9 @@ class SequentialDesign:
     allowed: Floats
     reach: Floats
     meter_of: Ints
+    heard: ToldError
     mismatch: Floats
-    visible: Bools
+    unseen: Bools
     book: Dictionary = field(repr=False)
     shapes: Shapes = field(repr=False)
     most: int
@@ -229,6 +232,7 @@ def design(
     fixed = slope**2 * accuracy.class_fraction**2 / 3.0
     known = prior(plant.feeder, plant.feeder.bus[meters], doubt, busbar=busbar, inverters=injections)
     suspect = float(norm.isf(0.5 * options.suspect / meters.size))
+    sigmas = tuple(_sigmas(options.alarms_per_year, meters.size, n, step_s, lengths) for n in lengths)
     return SequentialDesign(
         plant=plant,
         names=tuple(plant.feeder.customers[c] for c in meters),
@@ -239,7 +243,7 @@ def design(
         injections=injections,
         busbar=busbar,
         lengths=lengths,
-        sigmas=tuple(_sigmas(options.alarms_per_year, meters.size, n, step_s, lengths) for n in lengths),
+        sigmas=sigmas,
         suspect=suspect,
         white=white,
         fixed=fixed,
@@ -247,7 +251,8 @@ def design(
         reach=np.abs(lure.C) @ (2.0 * plant.droop.limit),
         meter_of=_meter_of(plant),
         mismatch=curve_mismatch(plant.droop),
-        visible=_visible(plant, effects, known, fixed + white / lengths[-1], suspect),
+        heard=ToldError.over(plant.accuracy, _meter_of(plant), sigmas[0]),
+        unseen=_unseen(plant, effects, known, fixed + white / lengths[-1], suspect),
         book=_suspicions(plant, effects, options),
         shapes=_shapes(plant, effects, options.alarms_per_year, step_s, lengths),
         most=meters.size // 3 if max_attacked is None else max_attacked,
@@ -262,8 +267,8 @@ def design(
 _CHANCE = 2.0
 
 
-def _visible(plant: Plant, effects: Effects, known: Prior, noise: Floats, suspect: float) -> Bools:
-    """Inverters whose whole range is evidence against them: ``span sqrt(c^T Q c)`` is beyond all limits."""
+def _unseen(plant: Plant, effects: Effects, known: Prior, noise: Floats, suspect: float) -> Bools:
+    """Inverters whose whole range is no evidence against them: ``span sqrt(c^T Q c)`` within the limits."""
     whole: Floats = known.among(np.arange(noise.size))
     whole[np.diag_indices_from(whole)] += noise
     moved = effects.columns(Power.REACTIVE, plant.droop.customer)[known.meters]
@@ -272,7 +277,7 @@ def _visible(plant: Plant, effects: Effects, known: Prior, noise: Floats, suspec
     if failed:
         raise np.linalg.LinAlgError("the matrix is not positive definite")
     span = plant.droop.q[:, 0] - plant.droop.q[:, 3]
-    return np.asarray(span * np.sqrt((half * half).sum(axis=0)) > suspect + _CHANCE)
+    return np.asarray(span * np.sqrt((half * half).sum(axis=0)) <= suspect + _CHANCE)
 
 
 # Powers that alone would move a squared voltage by this, pu, are none; nor are any beyond so many pu.

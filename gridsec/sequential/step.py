@@ -10,7 +10,7 @@ from gridsec.arrays import Bools, Floats, Ints
 from gridsec.frames import NO_VOLTAGE, nothing_new
 from gridsec.network import InPhases, bus_voltages, by_place, model_error_bound
 from gridsec.online import Estimate, Explanation, Frame, Verdict
-from gridsec.sequential.bounds import Lag, Powers, doubted, follow
+from gridsec.sequential.bounds import Lag, Powers, follow
 from gridsec.sequential.bounds import start as begin
 from gridsec.sequential.commission import conclude as learn
 from gridsec.sequential.commission import gather, ripe
@@ -89,7 +89,7 @@ def step(
     trust, rivals = name(design, begun, _acquit(seen, over), heard.live)
     trust = _distrust(trust, copies)
     rivals = rivals or _undecided(design, state, trust)
-    seen = replace(seen, trust=trust)
+    seen = seen if trust is seen.trust else replace(seen, trust=trust)
     reports = _reports(design, heard, frame, seen, x, lag)
     after = replace(
         state,
@@ -131,6 +131,8 @@ def _remembered(design: SequentialDesign, state: SequentialState, busbar: Bools 
 
     They are as far off as it had moved meanwhile, and all meters alike.
     """
+    if not np.any(state.unmetered):
+        return state.window
     since = np.where(busbar, state.unmetered, 0)
     if not since.any():
         return state.window
@@ -147,13 +149,11 @@ def _transient(design: SequentialDesign, age: float) -> Floats:
 def _undecided(design: SequentialDesign, state: SequentialState, trust: Trust) -> tuple[Explanation, ...]:
     """The last explanations, as long as the same are suspected: they are not looked for at every tick."""
     before = state.trust
-    same = all(
-        np.array_equal(getattr(trust, name), getattr(before, name))
-        for name in ("trusted", "named", "inverters")
-    )
-    if state.last is None or design.decoder is not None or not same or trust.trusted.all():
+    if state.last is None or design.decoder is not None or trust.trusted.all():
         return ()
-    return state.last[1].explanations
+    names = ("trusted", "named", "inverters")
+    same = all(np.array_equal(getattr(trust, name), getattr(before, name)) for name in names)
+    return state.last[1].explanations if same else ()
 
 
 def _acquit(seen: Examined, over: Bools) -> Examined:
@@ -406,7 +406,7 @@ def _inverters(
             v2 += state.last[0].v2 - now
         w, y = droop.vbar**2 - v2, np.where(driven, y, now[droop.customer])
         follows = ~driven, _given(design, state, frame, heard, sizes)
-    lag = follow(design, state.lag, heard.y, y, follows, h)
+    lag = follow(design, state.lag, y, follows, h)
     return *drive(design, state.x, y, driven, w, h, state.free), lag
 
 
@@ -415,9 +415,8 @@ def _given(
 ) -> Powers:
     """The powers that inverters follow which follow the model."""
     x, customer = np.zeros(0) if state.x is None else state.x, design.plant.droop.customer
-    errors = doubted(design, frame, state.trust.trusted, sizes, heard.told)
     q = heard.q + np.where(heard.told, 0.0, np.bincount(customer, weights=x, minlength=heard.q.size))
-    return Powers(frame.p, q, *errors, heard.told, heard.v0_squared)
+    return Powers(frame, q, heard.told, heard.v0_squared, state.trust.trusted, sizes)
 
 
 def _linear(design: SequentialDesign, frame: Frame, x: Floats, heard: _Heard) -> Floats:
