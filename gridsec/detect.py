@@ -175,9 +175,9 @@ class ToldError:
         Parameters
         ----------
         y : (k,)
-            The squared readings, not negative.
+            The squared readings.
         """
-        v = np.sqrt(y)
+        v = np.sqrt(np.maximum(y, 0.0))
         e = self.slope * v + self.floor
         return np.asarray(e * (2.0 * v + e))
 
