@@ -22,8 +22,6 @@ _TINY = float(np.finfo(np.float64).tiny)
 # So many liars may be alike: of larger sets there are too many, and what is gained is little.
 MOST = 8
 Curved = Callable[[Floats, Bools], Floats]
-# How often an explanation is linearised about itself.
-_PASSES = 2
 # Where nobody is named, meters beyond so many standard deviations are.
 _SUSPICIOUS = 3.0
 # Of the false alarms that are allowed, for false powers where no meter alone is suspicious enough.
@@ -316,12 +314,15 @@ class Problem:
         return np.stack([self.false.R[:, c] * self.false.p[c], self.false.X[:, c] * self.false.q[c]])
 
     def settle(self, at: State) -> None:
-        """Linearise about what this explanation says of the powers."""
+        """Linearise about what this explanation says of the powers.
+
+        Once: a second time moves neither who is named nor, in the 95th percentile, any voltage by more than
+        0.04 % of nominal in the scenes of docs/peers.md.
+        """
         if self.curved is None:
             return
-        for _ in range(_PASSES):
-            at.m = self.curved(at.g, at.powers)
-            at.g = at.times(at.m)
+        at.m = self.curved(at.g, at.powers)
+        at.g = at.times(at.m)
         at.fit, at.rise = float(at.m @ at.g), None
 
     def toggle(self, at: State, j: int) -> None:
