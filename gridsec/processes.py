@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import sys
+import threading
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
@@ -17,15 +18,28 @@ _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 
 @contextmanager
 def deaf() -> Iterator[None]:
-    """Let processes that begin now hear no signal until they `listen`: they would tell of it at length."""
-    if sys.platform == "win32":
+    """Begin processes undisturbed: signals to this one come after it, and theirs when they `listen`.
+
+    One that is interrupted before it knows what to do would tell of it at length.
+    """
+    if sys.platform == "win32" or threading.current_thread() is not threading.main_thread():
         yield
         return
+    late: list[int] = []
+    handlers = {
+        number: signal.signal(number, lambda heard, _: late.append(heard))
+        for number in _SIGNALS
+        if callable(signal.getsignal(number))
+    }
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
     try:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        if late:
+            signal.raise_signal(late[0])
 
 
 def listen() -> None:

@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -16,7 +16,9 @@ from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any, Final, Never
 
 import typer
+from rich.control import Control
 from rich.markup import escape
+from rich.segment import ControlType
 
 from gridsec.errors import GridsecError
 from service import console
@@ -40,6 +42,9 @@ NoJournal = Annotated[
 ]
 
 SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
+
+PATIENCE_S: Final = 3.0
+"""How long a command may take to hear a signal, s."""
 
 MOST: Final = 64
 """How many journals of interrupted studies stay in the user's folder for caches."""
@@ -188,7 +193,7 @@ def keeping(
     where = None if without else folder or cache_folder() / "journals"
     kept = Keeping(study, feeder, journal, where, stay=folder is not None)
     try:
-        with _signals():
+        with _signals(kept.left):
             yield kept
     except KeyboardInterrupt as stop:
         number = stop.number if isinstance(stop, Stopped) else signal.SIGINT
@@ -221,18 +226,47 @@ def idle() -> Callable[[], object]:
 
 
 @contextmanager
-def _signals() -> Iterator[None]:
-    """SIGTERM stops a command as Ctrl-C does, and whoever does that twice does not want to wait."""
+def _signals(left: Callable[[], str]) -> Iterator[None]:
+    """SIGTERM stops a command as Ctrl-C does, and whoever does that twice does not want to wait.
+
+    A solver that has the program for minutes lets no handler run, but a thread: this ends it then. Every
+    result is in the journal as soon as there is one, so that nothing more is lost.
+    """
+    heard = threading.Event()
 
     def stop(number: int, _: FrameType | None) -> Never:
+        heard.set()
         _handle(dict.fromkeys(SIGNALS, _end))
         raise Stopped(number)
 
-    before = _handle(dict.fromkeys(SIGNALS, stop))
+    def watch() -> None:
+        number = os.read(ours, 1)
+        if number and not heard.wait(PATIENCE_S):
+            try:
+                with suppress(IndexError):  # there is no progress bar
+                    console.err.clear_live()
+                console.err.control(Control(ControlType.CARRIAGE_RETURN, (ControlType.ERASE_IN_LINE, 2)))
+                complain(f"interrupted; {left()}")
+            finally:
+                _end(number[0], None)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    ours, theirs = os.pipe()
+    os.set_blocking(theirs, False)
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+    before, fd = _handle(dict.fromkeys(SIGNALS, stop)), signal.set_wakeup_fd(theirs)
     try:
         yield
     finally:
         _handle(before)
+        signal.set_wakeup_fd(fd)
+        heard.set()
+        os.close(theirs)
+        thread.join()
+        os.close(ours)
 
 
 def _handle(handlers: Mapping[signal.Signals, Any]) -> dict[signal.Signals, Any]:
