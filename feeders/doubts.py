@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
 from feeders.forecast import always
 from feeders.load import Site, Snapshot, to_frame
+from feeders.schema import FeederTables
 from gridsec.arrays import Floats
 from gridsec.online import Frame
 from gridsec.sequential import LoadDoubt
@@ -77,6 +79,44 @@ def _usual(half_width: Floats, std: Floats | None) -> Floats:
     """Standard deviation of what is uniform in an interval, or as stated beside it."""
     uniform = half_width / np.sqrt(3.0)
     return uniform if std is None else np.where(np.isnan(std), uniform, std)
+
+
+def forecast_errors(site: Site, t: Floats, p_kw: Floats, q_kvar: Floats) -> tuple[Floats, Floats]:
+    """What customers drew beyond what frames without any reading of them say, pu: a history to learn from.
+
+    Parameters
+    ----------
+    site
+        The feeder, with or without forecasts.
+    t : (T,)
+        Unix times, s.
+    p_kw, q_kvar : (T, N)
+        Net active import and reactive import of the loads as they were found later, kW and kvar.
+    """
+    none, base = np.full(site.meters.size, np.nan), site.feeder.base_kva
+    frames = [to_frame(site, Snapshot(float(now), none, none, none, np.nan)) for now in t]
+    p, q = (np.array([getattr(frame, name) for frame in frames]) for name in ("p", "q"))
+    return p_kw / base + p, q_kvar / base + q
+
+
+def tell(tables: FeederTables, doubt: LoadDoubt, base_kva: float) -> FeederTables:
+    """Write into customers without a meter how far their powers are off, and into `[load]` for how long.
+
+    Parameters
+    ----------
+    tables
+        The feeder's tables.
+    doubt
+        What was learned of all of its customers.
+    base_kva
+        Its 1 pu, kVA.
+    """
+    told = zip(tables.customers, doubt.p * base_kva, doubt.q * base_kva, strict=True)
+    rows = tuple(
+        row if row.meter else replace(row, p_std_kw=float(p), q_std_kvar=float(q)) for row, p, q in told
+    )
+    load = replace(tables.meta.load, correlation_s=doubt.time_s)
+    return replace(tables, meta=replace(tables.meta, load=load), customers=rows)
 
 
 def from_history(error_p: Floats, error_q: Floats, step_s: float) -> LoadDoubt:

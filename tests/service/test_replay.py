@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from feeders.load import Site, load
+from feeders.load import Site, from_tables, load
 from feeders.meters import Channel
 from feeders.recording import read_recording, record
 from feeders.scenario import Reading, Scenario, by_arrival, random_attacks, simulate
@@ -38,9 +38,11 @@ def scenario(site: Site) -> Scenario:
     return Scenario(seed=5, start=START, duration_s=90.0, attacks=attacks, channel=ROUGH)
 
 
+@pytest.mark.parametrize("forecast", ["none", "profiles"])
 def test_the_live_rounds_and_a_replay_agree_to_the_last_bit(
-    site: Site, scenario: Scenario, tmp_path: Path
+    site: Site, scenario: Scenario, tmp_path: Path, forecast: str
 ) -> None:
+    site = site if forecast == "none" else forecasting(site)
     readings = list(by_arrival(simulate(site, scenario)))
     samples = [
         Sample(f"gridsec/{key_of(FEEDER, r.meter)}", payload_of(r), "", r.arrival, 1) for r in readings
@@ -65,6 +67,14 @@ def test_the_live_rounds_and_a_replay_agree_to_the_last_bit(
     assert tally.readings["duplicate"] > 0
     assert tally.readings["late"] > 0
     assert sum(tally.ticks.values()) == len(replayed)
+
+
+def forecasting(site: Site) -> Site:
+    """Three customers without meters, whose powers are those of the profiles."""
+    meta, rows = site.tables.meta, site.tables.customers
+    rows = tuple(replace(row, meter="") if k in (2, 6, 10) else row for k, row in enumerate(rows))
+    meta = replace(meta, load=replace(meta.load, forecast="profiles"))
+    return from_tables(replace(site.tables, meta=meta, customers=rows))
 
 
 def test_a_file_and_the_stream_it_was_made_of_agree(site: Site, scenario: Scenario, tmp_path: Path) -> None:
