@@ -70,6 +70,10 @@ class Lies:
     more: float = 2.0
     story: float = 5.5
 
+    def __post_init__(self) -> None:
+        if min(self.size, self.amplitude, self.differ) <= 0.0:
+            raise ValueError("size, amplitude and differ must be positive")
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FalsePowers:

@@ -106,7 +106,8 @@ def identify(
     lies
         What lies are expected to be like; the defaults of `Lies` by default.
     false
-        What false powers do to voltages, and how false they may be; none by default.
+        What false powers do to voltages, and how false they may be; none by default. From snapshot to
+        snapshot `FalsePowers.claimed` hands on what depends on the feeder alone.
     curved
         The power flow is not linear, and false powers may be large: `curved(weights, powers)` is `m` for the
         live meters linearised about the powers of an explanation, by its weights and who reports false ones,
@@ -116,7 +117,14 @@ def identify(
     -------
     tuple of Explained
         The likeliest first; there is always one.
+
+    Raises
+    ------
+    ValueError
+        If `false` is of other meters.
     """
+    if false is not None and false.p.size != live.size:
+        raise ValueError(f"false powers of {false.p.size} meters cannot explain {live.size}")
     lies = Lies() if lies is None else lies
     if not live.any():
         none = np.zeros(0, dtype=np.bool_)

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from math import comb
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +13,21 @@ import pytest
 
 from benchmarks.peers import report
 from benchmarks.peers.answer import Method
-from benchmarks.peers.measure import OURS, PANDA, PEERS, Score, measure, prepared
+from benchmarks.peers.measure import (
+    OURS,
+    PANDA,
+    PEERS,
+    Score,
+    limits,
+    measure,
+    prepared,
+    too_many,
+    watched,
+)
+from benchmarks.peers.ours import Covariance
 from benchmarks.peers.scene import SIZE, Cell, Scene, mean, scene, snapshot
+from benchmarks.peers.served import suspects
+from gridsec.feeder import lindistflow
 
 FEEDER = "rural1-behind"
 Prepared = tuple[Scene, dict[str, Method]]
@@ -59,6 +76,48 @@ def test_ours_names_whose_powers_are_false_too(ready: Prepared) -> None:
     scores = measure(Cell(FEEDER, 0.001, 0.1, "coord+pq", 3), here, few, trials=12, panda=0)
     assert scores[OURS].exact >= 11
     assert scores[OURS].exact >= scores["pgm 3.5"].exact
+
+
+@pytest.mark.parametrize("feeder", [FEEDER, "rural3-behind"])
+def test_the_covariance_of_a_tree_is_that_of_its_matrices(feeder: str) -> None:
+    here = scene(feeder)
+    model = lindistflow(here.feeder)
+    R, X = 2.0 * model.R, 2.0 * model.X
+    p, q = np.random.default_rng(4).uniform(0.0, 1.0, (2, len(R)))
+    dense = R @ np.diag(p) @ R.T + X @ np.diag(q) @ X.T + 0.01
+    np.testing.assert_allclose(Covariance(here.feeder, R, X)(p, q, 0.01), dense, rtol=1e-10)
+
+
+def test_the_served_monitor_names_a_gross_liar_from_the_same_readings() -> None:
+    here = scene(FEEDER)
+    for attack, liars in (("clean", 0), ("bias", 1)):
+        told = snapshot(here, Cell(FEEDER, 0.001, 0.1, attack, liars), np.random.default_rng(6), 20)
+        assert np.array_equal(suspects(here, told), told.liars)
+    score = watched(Cell(FEEDER, 0.001, 0.1, "bias", 1), here, trials=2, seconds=10)
+    assert (score.trials, score.exact) == (2, 2)
+
+
+def test_clean_cells_are_judged_one_by_one_and_not_by_chance() -> None:
+    for count, trials in ((0, 100), (3, 100), (9, 500), (100, 100)):
+        low, high = limits(count, trials)
+        at_least = sum(comb(trials, k) * low**k * (1 - low) ** (trials - k) for k in range(count, trials + 1))
+        at_most = sum(comb(trials, k) * high**k * (1 - high) ** (trials - k) for k in range(count + 1))
+        assert at_least == pytest.approx(0.05) if count else low == 0.0
+        assert at_most == pytest.approx(0.05) if count < trials else high == 1.0
+    quiet, noisy = (Cell(FEEDER, std, 0.1) for std in (0.001, 0.005))
+    few, many = Score(trials=10_000, false=10), Score(trials=200, false=9)
+    assert too_many({quiet: {OURS: few}, noisy: {OURS: few}}) == []
+    # Together they are below one per cent; one of them is not.
+    assert too_many({quiet: {OURS: few}, noisy: {OURS: many}}) == [noisy]
+
+
+def test_one_thread_whatever_the_environment_says() -> None:
+    asked = {**os.environ, "OPENBLAS_NUM_THREADS": "8", "OMP_NUM_THREADS": "8"}
+    code = (
+        "import benchmarks.peers, os, sys; print('numpy' in sys.modules, os.environ['OPENBLAS_NUM_THREADS'])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], env=asked, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False", "1"]
 
 
 def test_peers_are_compared_in_the_snapshots_that_both_have_seen(tmp_path: Path) -> None:

@@ -285,6 +285,61 @@ def test_without_readings_nobody_is_named() -> None:
     assert found[0].probability == pytest.approx(1.0)
 
 
+def test_what_is_handed_on_changes_no_answer() -> None:
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        prior, noise, false = street(rng)
+        m = rng.multivariate_normal(np.zeros(P), prior.between + np.diag(noise))
+        m[rng.choice(P, 3, replace=False)] += 0.05
+        p, q = rng.uniform(0.1, 1.0, (2, P))
+        handed = false.claimed(q, p).claimed(p, q)
+        assert handed.felt is not None
+        np.testing.assert_array_equal(handed.felt, -np.sort(-false.R, axis=0))
+        plain = FalsePowers(false.R, false.X, p, q)
+        for live in (LIVE, np.arange(P) != 3):
+            one, other = (identify(prior, noise, m, live, false=each) for each in (plain, handed))
+            assert [who(each) for each in one] == [who(each) for each in other]
+            assert [each.cost for each in one] == [each.cost for each in other]
+
+
+def test_false_powers_of_other_meters_are_refused() -> None:
+    prior, noise, false = street(np.random.default_rng(3))
+    few = np.arange(P - 1)
+    with pytest.raises(ValueError, match="same meters"):
+        false.claimed(np.ones(P - 1), np.ones(P - 1))
+    with pytest.raises(ValueError, match="same meters"):
+        FalsePowers(false.R, false.X, false.p, false.q, false.of(few).claimed(few * 1.0, few * 1.0).felt)
+    with pytest.raises(ValueError, match="cannot explain"):
+        identify(prior, noise, np.zeros(P), LIVE, false=false.of(few))
+    with pytest.raises(ValueError, match="positive"):
+        Lies(differ=0.0)
+
+
+def test_a_state_is_what_dense_algebra_says_after_many_changes() -> None:
+    rng = np.random.default_rng(8)
+    prior, noise, false = street(rng)
+    K, m = prior.between + np.diag(noise), rng.normal(size=P)
+    start = State.nobody(m, np.linalg.inv(np.linalg.cholesky(K)))
+    problem, at = Problem(LIES, start, false, None), start.copy()
+    for j in (2, 5, 2, 6):
+        problem.toggle(at, j)
+    problem.powers(at, 6)
+    problem.powers(at, 5)
+    problem.powers(at, 5, -1.0)
+    B = np.column_stack([false.R[:, 6] * false.p[6], false.X[:, 6] * false.q[6]])
+    after = K + LIES.size**2 * np.diag(np.isin(np.arange(P), (5, 6))) + B @ B.T
+    Q, x = np.linalg.inv(after), rng.normal(size=P)
+    assert at.counts == (2, 1)
+    np.testing.assert_allclose(at.rows(np.arange(P)), Q, rtol=1e-7, atol=1e-7 * np.abs(Q).max())
+    np.testing.assert_allclose(at.times(x), Q @ x, rtol=1e-7, atol=1e-7 * np.abs(Q @ x).max())
+    np.testing.assert_allclose(at.diagonal, Q.diagonal(), rtol=1e-7)
+    np.testing.assert_allclose(at.g, Q @ m, rtol=1e-7, atol=1e-7 * np.abs(Q @ m).max())
+    assert at.fit == pytest.approx(float(m @ Q @ m), rel=1e-8)
+    assert at.logdet == pytest.approx(np.linalg.slogdet(after)[1] - np.linalg.slogdet(K)[1], abs=1e-8)
+    assert start.counts == (0, 0)
+    assert not start.liars.any()
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_nobody_tells_of_a_load_that_moves_nothing(seed: int) -> None:
     """A customer of the busbar has no column: what it draws moves no voltage, and who lies there is alone."""
