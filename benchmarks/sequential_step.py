@@ -27,13 +27,13 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 from gridsec import sequential
-from gridsec.arrays import Floats, Ints
+from gridsec.arrays import Floats
 from gridsec.detect import MeterAccuracy
 from gridsec.droop import fleet
 from gridsec.feeder import Feeder, bus_voltages
 from gridsec.online import Frame
 from gridsec.plant import Plant
-from gridsec.sequential import LoadDoubt, SequentialState
+from gridsec.sequential import LoadDoubt
 
 SIZES = (13, 30, 60, 146, 300, 600, 1000, 2000)
 STEADY_MS, ATTACK_MS, MEMORY_MB, POWER = 0.5, 5.0, 500.0, 2.0
@@ -136,6 +136,7 @@ class Watched:
     def __init__(self, customers: int) -> None:
         self.rng = np.random.default_rng(customers)
         self.made = design(customers)
+        self.state = sequential.init(self.made, 0.0)
         self.p = np.full(customers, -0.01)
         self.liars = np.sort(self.rng.choice(customers, customers // 3, replace=False))
 
@@ -145,15 +146,11 @@ class Watched:
         out[self.liars] = 0.03 * self.rng.choice([-1.0, 1.0], self.liars.size)
         return out
 
-    def play(
-        self, state: SequentialState, first: int, ticks: int, lies: Floats | float = 0.0
-    ) -> tuple[SequentialState, Floats]:
-        """The state some ticks later, and how long each took, ms.
+    def play(self, first: int, ticks: int, lies: Floats | float = 0.0) -> Floats:
+        """How long some ticks take, each, ms; `state` is that after them.
 
         Parameters
         ----------
-        state
-            Where to begin.
         first, ticks
             Number of the first tick, and how many.
         lies : (N,)
@@ -162,14 +159,15 @@ class Watched:
         made, p, size, took = self.made, self.p, self.p.size, np.empty(ticks)
         none, zero, seen = np.full(size, np.nan), np.zeros(size), np.ones(size, dtype=np.bool_)
         for k in range(ticks):
-            x: Floats = zero if state.x is None else np.bincount(made.plant.droop.customer, state.x, size)
+            injected = self.state.x
+            x: Floats = zero if injected is None else np.bincount(made.plant.droop.customer, injected, size)
             v = np.sqrt(bus_voltages(made.plant.feeder, p, x, 1.0, steps=3)[1:])
             y = (v * (1.0 + lies) + 5e-4 * self.rng.normal(size=size)) ** 2
             frame = Frame(float(first + k), y, seen, 1.0, p, zero, zero, zero, none, none)
             begun = time.thread_time()
-            state, _, _ = sequential.step(made, state, frame)
+            self.state, _, _ = sequential.step(made, self.state, frame)
             took[k] = 1e3 * (time.thread_time() - begun)
-        return state, took
+        return took
 
 
 def measure(customers: int) -> Measured:
@@ -184,27 +182,26 @@ def measure(customers: int) -> Measured:
     # The largest is watched until all it remembers is there.
     quiet, attack, onsets = (200, 60, 120) if customers <= 300 else (200, 60, 8)
     if customers > 1000:
-        quiet, attack, onsets = 1700, 20, 1
-    state, _ = street.play(sequential.init(street.made, 0.0), 0, 60)
-    state, steady = street.play(state, 60, quiet)
+        quiet, attack, onsets = 1700, 20, 0
+    street.play(0, 60)
+    steady = street.play(60, quiet)
     longest = []
     for k in range(60 + quiet, 60 + quiet + onsets):
         # Longer means are looked at now and then: what coincides depends on the second of the onset.
-        lies = street.lies()
-        longest.append(street.play(state, k, FOUND, lies)[1].max())
-        before, (state, _) = state, street.play(state, k, 1)
-    state, lying = street.play(before, k, attack, lies)
-    _named(state, street.liars)
+        before = street.state
+        longest.append(street.play(k, FOUND, street.lies()).max())
+        street.state = before
+        street.play(k, 1)
+        del before
+    lying = street.play(60 + quiet + onsets, attack, street.lies())
+    if not np.array_equal(np.flatnonzero(street.state.trust.named), street.liars):
+        raise RuntimeError(f"{customers} customers: not exactly the liars were named")
+    longest.append(lying.max())
     return Measured(
         *(float(np.median(steady)), float(np.median(lying)), float(lying.mean())),
         *(float(np.median(longest)), float(max(longest))),
         peak_mb(),
     )
-
-
-def _named(state: SequentialState, liars: Ints) -> None:
-    if not np.array_equal(np.flatnonzero(state.trust.named), liars):
-        raise RuntimeError("not exactly the liars were named")
 
 
 def main(picture: str | None) -> int:

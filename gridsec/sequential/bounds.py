@@ -86,8 +86,8 @@ class Powers:
     trusted: Bools
     sizes: Floats
 
-    def spread(self, plant: Plant, injected: Floats) -> tuple[Floats, Floats]:
-        """Half-width of each customer's squared voltage for a known busbar voltage, and its loss correction.
+    def linear(self, plant: Plant, injected: Floats) -> Floats:
+        """What the linear model can be off at each customer for a known busbar voltage, (N,).
 
         Parameters
         ----------
@@ -97,11 +97,21 @@ class Powers:
             How far the inverters' injections may be off, pu.
         """
         p_error, q_error = self._errors(plant)
-        q_error, at = q_error + np.where(self.told, 0.0, injected), plant.feeder.bus
-        p, v0 = self.frame.p, self.v0_squared
-        correction, lost = losses(plant, p, self.q, v0, p_error=p_error, q_error=q_error)
-        linear = reach(plant.feeder, p_error, q_error)[at]
-        return np.minimum(linear + lost, NO_VOLTAGE), correction[at]
+        return reach(plant.feeder, p_error, q_error + np.where(self.told, 0.0, injected))[plant.feeder.bus]
+
+    def lost(self, plant: Plant, injected: Floats) -> tuple[Floats, Floats]:
+        """What the loss correction can be off at each customer, (N,), and the correction itself.
+
+        Parameters
+        ----------
+        plant, injected
+            As in `linear`.
+        """
+        p_error, q_error = self._errors(plant)
+        q_error = q_error + np.where(self.told, 0.0, injected)
+        v0 = self.v0_squared
+        correction, off = losses(plant, self.frame.p, self.q, v0, p_error=p_error, q_error=q_error)
+        return off, correction[plant.feeder.bus]
 
     def _errors(self, plant: Plant) -> tuple[Floats, Floats]:
         """How far the powers may be off, inverters excluded, (N,) each."""
@@ -155,8 +165,9 @@ def follow(
         which, powers = free
         # The map is monotone: from above its images stay above the error.
         top = np.where(which, span, np.maximum(before.error, target))
+        lost, _ = powers.lost(plant, _of_customers(plant, top))
         for _ in range(_ROUNDS):
-            wide = powers.spread(plant, _of_customers(plant, top))[0][droop.customer]
+            wide = (powers.linear(plant, _of_customers(plant, top)) + lost)[droop.customer]
             image = np.minimum(span, droop.slope * (wide + hold) + design.mismatch)
             target = np.where(which, image, target)
             top = np.where(which, np.maximum(before.error, image), top)
@@ -208,7 +219,9 @@ class Grounds:
             The squared voltages.
         """
         plant, at = self.plant, self.plant.meters
-        spread, correction = self.powers.spread(plant, _of_customers(plant, self.injected))
+        injected = _of_customers(plant, self.injected)
+        lost, correction = self.powers.lost(plant, injected)
+        spread = np.minimum(self.powers.linear(plant, injected) + lost, NO_VOLTAGE)
         reading = told_error(plant.accuracy, self.y, self.sigmas)
         low, high = (by_place(plant.feeder, end)[plant.feeder.bus] for end in self._busbar(spread, reading))
         # What losses take off is that of the assumed busbar voltage.
