@@ -186,8 +186,8 @@ def test_no_recording(gridsec: Run, tmp_path: Path) -> None:
     file.write_text("no parquet")
     assert "notes.parquet" in refused(6, gridsec("replay", str(file)))
     assert "missing.parquet" in refused(6, gridsec("replay", str(tmp_path / "missing.parquet")))
-    out = str(tmp_path / "folder" / "x.parquet")
-    assert "folder" in refused(6, gridsec("simulate", FEEDER, "--duration", "2", "--out", out))
+    out = str(file / "x.parquet")
+    assert "notes.parquet" in refused(6, gridsec("simulate", FEEDER, "--duration", "2", "--out", out))
 
 
 def test_brackets_in_help_texts_are_shown(gridsec: Run) -> None:
