@@ -1,0 +1,38 @@
+"""Powers that nobody reads: forecast from the library's profiles, and how far off that is, learned.
+
+Three of the six customers of CIGRE's low-voltage benchmark have no meter. Loggers that are there for the first
+week of June show what they draw; what forecasts were off goes into the feeder's files.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from feeders.doubts import forecast_errors, from_history, load_doubt, tell
+from feeders.load import from_tables, load
+from feeders.scenario import START
+from feeders.schema import write
+from feeders.variation import Customers, Variation
+
+tables = load("cigre-lv").tables
+without = ("Load R15", "Load R16", "Load R17")
+rows = [replace(row, meter="") if row.customer in without else row for row in tables.customers]
+plain = from_tables(replace(tables, customers=tuple(rows)))
+meta = replace(tables.meta, load=replace(tables.meta.load, forecast="profiles"))
+site = from_tables(replace(plain.tables, meta=meta))
+
+step_s = 900.0
+t = START + step_s * np.arange(7 * 96)
+drawn = Customers(site, Variation(), seed=1, start=START, profile_s=0.0).at(t)
+
+learned = from_history(*forecast_errors(site, t, drawn.p_kw, drawn.q_kvar), step_s)
+told = from_tables(tell(site.tables, learned, site.feeder.base_kva))
+write(told.tables, Path("with-forecasts"))
+
+print("1 sigma, kW   no forecast  library  learned")
+stds = [site.feeder.base_kva * load_doubt(each).p for each in (plain, site, told)]
+for k, row in enumerate(tables.customers):
+    if row.customer in without:
+        print(f"{row.customer:12s}" + "".join(f"{std[k]:10.1f}" for std in stds))
+print(f"errors last {learned.time_s:.0f} s")
