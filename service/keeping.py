@@ -44,7 +44,7 @@ NoJournal = Annotated[
 SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 
 PATIENCE_S: Final = 3.0
-"""How long a command may take to hear a signal, s."""
+"""How long a command may take to hear a signal, and then to end its processes, s."""
 
 MOST: Final = 64
 """How many journals of interrupted studies stay in the user's folder for caches."""
@@ -229,10 +229,10 @@ def idle() -> Callable[[], object]:
 def _signals(left: Callable[[], str]) -> Iterator[None]:
     """SIGTERM stops a command as Ctrl-C does, and whoever does that twice does not want to wait.
 
-    A solver that has the program for minutes lets no handler run, but a thread: this ends it then. Every
-    result is in the journal as soon as there is one, so that nothing more is lost.
+    A solver that has the program for minutes lets no handler run, but a thread: this ends it then, and also
+    where processes do not end. Every result is in the journal as soon as there is one: no more is lost.
     """
-    heard = threading.Event()
+    heard, over = threading.Event(), threading.Event()
 
     def stop(number: int, _: FrameType | None) -> Never:
         heard.set()
@@ -241,14 +241,15 @@ def _signals(left: Callable[[], str]) -> Iterator[None]:
 
     def watch() -> None:
         number = os.read(ours, 1)
-        if number and not heard.wait(PATIENCE_S):
-            try:
-                with suppress(IndexError):  # there is no progress bar
-                    console.err.clear_live()
-                console.err.control(Control(ControlType.CARRIAGE_RETURN, (ControlType.ERASE_IN_LINE, 2)))
-                complain(f"interrupted; {left()}")
-            finally:
-                _end(number[0], None)
+        if not number or (heard.wait(PATIENCE_S) and over.wait(PATIENCE_S)):
+            return
+        try:
+            with suppress(IndexError):  # there is no progress bar
+                console.err.clear_live()
+            console.err.control(Control(ControlType.CARRIAGE_RETURN, (ControlType.ERASE_IN_LINE, 2)))
+            complain(f"interrupted; {left()}")
+        finally:
+            _end(number[0], None)
 
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -264,6 +265,7 @@ def _signals(left: Callable[[], str]) -> Iterator[None]:
         _handle(before)
         signal.set_wakeup_fd(fd)
         heard.set()
+        over.set()
         os.close(theirs)
         thread.join()
         os.close(ours)
