@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from feeders.equipment import LoadModel, indices
 from feeders.profiles import PROFILE_STEP_S, Profiles, Season, library, profile
-from gridsec.arrays import Bools, Floats
+from gridsec.arrays import Bools, Floats, Ints
 from gridsec.online import Frame
 
 if TYPE_CHECKING:
-    from feeders.equipment import LoadModel
     from feeders.schema import FeederTables
 
 __all__ = ["Forecast", "always", "forecast"]
@@ -47,8 +47,12 @@ class Forecast:
         meter where its row has them, else what `spread` says of its profiles, times its peaks.
     p_range, q_range : (2, N)
         Least and most that the customers can draw, of q the load alone.
+    peaks : (3, N)
+        Peak of the load, reactive power that belongs to it, and peak of the generation.
+    which : (3, N)
+        Which of the curves each of these follows.
     weeks
-        p and q over a week, (2, 672, N), by season.
+        By season: the K curves over a week, parts of the peak, (672, K).
     origin
         Unix time at which a week began, s: Monday 00:00 of local time.
     season
@@ -59,6 +63,8 @@ class Forecast:
     q_std: Floats
     p_range: Floats
     q_range: Floats
+    peaks: Floats
+    which: Ints
     weeks: Mapping[Season, Floats]
     origin: float
     season: Season | None = None
@@ -75,9 +81,22 @@ class Forecast:
         season = season_of(local + FIRST_MONDAY_S) if self.season is None else self.season
         week = self.weeks[season]
         place = (local % WEEK_S) / PROFILE_STEP_S
-        here, share = int(place) % week.shape[1], place % 1.0
-        p, q = week[:, here] + share * (week[:, (here + 1) % week.shape[1]] - week[:, here])
+        here, share = int(place) % len(week), place % 1.0
+        return self._powers(week[here] + share * (week[(here + 1) % len(week)] - week[here]))
+
+    def farthest(self) -> tuple[Floats, Floats]:
+        """Half-widths of intervals about p and q that hold their ranges at any time, (N,)."""
+        found = [self._powers(week) for week in self.weeks.values()]
+        p, q = (
+            np.max([_farther(powers[k], limits).max(axis=0) for powers in found], axis=0)
+            for k, limits in enumerate((self.p_range, self.q_range))
+        )
         return p, q
+
+    def _powers(self, curves: Floats) -> tuple[Floats, Floats]:
+        """Active and reactive powers, (…, N), from the values of all curves, (…, K)."""
+        load, q, pv = (peak * curves[..., which] for peak, which in zip(self.peaks, self.which, strict=True))
+        return np.clip(load - pv, *self.p_range), np.clip(q, *self.q_range)
 
     def played(self, origin: float, season: Season) -> Forecast:
         """The same in a simulation, whose calendar is its own.
@@ -135,34 +154,23 @@ def forecast(tables: FeederTables, loads: LoadModel) -> Forecast | None:
     if meta.load.forecast == "none":
         return None
     factor = np.array([row.power_factor or meta.load.power_factor for row in rows])
-    peaks = {
-        _LOAD_P: loads.load_peak,
-        _LOAD_Q: loads.load_peak * np.tan(np.arccos(factor)),
-        _PV: loads.pv_peak,
-    }
-    named = {
-        _LOAD_P: [row.load_profile for row in rows],
-        _LOAD_Q: [row.load_profile for row in rows],
-        _PV: [row.pv_profile for row in rows],
-    }
-    p_range = np.stack([-loads.pv_peak, loads.load_peak])
-    q_range = np.stack([-loads.q_floor, loads.load_peak * loads.tan_max + loads.q_floor])
-    weeks = {}
-    for season in Season:
-        load, q, pv = (
-            peaks[what] * np.stack([_week(season, what, name) for name in names], axis=1)
-            for what, names in named.items()
-        )
-        weeks[season] = np.stack([np.clip(load - pv, *p_range), np.clip(q, *q_range)])
-    load_std, q_std, pv_std = (
-        peaks[what] * np.array([spread(what, name) for name in names]) for what, names in named.items()
-    )
+    peaks = np.stack([loads.load_peak, loads.load_peak * np.tan(np.arccos(factor)), loads.pv_peak])
+    followed = [
+        *((_LOAD_P, row.load_profile) for row in rows),
+        *((_LOAD_Q, row.load_profile) for row in rows),
+        *((_PV, row.pv_profile) for row in rows),
+    ]
+    curves = {curve: k for k, curve in enumerate(dict.fromkeys(followed))}
+    which = indices([curves[curve] for curve in followed]).reshape(peaks.shape)
+    load_std, q_std, pv_std = peaks * np.array([spread(*curve) for curve in curves])[which]
     return Forecast(
         p_std=_told(np.hypot(load_std, pv_std), tables, "p_std_kw"),
         q_std=_told(q_std, tables, "q_std_kvar"),
-        p_range=p_range,
-        q_range=q_range,
-        weeks=weeks,
+        p_range=np.stack([-loads.pv_peak, loads.load_peak]),
+        q_range=np.stack([-loads.q_floor, loads.load_peak * loads.tan_max + loads.q_floor]),
+        peaks=peaks,
+        which=which,
+        weeks={season: np.stack([_week(season, *curve) for curve in curves], axis=1) for season in Season},
         origin=FIRST_MONDAY_S - 3600.0 * meta.load.utc_offset_h,
     )
 
@@ -181,11 +189,7 @@ def always(given: Forecast | None, frame: Frame, unread: Bools) -> Frame:
     """
     if given is None:
         return frame
-    powers = np.concatenate(list(given.weeks.values()), axis=1)
-    p, q = (
-        _farther(power, limits).max(axis=0)
-        for power, limits in zip(powers, (given.p_range, given.q_range), strict=True)
-    )
+    p, q = given.farthest()
     return replace(
         frame,
         p_error=np.where(unread, p, frame.p_error),
@@ -221,17 +225,12 @@ def spread(what: str, name: str) -> float:
     """
     worst = 0.0
     for season in Season:
-        there, expected = _curves(library(season), what), _week(season, what, name)
-        off = np.array(
-            [
-                each - np.resize(expected, each.size)
-                for key, each in there.items()
-                if key[:1] in name[:1] or not name
-            ]
-        )
-        day = (
-            np.resize(expected > 0.0, off.shape[1]) if what == _PV else np.ones(off.shape[1], dtype=np.bool_)
-        )
+        expected = _week(season, what, name)
+        alike = [
+            each for key, each in _curves(library(season), what).items() if not name or key[0] == name[0]
+        ]
+        off = np.array(alike) - np.resize(expected, alike[0].size)
+        day = np.resize((what != _PV) | (expected > 0.0), alike[0].size)
         worst = max(worst, float(np.sqrt(np.mean(off[:, day] ** 2))))
     return worst
 

@@ -1,6 +1,6 @@
 """Powers that nobody reads: forecast from the library's profiles, and how far off that is, learned.
 
-Three of the six customers of CIGRE's low-voltage benchmark have no meter. Loggers that are there for the first
+Three of the six customers of CIGRE's low-voltage benchmark have no meter. Loggers that are there for a
 week of June show what they draw; what forecasts were off goes into the feeder's files.
 """
 
