@@ -36,7 +36,7 @@ from feeders.studies.campaign_run import (
 )
 from feeders.studies.campaign_tables import false_names, grouped, scenarios
 from feeders.studies.campaign_watch import risings
-from feeders.studies.journal import OtherStudy
+from feeders.studies.journal import OtherStudy, edition
 from feeders.trials import LoadError, frames, judge
 from feeders.variation import Variation
 from gridsec.feeder import lindistflow
@@ -458,4 +458,5 @@ def test_a_killed_campaign_goes_on(here: Campaign, tmp_path: Path) -> None:
         time.sleep(0.02)
     child.kill()
     child.wait()
+    edition.cache_clear()  # that process has read the code later than this one
     same(here, campaign(SITE, PLAN, journal=journal))
