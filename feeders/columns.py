@@ -328,14 +328,7 @@ META_COLUMNS: dict[str, tuple[Column, ...]] = {
     ),
     "monitor": (
         Column("estimator", Kind.TEXT, "estimator family", "sequential", choices=ESTIMATORS),
-        Column(
-            "max_attacked",
-            Kind.WHOLE,
-            "manipulated meters to withstand; `sequential` tells up to a third apart anyway",
-            1,
-            low=0,
-            high=1000,
-        ),
+        Column("max_attacked", Kind.WHOLE, "liars to withstand; `sequential`: a third", 1, low=0, high=1000),
         Column("tick_s", Kind.NUMBER, "period of the frames, s", 1.0, low=0.01, high=1e5),
         Column(
             "on_delay_s",
