@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from feeders.studies.journal import edition
 from tests.service.commands import command, plain
 
 run = command("study")
@@ -30,6 +31,7 @@ CAMPAIGN = (
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Journals' folder of these tests."""
     monkeypatch.setenv("GRIDSEC_CACHE_DIR", str(tmp_path / "cache"))
+    edition.cache_clear()  # other processes read the code later than this one has
     return tmp_path / "cache" / "journals"
 
 
