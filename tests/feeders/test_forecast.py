@@ -18,7 +18,9 @@ from feeders.load import Site, Snapshot, from_tables, load, to_frame
 from feeders.profiles import Season, library
 from feeders.scenario import START, Scenario, simulate, snapshots
 from feeders.schema import read, to_json, write
+from feeders.studies.detectable import detectable
 from feeders.studies.operating import box
+from feeders.studies.rehearsal import Rehearsal, rehearse
 from feeders.trials import Trial, frames
 from gridsec.arrays import Floats
 from gridsec.frames import usual
@@ -35,6 +37,7 @@ MONDAYS = {
     }.items()
 }
 NOBODY = unmetered(CIGRE)
+METERED = load("cigre-lv")
 RURAL = without("simbench-lv-rural1", "LV1.101 Load 3", "LV1.101 Load 7", "LV1.101 Load 11")
 
 
@@ -239,6 +242,26 @@ def test_nobody_honest_is_named(site: Site, tick_s: float, duration_s: float) ->
         assert not watched(watcher, wise, moment(seed, rng, dt_s=tick_s, duration_s=duration_s))[2]
 
 
+def test_meters_that_fall_silent_are_forecast() -> None:
+    """The meters at two customers' loads stop after three readings; the doubt then is the forecast's."""
+    gone, some = np.array([False, False, True, False, True, False]), np.array([2, 4])
+    off: list[list[Floats]] = []
+    for site in (METERED, forecasting(METERED)):
+        watcher, rng, errors = design(site), np.random.default_rng(5), list[Floats]()
+        for scenario in [moment(seed, rng, duration_s=6.0) for seed in range(12)]:
+            state, samples = watcher.init(scenario.start), list(simulate(site, scenario))
+            for sample, said in zip(samples, snapshots(samples), strict=True):
+                missing = gone & (sample.t > scenario.start + 2.5)
+                v, p, q = (np.where(missing, np.nan, each) for each in (said.v_volt, said.p_kw, said.q_kvar))
+                state, estimate, verdict = watcher.step(
+                    state, to_frame(site, replace(said, v_volt=v, p_kw=p, q_kvar=q))
+                )
+                assert not verdict.suspects.any()
+            errors.append((estimate.v2 - (sample.v_volt / site.customer_volt) ** 2)[some])
+        off.append(errors)
+    assert rms(off[1]) < 0.8 * rms(off[0])
+
+
 def test_a_told_deviation_is_believed_although_the_interval_is_wide() -> None:
     """0.5 kW of 60: the interval of the frame is seventy times as wide, and the prior is the design's own."""
     site = forecasting(CIGRE, std=0.5)
@@ -299,6 +322,13 @@ def test_promises_of_studies_hold_whatever_is_forecast() -> None:
     wide, plain = box(FORECAST), box(CIGRE)
     assert (np.abs(wide.effect) >= np.abs(plain.effect) - 1e-12).all()
     assert (unread(FORECAST).p_error <= half.load_peak + half.pv_peak).all()
+
+
+def test_smaller_lies_are_noticed_and_the_monitor_keeps_what_is_promised() -> None:
+    wise, plain = (detectable(site, max_attacked=1) for site in (FORECAST, CIGRE))
+    assert (wise.meters["noticed"] < plain.meters["noticed"]).all()
+    assert (wise.customers["error"] < plain.customers["error"]).all()
+    assert rehearse(FORECAST, wise, trials=12, seed=2) == Rehearsal(12, 0, 0, 0)
 
 
 # -------------------------------------------------------------------------------------------- from history
