@@ -22,8 +22,8 @@ _TINY = float(np.finfo(np.float64).tiny)
 # So many liars may be alike: of larger sets there are too many, and what is gained is little.
 MOST = 8
 Curved = Callable[[Floats, Bools], Floats]
-# How often an explanation is linearised about itself; not again where that changed J by less than this, for then
-# what is left is about a tenth of it.
+# How often an explanation is linearised about itself; not again where that changed J by less than this: what
+# is left is about a tenth of it.
 _PASSES, _LITTLE = 2, 1.0
 # Where nobody is named, meters beyond so many standard deviations are.
 _SUSPICIOUS = 3.0
