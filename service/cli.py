@@ -209,13 +209,11 @@ def simulate(
     """
     from feeders.load import load
     from feeders.meters import Channel, MeterErrors
-    from feeders.recording import record, truth_path
+    from feeders.recording import record
     from feeders.scenario import Scenario
 
     if out is not None:
-        if not duration:
-            raise typer.BadParameter("a recording has an end", param_hint="--duration")
-        see(replaced={"--out": out, "--out, its truth": truth_path(out)})
+        _see_recording(out, duration)
     site = load(feeder)
     tick = dt or site.tables.meta.monitor.tick_s
     first = math.ceil(time.time() / tick) * tick if start is None else start
@@ -236,6 +234,14 @@ def simulate(
         console.out.print(f"{recording.path}: {recording.count} readings of {site.feeder.name}")
         return
     _publish(site, scenario, tuple(connect or ("tcp/127.0.0.1:7447",)), prefix, (speed or math.inf, lockstep))
+
+
+def _see_recording(out: Path, duration: float) -> None:
+    from feeders.recording import truth_path
+
+    if not duration:
+        raise typer.BadParameter("a recording has an end", param_hint="--duration")
+    see(replaced={"--out": out, "--out, its truth": truth_path(out)})
 
 
 def _season(text: str) -> Season:

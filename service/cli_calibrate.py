@@ -57,12 +57,8 @@ def calibrate(
     for name in look_for or ():
         if name not in tuple(Kind):
             raise typer.BadParameter(f"{name!r}: expected one of {', '.join(Kind)}", param_hint="--look-for")
-    see(
-        folders={"--out": out},
-        new={"--write": write},
-        files={"--journal": journal},
-        read={"--readings": readings},
-    )
+    written = {"folders": {"--out": out}, "new": {"--write": write}, "files": {"--journal": journal}}
+    see(**written, read={"--readings": readings})
     with keeping("calibrate", feeder, journal, without=no_journal) as kept:
         feeder = converted(feeder, out)
         site = site_of(feeder)

@@ -94,14 +94,9 @@ def rehearse(
     InUse
         If another process is writing it.
     """
-    subject = {
-        "study": "trials",
-        "digest": site.digest,
-        "found": [found.max_attacked, found.risk, *map(float, found.meters["hidden"])],
-        "large": [*map(float, found.meters["named"]), *map(float, found.meters["named_alone"])],
-        "seed": seed,
-        "share": share,
-    }
+    sizes = [float(size) for name in ("hidden", "named", "named_alone") for size in found.meters[name]]
+    told = {"max_attacked": found.max_attacked, "risk": found.risk, "sizes": sizes}
+    subject = {"study": "trials", "digest": site.digest, "found": told, "seed": seed, "share": share}
     given = monitor_rule(site, risk=found.risk, share=share)
     p = site.meters.size
 
