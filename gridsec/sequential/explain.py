@@ -339,7 +339,7 @@ class Search:
 
     def _prices(self, found: Explanation) -> float:
         suspects = int(np.count_nonzero(~self._trusted(found)))
-        return found.charge + search.price(self.keep.size, suspects)
+        return found.charge + search.price(self.keep.size, suspects, self.design.most)
 
     def _trusted(self, found: Explanation) -> Bools:
         return np.where(self.here.enough, found.trusted, self.trust.trusted)

@@ -107,7 +107,9 @@ class Scales:
             noise=design.white / need + self.learned.variance,
             m=self.window.sums[s] / np.maximum(counts, 1),
             enough=counts >= need,
-            limits=Limits(design.sigmas[s], self.model, self.learned.allowed, self.learned.variance),
+            limits=Limits(
+                design.sigmas[s], self.model, self.learned.allowed, self.learned.variance, design.most
+            ),
         )
 
 

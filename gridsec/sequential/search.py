@@ -48,12 +48,15 @@ class Limits:
         Offsets that are honest whatever their probability, the accuracy class, squared pu.
     certain : (p,)
         Variance within the meters' noise that `allowed` stands for.
+    most
+        How many liars can be told apart; None: however many.
     """
 
     sigmas: float
     model: Floats
     allowed: Floats
     certain: Floats
+    most: int | None = None
 
     @property
     def penalty(self) -> float:
@@ -214,25 +217,28 @@ def descend(
     if dictionary is not None and loosened:
         charges = dictionary.charges(np.array(loosened, dtype=np.intp), now.trusted)
         charge = float(charges.sum()) * price(size, 1)
-    cost = judged.misfit + price(size, dropped) + charge
+    cost = judged.misfit + price(size, dropped, limits.most) + charge
     return Solution(now.trusted, loosened, charge, cost, now, judged)
 
 
 @cache
-def price(meters: int, liars: int) -> float:
+def price(meters: int, liars: int, most: int | None = None) -> float:
     """What accusing so many of so many meters costs: `2 ln binom(meters, liars)`, but always rising.
 
     Parameters
     ----------
     meters, liars
         p and k.
+    most
+        How many lie at most, if that is supposed: whoever else is accused costs far more.
     """
     k = np.arange(liars)
-    return float(np.sum(np.maximum(2.0 * np.log((meters - k) / (k + 1.0)), _LEAST)))
+    least = np.where(k < (meters if most is None else most), _LEAST, _BEYOND)
+    return float(np.sum(np.maximum(2.0 * np.log((meters - k) / (k + 1.0)), least)))
 
 
-# Beyond half of the meters, each further accusation still costs this.
-_LEAST = 1.0
+# Beyond half of the meters, each further accusation still costs this; beyond those that lie at most, this.
+_LEAST, _BEYOND = 1.0, 9.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
