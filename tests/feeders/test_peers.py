@@ -134,3 +134,11 @@ def test_peers_are_compared_in_the_snapshots_that_both_have_seen(tmp_path: Path)
     assert not minute
     # Ours is exact in one of the two that pandapower has seen, though better than it in per cent of all.
     assert "| 100 | 50 | **75** | 0 | -50.0 (0 : 1) |" in report.tables(again, minute)
+
+
+@pytest.mark.parametrize("trial", [0, 3, 6])
+def test_honest_meters_that_contradict_a_false_power_are_not_accused_for_being_many(trial: int) -> None:
+    """Three of thirteen tell of a load that one of them reports; ten were accused once, being no dearer."""
+    cell = Cell(FEEDER, 0.001, 0.1, "coord+pq", 3)
+    told = snapshot(scene(FEEDER), cell, np.random.default_rng([5, trial, 3]), 60)
+    np.testing.assert_array_equal(suspects(scene(FEEDER), told), told.liars)

@@ -242,6 +242,9 @@ def test_price_is_the_binomial_up_to_the_middle_and_rises_for_ever() -> None:
                 break
             assert price(count, k) == pytest.approx(2.0 * log(comb(count, k)))
         steps = np.diff([price(count, k) for k in range(count + 1)])
+        third = count // 3
+        assert price(count, third, third) == price(count, third)
+        assert price(count, count, third) >= price(count, third) + 9.0 * (count - third)
         assert (steps >= 1.0 - 1e-12).all()
 
 
