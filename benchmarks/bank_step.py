@@ -22,7 +22,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 from gridsec import bank as banks
-from gridsec import detect, monitor
+from gridsec import monitor
+from gridsec.accuracy import MeterAccuracy
 from gridsec.arrays import Floats
 from gridsec.droop import fleet
 from gridsec.feeder import Feeder, lindistflow, squared_voltages
@@ -63,7 +64,7 @@ def street(customers: int) -> monitor.Plant:
     )
     every = np.arange(customers)
     droop = fleet(every, [presets[k % 3] for k in every], rng.uniform(3.0, 10.0, customers), 100.0)
-    accuracy = detect.MeterAccuracy(
+    accuracy = MeterAccuracy(
         np.full(customers, 0.005), np.full(customers, 4e-4), np.full(customers, 5e-4), 0.001, 4e-4, 1e-4
     )
     return monitor.Plant(feeder, droop, every, accuracy)

@@ -27,8 +27,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 from gridsec import sequential
+from gridsec.accuracy import MeterAccuracy
 from gridsec.arrays import Floats
-from gridsec.detect import MeterAccuracy
 from gridsec.droop import fleet
 from gridsec.feeder import Feeder, bus_voltages
 from gridsec.online import Frame

@@ -19,8 +19,8 @@ from feeders.profiles import data_root
 from feeders.raw import CUSTOMERS_FILE, LINES_FILE, META_FILE, advice
 from feeders.schema import CustomerRow, FeederTables, read, to_json
 from feeders.topology import Tree
+from gridsec.accuracy import MeterAccuracy
 from gridsec.arrays import Floats, Ints, frozen, frozen_ints
-from gridsec.detect import MeterAccuracy
 from gridsec.droop import Droop, fleet
 from gridsec.errors import FeederInvalid
 

@@ -29,8 +29,8 @@ from feeders.load_phases import spanned
 from feeders.schema import CustomerRow, FeederTables, validate
 from feeders.taps import Referred, refer
 from feeders.topology import Edge, Tree, tree
+from gridsec.accuracy import MeterAccuracy
 from gridsec.arrays import Floats, Ints, frozen
-from gridsec.detect import MeterAccuracy
 from gridsec.droop import Droop
 from gridsec.errors import FeederInvalid
 from gridsec.feeder import Feeder

@@ -27,8 +27,8 @@ from feeders.matrices import cells_of, series_ohm, shunt_us
 from feeders.schema import FeederTables, LineRow, validate
 from feeders.taps import Referred, refer
 from feeders.topology import Edge, Tree, tree
+from gridsec.accuracy import MeterAccuracy
 from gridsec.arrays import Floats, Ints, Phasors, frozen
-from gridsec.detect import MeterAccuracy
 from gridsec.droop import Droop
 from gridsec.errors import FeederInvalid
 from gridsec.phases import PHASES, ThreePhaseFeeder, sequence_matrix

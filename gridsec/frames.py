@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gridsec import detect
+from gridsec.accuracy import busbar_error, reading_error
 from gridsec.arrays import Bools, Floats
 from gridsec.detect import Uncertainty
 from gridsec.feeder import Feeder, corrected
@@ -197,7 +198,7 @@ def clean(setting: Setting, past: Past, frame: Frame) -> Inputs:
     correction, rest = losses(plant, frame.p, q_all, v0, p_error=frame.p_error, q_error=q_error)
     base = setting.errors.R2 @ frame.p_error + setting.errors.X2 @ q_error + rest
     rise = 2.0 * (model.R @ frame.p + model.X @ q_all) + correction[plant.feeder.bus]
-    reading = detect.reading_error(plant.accuracy, here[at] + rise[at] + base[at] + _ROOM, options.sigmas)
+    reading = reading_error(plant.accuracy, here[at] + rise[at] + base[at] + _ROOM, options.sigmas)
     extra = np.where(told, np.maximum(frame.q_error[at] - frame.q_net_error[at], 0.0), 0.0)
     now = Uncertainty(np.minimum(base, NO_VOLTAGE), reading, live, told, extra)
     error = busbar_errors(plant, v0, options.sigmas)
@@ -232,12 +233,12 @@ def busbar_errors(plant: Plant, v0_squared: Floats | float, sigmas: float) -> Fl
     plant
         The feeder, and what its meters promise.
     v0_squared, sigmas
-        As in `gridsec.detect.busbar_error`.
+        As in `gridsec.accuracy.busbar_error`.
     """
     if not isinstance(plant.feeder, InPhases):
-        return detect.busbar_error(plant.accuracy, float(v0_squared), sigmas)
+        return busbar_error(plant.accuracy, float(v0_squared), sigmas)
     each = np.broadcast_to(v0_squared, 3).tolist()
-    return np.array([detect.busbar_error(plant.accuracy, one, sigmas) for one in each])
+    return np.array([busbar_error(plant.accuracy, one, sigmas) for one in each])
 
 
 def _of_customers(feeder: Network, of_busbar: Floats | float) -> Floats:

@@ -23,6 +23,7 @@ import numpy as np
 
 from gridsec import bank as banks
 from gridsec import detect
+from gridsec.accuracy import reading_error
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.certificates import Certificate, certify, small_gain, verify
 from gridsec.detect import ErrorBound, Majorant, Motion
@@ -389,7 +390,7 @@ def _view(  # noqa: PLR0917  # as _conclude
     else:
         bound, level = state.bound, state.level
         error = _saturated(design, inputs, frame, x)
-    threshold = detect.reading_error(plant.accuracy, v2[at] + error[at], design.options.sigmas) + error[at]
+    threshold = reading_error(plant.accuracy, v2[at] + error[at], design.options.sigmas) + error[at]
     score = np.where(inputs.live, np.abs(inputs.y - v2[at]), np.nan)
     settled = state.settled
     if index >= 0 and not settled:

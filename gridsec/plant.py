@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from gridsec import bank as banks
+from gridsec.accuracy import MeterAccuracy
 from gridsec.arrays import Floats, Ints
 from gridsec.certificates import Certificate
-from gridsec.detect import ErrorBound, ErrorModel, MeterAccuracy, error_model
+from gridsec.detect import ErrorBound, ErrorModel, error_model
 from gridsec.droop import Droop
 from gridsec.feeder import LinDistFlow
 from gridsec.judge import Tally

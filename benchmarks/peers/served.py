@@ -11,8 +11,8 @@ import numpy as np
 
 from benchmarks.peers.scene import Scene, Snapshot
 from gridsec import sequential
+from gridsec.accuracy import MeterAccuracy
 from gridsec.arrays import Bools
-from gridsec.detect import MeterAccuracy
 from gridsec.droop import Droop
 from gridsec.online import Frame
 from gridsec.plant import Plant

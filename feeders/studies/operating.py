@@ -11,8 +11,8 @@ from feeders.doubts import unread
 from feeders.forecast import always
 from feeders.load import Snapshot, to_frame
 from feeders.studies.hidden import Curves, customer_indices
+from gridsec.accuracy import busbar_error, reading_error
 from gridsec.arrays import Floats
-from gridsec.detect import busbar_error, reading_error
 from gridsec.network import Power, between
 from gridsec.online import Frame
 from gridsec.studies.false_powers import FalsePowers

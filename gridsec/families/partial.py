@@ -41,6 +41,7 @@ from math import comb
 import numpy as np
 
 from gridsec import detect
+from gridsec.accuracy import reading_error
 from gridsec.arrays import Bools, Floats
 from gridsec.certificates import Certificate, verify
 from gridsec.decode.boxes import Fits, fits
@@ -351,7 +352,7 @@ def _scores(  # noqa: PLR0917  # as _conclude
     plant, options = design.setting.plant, design.setting.options
     around = estimate.bound[plant.meters]
     top = np.maximum(estimate.v2[plant.meters], 0.0) + around
-    threshold = detect.reading_error(plant.accuracy, top, options.sigmas) + around
+    threshold = reading_error(plant.accuracy, top, options.sigmas) + around
     score = np.where(inputs.live, 0.0, np.nan)
     at = word.block[word.reading]
     fitted, alone = np.abs(found.residual[index]), np.abs(word.s)

@@ -17,6 +17,7 @@ import numpy as np
 
 from gridsec import bank as banks
 from gridsec import detect
+from gridsec.accuracy import reading_error
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.certificates import Certificate, certify
 from gridsec.detect import ErrorBound, ErrorModel, Motion, Uncertainty
@@ -345,7 +346,7 @@ def threshold_of(design: SetSearchDesign, v2: Floats, error: Floats) -> Floats:
         How far these may be off, squared pu.
     """
     plant, sigmas = design.setting.plant, design.setting.options.sigmas
-    return np.asarray(detect.reading_error(plant.accuracy, v2 + error, sigmas) + error)
+    return np.asarray(reading_error(plant.accuracy, v2 + error, sigmas) + error)
 
 
 def _settled(

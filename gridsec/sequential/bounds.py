@@ -26,8 +26,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gridsec.accuracy import told_error
 from gridsec.arrays import Bools, Floats
-from gridsec.detect import told_error
 from gridsec.frames import NO_VOLTAGE, busbar_errors, losses
 from gridsec.network import by_place, hangs_on, reach
 from gridsec.online import Estimate, Frame

@@ -13,9 +13,10 @@ import numpy as np
 from scipy.linalg import lapack
 from scipy.stats import norm
 
+from gridsec.accuracy import ToldError, busbar_error
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.certificates import Certificate, certify, verify
-from gridsec.detect import ToldError, busbar_error, curve_mismatch
+from gridsec.detect import curve_mismatch
 from gridsec.errors import DesignInfeasible, NotObservable
 from gridsec.lmi import contraction
 from gridsec.lure import Lure, close_loop

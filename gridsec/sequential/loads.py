@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gridsec.accuracy import MeterAccuracy
 from gridsec.arrays import Floats, Ints
-from gridsec.detect import MeterAccuracy
 from gridsec.droop import Droop
 from gridsec.network import Network, Power, bus_voltages, by_place, covariance, one_busbar, variances
 from gridsec.sequential.conditional import Prior

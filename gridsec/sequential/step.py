@@ -58,11 +58,7 @@ def step(
         As every estimator's step; see `gridsec.online`.
     """
     if not np.isfinite(frame.t) or (state.x is not None and not frame.t > state.t):
-        none = np.zeros(design.plant.droop.tau.size)
-        estimate, verdict = nothing_new(design.plant, frame, state.t, state.last, state.v0_squared, none)
-        if state.last is None:
-            estimate = replace(estimate, std=estimate.bound)
-        return state, estimate, verdict
+        return state, *_unused(design, state, frame)
     at = design.plant.feeder.bus[design.plant.meters]
     frame = _powers(design, frame)
     heard = _clean(design, state, frame)
@@ -71,7 +67,6 @@ def step(
         state = replace(state, fits=(None,) * len(state.fits))
     kinds = listen(design.shapes, state.kinds, heard.y, heard.live)
     copies = suspicious(kinds) & (design.decoder is None)
-    begun = _distrust(state.trust, copies)
     x, free, lag = _inverters(design, state, frame, heard, doubts.sizes)
     q, v2_bus = _voltages(design, frame, heard, x)
     residual = heard.y - v2_bus[at] - state.learned.bias
@@ -82,14 +77,8 @@ def step(
         state = replace(state, model_error=error, swing=swing)
     since = frame.t if state.x is None else state.since
     transient = _transient(design, frame.t - since)
-    model = state.model_error + transient
-    seen = examine(design, replace(state, trust=begun, window=window, doubts=doubts), model)
-    over = ended(design, begun, seen, window)
-    window = forget(window, over)
-    trust, rivals = name(design, begun, _acquit(seen, over), heard.live)
-    trust = _distrust(trust, copies)
-    rivals = rivals or _undecided(design, state, trust)
-    seen = seen if trust is seen.trust else replace(seen, trust=trust)
+    now = replace(state, trust=_distrust(state.trust, copies), window=window, doubts=doubts)
+    seen, window, rivals = _judge(design, now, state.trust, copies, heard.live, transient)
     reports = _reports(design, heard, frame, seen, x, lag)
     after = replace(
         state,
@@ -102,28 +91,44 @@ def step(
         v0_squared=heard.v0_squared,
         unmetered=np.where(heard.busbar, 0, state.unmetered + 1),
         window=window,
-        trust=trust,
+        trust=seen.trust,
         fits=seen.fits,
         doubts=doubts,
         curves=compare(design, state.curves, reports),
         kinds=_kinds(design, state, kinds, seen, window, v2_bus[at]),
     )
     after = _learn(design, after, residual, heard.live, frame.t - state.t)
-    tick = Tick(
-        frame,
-        q,
-        heard.told,
-        heard.y,
-        heard.live,
-        heard.v0_squared,
-        heard.busbar,
-        v2_bus,
-        transient,
-        seen,
-        rivals,
-    )
+    given = heard.told, heard.y, heard.live, heard.v0_squared, heard.busbar
+    tick = Tick(frame, q, *given, v2_bus, transient, seen, rivals)
     estimate, verdict = conclude(design, after, tick)
     return replace(after, last=(estimate, verdict)), estimate, verdict
+
+
+def _unused(design: SequentialDesign, state: SequentialState, frame: Frame) -> tuple[Estimate, Verdict]:
+    """What is answered to a frame that is not later than the last one."""
+    none = np.zeros(design.plant.droop.tau.size)
+    estimate, verdict = nothing_new(design.plant, frame, state.t, state.last, state.v0_squared, none)
+    if state.last is None:
+        estimate = replace(estimate, std=estimate.bound)
+    return estimate, verdict
+
+
+def _judge(  # noqa: PLR0917  # what there is to judge by
+    design: SequentialDesign,
+    now: SequentialState,
+    before: Trust,
+    copies: Bools,
+    live: Bools,
+    transient: Floats,
+) -> tuple[Examined, Window, tuple[Explanation, ...]]:
+    """Who is believed and named now, what is remembered then, and rivals of what was found."""
+    seen = examine(design, now, now.model_error + transient)
+    over = ended(design, now.trust, seen, now.window)
+    trust, rivals = name(design, now.trust, _acquit(seen, over), live)
+    trust = _distrust(trust, copies)
+    rivals = rivals or _undecided(design, now.last, before, trust)
+    seen = seen if trust is seen.trust else replace(seen, trust=trust)
+    return seen, forget(now.window, over), rivals
 
 
 def _remembered(design: SequentialDesign, state: SequentialState, busbar: Bools | bool) -> Window:
@@ -146,14 +151,15 @@ def _transient(design: SequentialDesign, age: float) -> Floats:
     return np.asarray(design.reach * (np.exp(-design.certificate.rate * age) if age > 0 else 1.0))
 
 
-def _undecided(design: SequentialDesign, state: SequentialState, trust: Trust) -> tuple[Explanation, ...]:
+def _undecided(
+    design: SequentialDesign, last: tuple[Estimate, Verdict] | None, before: Trust, trust: Trust
+) -> tuple[Explanation, ...]:
     """The last explanations, as long as the same are suspected: they are not looked for at every tick."""
-    before = state.trust
-    if state.last is None or design.decoder is not None or trust.trusted.all():
+    if last is None or design.decoder is not None or trust.trusted.all():
         return ()
     names = ("trusted", "named", "inverters")
     same = all(np.array_equal(getattr(trust, name), getattr(before, name)) for name in names)
-    return state.last[1].explanations if same else ()
+    return last[1].explanations if same else ()
 
 
 def _acquit(seen: Examined, over: Bools) -> Examined:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gridsec.detect import MeterAccuracy
+from gridsec.accuracy import MeterAccuracy
 from gridsec.droop import Droop, fleet
 from gridsec.feeder import Feeder
 from gridsec.monitor import Plant

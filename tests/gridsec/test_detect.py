@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from gridsec import detect
-from gridsec.detect import ErrorBound, MeterAccuracy, Motion, Uncertainty
+from gridsec.accuracy import MeterAccuracy, busbar_error, reading_error
+from gridsec.detect import ErrorBound, Motion, Uncertainty
 from gridsec.droop import PRESETS, fleet
 from gridsec.feeder import lindistflow
 from tests.gridsec.street import make_plant, random_tree
@@ -44,17 +45,17 @@ class TestReadingError:
         reading = v * (1.0 + bias * spec.class_fraction[meter]) + jitter * spec.jitter[meter]
         if step:
             reading = np.round(reading / step) * step
-        bound = detect.reading_error(spec, np.full(2, v * v), 3.0)[meter]
+        bound = reading_error(spec, np.full(2, v * v), 3.0)[meter]
         assert abs(reading**2 - v**2) <= bound * (1.0 + 1e-12)
 
     def test_is_reached(self) -> None:
         spec = accuracy()
         worst = (1.0 * 1.005 + 2e-4 + 3.0 * 5e-4) ** 2 - 1.0
-        assert detect.reading_error(spec, np.ones(2), 3.0)[0] == pytest.approx(worst, rel=1e-12)
+        assert reading_error(spec, np.ones(2), 3.0)[0] == pytest.approx(worst, rel=1e-12)
         # The reading is 1, the truth below it by what the class is of the truth itself.
         truth = (1.0 - 2e-4 - 3e-4) / 1.001
         below = 1.0 - truth**2
-        assert below <= detect.busbar_error(spec, 1.0, 3.0) <= 1.004 * below
+        assert below <= busbar_error(spec, 1.0, 3.0) <= 1.004 * below
 
     @settings(max_examples=200)
     @given(
@@ -67,11 +68,11 @@ class TestReadingError:
         """The class is a part of the truth; what is known is the reading."""
         spec = accuracy(busbar_class=klass)
         reading = v * (1.0 + bias * klass) + jitter * spec.busbar_jitter
-        bound = detect.busbar_error(spec, reading**2, 3.0)
+        bound = busbar_error(spec, reading**2, 3.0)
         assert abs(reading**2 - v**2) <= bound * (1.0 + 1e-12)
 
     def test_a_class_of_a_hundred_percent_says_nothing(self) -> None:
-        assert detect.busbar_error(accuracy(busbar_class=1.0), 1.0, 3.0) == np.inf
+        assert busbar_error(accuracy(busbar_class=1.0), 1.0, 3.0) == np.inf
 
     @pytest.mark.parametrize(
         "changes",

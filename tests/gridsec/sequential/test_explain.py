@@ -9,8 +9,8 @@ import pytest
 from scipy.sparse.csgraph import connected_components
 
 from gridsec import sequential
+from gridsec.accuracy import MeterAccuracy
 from gridsec.arrays import Bools, Floats
-from gridsec.detect import MeterAccuracy
 from gridsec.droop import fleet
 from gridsec.feeder import Feeder
 from gridsec.network import Power, columns

@@ -14,7 +14,7 @@ from feeders.load import Site, from_tables, load, one_phase_each
 from feeders.powerflow_unbalanced import power_flow
 from feeders.trials import Lie, LoadError, Meters, Trial, Trick, frames
 from gridsec import sequential
-from gridsec.detect import MeterAccuracy
+from gridsec.accuracy import MeterAccuracy
 from gridsec.droop import Droop
 from gridsec.feeder import Feeder
 from gridsec.mesh import MeshedFeeder, PhasedMesh

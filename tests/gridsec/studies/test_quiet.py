@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
+from gridsec.accuracy import MeterAccuracy
 from gridsec.arrays import Floats
-from gridsec.detect import MeterAccuracy
 from gridsec.droop import fleet
 from gridsec.plant import Plant
 from gridsec.sequential import LoadDoubt, design

@@ -1,0 +1,175 @@
+"""What meters promise, and how far an honest reading may be from the truth.
+
+References
+----------
+IEC 62053 for what a class is; docs/theory-detection.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gridsec.arrays import Floats, Ints
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeterAccuracy:
+    """What the data sheets promise about the voltage meters. p meters.
+
+    A reading is ``v (1 + c) + r + n`` with a fixed unknown relative bias ``|c| <= class_fraction``,
+    rounding ``|r| <= resolution / 2`` and white jitter ``n`` of standard deviation ``jitter``.
+
+    Attributes
+    ----------
+    class_fraction : (p,)
+        Accuracy class as a fraction of the reading: 0.005 for class 0.5.
+    resolution : (p,)
+        Step of the register, pu of the nominal voltage.
+    jitter : (p,)
+        Standard deviation from one reading to the next, pu of the nominal voltage.
+    busbar_class
+        Class of the busbar meter, fraction of the reading.
+    busbar_resolution
+        Its resolution, pu.
+    busbar_jitter
+        Its jitter, pu.
+    """
+
+    class_fraction: Floats
+    resolution: Floats
+    jitter: Floats
+    busbar_class: float
+    busbar_resolution: float
+    busbar_jitter: float
+
+    def __post_init__(self) -> None:
+        """Check shapes and signs; a wrong description is a programming error, not an online outcome."""
+        p = np.shape(self.class_fraction)
+        for name in ("class_fraction", "resolution", "jitter"):
+            value = np.asarray(getattr(self, name), dtype=np.float64)
+            object.__setattr__(self, name, value)
+            if value.ndim != 1 or value.shape != p:
+                raise ValueError(f"{name} must have one entry per meter, got shape {value.shape}")
+            if not (np.isfinite(value).all() and (value >= 0).all()):
+                raise ValueError(f"{name} must be finite and not negative")
+        for name in ("busbar_class", "busbar_resolution", "busbar_jitter"):
+            number = float(getattr(self, name))
+            if not (np.isfinite(number) and number >= 0):
+                raise ValueError(f"{name} must be finite and not negative, got {number}")
+
+
+def reading_error(accuracy: MeterAccuracy, v2: Floats, sigmas: float) -> Floats:
+    """Largest honest error of a squared reading, per meter.
+
+    `(v + e)^2 - v^2 = 2 v e + e^2` with `e = class v + resolution / 2 + sigmas jitter`.
+
+    Parameters
+    ----------
+    accuracy
+        The meters.
+    v2 : (p,)
+        The largest squared voltage that the meter may be at, pu.
+    sigmas
+        How many standard deviations of jitter an honest reading may be off.
+
+    Returns
+    -------
+    (p,)
+        Bounds, squared pu.
+    """
+    v = np.sqrt(np.maximum(v2, 0.0))
+    e = accuracy.class_fraction * v + 0.5 * accuracy.resolution + sigmas * accuracy.jitter
+    return np.asarray(e * (2.0 * v + e))
+
+
+def busbar_error(accuracy: MeterAccuracy, v0_squared: float, sigmas: float) -> float:
+    """Largest honest error of the squared busbar voltage.
+
+    The class is a part of the truth, and only the reading r is known: `r = v (1 + c) + n` gives
+    `|r - v| = |c r + n| / (1 + c) <= e = (class |r| + resolution / 2 + sigmas jitter) / (1 - class)`,
+    and `|r^2 - v^2| <= e (2 r + e)`.
+
+    Parameters
+    ----------
+    accuracy
+        The meters.
+    v0_squared
+        The squared reading, pu.
+    sigmas
+        As in `reading_error`.
+    """
+    if accuracy.busbar_class >= 1.0:
+        return float("inf")  # such a reading says nothing
+    v = float(np.sqrt(max(v0_squared, 0.0)))
+    e = accuracy.busbar_class * v + 0.5 * accuracy.busbar_resolution + sigmas * accuracy.busbar_jitter
+    e /= 1.0 - accuracy.busbar_class
+    return e * (2.0 * v + e)
+
+
+def told_error(accuracy: MeterAccuracy, y: Floats, sigmas: float) -> Floats:
+    """Largest distance of the truth from a squared reading, per meter: `busbar_error` for the others.
+
+    Parameters
+    ----------
+    accuracy
+        The meters.
+    y : (p,)
+        The squared readings, pu.
+    sigmas
+        As in `reading_error`.
+
+    Returns
+    -------
+    (p,)
+        Bounds, squared pu; beyond any voltage where a class says nothing.
+    """
+    return ToldError.over(accuracy, np.arange(y.size), sigmas).of(y)
+
+
+# Error of a voltage whose class says nothing, pu.
+_NOTHING = 4.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ToldError:
+    """How far the truth may be from readings of some meters, prepared; k meters.
+
+    Attributes
+    ----------
+    slope, floor : (k,)
+        Error of a voltage, pu: `slope v + floor` for a reading v.
+    """
+
+    slope: Floats
+    floor: Floats
+
+    @classmethod
+    def over(cls, accuracy: MeterAccuracy, which: Ints, sigmas: float) -> ToldError:
+        """Prepare some meters.
+
+        Parameters
+        ----------
+        accuracy, sigmas
+            As in `told_error`.
+        which : (k,)
+            The meters, each as often as wanted.
+        """
+        part = accuracy.class_fraction[which]
+        even = 0.5 * accuracy.resolution[which] + sigmas * accuracy.jitter[which]
+        told = part < 1.0
+        rest = np.where(told, 1.0 - part, 1.0)
+        return cls(np.where(told, part / rest, 0.0), np.where(told, even / rest, _NOTHING))
+
+    def of(self, y: Floats) -> Floats:
+        """Bounds for squared readings, squared pu.
+
+        Parameters
+        ----------
+        y : (k,)
+            The squared readings.
+        """
+        v = np.sqrt(np.maximum(y, 0.0))
+        e = self.slope * v + self.floor
+        return np.asarray(e * (2.0 * v + e))
