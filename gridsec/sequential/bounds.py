@@ -11,9 +11,13 @@ with e the error of the observed injections. Every ``|e_i|`` is a first-order la
     tau_i |e_i|' <= -|e_i| + min(span_i, d_i (error of what it is given + hold) + mismatch),
 
 where `hold` is what the inverter's voltage changed from frame to frame: saturation keeps it finite, whatever
-happens. An inverter that follows a trusted meter is given a reading, any other the model. Powers told by
-customers whose meters are not trusted may be false, by as much as the book of the search allows for. The
-busbar voltage is metered, or what the trusted meters leave of it: it is eliminated, not assumed.
+happens. An inverter that follows a trusted meter is given a reading, any other the model. Supposed is that
+inverters follow their curves, and that between two frames a voltage stays between its values at them: what
+comes and goes unseen moves inverters that nobody knows of.
+
+Powers told by customers whose meters are not trusted may be false, by as much as the book of the search
+allows for. The busbar voltage is metered, or what the trusted meters leave of it: it is eliminated, not
+assumed.
 
 References
 ----------
@@ -22,7 +26,7 @@ docs/theory-sequential.md, section 7; docs/theory-detection.md for the lag and f
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -50,13 +54,26 @@ class Lag:
         Half-widths, pu.
     given : (m,)
         Squared voltage that each was given at the last frame, pu.
+    width : (m,)
+        How far that may have been from the truth, squared pu.
     span : (m,)
         Distance between the saturated values of each curve, pu: no error is larger.
     """
 
     error: Floats
     given: Floats
+    width: Floats
     span: Floats
+
+    def lied_to(self, which: Bools) -> Lag:
+        """Of inverters that followed a liar nothing is known but where they saturate.
+
+        Parameters
+        ----------
+        which : (m,)
+            Their inverters.
+        """
+        return replace(self, error=np.where(which, self.span, self.error)) if which.any() else self
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,14 +151,14 @@ def start(plant: Plant, given: Floats) -> Lag:
         Squared voltage that each is given, pu.
     """
     span = plant.droop.q[:, 0] - plant.droop.q[:, 3]
-    return Lag(span, given, span)
+    return Lag(span, given, np.full(span.size, NO_VOLTAGE), span)
 
 
 def follow(
     design: SequentialDesign,
     before: Lag,
     given: Floats,
-    free: tuple[Bools, Powers] | None,
+    free: tuple[Bools, Powers, Bools | bool] | None,
     h: float,
 ) -> Lag:
     """The errors a time h later.
@@ -153,25 +170,32 @@ def follow(
     given : (m,)
         Squared voltage that each inverter is given: its meter's reading or the model's, pu.
     free
-        Which inverters follow the model, (m,), and what the frame says of powers; None where all follow their
-        meters.
+        Which inverters follow the model, (m,), what the frame says of powers, and whether the busbar voltage
+        is metered; None where all follow their meters.
     h
         Step, s.
     """
     plant, droop, span = design.plant, design.plant.droop, before.span
     hold = np.abs(given - before.given)
-    target = np.minimum(span, droop.slope * (design.heard.of(given) + hold) + design.mismatch)
+    width = design.heard.of(given)
+    wider = np.maximum(width, before.width)
+    target = np.minimum(span, droop.slope * (wider + hold) + design.mismatch)
     if free is not None:
-        which, powers = free
+        which, powers, metered = free
         # The map is monotone: from above its images stay above the error.
         top = np.where(which, span, np.maximum(before.error, target))
         lost, _ = powers.lost(plant, _of_customers(plant, top))
+        known = np.where(metered, busbar_errors(plant, powers.v0_squared, design.sigmas[0]), NO_VOLTAGE)
+        busbar = by_place(plant.feeder, known)[plant.feeder.bus]
         for _ in range(_ROUNDS):
-            wide = (powers.linear(plant, _of_customers(plant, top)) + lost)[droop.customer]
-            image = np.minimum(span, droop.slope * (wide + hold) + design.mismatch)
+            model = powers.linear(plant, _of_customers(plant, top)) + lost + busbar
+            width = np.where(which, model[droop.customer], width)
+            wider = np.maximum(width, before.width)
+            image = np.minimum(span, droop.slope * (wider + hold) + design.mismatch)
             target = np.where(which, image, target)
             top = np.where(which, np.maximum(before.error, image), top)
-    return Lag(target + np.exp(-h / droop.tau) * (before.error - target), given, span)
+    error = target + np.exp(-h / droop.tau) * (before.error - target)
+    return Lag(error, given, width, span)
 
 
 def _of_customers(plant: Plant, of_inverters: Floats) -> Floats:
@@ -264,7 +288,10 @@ _LATER: Floats = np.zeros(0)
 
 
 class Bounded(Estimate):
-    """An estimate whose bound is worked out when it is first asked for: that takes half as long as a step."""
+    """An estimate whose bound is worked out when it is first asked for: that takes half as long as a step.
+
+    From the arrays of its frame, which must not be changed meanwhile.
+    """
 
     __slots__ = ("_grounds",)
     _grounds: Grounds

@@ -116,9 +116,9 @@ def conclude(design: SequentialDesign, state: SequentialState, tick: Tick) -> tu
 
 
 def _inverters(design: SequentialDesign, state: SequentialState) -> Bools:
-    """Inverters named, by the voltages or by what is metered of them, (m,)."""
-    named = state.trust.inverters
-    return named if state.curves.idle else named | state.curves.named(design)
+    """Inverters named: by the voltages, unless what is metered agrees with their curves, or by that."""
+    named, curves = state.trust.inverters, state.curves
+    return named if curves.idle else (named & ~curves.agrees(design)) | curves.named(design)
 
 
 def _injected(

@@ -39,7 +39,7 @@ class Curves:
     Attributes
     ----------
     count : (p,)
-        Ticks in which a report and the curve disagreed, less those in which they agreed.
+        Ticks in which a report and the curve disagreed, four times, less those in which they agreed.
     off : (p,)
         Whose do, for long enough.
     amount : (p,)
@@ -49,7 +49,7 @@ class Curves:
     sure : (p,)
         Where it is the inverter, by the voltages, and nothing has spoken against it since.
     heard : (m,)
-        Inverters whose injection is metered.
+        Inverters whose injection is metered well enough to notice if they were where they can be.
     """
 
     count: Ints
@@ -70,8 +70,33 @@ class Curves:
 
     def amounts(self, design: SequentialDesign) -> Floats:
         """What each inverter injects that its curve does not ask for, (m,) in pu."""
-        amount = self.amount[design.meter_of] if self.amount.size else np.zeros(design.meter_of.size)
-        return np.where(design.meter_of >= 0, amount, 0.0)
+        metered, at = design.meter_of >= 0, design.meter_of
+        if not metered.any():
+            return np.zeros(at.size)
+        # Several inverters of a customer are metered together.
+        share = np.bincount(at[metered], minlength=self.amount.size)
+        return np.where(metered, self.amount[at] / np.maximum(share[at], 1), 0.0)
+
+    def agrees(self, design: SequentialDesign) -> Bools:
+        """Inverters that are metered and do what their curves ask for, (m,)."""
+        return self.heard & (self.count[design.meter_of] == 0) if self.count.size else self.heard
+
+    def renewed(self, which: Bools) -> Curves:
+        """Nothing of meters that were replaced counts any more.
+
+        Parameters
+        ----------
+        which : (p,)
+            The meters.
+        """
+        return Curves(
+            np.where(which, 0, self.count),
+            self.off & ~which,
+            np.where(which, 0.0, self.amount),
+            np.where(which, 0.0, self.share),
+            self.sure & ~which,
+            self.heard,
+        )
 
     def explanations(self, design: SequentialDesign) -> tuple[Explanation, ...]:
         """What may be the case where the voltages do not decide: that of the strangest customer."""
@@ -104,10 +129,12 @@ def empty(meters: int, inverters: int) -> Curves:
 
 
 CONFIRM = 5
-"""Ticks that a disagreement must last."""
+"""Ticks of the longest means that say which of both is wrong."""
 
-# So many are counted at most.
-_MOST = 12
+# A disagreement counts so much, an agreement takes one away: who comes back after a pause is not forgotten.
+_EACH = 4
+# So much must be counted, and so much is at most.
+_ENOUGH, _MOST = 12, 48
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -166,8 +193,8 @@ def compare(design: SequentialDesign, before: Curves, now: Evidence) -> Curves:
     other = np.minimum(span, slope * (np.abs(judged.offset) + design.sigmas[0] * judged.std))
     room = frame.q_error[at] + frame.q_net_error[at] + error + other
     off = asked & (np.abs(amount) > room)
-    count = np.where(asked, np.clip(before.count + np.where(off, 1, -1), 0, _MOST), before.count)
-    lasts = (count >= CONFIRM) | (before.off & (count > 0))
+    count = np.where(asked, np.clip(before.count + np.where(off, _EACH, -1), 0, _MOST), before.count)
+    lasts = (count >= _ENOUGH) | (before.off & (count > 0))
     share, beyond = np.zeros(at.size), before.sure.copy()
     for j in np.flatnonzero(lasts & asked).tolist():
         told = bool(now.told[at[j]])
@@ -176,7 +203,9 @@ def compare(design: SequentialDesign, before: Curves, now: Evidence) -> Curves:
     share = np.where(asked, share, before.share * lasts)
     amount = np.where(asked, amount, before.amount) * lasts
     sure = lasts & beyond & ((share >= 1.0 - 1.0 / design.options.like) | (before.sure & (share >= 0.5)))
-    heard = (design.meter_of >= 0) & asked[design.meter_of]
+    most, least = (np.bincount(droop.customer, weights=droop.q[:, k], minlength=size)[at] for k in (0, 3))
+    told = asked & (room < np.maximum(most - x, x - least))
+    heard = (design.meter_of >= 0) & told[design.meter_of]
     return Curves(count, lasts, amount, share, sure, heard)
 
 

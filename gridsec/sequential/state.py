@@ -235,6 +235,7 @@ def renew(design: SequentialDesign, state: SequentialState, which: Bools) -> Seq
         learning=known.learning,
         window=forget(state.window, which),
         fits=(None,) * len(state.fits),
+        curves=state.curves.renewed(which),
         kinds=replace(state.kinds, memory=forget_calm(state.kinds.memory, which)),
         trust=replace(
             trust,

@@ -87,7 +87,7 @@ def step(
         ticks=state.ticks + 1,
         x=x,
         free=free,
-        lag=lag,
+        lag=lag.lied_to(_lied_to(design, state.trust, seen.trust)),
         v0_squared=heard.v0_squared,
         unmetered=np.where(heard.busbar, 0, state.unmetered + 1),
         window=window,
@@ -102,6 +102,14 @@ def step(
     tick = Tick(frame, q, *given, v2_bus, transient, seen, rivals)
     estimate, verdict = conclude(design, after, tick)
     return replace(after, last=(estimate, verdict)), estimate, verdict
+
+
+def _lied_to(design: SequentialDesign, before: Trust, now: Trust) -> Bools:
+    """Inverters whose meters were believed until now, (m,)."""
+    caught = before.trusted & ~now.trusted
+    if not caught.any():
+        return np.zeros(design.meter_of.size, dtype=np.bool_)
+    return (design.meter_of >= 0) & caught[design.meter_of]
 
 
 def _unused(design: SequentialDesign, state: SequentialState, frame: Frame) -> tuple[Estimate, Verdict]:
@@ -411,7 +419,7 @@ def _inverters(
             # What losses took off at the last frame is close enough for inverters without a meter.
             v2 += state.last[0].v2 - now
         w, y = droop.vbar**2 - v2, np.where(driven, y, now[droop.customer])
-        follows = ~driven, _given(design, state, frame, heard, sizes)
+        follows = ~driven, _given(design, state, frame, heard, sizes), heard.busbar
     lag = follow(design, state.lag, y, follows, h)
     return *drive(design, state.x, y, driven, w, h, state.free), lag
 

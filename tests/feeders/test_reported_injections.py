@@ -125,10 +125,49 @@ def test_a_false_report_is_never_clean_and_names_no_inverter(meters: Meters) -> 
 
 def test_inverters_that_nobody_hears_and_that_move_nothing_are_not_judged() -> None:
     trial = Trial(load("simbench-lv-rural1"), 0, duration_s=3.0)
-    for heard in (False, True):
-        told = replace(trial, report_q=heard)
+    for heard, error in (
+        (False, LoadError(0.1, 0.05)),
+        (True, LoadError(0.1, 0.05)),
+        (True, LoadError(2.0, 2.0)),
+    ):
+        told = replace(trial, report_q=heard, load_error=error)
         watcher = design(told.stated)
         state = watcher.init(0.0)
         for frame, _ in frames(told):
             state, _, verdict = watcher.step(state, frame)
-        assert verdict.unjudged.any() != heard
+        # Nor where loads are known less well than what an inverter can inject.
+        assert verdict.unjudged.any() != (heard and error.q_kvar < 1.0)
+
+
+def test_who_pauses_is_not_forgotten() -> None:
+    """A report that is false for four seconds and true for four, again and again, is not CLEAN for long."""
+    site = load("cigre-lv")
+    trial = Trial(site, 3, duration_s=90.0, load_error=LoadError(0.1, 0.05), report_q=True)
+    c = int(site.droop.customer[1])
+    false = site.tables.customers[c].inverter_kva / site.feeder.base_kva
+    watcher, late = design(trial.stated), []
+    state = watcher.init(0.0)
+    for k, (frame, _) in enumerate(frames(trial)):
+        q_net = frame.q_net.copy()
+        q_net[c] += false * (k >= 20 and k % 8 < 4)
+        state, _, verdict = watcher.step(state, replace(frame, q_net=q_net))
+        assert not verdict.inverters.any()
+        late += [verdict.decision] * (k >= 40)
+    assert Decision.CLEAN not in late
+
+
+def test_nothing_of_a_replaced_meter_counts() -> None:
+    site = load("cigre-lv")
+    trial = Trial(site, 3, duration_s=30.0, load_error=LoadError(0.1, 0.05), report_q=True)
+    c = int(site.droop.customer[1])
+    made, which = default("cigre-lv", 1.0), load("cigre-lv").meters == c
+    state = sequential.init(made, 0.0)
+    for k, (frame, _) in enumerate(frames(trial)):
+        q_net = frame.q_net.copy()
+        q_net[c] += 0.5 * (10 <= k < 20)
+        q_net[:] = np.nan if k >= 20 else q_net
+        state = sequential.renew(made, state, which) if k == 22 else state
+        state, _, verdict = sequential.step(made, state, replace(frame, q_net=q_net))
+        # Silence clears nobody; a new meter does.
+        assert k != 21 or verdict.cause is Cause.AMBIGUOUS
+    assert verdict.decision is Decision.CLEAN
