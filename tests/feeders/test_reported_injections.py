@@ -124,7 +124,7 @@ def test_a_false_report_is_never_clean_and_names_no_inverter(meters: Meters) -> 
 
 
 def test_inverters_that_nobody_hears_and_that_move_nothing_are_not_judged() -> None:
-    trial = Trial(load("simbench-lv-rural1"), 0, duration_s=3.0)
+    trial = Trial(load("simbench-lv-rural1"), 0, duration_s=40.0)  # what they inject is forgotten by then
     for heard, error in (
         (False, LoadError(0.1, 0.05)),
         (True, LoadError(0.1, 0.05)),
