@@ -150,8 +150,12 @@ def test_no_alignment_of_honest_errors_is_an_attack(name: str, step_s: float, ba
                     assert watch.look().cause in {Cause.AGREEMENT, Cause.SETTLING}
 
 
-@pytest.mark.parametrize("bank", [True, False])
-@pytest.mark.parametrize("name", names())
+SMALL = ("cigre-lv", "kerber-landnetz", "simbench-lv-rural1")
+
+
+@pytest.mark.parametrize(
+    ("name", "bank"), [(name, True) for name in names()] + [(name, False) for name in SMALL]
+)
 def test_no_jump_between_two_readings_is_an_attack(name: str, bank: bool) -> None:
     """A tap step of 2.5 %, all loads or all the sun at once, just before a reading or long before."""
     for ends in (HIGH, LOW):

@@ -289,7 +289,7 @@ def watch(
         for values in (estimate.v2, estimate.bound, estimate.std, verdict.threshold, verdict.attack):
             assert np.isfinite(values).all()
         assert (estimate.std > 0).all()
-        assert (estimate.bound >= estimate.std).all()
+        assert (estimate.bound > 0).all()
         assert not (estimate.trusted & (verdict.suspects | ~frame.seen)).any()
         assert (verdict.attack[~verdict.suspects] == 0).all()
         answers.append((estimate, verdict))
