@@ -419,7 +419,7 @@ def _nothing(kind: str) -> Certificate:
 def _span(lure: Lure) -> Floats:
     """Distance between the two saturated values of each curve (m,); infinite where unknown."""
     if isinstance(lure.phi, Droop):
-        return np.asarray(lure.phi.q[:, 0] - lure.phi.q[:, 3])
+        return lure.phi.span
     return np.full(lure.slope.size, np.inf)
 
 

@@ -111,7 +111,7 @@ def error_model(droop: Droop, model: LinDistFlow, meters: Ints, max_attacked: in
         reach_own=frozen(X2[np.ix_(own, meters)]),
         meters=meters,
         meter_of=np.array([at.get(int(c), -1) for c in droop.customer], dtype=np.intp),
-        span=frozen(droop.q[:, 0] - droop.q[:, 3]),
+        span=frozen(droop.span),
         mismatch=curve_mismatch(droop),
     )
 

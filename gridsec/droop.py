@@ -109,6 +109,23 @@ class Droop:
             total += _pick(self._offset, rows)
         return total
 
+    @property
+    def span(self) -> Floats:
+        """Distance between the saturated values of each curve, (m,) in pu."""
+        return np.asarray(self.q[:, 0] - self.q[:, 3])
+
+    def per_customer(self, of_inverters: Floats, customers: int) -> Floats:
+        """Sums over the inverters of each customer, (N,).
+
+        Parameters
+        ----------
+        of_inverters : (m,)
+            What is summed.
+        customers
+            N.
+        """
+        return np.asarray(np.bincount(self.customer, weights=of_inverters, minlength=customers), np.float64)
+
     def take(self, rows: Ints) -> Droop:
         """The droop of the inverters `rows`, in that order and with repetitions.
 

@@ -260,8 +260,7 @@ def _credible(setting: Setting, frame: Frame) -> Bools:
     if not setting.believes_q:
         return np.zeros(plant.meters.size, dtype=np.bool_)
     count_ = frame.q.size
-    most = np.bincount(plant.droop.customer, weights=plant.droop.q[:, 0], minlength=count_)
-    least = np.bincount(plant.droop.customer, weights=plant.droop.q[:, 3], minlength=count_)
+    most, least = (plant.droop.per_customer(plant.droop.q[:, k], count_) for k in (0, 3))
     room = frame.q_error + np.nan_to_num(frame.q_net_error)
     rest = np.nan_to_num(frame.q_net) - frame.q
     credible = np.isfinite(frame.q_net) & (least - room <= rest) & (rest <= most + room)
@@ -270,7 +269,7 @@ def _credible(setting: Setting, frame: Frame) -> Bools:
 
 def injections(plant: Plant, frame: Frame, x: Floats, told: Bools) -> Floats:
     """Net reactive injection of every customer: metered where told, otherwise load plus inverter; (N,)."""
-    q = frame.q + np.bincount(plant.droop.customer, weights=x, minlength=frame.q.size)
+    q = frame.q + plant.droop.per_customer(x, frame.q.size)
     at = plant.meters[told]
     q[at] = frame.q_net[at]
     return np.asarray(q)

@@ -261,8 +261,8 @@ def _with_inverters(
     feeder, droop, steps = plant.feeder, plant.droop, plant.loss_correction
     if not isinstance(feeder, Feeder):
         count_ = frame.q.size
-        q = frame.q + np.bincount(droop.customer, weights=state.x, minlength=count_)
-        room = np.bincount(droop.customer, weights=reach + np.abs(state.x), minlength=count_)
+        q = frame.q + droop.per_customer(state.x, count_)
+        room = droop.per_customer(reach + np.abs(state.x), count_)
         far = interval_bounds(
             feeder, frame.p, q, inputs.v0_squared, p_error=frame.p_error, q_error=frame.q_error + room
         )

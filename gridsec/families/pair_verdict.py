@@ -70,8 +70,7 @@ def deaf_inverters(design: UnknownInputDesign, trial: Trial) -> Bools:
     design, trial
         What watches, and what a pair makes of the tick.
     """
-    q = design.setting.plant.droop.q
-    return np.asarray(trial.attack_error > q[:, 0] - q[:, 3])
+    return np.asarray(trial.attack_error > design.setting.plant.droop.span)
 
 
 def answer(

@@ -224,7 +224,7 @@ def _estimate(
     tube = tick.tube(meters)
     wrong = np.where(accused, np.clip(trial.attack, -tick.room(tube), tick.room(tube)), 0.0)
     x = tube.middle + wrong
-    q = tick.frame.q + np.bincount(plant.droop.customer, weights=x, minlength=tick.frame.q.size)
+    q = tick.frame.q + plant.droop.per_customer(x, tick.frame.q.size)
     seen = reconstruct(now, tick.frame, inputs, q)
     gain = np.abs(design.gain)
     if chosen is None:

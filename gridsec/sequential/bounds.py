@@ -113,8 +113,7 @@ class Powers:
         injected : (N,)
             How far the inverters' injections may be off, pu.
         """
-        p_error, q_error = self._errors(plant)
-        return reach(plant.feeder, p_error, q_error + np.where(self.told, 0.0, injected))[plant.feeder.bus]
+        return reach(plant.feeder, *self._errors(plant, injected))[plant.feeder.bus]
 
     def lost(self, plant: Plant, injected: Floats) -> tuple[Floats, Floats]:
         """What the loss correction can be off at each customer, (N,), and the correction itself.
@@ -124,20 +123,19 @@ class Powers:
         plant, injected
             As in `linear`.
         """
-        p_error, q_error = self._errors(plant)
-        q_error = q_error + np.where(self.told, 0.0, injected)
+        p_error, q_error = self._errors(plant, injected)
         v0 = self.v0_squared
         correction, off = losses(plant, self.frame.p, self.q, v0, p_error=p_error, q_error=q_error)
         return off, correction[plant.feeder.bus]
 
-    def _errors(self, plant: Plant) -> tuple[Floats, Floats]:
-        """How far the powers may be off, inverters excluded, (N,) each."""
+    def _errors(self, plant: Plant, injected: Floats) -> tuple[Floats, Floats]:
+        """How far the net powers may be off, (N,) each."""
         frame = self.frame
         p_error, q_error = frame.p_error.copy(), np.where(self.told, frame.q_net_error, frame.q_error)
         liars = plant.meters[~self.trusted]
         p_error[liars] += self.sizes[liars]
         q_error[liars] += np.abs(frame.q[liars]) + _FALSE_Q * self.sizes[liars]
-        return p_error, q_error
+        return p_error, q_error + np.where(self.told, 0.0, injected)
 
 
 def start(plant: Plant, given: Floats) -> Lag:
@@ -150,7 +148,7 @@ def start(plant: Plant, given: Floats) -> Lag:
     given : (m,)
         Squared voltage that each is given, pu.
     """
-    span = plant.droop.q[:, 0] - plant.droop.q[:, 3]
+    span = plant.droop.span
     return Lag(span, given, np.full(span.size, NO_VOLTAGE), span)
 
 
@@ -181,14 +179,14 @@ def follow(
     wider = np.maximum(width, before.width)
     target = np.minimum(span, droop.slope * (wider + hold) + design.mismatch)
     if free is not None:
-        which, powers, metered = free
+        (which, powers, metered), size = free, plant.feeder.bus.size
         # The map is monotone: from above its images stay above the error.
         top = np.where(which, span, np.maximum(before.error, target))
-        lost, _ = powers.lost(plant, _of_customers(plant, top))
+        lost, _ = powers.lost(plant, droop.per_customer(top, size))
         known = np.where(metered, busbar_errors(plant, powers.v0_squared, design.sigmas[0]), NO_VOLTAGE)
         busbar = by_place(plant.feeder, known)[plant.feeder.bus]
         for _ in range(_ROUNDS):
-            model = powers.linear(plant, _of_customers(plant, top)) + lost + busbar
+            model = powers.linear(plant, droop.per_customer(top, size)) + lost + busbar
             width = np.where(which, model[droop.customer], width)
             wider = np.maximum(width, before.width)
             image = np.minimum(span, droop.slope * (wider + hold) + design.mismatch)
@@ -196,11 +194,6 @@ def follow(
             top = np.where(which, np.maximum(before.error, image), top)
     error = target + np.exp(-h / droop.tau) * (before.error - target)
     return Lag(error, given, width, span)
-
-
-def _of_customers(plant: Plant, of_inverters: Floats) -> Floats:
-    size = plant.feeder.bus.size
-    return np.bincount(plant.droop.customer, weights=of_inverters, minlength=size).astype(np.float64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -243,7 +236,7 @@ class Grounds:
             The squared voltages.
         """
         plant, at = self.plant, self.plant.meters
-        injected = _of_customers(plant, self.injected)
+        injected = plant.droop.per_customer(self.injected, plant.feeder.bus.size)
         lost, correction = self.powers.lost(plant, injected)
         spread = np.minimum(self.powers.linear(plant, injected) + lost, NO_VOLTAGE)
         reading = told_error(plant.accuracy, self.y, self.sigmas)

@@ -185,8 +185,7 @@ def compare(design: SequentialDesign, before: Curves, now: Evidence) -> Curves:
     if now.fit is None or now.judged is None or not (asked.any() or before.count.any()):
         return before if not before.count.any() and not before.heard.any() else empty(at.size, droop.tau.size)
     x, error, slope, span = (
-        np.bincount(droop.customer, weights=of, minlength=size)[at]
-        for of in (now.x, now.lag.error, droop.slope, now.lag.span)
+        droop.per_customer(of, size)[at] for of in (now.x, now.lag.error, droop.slope, now.lag.span)
     )
     frame, judged = now.frame, now.judged
     amount = np.where(asked, frame.q_net[at] - frame.q[at] - x, 0.0)
@@ -203,9 +202,9 @@ def compare(design: SequentialDesign, before: Curves, now: Evidence) -> Curves:
     share = np.where(asked, share, before.share * lasts)
     amount = np.where(asked, amount, before.amount) * lasts
     sure = lasts & beyond & ((share >= 1.0 - 1.0 / design.options.like) | (before.sure & (share >= 0.5)))
-    most, least = (np.bincount(droop.customer, weights=droop.q[:, k], minlength=size)[at] for k in (0, 3))
-    told = asked & (room < np.maximum(most - x, x - least))
-    heard = (design.meter_of >= 0) & told[design.meter_of]
+    most, least = (droop.per_customer(droop.q[:, k], size)[at] for k in (0, 3))
+    enough = asked & (room < np.maximum(most - x, x - least))
+    heard = (design.meter_of >= 0) & enough[design.meter_of]
     return Curves(count, lasts, amount, share, sure, heard)
 
 

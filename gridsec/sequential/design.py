@@ -277,8 +277,7 @@ def _unseen(plant: Plant, effects: Effects, known: Prior, noise: Floats, suspect
     half, _ = lapack.dtrtrs(whole, moved, lower=True)
     if failed:
         raise np.linalg.LinAlgError("the matrix is not positive definite")
-    span = plant.droop.q[:, 0] - plant.droop.q[:, 3]
-    return np.asarray(span * np.sqrt((half * half).sum(axis=0)) <= suspect + _CHANCE)
+    return np.asarray(plant.droop.span * np.sqrt((half * half).sum(axis=0)) <= suspect + _CHANCE)
 
 
 # Powers that alone would move a squared voltage by this, pu, are none; nor are any beyond so many pu.

@@ -132,4 +132,4 @@ def injection_doubt(droop: Droop, accuracy: MeterAccuracy, meters: Ints, custome
         accuracy.class_fraction**2 / 3.0 + accuracy.resolution**2 / 12.0 + accuracy.jitter**2
     )
     own = np.minimum(droop.slope * error[droop.customer], droop.limit)
-    return np.asarray(np.sqrt(np.bincount(droop.customer, weights=own**2, minlength=customers)))
+    return np.asarray(np.sqrt(droop.per_customer(own**2, customers)))

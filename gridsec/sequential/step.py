@@ -181,13 +181,16 @@ def _acquit(seen: Examined, over: Bools) -> Examined:
 def _voltages(design: SequentialDesign, frame: Frame, heard: _Heard, x: Floats) -> tuple[Floats, Floats]:
     """Reactive injections, (N,), and what the model makes of all of them, (n,)."""
     plant = design.plant
-    q = heard.q + np.where(
-        heard.told, 0.0, np.bincount(plant.droop.customer, weights=x, minlength=heard.q.size)
-    )
+    q = _net(design, heard, x)
     with np.errstate(all="ignore"):
         v2_bus = bus_voltages(plant.feeder, frame.p, q, heard.v0_squared, steps=plant.loss_correction)
         v2_bus = np.clip(v2_bus, 0.0, NO_VOLTAGE)
     return q, np.where(np.isnan(v2_bus), by_place(plant.feeder, heard.v0_squared), v2_bus)
+
+
+def _net(design: SequentialDesign, heard: _Heard, x: Floats) -> Floats:
+    """Net reactive injections with observed ones of the inverters where they are not metered, (N,)."""
+    return heard.q + np.where(heard.told, 0.0, design.plant.droop.per_customer(x, heard.q.size))
 
 
 def _swing(design: SequentialDesign, v2_bus: Floats, v0_squared: Floats | float) -> float:
@@ -298,8 +301,7 @@ def _clean(design: SequentialDesign, state: SequentialState, frame: Frame) -> _H
         trusted = np.zeros(frame.q.size, dtype=np.bool_)
         trusted[plant.meters] = live & state.trust.trusted
         count = frame.q.size
-        most = np.bincount(plant.droop.customer, weights=plant.droop.q[:, 0], minlength=count)
-        least = np.bincount(plant.droop.customer, weights=plant.droop.q[:, 3], minlength=count)
+        most, least = (plant.droop.per_customer(plant.droop.q[:, k], count) for k in (0, 3))
         rest, room = (
             np.where(reported, frame.q_net, 0.0) - frame.q,
             frame.q_error + np.where(reported, frame.q_net_error, 0.0),
@@ -428,15 +430,14 @@ def _given(
     design: SequentialDesign, state: SequentialState, frame: Frame, heard: _Heard, sizes: Floats
 ) -> Powers:
     """The powers that inverters follow which follow the model."""
-    x, customer = np.zeros(0) if state.x is None else state.x, design.plant.droop.customer
-    q = heard.q + np.where(heard.told, 0.0, np.bincount(customer, weights=x, minlength=heard.q.size))
-    return Powers(frame, q, heard.told, heard.v0_squared, state.trust.trusted, sizes)
+    x = np.zeros(0) if state.x is None else state.x
+    return Powers(frame, _net(design, heard, x), heard.told, heard.v0_squared, state.trust.trusted, sizes)
 
 
 def _linear(design: SequentialDesign, frame: Frame, x: Floats, heard: _Heard) -> Floats:
     """Squared voltages by the linear model with injections x, (N,)."""
     feeder = design.plant.feeder
-    q = frame.q + np.bincount(design.plant.droop.customer, weights=x, minlength=frame.q.size)
+    q = frame.q + design.plant.droop.per_customer(x, frame.q.size)
     return np.asarray(bus_voltages(feeder, frame.p, q, heard.v0_squared, steps=0)[feeder.bus])
 
 
