@@ -38,8 +38,9 @@ from gridsec.online import Estimate, Frame
 from gridsec.plant import Plant
 from gridsec.sequential.design import SequentialDesign
 
-# A false power is told with any power factor down to this: reactive power per active power.
-_FALSE_Q = 0.5
+FALSE_Q = 0.5
+"""Reactive power per active power that a false power is told with at most."""
+
 # The monotone map of the free inverters is applied so often from above.
 _ROUNDS = 2
 
@@ -134,7 +135,7 @@ class Powers:
         p_error, q_error = frame.p_error.copy(), np.where(self.told, frame.q_net_error, frame.q_error)
         liars = plant.meters[~self.trusted]
         p_error[liars] += self.sizes[liars]
-        q_error[liars] += np.abs(frame.q[liars]) + _FALSE_Q * self.sizes[liars]
+        q_error[liars] += np.abs(frame.q[liars]) + FALSE_Q * self.sizes[liars]
         return p_error, q_error + np.where(self.told, 0.0, injected)
 
 

@@ -7,7 +7,7 @@ docs/theory-sequential.md, sections 5 and 7.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from gridsec.sequential.bounds import Bounded, Grounds, Powers
 from gridsec.sequential.conditional import judge
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.examine import Examined
+from gridsec.sequential.release import Released, release
 from gridsec.sequential.state import SequentialState
 
 
@@ -63,7 +64,9 @@ class Tick:
     rivals: tuple[Explanation, ...]
 
 
-def conclude(design: SequentialDesign, state: SequentialState, tick: Tick) -> tuple[Estimate, Verdict]:
+def conclude(
+    design: SequentialDesign, state: SequentialState, tick: Tick
+) -> tuple[SequentialState, Estimate, Verdict]:
     """Put the answer together.
 
     Parameters
@@ -72,9 +75,14 @@ def conclude(design: SequentialDesign, state: SequentialState, tick: Tick) -> tu
         The design, and the state after this tick.
     tick
         What it brought.
+
+    Returns
+    -------
+    SequentialState, Estimate, Verdict
+        The state with the answer in it, and the answer.
     """
     plant, trust = design.plant, state.trust
-    estimate = _estimate(design, state, tick)
+    estimate, released = _estimate(design, state, tick)
     score, threshold, judged = _worst(design, tick.seen, tick.live.size)
     live, beyond = judged & tick.live, score > threshold
     at = plant.feeder.bus[plant.meters]
@@ -112,7 +120,7 @@ def conclude(design: SequentialDesign, state: SequentialState, tick: Tick) -> tu
         explanations=tick.rivals or (state.curves.explanations(design) if cause is Cause.AMBIGUOUS else ()),
         unjudged=design.unseen & ~(state.curves.heard | inverters),
     )
-    return estimate, verdict
+    return replace(state, released=released, last=(estimate, verdict)), estimate, verdict
 
 
 def _inverters(design: SequentialDesign, state: SequentialState) -> Bools:
@@ -135,9 +143,11 @@ def _injected(
     return out
 
 
-def _estimate(design: SequentialDesign, state: SequentialState, tick: Tick) -> Estimate:
+def _estimate(
+    design: SequentialDesign, state: SequentialState, tick: Tick
+) -> tuple[Estimate, Released | None]:
     plant = design.plant
-    w, variance = _reconstructed(design, state, tick.seen)
+    w, variance, released = _reconstructed(design, state, tick.seen, tick.frame.p_std)
     v2_bus = tick.v2_bus + w
     first = busbar_places(plant.feeder)
     v2_bus[first] = np.where(tick.busbar, tick.v0_squared, v2_bus[first])
@@ -154,7 +164,8 @@ def _estimate(design: SequentialDesign, state: SequentialState, tick: Tick) -> E
         trusted=trusted,
         sigmas=design.sigmas[0],
     )
-    return Bounded.on(grounds, state.t, v2_bus, variance, np.zeros(0) if state.x is None else state.x)
+    x = np.zeros(0) if state.x is None else state.x
+    return Bounded.on(grounds, state.t, v2_bus, variance, x), released
 
 
 _Said = tuple[Decision, Cause, str]
@@ -281,10 +292,38 @@ def _amounts(design: SequentialDesign, state: SequentialState, seen: Examined) -
     return out
 
 
-def _reconstructed(design: SequentialDesign, state: SequentialState, seen: Examined) -> tuple[Floats, Floats]:
-    """What the trusted meters add to the model at every bus, and its variance, on the best scale."""
+def _reconstructed(
+    design: SequentialDesign, state: SequentialState, seen: Examined, told: Floats | None
+) -> tuple[Floats, Floats, Released | None]:
+    """What the trusted meters add to the model at every bus, its variance, and what is kept of the work.
+
+    `told`, (N,) or None, are the standard deviations of powers that nobody told, NaN for all others: about
+    these nobody lies.
+    """
     prior_ = state.doubts.prior
-    whole, at, least, moved = float(prior_.variance.sum()), -1, np.inf, 0.0
+    s, moved = _best(design, state)
+    now, view = (None, None) if s < 0 else (state.fits[s], seen.views[s])
+    if now is None:
+        return np.zeros_like(prior_.variance), prior_.variance, None
+    m = state.window.sums[s] / np.maximum(state.window.counts[s], 1)
+    judged = judge(now, m) if view is None else view.judged
+    after = moved * prior_.variance + _hidden(state)
+    liars = design.plant.meters[~state.trust.trusted]
+    liars = liars if told is None else liars[np.isnan(told[liars])]
+    if not liars.size:
+        return judged.w, now.variance + after, None
+    sizes, released = state.doubts.sizes[liars], state.released
+    if released is None or not released.holds(now, liars, sizes, judged):
+        released = release(design.effects, now, liars, sizes, judged)
+    return released.said(judged), released.variance + after, released
+
+
+def _best(design: SequentialDesign, state: SequentialState) -> tuple[int, float]:
+    """The scale that leaves least open, -1 for none, and what part of the loads' variance it is short of.
+
+    A mean over many ticks does not know what the loads did meanwhile.
+    """
+    whole, at, least, moved = float(state.doubts.prior.variance.sum()), -1, np.inf, 0.0
     for s, (now, length) in enumerate(zip(state.fits, design.lengths, strict=True)):
         if now is None:
             continue
@@ -292,12 +331,7 @@ def _reconstructed(design: SequentialDesign, state: SequentialState, seen: Exami
         total = float(now.variance.sum()) + lag * whole
         if total < least:
             at, least, moved = s, total, lag
-    now, view = (None, None) if at < 0 else (state.fits[at], seen.views[at])
-    if now is None:
-        return np.zeros_like(prior_.variance), prior_.variance
-    best = now.variance + moved * prior_.variance
-    m = state.window.sums[at] / np.maximum(state.window.counts[at], 1)
-    return (judge(now, m).w if view is None else view.judged.w), best + _hidden(state)
+    return at, moved
 
 
 def _hidden(state: SequentialState) -> Floats:

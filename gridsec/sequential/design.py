@@ -183,6 +183,11 @@ class SequentialDesign:
         return self.plant.feeder.bus.size
 
     @property
+    def effects(self) -> Effects:
+        """What every customer's powers do to the voltages."""
+        return self.shapes.traces.effects
+
+    @property
     def observers(self) -> int:
         """One observer, whatever is trusted."""
         return 1

@@ -19,8 +19,22 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.sequential.conditional import Fit, Judged, Move, drop, loosen
 
-OF_A_LIAR = 2.0
-"""What accusing the powers of a customer costs whose voltage meter is accused already."""
+_OF_A_LIAR, _FEW, _OF_MANY = 2.0, 3, 0.5
+
+
+def of_a_liar(liars: int) -> float:
+    """What accusing the powers of a customer costs whose meter is accused already, in accusations of a meter.
+
+    Where many lie the next one is no surprise (`search.price`), and neither is that its powers are false as
+    well: were that dear, honest neighbours would be accused instead. Two up to three liars, then in inverse
+    proportion to their number, half at least.
+
+    Parameters
+    ----------
+    liars
+        How many meters are accused.
+    """
+    return max(_OF_A_LIAR * min(1.0, _FEW / max(liars, 1)), _OF_MANY)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,7 +53,7 @@ class Dictionary:
         `columns(which)` are the changes of every squared voltage per unit of what is doubted, (n, …).
     meter : (k,)
         Meter of the customer whose powers it doubts; -1 for none. Who is accused of lying about the voltage
-        is not believed about powers either: that costs no more than `OF_A_LIAR`.
+        is not believed about powers either: that costs no more than `of_a_liar`.
     along
         `along(weights)` is the weighted sum of each direction's changes at the meters, (k,).
     """
@@ -51,7 +65,7 @@ class Dictionary:
     columns: Callable[[Ints], Floats]
     along: Callable[[Floats], Floats]
 
-    def charges(self, which: Ints, trusted: Bools) -> Floats:
+    def charges(self, which: Ints, trusted: Bools, liars: int) -> Floats:
         """What accusing some directions costs, in accusations of a meter.
 
         Parameters
@@ -60,13 +74,15 @@ class Dictionary:
             The directions.
         trusted : (p,)
             Which meters are believed.
+        liars
+            How many of those that report are not.
         """
         charge, of_liar = self.charge[which], (self.meter[which] >= 0) & ~trusted[self.meter[which]]
-        return np.where(of_liar, np.minimum(charge, OF_A_LIAR), charge)
+        return np.where(of_liar, np.minimum(charge, of_a_liar(liars)), charge)
 
     def doubtful(self) -> Dictionary:
         """The book for those who look for reasons not to name anybody."""
-        return replace(self, charge=np.minimum(self.charge, OF_A_LIAR))
+        return replace(self, charge=np.minimum(self.charge, _OF_A_LIAR))
 
 
 # So many directions are tried, those that the residuals point at most.
@@ -88,11 +104,13 @@ class Powers:
         What may be loosened.
     weights : (p,)
         Q m.
+    live : (p,)
+        Which meters report.
     """
 
-    def __init__(self, now: Fit, dictionary: Dictionary, weights: Floats) -> None:
+    def __init__(self, now: Fit, dictionary: Dictionary, weights: Floats, live: Bools) -> None:
         towards = dictionary.along(weights) ** 2 / np.maximum(dictionary.size, _TINY)
-        self.dictionary, self.now = dictionary, now
+        self.dictionary, self.now, self.live = dictionary, now, live
         self.index = np.argsort(-towards)[:_CANDIDATES]
         self.columns = dictionary.columns(self.index)
         self.seen = self.columns[now.prior.meters]
@@ -123,8 +141,10 @@ class Powers:
         innocent : (k,)
             Meters that are not dropped.
         """
-        alone = self._alone(judged.weights) - penalty * self.dictionary.charges(self.index, self.now.trusted)
-        both = self._with_meter(judged.weights) - penalty * (1.0 + OF_A_LIAR)
+        trusted = self.now.trusted
+        liars = int(np.count_nonzero(self.live & ~trusted))
+        alone = self._alone(judged.weights) - penalty * self.dictionary.charges(self.index, trusted, liars)
+        both = self._with_meter(judged.weights) - penalty * (1.0 + of_a_liar(liars))
         both[np.isin(self.meter, innocent)] = -np.inf
         alone[self.accused] = both[self.accused] = -np.inf
         k, pair = int(np.argmax(alone)), int(np.argmax(both))

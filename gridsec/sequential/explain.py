@@ -180,9 +180,10 @@ class Search:
 
     def _after(self, before: Solution, found: Solution) -> Solution:
         """What a descent without a book found, from all that another loosened: powers of liars cost less."""
-        loosened, live = before.loosened, int(np.count_nonzero(self.here.enough))
-        charges = self.book.charges(np.array(loosened, dtype=np.intp), found.trusted)
-        charge = float(charges.sum()) * search.price(live, 1)
+        loosened, live = before.loosened, self.here.enough
+        liars = int(np.count_nonzero(live & ~found.trusted))
+        charges = self.book.charges(np.array(loosened, dtype=np.intp), found.trusted, liars)
+        charge = float(charges.sum()) * search.price(int(np.count_nonzero(live)), 1)
         return replace(found, loosened=loosened, charge=charge, cost=found.cost + charge)
 
     def _fair(self) -> Limits:

@@ -200,7 +200,7 @@ def descend(
     for j in np.flatnonzero(now.trusted & ~live):
         drop(now, int(j))
     judged, before = judge(now, m), now.changes
-    powers = None if dictionary is None else Powers(now, dictionary, judged.weights)
+    powers = None if dictionary is None else Powers(now, dictionary, judged.weights, live)
     for _ in range(_MOVES_PER_METER * m.size):
         steps = _best(_Place(now, judged, limits, barred, innocent, pairs, powers))
         if not steps:
@@ -215,7 +215,7 @@ def descend(
     size = int(np.count_nonzero(live))
     charge = 0.0
     if dictionary is not None and loosened:
-        charges = dictionary.charges(np.array(loosened, dtype=np.intp), now.trusted)
+        charges = dictionary.charges(np.array(loosened, dtype=np.intp), now.trusted, dropped)
         charge = float(charges.sum()) * price(size, 1)
     cost = judged.misfit + price(size, dropped, limits.most) + charge
     return Solution(now.trusted, loosened, charge, cost, now, judged)

@@ -19,6 +19,7 @@ from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.drive import Free
 from gridsec.sequential.kinds import Kinds
 from gridsec.sequential.kinds import empty as no_kinds
+from gridsec.sequential.release import Released
 from gridsec.sequential.repeats import forget as forget_calm
 from gridsec.sequential.windows import Window, empty, forget
 
@@ -118,6 +119,8 @@ class SequentialState:
         Who is believed.
     fits : (s,)
         What the trusted meters say on each scale; None where no meter can be judged yet.
+    released
+        What they say where the powers of the others are not believed; None where all are.
     doubts
         What the frames do not know.
     learning
@@ -147,6 +150,7 @@ class SequentialState:
     window: Window
     trust: Trust
     fits: tuple[Fit | None, ...]
+    released: Released | None
     doubts: Doubts
     learning: Learning | None
     learned: Learned
@@ -206,6 +210,7 @@ def init(
             np.zeros(m, dtype=np.bool_),
         ),
         fits=(None,) * s,
+        released=None,
         doubts=Doubts(one, one, never, never, True, design.prior, design.book.std),
         learning=known.learning,
         learned=known.learned,

@@ -100,8 +100,7 @@ def step(
     after = _learn(design, after, residual, heard.live, frame.t - state.t)
     given = heard.told, heard.y, heard.live, heard.v0_squared, heard.busbar
     tick = Tick(frame, q, *given, v2_bus, transient, seen, rivals)
-    estimate, verdict = conclude(design, after, tick)
-    return replace(after, last=(estimate, verdict)), estimate, verdict
+    return conclude(design, after, tick)
 
 
 def _lied_to(design: SequentialDesign, before: Trust, now: Trust) -> Bools:

@@ -25,7 +25,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats
 from gridsec.sequential.design import SequentialDesign
-from gridsec.sequential.dictionary import OF_A_LIAR
+from gridsec.sequential.dictionary import of_a_liar
 from gridsec.sequential.search import Limits, price
 from gridsec.studies.collusion import Corridor, Shift, corridor, furthest
 
@@ -162,9 +162,10 @@ def named_size(given: Rule, meter: int, liars: int, *, claims: Floats) -> float:
     """From which lie on no explanation that believes a meter is a rival, whatever other liars do, squared pu.
 
     The truth, with at most M liars, costs at most ``p + 2 sqrt(p t) + 2 t + 2 ln binom(p, M)``, t = -ln risk,
-    but for the risk (Hsu, Kakade and Zhang 2012, for sub-Gaussian residuals). Believing k and loosening
-    directions D costs at least ``m_k^2 / (S_kk + d_k + sum_D s^2 b_k^2)`` and what D is charged; the best D
-    is bounded by a knapsack whose items may be cut. Without k, its offset is evidence.
+    but for the risk (Hsu, Kakade and Zhang 2012, for sub-Gaussian residuals). Believing k, accusing n others
+    and loosening directions D costs at least ``m_k^2 / (S_kk + d_k + sum_D s^2 b_k^2) + 2 ln binom(p, n)``
+    and what D is charged then; the best D is bounded by a knapsack whose items may be cut, for every n from
+    which on charges are lower. Without k, its offset is evidence.
 
     Parameters
     ----------
@@ -182,10 +183,15 @@ def named_size(given: Rule, meter: int, liars: int, *, claims: Floats) -> float:
     book = design.book
     std = np.concatenate([claims, book.std[design.customers :]])
     at = book.columns(np.arange(std.size))[bus[0]]
-    # A power is charged least while its customer's meter is not believed.
-    least = np.where(np.arange(std.size) < design.customers, np.minimum(book.charge, OF_A_LIAR), book.charge)
     loose = (std * at) ** 2
-    cost = least * price(p, 1)
+    # A power is charged least while its customer's meter is not believed, and the less the more are accused:
+    # with the next such number of them.
+    numbers = [0, *(k for k in range(1, p) if of_a_liar(k) < of_a_liar(k - 1))]
+    of_customers = np.arange(std.size) < design.customers
+    ways = [
+        (np.where(of_customers, np.minimum(book.charge, of_a_liar(k)), book.charge), price(p, k))
+        for k in numbers
+    ]
     t = -float(np.log(given.risk))
     truth = p + 2.0 * np.sqrt(p * t) + 2.0 * t + price(p, liars) + 2.0 * np.log(design.options.like)
     sizes = []
@@ -193,7 +199,8 @@ def named_size(given: Rule, meter: int, liars: int, *, claims: Floats) -> float:
         own = float(design.prior.variance[bus[0]] + d)
         honest = given.deviations * np.sqrt(own) + float(given.model[meter])
         evidence = sigmas * np.sqrt(own) + float(given.model[meter])
-        sizes.append(max(np.sqrt(_worst(own, loose, cost, truth)), evidence) + honest)
+        rivals = (_worst(own, loose, each * price(p, 1), truth - others) for each, others in ways)
+        sizes.append(max(np.sqrt(max(rivals)), evidence) + honest)
     return float(min(sizes))
 
 

@@ -18,7 +18,7 @@ from gridsec.online import Frame
 from gridsec.plant import Plant
 from gridsec.sequential import LoadDoubt, SequentialDesign
 from gridsec.sequential.conditional import Fit, misfit
-from gridsec.sequential.dictionary import OF_A_LIAR
+from gridsec.sequential.dictionary import of_a_liar
 from gridsec.sequential.explain import Search, _linked
 from gridsec.sequential.scales import Scales, View, adapt, view_of
 from gridsec.sequential.search import Found, price
@@ -176,7 +176,7 @@ def test_a_street_is_turned_round_where_powers_are_accused_too() -> None:
         for each in made._turned(made._descend(now, np.zeros(count, dtype=bool), design.book)):
             liars, which = ~each.trusted, np.array(each.loosened, dtype=int)
             honest = each.trusted[book.meter[which]]
-            charge = np.where(honest, book.charge[which], OF_A_LIAR).sum() * price(count, 1)
+            charge = np.where(honest, book.charge[which], of_a_liar(liars.sum())).sum() * price(count, 1)
             told, full = told + bool(which.size), full + bool(honest.any())
             assert each.charge == pytest.approx(charge)
             assert each.cost == pytest.approx(cost(design, m, liars, each.loosened) + charge, rel=1e-6)

@@ -133,7 +133,7 @@ def _cost(
     trusted[list(accused)] = False
     if direction is None:
         return misfit(monitor.prior, given.noise[s], m, trusted) + price(p, len(accused))
-    charge = monitor.book.charges(np.array([direction]), trusted)[0] * price(p, 1)
+    charge = monitor.book.charges(np.array([direction]), trusted, len(accused))[0] * price(p, 1)
     loose = columns[:, [direction]]
     return misfit(monitor.prior, given.noise[s], m, trusted, loose) + price(p, len(accused)) + float(charge)
 

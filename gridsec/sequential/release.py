@@ -1,0 +1,141 @@
+"""What the trusted meters say where the powers that the others tell are not believed either.
+
+Who lies about the voltage may lie about its powers: the active power of customer k, whose meter is not
+trusted, by as much as the search allows for, evenly spread, and the reactive one by half of that. Whether it
+does is as likely as not, before the trusted meters are asked. With a its column of 2R, times the standard
+deviation of a false power, what they say is a Bayes factor,
+
+    log B_k = (a_T^T Q m)^2 / (2 (1 + a_T^T Q a_T)) - log(1 + a_T^T Q a_T) / 2,
+
+and the variance of what is false of k's power is that of a false one times ``B_k / (1 + B_k)``: where nobody
+feels this load its power is doubted for good, where many do and find nothing odd it is believed after all.
+With U the columns of 2R and 2X of all these customers, each times its standard deviation, the prior
+covariance of `gridsec.sequential.conditional` is ``S + U U^T``, hence
+
+    C = U - S_:T Q U_T,   G = I + U_T^T Q U_T,
+    w' = w + C G^-1 U_T^T Q m,   M' = M + C G^-1 C^T.
+
+References
+----------
+Sherman, Morrison and Woodbury's identity; Mitchell and Beauchamp 1988 (spike and slab); here each customer is
+asked as if no other lied about powers, and the mixture is taken for the normal distribution of the same
+variance. docs/theory-sequential.md, section 7.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.special import expit
+
+from gridsec.arrays import Floats, Ints
+from gridsec.network import Power
+from gridsec.sequential.bounds import FALSE_Q
+from gridsec.sequential.conditional import Fit, Judged
+from gridsec.sequential.effects import Effects
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Released:
+    """A fit in which liars' powers are not believed. n buses, p meters, l liars.
+
+    Attributes
+    ----------
+    fit
+        The fit, in which they are.
+    customers, sizes : (l,)
+        Whose powers, and by how much they may be false, pu.
+    share : (l,)
+        Part of the standard deviation of a false power that was reckoned with.
+    felt : (p, l)
+        What a false active power does to the trusted meters, as a standard deviation.
+    form : (l,)
+        ``a_T^T Q a_T``.
+    gain : (n, 2 l)
+        C G^-1.
+    seen : (p, 2 l)
+        U at the trusted meters; zero elsewhere.
+    variance : (n,)
+        Diagonal of M'.
+    """
+
+    fit: Fit
+    customers: Ints
+    sizes: Floats
+    share: Floats
+    felt: Floats
+    form: Floats
+    gain: Floats
+    seen: Floats
+    variance: Floats
+
+    def said(self, judged: Judged) -> Floats:
+        """w', (n,).
+
+        Parameters
+        ----------
+        judged
+            What the fit says.
+        """
+        return np.asarray(judged.w + self.gain @ (judged.weights @ self.seen))
+
+    def holds(self, fit: Fit, customers: Ints, sizes: Floats, judged: Judged) -> bool:
+        """Whether this is about what `release` would make of the same.
+
+        Parameters
+        ----------
+        fit, customers, sizes, judged
+            As there.
+        """
+        if not (fit is self.fit and np.array_equal(customers, self.customers)):
+            return False
+        share = _share(self.felt, self.form, judged)
+        same = (share <= _MORE * self.share) & (share >= _LESS * self.share)
+        return bool(same.all()) and np.array_equal(sizes, self.sizes)
+
+
+# Parts of a false power's standard deviation that are as good as one another; and the least.
+_MORE, _LESS, _LEAST = 1.25, 0.5, 0.125
+
+
+def release(effects: Effects, fit: Fit, customers: Ints, sizes: Floats, judged: Judged) -> Released:
+    """Doubt some customers' powers; O(n p l).
+
+    Parameters
+    ----------
+    effects
+        Of the feeder.
+    fit
+        The trusted meters.
+    customers, sizes : (l,)
+        Whose powers, and by how much the active ones may be false, pu.
+    judged
+        What the fit says.
+    """
+    prior, (at, inverse), std = fit.prior, fit.trusting(), sizes / np.sqrt(3.0)
+    scales = std, FALSE_Q * std
+    U = np.hstack([effects.columns(power, customers) * by for power, by in zip(Power, scales, strict=True)])
+    seen, known = np.zeros((2, prior.meters.size, U.shape[1]))
+    seen[at] = U[prior.meters[at]]
+    known[at] = inverse @ seen[at]
+    form = seen.T @ known
+    felt, alone = seen[:, : sizes.size].copy(), form.diagonal()[: sizes.size].copy()
+    share = _share(felt, alone, judged)
+    both = np.tile(share, 2)
+    U -= prior.of_meters @ known
+    if fit.loose.shape[1]:
+        U -= fit.loose @ (fit.loose[prior.meters].T @ known)
+    U, seen, form = U * both, seen * both, form * np.multiply.outer(both, both)
+    form[np.diag_indices(both.size)] += 1.0
+    gain = cho_solve(cho_factor(form, lower=True), U.T).T
+    variance = fit.variance + np.einsum("ij,ij->i", gain, U)
+    return Released(fit, customers, sizes, share, felt, alone, gain, seen, variance)
+
+
+def _share(felt: Floats, form: Floats, judged: Judged) -> Floats:
+    """Root of the probability that each power is false, (l,)."""
+    along = judged.weights @ felt
+    odds = 0.5 * (along**2 / (1.0 + form) - np.log1p(form))
+    return np.asarray(np.maximum(np.sqrt(expit(odds)), _LEAST))
