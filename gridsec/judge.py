@@ -109,7 +109,8 @@ def decide(now: Situation) -> tuple[Decision, Cause, str]:
 
 def _blind(now: Situation) -> tuple[Cause, str] | None:
     """What keeps anybody from being named."""
-    live, named = int(np.count_nonzero(now.live)), int(np.count_nonzero(now.named))
+    # Who is silent, named or not, neither says anything nor contradicts anybody.
+    live, named = int(np.count_nonzero(now.live)), int(np.count_nonzero(now.named & now.live))
     need = 2 * now.max_attacked + 1
     if not now.valid:
         reason = "The design's certificate does not hold for this feeder; nothing is guaranteed."

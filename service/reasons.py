@@ -34,15 +34,10 @@ def reason_of(site: Site, tick: Tick, max_attacked: int, verdict: Verdict) -> st
     named = _meters(site, suspects)
     if verdict.cause is Cause.RESIDUALS:
         who = _who(site, verdict.suspects, verdict.inverters)
-        return f"Manipulated: {who}; further off than meter accuracy and load uncertainty allow."
+        sure = f"Manipulated: {who}; further off than meter accuracy and load uncertainty allow."
+        return f"{sure} {_ways(site, verdict)}" if verdict.explanations else sure
     if verdict.cause is Cause.AMBIGUOUS and verdict.explanations:
-        ways = [
-            f"{_who(site, e.meters, e.inverters, e.powers)} ({e.probability:.0%})"
-            for e in verdict.explanations
-        ]
-        more = f" or {len(ways) - _SHOWN} more" if len(ways) > _SHOWN else ""
-        begin = "Several explanations fit" if len(ways) > 1 else "Only this explains the readings"
-        return f"{begin}: {' or else '.join(ways[:_SHOWN])}{more}."
+        return _ways(site, verdict)
     if verdict.cause is Cause.TOO_MANY_SUSPECTS and suspects:
         return (
             f"{len(suspects)} meters disagree with the feeder ({named}), and at most {max_attacked} can be "
@@ -53,6 +48,16 @@ def reason_of(site: Site, tick: Tick, max_attacked: int, verdict: Verdict) -> st
     if verdict.cause in {Cause.AMBIGUOUS, Cause.SILENT_METERS}:
         return _in_ids(site, verdict.reason)
     return verdict.reason
+
+
+def _ways(site: Site, verdict: Verdict) -> str:
+    """What may be the case, each with its share."""
+    ways = [
+        f"{_who(site, e.meters, e.inverters, e.powers)} ({e.probability:.0%})" for e in verdict.explanations
+    ]
+    more = f" or {len(ways) - _SHOWN} more" if len(ways) > _SHOWN else ""
+    begin = "Several explanations fit" if len(ways) > 1 else "Only this explains the readings"
+    return f"{begin}: {' or else '.join(ways[:_SHOWN])}{more}."
 
 
 def _meters(site: Site, which: Sequence[int]) -> str:

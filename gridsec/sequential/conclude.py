@@ -13,7 +13,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats
 from gridsec.judge import Situation, decide
-from gridsec.network import busbar_places, one_busbar
+from gridsec.network import busbar_places, by_place, one_busbar
 from gridsec.online import Cause, Decision, Estimate, Explanation, Frame, Verdict
 from gridsec.sequential.bounds import Bounded, Grounds, Powers
 from gridsec.sequential.conditional import judge
@@ -104,7 +104,8 @@ def conclude(
     )
     said = _contradicted(design, beyond & ~trust.named, trust.named, said)
     said = _unvouched(design, tick.busbar, live, said)
-    decision, cause, reason = _beside_meters(design, state, tick, amounts, said)
+    open_ = _open(design, state, said)
+    decision, cause, reason = _beside_meters(design, state, tick, amounts, open_, said)
     inverters = _inverters(design, state)
     verdict = Verdict(
         decision,
@@ -117,7 +118,7 @@ def conclude(
         inverters=inverters,
         inverter_attack=_injected(design, state, inverters, amounts),
         kinds=state.kinds.kinds,
-        explanations=tick.rivals or (state.curves.explanations(design) if cause is Cause.AMBIGUOUS else ()),
+        explanations=tick.rivals or open_,
         unjudged=design.unseen & ~(state.curves.heard | inverters),
     )
     return replace(state, released=released, last=(estimate, verdict)), estimate, verdict
@@ -147,7 +148,7 @@ def _estimate(
     design: SequentialDesign, state: SequentialState, tick: Tick
 ) -> tuple[Estimate, Released | None]:
     plant = design.plant
-    w, variance, released = _reconstructed(design, state, tick.seen, tick.frame.p_std)
+    w, variance, released = _reconstructed(design, state, tick)
     v2_bus = tick.v2_bus + w
     first = busbar_places(plant.feeder)
     v2_bus[first] = np.where(tick.busbar, tick.v0_squared, v2_bus[first])
@@ -205,15 +206,27 @@ def _unvouched(design: SequentialDesign, busbar: Bools | bool, live: Bools, said
     return Decision.UNDECIDED, Cause.TOO_FEW_METERS, sentence
 
 
-def _beside_meters(
-    design: SequentialDesign, state: SequentialState, tick: Tick, amounts: dict[int, float], said: _Said
+def _open(design: SequentialDesign, state: SequentialState, said: _Said) -> tuple[Explanation, ...]:
+    """What metered reactive powers leave open, whoever else is named."""
+    sure = state.trust.named if said[1] is Cause.RESIDUALS else np.zeros_like(state.trust.named)
+    return state.curves.explanations(design, sure) if said[1] in (*_MILD, Cause.RESIDUALS) else ()
+
+
+def _beside_meters(  # noqa: PLR0917  # what was found
+    design: SequentialDesign,
+    state: SequentialState,
+    tick: Tick,
+    amounts: dict[int, float],
+    open_: tuple[Explanation, ...],
+    said: _Said,
 ) -> _Said:
     """The answer, with what was found besides meters."""
     decision, cause, reason = said
     plant, inverters = design.plant, _inverters(design, state)
     owners = ", ".join(plant.feeder.customers[c] for c in plant.droop.customer[inverters])
-    if owners and cause is Cause.RESIDUALS:
-        return decision, cause, f"{reason[:-1]}; and the inverters of {owners}."
+    if cause is Cause.RESIDUALS:
+        reason = f"{reason[:-1]}; and the inverters of {owners}." if owners else reason
+        return decision, cause, f"{reason} {_ways(design, open_)}" if open_ else reason
     if cause not in _MILD:
         return said
     if owners:
@@ -222,7 +235,7 @@ def _beside_meters(
         )
         return Decision.ATTACKED, Cause.RESIDUALS, sentence
     sentence = ""
-    ways = tick.rivals or state.curves.explanations(design)
+    ways = tick.rivals or open_
     if ways:
         sentence = _ways(design, ways)
     elif amounts:
@@ -293,22 +306,22 @@ def _amounts(design: SequentialDesign, state: SequentialState, seen: Examined) -
 
 
 def _reconstructed(
-    design: SequentialDesign, state: SequentialState, seen: Examined, told: Floats | None
+    design: SequentialDesign, state: SequentialState, tick: Tick
 ) -> tuple[Floats, Floats, Released | None]:
-    """What the trusted meters add to the model at every bus, its variance, and what is kept of the work.
-
-    `told`, (N,) or None, are the standard deviations of powers that nobody told, NaN for all others: about
-    these nobody lies.
-    """
-    prior_ = state.doubts.prior
+    """What the trusted meters add to the model at every bus, its variance, and what is kept of the work."""
+    prior_, told = state.doubts.prior, tick.frame.p_std
     s, moved = _best(design, state)
-    now, view = (None, None) if s < 0 else (state.fits[s], seen.views[s])
+    now, view = (None, None) if s < 0 else (state.fits[s], tick.seen.views[s])
     if now is None:
         return np.zeros_like(prior_.variance), prior_.variance, None
     m = state.window.sums[s] / np.maximum(state.window.counts[s], 1)
     judged = judge(now, m) if view is None else view.judged
-    after = moved * prior_.variance + _hidden(state)
+    # The model begins at this reading of the busbar, a mean takes only its part of that one's jitter off.
+    jitter = (1.0 - 1.0 / design.lengths[s]) * design.flicker
+    flicker = by_place(design.plant.feeder, np.where(tick.busbar, jitter, 0.0))
+    after = moved * prior_.variance + _hidden(state) + flicker
     liars = design.plant.meters[~state.trust.trusted]
+    # Nobody lies about powers that nobody told, which are known by a standard deviation.
     liars = liars if told is None else liars[np.isnan(told[liars])]
     if not liars.size:
         return judged.w, now.variance + after, None

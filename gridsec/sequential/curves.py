@@ -22,6 +22,7 @@ chong2020 (16) to (18) for the curves; docs/theory-sequential.md, section 4.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
@@ -98,19 +99,28 @@ class Curves:
             self.heard,
         )
 
-    def explanations(self, design: SequentialDesign) -> tuple[Explanation, ...]:
-        """What may be the case where the voltages do not decide: that of the strangest customer."""
+    def explanations(self, design: SequentialDesign, named: Bools) -> tuple[Explanation, ...]:
+        """What may be the case where the voltages do not decide: that of the strangest customers.
+
+        Parameters
+        ----------
+        design
+            The design.
+        named : (p,)
+            Meters that are manipulated in any case.
+        """
         open_ = self.off & ~self.sure
         if self.idle or not open_.any():
             return ()
-        j = int(np.argmax(np.where(open_, np.abs(self.amount), -1.0)))
-        nobody, none = np.zeros_like(self.off), np.zeros_like(self.heard)
-        powers = np.zeros(design.customers, dtype=np.bool_)
-        powers[design.plant.meters[j]] = True
-        ways = (
-            Explanation(nobody, design.meter_of == j, float(self.share[j])),
-            Explanation(nobody, none, float(1.0 - self.share[j]), powers),
-        )
+        strange = np.argsort(-np.where(open_, np.abs(self.amount), -1.0), kind="stable")
+        who = np.sort(strange[: min(int(open_.sum()), _TOGETHER)])
+        ways = []
+        for wrong in product((True, False), repeat=who.size):
+            inverters = np.isin(design.meter_of, who[np.array(wrong)])
+            powers = np.zeros(design.customers, dtype=np.bool_)
+            powers[design.plant.meters[who[~np.array(wrong)]]] = True
+            each = np.where(wrong, self.share[who], 1.0 - self.share[who])
+            ways.append(Explanation(named, inverters, float(each.prod()), powers))
         likely = [way for way in ways if way.probability > 1.0 / design.options.like]
         return tuple(sorted(likely, key=lambda way: -way.probability))
 
@@ -127,6 +137,9 @@ def empty(meters: int, inverters: int) -> Curves:
     zero = np.zeros(meters)
     return Curves(np.zeros(meters, dtype=np.intp), no, zero, zero, no, np.zeros(inverters, dtype=np.bool_))
 
+
+# Customers whose reports or inverters are wrong, of all of which explanations tell.
+_TOGETHER = 3
 
 CONFIRM = 5
 """Ticks of the longest means that say which of both is wrong."""

@@ -112,6 +112,8 @@ class SequentialDesign:
         Standard deviation of the observed injections, pu.
     busbar
         Standard deviation of the squared busbar voltage, squared pu.
+    flicker
+        Variance of what its meter says from tick to tick, squared pu^2.
     lengths : (s,)
         Ticks of each scale.
     sigmas : (s,)
@@ -157,6 +159,7 @@ class SequentialDesign:
     prior: Prior
     injections: Floats
     busbar: float
+    flicker: float
     lengths: tuple[int, ...]
     sigmas: tuple[float, ...]
     suspect: float
@@ -248,6 +251,7 @@ def design(
         prior=known,
         injections=injections,
         busbar=busbar,
+        flicker=slope**2 * (accuracy.busbar_jitter**2 + accuracy.busbar_resolution**2 / 12.0),
         lengths=lengths,
         sigmas=sigmas,
         suspect=suspect,

@@ -82,6 +82,8 @@ class Doubts:
     sizes : (k,)
         How much there may be of whatever else is in the book of the design, pu: false powers are of the size
         of what the customers claim, rounded up.
+    heard
+        While no meter is heard: the same when one was, for the last time.
     """
 
     p: Floats
@@ -91,6 +93,7 @@ class Doubts:
     busbar: Bools | bool
     prior: Prior
     sizes: Floats
+    heard: Doubts | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

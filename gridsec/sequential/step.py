@@ -62,7 +62,7 @@ def step(
     at = design.plant.feeder.bus[design.plant.meters]
     frame = _powers(design, frame)
     heard = _clean(design, state, frame)
-    doubts = _doubts(design, state.doubts, frame, heard.busbar)
+    doubts = _doubted(design, state.doubts, frame, heard)
     if doubts is not state.doubts and doubts.prior is not state.doubts.prior:
         state = replace(state, fits=(None,) * len(state.fits))
     kinds = listen(design.shapes, state.kinds, heard.y, heard.live)
@@ -335,6 +335,19 @@ def _busbar(
 _MUCH_LESS = 4.0
 # Squared busbar voltage that is not metered: its standard deviation, squared pu.
 _UNMETERED = 0.1
+
+
+def _doubted(design: SequentialDesign, before: Doubts, frame: Frame, heard: _Heard) -> Doubts:
+    """What is not known at this frame, and of the residuals that are remembered.
+
+    Where no meter is heard there is no residual that was made with what this frame does not know: once one is
+    heard again, doubts go on as they were before.
+    """
+    last = before if before.heard is None else before.heard
+    if heard.live.any():
+        return _doubts(design, last, frame, heard.busbar)
+    found = _doubts(design, before, frame, heard.busbar)
+    return found if found.heard is last else replace(found, heard=last)
 
 
 def _doubts(design: SequentialDesign, before: Doubts, frame: Frame, busbar: Bools | bool) -> Doubts:

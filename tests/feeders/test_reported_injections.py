@@ -10,8 +10,10 @@ import pytest
 
 from feeders.estimators import design
 from feeders.load import load, names, to_frame
+from feeders.scenario import START
 from feeders.trials import Lie, LoadError, Meters, Trial, Trick, frames
 from gridsec import sequential
+from gridsec.attack import Bias
 from gridsec.online import Cause, Decision, Frame, Verdict
 from tests.feeders.test_adversarial import HIGH, LOW, Ends, World, default
 
@@ -47,6 +49,33 @@ def test_honest_errors_at_their_ends_never_accuse_an_inverter(name: str, step_s:
                     assert verdict.cause in {Cause.AGREEMENT, Cause.SETTLING}
                     true = (world.now.v_volt / world.volt) ** 2
                     assert (np.abs(estimate.v2 - true) <= estimate.bound).all()
+
+
+@pytest.mark.parametrize(("count", "liar"), [(1, 2), (2, None), (2, 2)])
+def test_all_are_told_of_whoever_else_lies(count: int, liar: int | None) -> None:
+    """Two inverters off their curves are both in an explanation; a named meter hides none of them."""
+    site = load("cigre-lv")
+    lie = Lie(Trick.INVERTER, count, 100.0)
+    trial = Trial(site, 0, duration_s=60.0, load_error=LoadError(0.1, 0.05), lie=lie, report_q=True)
+    honest = trial.scenario
+    owners = set(site.droop.customer[honest.inverter_attacks[0].inverters].tolist())
+    attacks = () if liar is None else (Bias(np.array([liar]), START + 30.0, START + 90.0, np.array([0.03])),)
+    watcher = design(trial.stated)
+    state = watcher.init(0.0)
+    for frame, _ in frames(trial, replace(honest, attacks=attacks)):
+        state, _, verdict = watcher.step(state, frame)
+    assert verdict.decision is (Decision.UNDECIDED if liar is None else Decision.ATTACKED)
+    assert np.flatnonzero(verdict.suspects).tolist() == ([] if liar is None else [liar])
+    assert all((way.meters == verdict.suspects).all() for way in verdict.explanations)
+    named = set(site.droop.customer[verdict.inverters].tolist())
+    told = [
+        named | set(site.droop.customer[way.inverters].tolist()) | set(np.flatnonzero(way.powers).tolist())
+        for way in verdict.explanations
+    ]
+    assert all(each == owners for each in told or [named])
+    assert all(site.feeder.customers[owner] in verdict.reason for owner in owners)
+    if told:
+        assert sum(way.probability for way in verdict.explanations) == pytest.approx(1.0, abs=0.05)
 
 
 def watched(
