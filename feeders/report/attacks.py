@@ -8,23 +8,39 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from feeders.lies import Trick
 from feeders.report.charts import LINES, Bar, Curve, Row, curves, rows
 from feeders.report.drawing import Drawing
 from feeders.report.figure import Figure
 from feeders.report.section import Question, Section
 from feeders.report.words import Finding, Sentence, Standing, Value, listed, number, plural
+from feeders.trials import Meters
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from feeders.load import Site
     from feeders.studies.campaign import Campaign
+    from feeders.studies.campaign_plan import Plan
     from feeders.trials import LoadError
 
 __all__ = ["campaign"]
 
 # What a page has room for; the files have all.
 _BY = {"by_kind": "kind", "by_size": "size", "by_place": "place", "by_liars": "liars"}
+_SIZES = (
+    "bias, scaling: % of nominal; drift: % of nominal a minute; replay: how old reports are, s; coordinated: "
+    "% of nominal by which the load that liars pretend moves the least affected of them; stuck: none"
+)
+_UNITS = {
+    **dict.fromkeys((Trick.BIAS, Trick.TOGETHER, Trick.SCALING, Trick.COORDINATED), " %"),
+    **{Trick.DRIFT: " %/min", Trick.REPLAY: " s", Trick.CLOCK_SHIFT: " s", Trick.INVERTER: " %"},
+}
+_ERRORS = {
+    Meters.SITE: "as the feeder's files say",
+    Meters.WHITE: "white noise of 0.2 %, nothing fixed",
+    Meters.REAL: "fixed within 0.5 %, and jitter of 0.05 %",
+}
 _SHOWN = (
     *("scenarios", "exact", "named", "named_low", "named_high", "false", "delay_median_s"),
     *("error_liars_worst", "error_others_worst", "undecided"),
@@ -53,6 +69,7 @@ def campaign(_: Site, found: Campaign) -> Section:
         shown={name: (by, *_SHOWN) if by == "kind" else ("kind", by, *_SHOWN) for name, by in _BY.items()}
         | {"scenarios": _SCENARIOS},
         columns={
+            "size": _SIZES,
             "exact": "share of scenarios in which all liars and nobody else were named",
             "named": "share of the liars that were named",
             "false": "share of scenarios in which somebody honest was named",
@@ -63,12 +80,13 @@ def campaign(_: Site, found: Campaign) -> Section:
             "undecided": "share of the time in which the monitor said that it cannot tell",
             "clean lying s": "for how long it said CLEAN although somebody lied",
             "reason": "why a scenario could not be played",
+            "per year": "false names a year, from so many hours without a lie; with limits for these few",
         },
         assumptions=(
             f"{plan.scenarios} scenarios of {plan.duration_s:g} s at {plan.step_s:g} s on days of profiles, "
             f"seed {plan.seed}; the truth is full AC power flow with the inverters in closed loop.",
-            f"Watched by the {plan.estimator} monitor, set for {rate:g} false alarms a year; powers known "
-            f"{_known(plan.load_error)}; errors of meters: {plan.meters}.",
+            f"Watched by the {plan.estimator} monitor, set for {rate:g} {plural(rate, 'false alarm')} a "
+            f"year; powers known {_known(plan.load_error)}; errors of meters: {_ERRORS[plan.meters]}.",
             "A simulated attack is one that somebody thought of: others may fare differently.",
         ),
     )
@@ -86,8 +104,8 @@ def _figures(found: Campaign, rate: float) -> tuple[Figure, ...]:
             "campaign-named",
             "Who is named, by what they do and how much",
             "Share of the liars that were named, with the interval that holds the true share in 95 of "
-            "100 cases; sizes are those of the table.",
-            partial(_named_chart, _at(found.by_size, rate)),
+            "100 cases; on the right how many of how many. Percentages on the left are of nominal voltage.",
+            partial(_named_chart, found.plan, _at(found.by_size, rate)),
         ),
         Figure(
             "campaign-delay",
@@ -99,8 +117,8 @@ def _figures(found: Campaign, rate: float) -> tuple[Figure, ...]:
         Figure(
             "campaign-error",
             "How wrong the voltage shown was",
-            "Largest error of the reconstructed voltage while somebody lied, % of nominal, by kind; "
-            "liars' own voltages and those of the others.",
+            "Largest error of the reconstructed voltage, % of nominal, by kind; liars' own voltages / those "
+            "of the others.",
             partial(_error_chart, _at(found.by_kind, rate)),
         ),
     )
@@ -151,10 +169,10 @@ def _missed(found: Campaign, rate: float) -> list[Sentence]:
     never = liars[~np.isfinite(liars["delay_s"].to_numpy())]
     delay = liars["delay_s"][np.isfinite(liars["delay_s"].to_numpy())]
     soon = (
-        f" Those named were named within {number(float(delay.median()), 1)} s (median)." if len(delay) else ""
+        f" Of the others, half were named within {number(float(delay.median()), 1)} s." if len(delay) else ""
     )
     if never.empty:
-        return [(f"None was missed.{soon}",)]
+        return [(f"None was missed.{soon.replace('Of the others, half', 'Half')}",)]
     total = liars.groupby("kind").size()
     kinds = [f"{kind} ({count} of {total[kind]})" for kind, count in never.groupby("kind").size().items()]
     missed = Value(len(never), str(len(never)), "campaign-liars:delay_s:infinite")
@@ -180,13 +198,16 @@ def _open(played: pd.DataFrame, impossible: int) -> list[Sentence]:
     """What the monitor did not say, and what could not be tried."""
     out: list[Sentence] = []
     total, clean = float(played["undecided_s"].sum()), float(played["clean_lying_s"].sum())
+    watched = float(played["watched_s"].sum())
     out.append(
         (
-            "In all it said UNDECIDED for ",
+            "Of ",
+            Value(watched, f"{number(watched, 0)} s", "campaign-scenarios:watched_s:sum"),
+            " watched, it said UNDECIDED for ",
             Value(total, f"{number(total, 0)} s", "campaign-scenarios:undecided_s:sum"),
             ", and CLEAN for ",
             Value(clean, f"{number(clean, 0)} s", "campaign-scenarios:clean_lying_s:sum"),
-            " in which somebody lied and was not seen yet, or never.",
+            " in which somebody lied who was not noticed yet, or never.",
         )
     )
     if impossible:
@@ -210,7 +231,8 @@ def _percent(share: float) -> str:
     return f"{text} %"
 
 
-def _named_chart(table: pd.DataFrame, width: float) -> Drawing:
+def _named_chart(plan: Plan, table: pd.DataFrame, width: float) -> Drawing:
+    tricks = {kind.name: kind for kind in plan.kinds}
     data = []
     for row in table[table["liars_told"] > 0].to_dict("records"):
         share, low, high = (100.0 * float(row[name]) for name in ("named", "named_low", "named_high"))
@@ -219,7 +241,11 @@ def _named_chart(table: pd.DataFrame, width: float) -> Drawing:
             Bar(low, high, "fill-ink", "95 % interval", f"{low:.0f} to {high:.0f} %", inset=8.4),
         )
         told = int(row["liars_told"])
-        data.append(Row(f"{row['kind']} {row['size']:g}", bars, f"{round(share * told / 100.0)} of {told}"))
+        kind = tricks.get(row["kind"])
+        # Sizes of kinds in volts are factors.
+        unit = "" if kind is None or kind.volts or kind.together else _UNITS.get(kind.trick, "")
+        size = "" if kind is not None and kind.trick is Trick.STUCK else f" {row['size']:g}{unit}"
+        data.append(Row(f"{row['kind']}{size}", bars, f"{round(share * told / 100.0)} of {told}"))
     return rows(data, width, axis="liars named, %")
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -54,7 +54,14 @@ class Row:
     tip: str = ""
 
 
-def rows(data: Sequence[Row], width: float, *, axis: str, start: float = 0.0) -> Drawing:
+def rows(
+    data: Sequence[Row],
+    width: float,
+    *,
+    axis: str,
+    start: float = 0.0,
+    limits: Mapping[str, Sequence[float]] | None = None,
+) -> Drawing:
     """Draw rows of bars over one axis.
 
     Parameters
@@ -67,6 +74,8 @@ def rows(data: Sequence[Row], width: float, *, axis: str, start: float = 0.0) ->
         What the axis is, with its unit.
     start
         Where the axis begins.
+    limits
+        Values with a line through all rows, by what they mean; those beyond the axis are left out.
     """
     left = min(max((width_of(row.label, _LETTERS) for row in data), default=0.0), 0.36 * width) + 12.0
     right = max((width_of(row.shown, _LETTERS) for row in data), default=0.0) + 14.0
@@ -92,6 +101,10 @@ def rows(data: Sequence[Row], width: float, *, axis: str, start: float = 0.0) ->
         marks.append(Text(at(furthest) + 6.0, y + 12.5, row.shown, "text", size=_LETTERS))
     marks += [Text(at(v), bottom + 15.0, _tick(v, steps), "quiet", "middle", _LETTERS) for v in steps]
     meanings = {bar.meaning: bar.look for row in data for bar in row.bars}
+    for meaning, values in (limits or {}).items():
+        inside = [v for v in values if start <= v <= end]
+        marks += [Line(((at(v), 24.0), (at(v), bottom)), "limit", meaning) for v in inside]
+        meanings |= dict.fromkeys([meaning] * len(inside), "limit")
     extra, height = _legend(meanings, bottom + 24.0, width) if len(meanings) > 1 else ([], bottom + 24.0)
     return Drawing(width, height, (*marks, *extra))
 

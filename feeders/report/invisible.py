@@ -50,6 +50,9 @@ def redundancy(site: Site, found: Redundancy) -> Section:
             "patterns": "dimensions in which a lie can hide",
             "detected, identified": "most liars that cannot hide, and that can be told who they are",
             "critical": "without this meter nobody else sees some pattern",
+            "identified without": "most liars that are identified by the others once this meter is silent",
+            "with": "meters that it can stay invisible together with, by an attack whose effect stays",
+            "branch": "whether the part begins at the busbar",
             "blind": "customers whose voltage no meter tells, whoever lies",
         },
         assumptions=(
@@ -70,15 +73,16 @@ def _invisible(found: Redundancy) -> Finding:
         kind = (
             "by attacks whose effect stays"
             if row["attack"] == "persistent"
-            else "counting also attacks that the inverters forget within seconds"
+            else "by any attack, those included that the inverters forget within seconds"
         )
+        by = f"B{kind[1:]}"
         prefix = "" if case == "all live" else f"Without {listed(found.silent)}: "
         if math.isnan(index):
             open_ = True
             gave_up = "how many liars it takes is not proved: the search gave up. Some may well be able to"
-            sentences.append((f"{prefix}{kind}, {gave_up}.",))
+            sentences.append((f"{prefix}{by}, {gave_up}.",))
         elif math.isinf(index):
-            sentences.append((f"{prefix}No number of liars can stay invisible, {kind}.",))
+            sentences.append((f"{prefix}{by}, no number of liars can stay invisible.",))
         else:
             who = f": {listed(str(row['liars']).split(' '))}" if row["liars"] else ""
             verb = "liar can" if index == 1 else "liars together can"
@@ -86,7 +90,7 @@ def _invisible(found: Redundancy) -> Finding:
                 (
                     prefix,
                     value,
-                    f" {verb} stay invisible, {kind}{who}{'' if index == 1 else '; fewer cannot'}.",
+                    f" {verb} stay invisible {kind}{who}{'' if index == 1 else '; fewer cannot'}.",
                 )
             )
         if row["blind"]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -19,6 +19,10 @@ if TYPE_CHECKING:
 __all__ = ["Placed", "has_places", "place"]
 
 Point = tuple[float, float]
+
+FEW: Final = 8
+"""Maps of so many customers at most get no more than HALF_PAGE, px: two of them, with captions, fit on A4."""
+HALF_PAGE: Final = 400.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +91,10 @@ def _real(site: Site, width: float) -> Placed:
         span = np.ptp(xy, axis=0)
     pad = 34.0
     span = np.where(span > 0.0, span, 1.0)
-    height = min(max(240.0, (width - 2 * pad) * float(span[1] / span[0]) + 2 * pad), 0.5 * width + 180.0)
+    most = 0.5 * width + 180.0
+    if site.feeder.bus.size <= FEW:
+        most = min(most, HALF_PAGE)
+    height = min(max(240.0, (width - 2 * pad) * float(span[1] / span[0]) + 2 * pad), most)
     factor = min((width - 2 * pad) / span[0], (height - 2 * pad) / span[1])
     low = xy.min(axis=0)
     x = 0.5 * (width - factor * span[0]) + factor * (xy[:, 0] - low[0])

@@ -12,13 +12,17 @@ from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
+from itertools import pairwise
 from typing import TYPE_CHECKING, Final
+
+import numpy as np
 
 from feeders.report.drawing import STEPS, Area, Disc, Drawing, Line, Mark, Text, regular, width_of
 from feeders.report.layout import Placed, place
 
 if TYPE_CHECKING:
     from feeders.load import Site
+    from gridsec.arrays import Floats
 
 __all__ = ["Scale", "Shape", "Spot", "draw_map", "legend_of", "steps_of"]
 
@@ -234,7 +238,11 @@ Box = tuple[float, float, float, float]
 
 
 def _labels(spots: Sequence[Spot], at: Placed, size: float, top: float) -> list[Mark]:
-    """Labels where there is room: right, left, below, above, in this order; those of trees below first."""
+    """Labels where there is room, off the lines if possible: right, left, below, above, in this order.
+
+    Those of trees are below first.
+    """
+    lit = np.array([(*a, *b) for wire in (*at.wires, *at.ties, *at.drops) for a, b in pairwise(wire)])
     taken: list[Box] = [_around(x, y, size) for x, y in at.customers]
     marks: list[Mark] = []
     letters = 11.0
@@ -250,6 +258,7 @@ def _labels(spots: Sequence[Spot], at: Placed, size: float, top: float) -> list[
             "above": (x, y - away, "middle", x - 0.5 * long),
         }
         wanted = ("right", "left", "below", "above") if at.real else ("below", "right")
+        free: list[tuple[Text, Box]] = []
         for name in wanted:
             tx, ty, anchor, left = places[name]
             box = (left, ty - 9.0, left + long, ty + 2.0)
@@ -257,14 +266,29 @@ def _labels(spots: Sequence[Spot], at: Placed, size: float, top: float) -> list[
                 box[0] >= 1.0 and box[2] <= at.width - 1.0 and box[1] >= top and box[3] <= at.height + 6.0
             )
             if inside and not any(_overlap(box, other) for other in taken):
-                taken.append(box)
-                marks.append(Text(tx, ty, spots[k].label, "label", anchor, letters))
-                break
+                free.append((Text(tx, ty, spots[k].label, "label", anchor, letters), box))
+        if free:
+            mark, box = next((each for each in free if not _crossed(each[1], lit)), free[0])
+            taken.append(box)
+            marks.append(mark)
     return marks
 
 
 def _around(x: float, y: float, r: float) -> Box:
     return (x - r, y - r, x + r, y + r)
+
+
+def _crossed(box: Box, lines: Floats) -> bool:
+    """Whether any of the lines, (n, 4) from x, y to x, y, crosses a box."""
+    if not lines.size:
+        return False
+    x0, y0, x1, y1 = lines.T
+    near = (np.minimum(x0, x1) < box[2]) & (np.maximum(x0, x1) > box[0])
+    near &= (np.minimum(y0, y1) < box[3]) & (np.maximum(y0, y1) > box[1])
+    # A line misses a box that it is near to where all corners are on one side of it.
+    sides = [(x1 - x0) * (y - y0) - (y1 - y0) * (x - x0) for x in box[::2] for y in box[1::2]]
+    apart = (np.min(sides, axis=0) > 0.0) | (np.max(sides, axis=0) < 0.0)
+    return bool(np.any(near & ~apart))
 
 
 def _overlap(a: Box, b: Box) -> bool:

@@ -12,7 +12,7 @@ from feeders.report.drawing import Drawing
 from feeders.report.figure import Figure
 from feeders.report.maps import Shape, Spot, draw_map
 from feeders.report.section import Question, Section
-from feeders.report.spots import names_of, single_phase, size_map
+from feeders.report.spots import comparable, names_of, single_phase, size_map
 from feeders.report.words import (
     Finding,
     Sentence,
@@ -52,67 +52,79 @@ def detectable(site: Site, found: Detectable) -> Section:
     site, found
         The feeder, and what was found.
     """
-    liars, sure = found.max_attacked, _sure(found.risk)
-    (meters, unit), (customers, _) = (_comparable(site, each) for each in (found.meters, found.customers))
+    once, twice = _sure(found.risk), _sure(2.0 * found.risk)
     return Section(
         title="How large a lie must be",
         answers={
-            Question.LIES: _sizes(found.meters, liars, sure),
-            Question.PICTURE: _picture(site, found.customers, liars, _sure(2.0 * found.risk)),
+            Question.LIES: _sizes(site, found.meters, found.max_attacked, (once, twice)),
+            Question.PICTURE: _picture(site, found.customers, found.max_attacked, twice),
         },
-        figures=(
-            Figure(
-                "detectable-sizes",
-                "What becomes of a lie, by its size",
-                f"Each meter lying together with at most {liars - 1} more. Left: nobody is named. "
-                "Middle: it depends on the honest errors of the moment. From the end of the last bar on no "
-                f"other explanation than the lying meter is left.{_largest_only(meters)}",
-                partial(_sizes_chart, meters, unit=unit),
-            ),
-            Figure(
-                "detectable-map",
-                "Where lies may stay unnoticed",
-                f"Size from which a lie is surely noticed, {unit}, {liars} {plural(liars, 'liar')} together. "
-                f"Larger discs, larger lies. Largest at {_extreme(meters, 'meter', 'noticed')}.",
-                partial(size_map, site, meters, who="meter", column="noticed", unit=unit),
-            ),
-            Figure(
-                "detectable-picture",
-                "How wrong the picture of the voltage can be",
-                f"Largest error of each customer's reconstructed voltage under {liars} unnoticed "
-                f"{plural(liars, 'liar')}, {unit}. Largest at {_extreme(customers, 'customer', 'error')}.",
-                partial(size_map, site, customers, who="customer", column="error", unit=unit),
-            ),
-        ),
+        figures=_size_figures(site, found, once, twice),
         tables=found.tables,
         columns={
-            "hidden": f"up to this, V, with probability {sure} at any one moment, nobody is named",
-            "noticed": "beyond this somebody is beyond a limit, with that probability",
+            "hidden": f"up to this, V, with probability {once} at any one moment, nobody is named",
+            "noticed": "beyond this somebody is beyond a limit of the monitor, with that probability",
             "named": "beyond this no other explanation is a rival, whoever else lies, with probability "
-            f"{_sure(2.0 * found.risk)} at any one moment",
+            f"{twice} at any one moment",
             "fits": "up to this the readings are those of some honest feeder, all errors at their worst: "
             "no test without false alarms can object",
             "identified": "beyond this every explanation by so few liars accuses the meter",
             "… alone": "the same without accomplices",
-            "error": "largest error of the monitor's reconstructed voltage, V, with probability "
-            f"{_sure(2.0 * found.risk)} for each customer at any one moment",
+            "error": f"largest error of the monitor's reconstructed voltage, V, with probability {twice} for "
+            "each customer at any one moment",
             "error fits": "how far apart two voltages can be that fit to the same readings, V",
         },
-        assumptions=(
-            f"At most {liars} {plural(liars, 'meter lies', 'meters lie')} together; liars know the feeder, "
-            "but not the honest errors of the moment.",
-            "Sequential monitor, before it has learned the fixed errors of its meters; "
-            f"{'balanced' if single_phase(site) else 'three-phase'} model; "
-            "inverters in their deadbands; nominal voltage.",
-            f"Sizes for the monitor hold with {sure} at any one moment: honest errors Gaussian or uniform "
-            f"with the deviations of the files, and every load draws {100.0 * found.share:g} % of its peak. "
-            "Powers of customers without a meter are unknown within what they can draw and feed in.",
-            "Proofs are for the linear effect of errors of loads; AC power flow was only simulated.",
-            "That the monitor, once it looks, finds the liar, and that it goes on to, is not proved but was "
-            "checked by simulation (gridsec study detectable --trials, and campaigns).",
-            "Where the search for the worst collusion was cut short, sizes are what was proved until there: "
-            "on the safe side.",
+        assumptions=_assumed(site, found, once),
+    )
+
+
+def _size_figures(site: Site, found: Detectable, once: str, twice: str) -> tuple[Figure, ...]:
+    liars = found.max_attacked
+    (meters, unit), (customers, _) = (comparable(site, each) for each in (found.meters, found.customers))
+    together = "alone" if liars == 1 else f"together with at most {liars - 1} more"
+    return (
+        Figure(
+            "detectable-sizes",
+            "What becomes of a lie, by its size",
+            f"Each meter lying {together}. Left: nobody is named. Middle: it depends on the honest errors of "
+            "the moment. Right: noticed, but another meter may be blamed. Beyond the number no explanation "
+            f"without the lying meter is left.{_largest_only(meters)}",
+            partial(_sizes_chart, meters, unit=unit),
         ),
+        Figure(
+            "detectable-map",
+            "Where lies may stay unnoticed",
+            f"Size from which a lie is noticed with {once}, {unit}, {liars} {plural(liars, 'liar')}"
+            f"{' together' * (liars > 1)}. Larger discs, larger lies. "
+            f"Largest at {_extreme(meters, 'meter', 'noticed')}.",
+            partial(size_map, site, meters, who="meter", column="noticed", unit=unit),
+        ),
+        Figure(
+            "detectable-picture",
+            "How wrong the picture of the voltage can be",
+            f"Largest error of each customer's reconstructed voltage, with {twice}, under {liars} unnoticed "
+            f"{plural(liars, 'liar')}, {unit}. Largest at {_extreme(customers, 'customer', 'error')}.",
+            partial(size_map, site, customers, who="customer", column="error", unit=unit),
+        ),
+    )
+
+
+def _assumed(site: Site, found: Detectable, once: str) -> tuple[str, ...]:
+    liars = found.max_attacked
+    return (
+        f"At most {liars} {plural(liars, 'meter lies', 'meters lie together')}; liars know the feeder, but "
+        "not the honest errors of the moment.",
+        "Sequential monitor, before it has learned the fixed errors of its meters; "
+        f"{'balanced' if single_phase(site) else 'three-phase'} model; "
+        "inverters in their deadbands; nominal voltage.",
+        f"Sizes for the monitor hold with {once} at any one moment: honest errors Gaussian or uniform "
+        f"with the deviations of the files, and every load draws {100.0 * found.share:g} % of its peak. "
+        "Powers of customers without a meter are unknown within what they can draw and feed in.",
+        "Proofs are for the linear effect of errors of loads; AC power flow was only simulated.",
+        "That the monitor, once it looks, finds the liar, and that it goes on to, is not proved but was "
+        "checked by simulation (gridsec study detectable --trials, and campaigns).",
+        "Where the search for the worst collusion was cut short, sizes are what was proved until there: "
+        "on the safe side.",
     )
 
 
@@ -120,18 +132,9 @@ def _sure(risk: float) -> str:
     return f"{100.0 * (1.0 - risk):.6g} %"
 
 
-def _comparable(site: Site, table: pd.DataFrame) -> tuple[pd.DataFrame, str]:
-    """A table of volts and their unit: in parts of the nominal voltage where there are several."""
-    if bool((site.nominal_volt == site.nominal_volt[0]).all()):
-        return table, "V"
-    nominal = dict(zip(site.feeder.customers, site.customer_nominal, strict=True))
-    share = 100.0 / table["customer"].map(nominal).astype(float)
-    sizes = table.select_dtypes("number").mul(share, axis="index")
-    return table.assign(**{str(name): sizes[name] for name in sizes}), "% of nominal"
-
-
-def _sizes(meters: pd.DataFrame, liars: int, sure: str) -> Finding:
+def _sizes(site: Site, meters: pd.DataFrame, liars: int, sure: tuple[str, str]) -> Finding:
     name = "detectable-meters"
+    levels = f" Volts are those of each meter's own level{_percent(site)}." if _percent(site) else ""
     together = "alone" if liars == 1 else f"with up to {liars} lying together"
     never = meters[[math.isinf(v) or math.isnan(v) for v in meters["noticed"]]]
     lead: Sentence = (
@@ -141,7 +144,8 @@ def _sizes(meters: pd.DataFrame, liars: int, sure: str) -> Finding:
         least(meters, name, "hidden", "V", digits=3, side=Side.BELOW),
         f" ({_extreme(meters, 'meter', 'hidden', smallest=True)}) to ",
         most(meters, name, "hidden", "V", digits=3, side=Side.BELOW),
-        f" ({_extreme(meters, 'meter', 'hidden')}) nobody is named, with {sure} at any one moment.",
+        f" ({_extreme(meters, 'meter', 'hidden')}) nobody is named, with {sure[0]} at any one moment.",
+        levels,
     )
     if len(never):
         noticed: Sentence = (
@@ -150,8 +154,8 @@ def _sizes(meters: pd.DataFrame, liars: int, sure: str) -> Finding:
         )
         return Finding(Standing.PART, (lead, noticed))
     noticed = (
-        "Larger lies may go unnoticed, depending on the honest errors of the moment; somebody is beyond a "
-        "limit, as surely, from ",
+        "Larger lies may go unnoticed too, depending on the honest errors of the moment. Somebody is beyond "
+        "a limit of the monitor, as surely, from ",
         least(meters, name, "noticed", "V", side=Side.ABOVE),
         f" ({_extreme(meters, 'meter', 'noticed', smallest=True)}) to ",
         most(meters, name, "noticed", "V", side=Side.ABOVE),
@@ -161,12 +165,12 @@ def _sizes(meters: pd.DataFrame, liars: int, sure: str) -> Finding:
         named: Sentence = ("Not every liar is proved to be named, however large the lie.",)
         return Finding(Standing.PART, (lead, noticed, named))
     named = (
-        "No explanation but the lying meter is left from ",
+        "No explanation without the lying meter is left from ",
         least(meters, name, "named", "V", side=Side.ABOVE),
         " to ",
         most(meters, name, "named", "V", side=Side.ABOVE),
-        " on. That much is proved; that the monitor's search then finds and names it is not, but was "
-        "checked by simulation.",
+        f" on, with {sure[1]}. That much is proved; that the monitor's search then finds and names it is "
+        "not, but was checked by simulation.",
     )
     return Finding(Standing.PART, (lead, noticed, named))
 
@@ -229,14 +233,14 @@ def _sizes_chart(meters: pd.DataFrame, width: float, *, unit: str) -> Drawing:
                 b,
                 "band0",
                 "it depends on honest errors",
-                f"surely noticed from {number(row['noticed'], 2, Side.ABOVE)} {unit} on",
+                f"noticed from {number(row['noticed'], 2, Side.ABOVE)} {unit} on",
             ),
             Bar(
                 b,
                 max(b, c),
                 "band2",
-                "noticed, not yet surely named",
-                f"named from {number(row['named'], 2, Side.ABOVE)} {unit} on",
+                "noticed, another may be blamed",
+                f"no explanation without it from {number(row['named'], 2, Side.ABOVE)} {unit} on",
             ),
         )
         data.append(Row(str(row["meter"]), bars, f"{number(row['named'], 2, Side.ABOVE)} {unit[0]}"))
@@ -273,9 +277,9 @@ def protect(site: Site, found: Protect) -> Section:
         ),
         tables=found.tables,
         columns={
-            "before, after": "largest hidden lie, V of the busbar's level"
+            "before, after": "largest hidden lie, V of the busbar's level, without and with protection"
             if found.goal.in_volts
-            else "fewest liars that stay invisible, without and with protection",
+            else "fewest liars that stay invisible, without and with protection; ∞: none can, however many",
             **({"alone": ALONE, "lie volt": "what was asked, V"} if found.goal.in_volts else {}),
             "least": "no fewer protected meters suffice",
             "attacks": "in how many of the listed attacks the meter takes part",
@@ -295,7 +299,9 @@ def protect(site: Site, found: Protect) -> Section:
     )
 
 
-ALONE = "largest lie, V, that one meter hides by itself within honest errors, its powers being true"
+ALONE = (
+    "largest lie, V, that one unprotected meter hides by itself within honest errors, its powers being true"
+)
 
 
 def _no_protection(found: Protect) -> Finding:
@@ -324,10 +330,10 @@ def _protection(site: Site, found: Protect) -> Finding:
     purpose = {
         Goal.IDENTIFY: f"{others}{among} would be identified",
         Goal.NOTICE: f"the lies of {others}{among} would be noticed",
-        Goal.BOUND: f"no lie above {number(found.lie_volt)} V{there} of {others} fits to an honest feeder, "
-        "if all powers are reported truly",
-        Goal.CONTAIN: f"no lie above {number(found.lie_volt)} V{there} of {others} fits to an honest feeder, "
-        "whatever powers they report",
+        Goal.BOUND: f"no lie above {number(found.lie_volt)} V{there} of {others}{among} fits to an honest "
+        "feeder, if all powers are reported truly",
+        Goal.CONTAIN: f"no lie above {number(found.lie_volt)} V{there} of {others}{among} fits to an honest "
+        "feeder, whatever powers they report",
     }[found.goal]
     scope = "" if found.goal.in_volts else " by someone who knows all other loads and errors exactly"
     if not count:
@@ -340,19 +346,7 @@ def _protection(site: Site, found: Protect) -> Finding:
             f" of {site.meters.size} meters: {listed(found.meters['meter'].tolist())}. "
             f"Then {purpose}{scope}.",
         )
-    effect: Sentence = (
-        "Largest lie that can hide: " if found.goal.in_volts else "Fewest liars that stay invisible: ",
-        _cell(found.before, "protect-summary:before:row 0", found.goal),
-        " before, ",
-        _cell(found.after, "protect-summary:after:row 0", found.goal),
-        " after.",
-    )
-    if not math.isnan(found.alone):
-        effect += (
-            " A meter hides up to ",
-            _cell(found.alone, "protect-summary:alone:row 0", found.goal),
-            " by itself with its powers true, whatever others are protected.",
-        )
+    effect = _effect(found)
     proof: Sentence = ("No fewer suffice; other choices of as many may be as good.",)
     # What is proved in volts is proved for the linear effect of errors.
     sure = Standing.PART if found.gap or found.goal.in_volts else Standing.PROVED
@@ -368,12 +362,27 @@ def _protection(site: Site, found: Protect) -> Finding:
     return Finding(sure, (lead, effect, proof))
 
 
-def _cell(value: float, source: str, goal: Goal) -> Value:
+def _effect(found: Protect) -> Sentence:
+    """What protection changes."""
+    before, after, alone = (
+        Value(value, _cell(value, found.goal), f"protect-summary:{name}:row 0")
+        for name, value in (("before", found.before), ("after", found.after), ("alone", found.alone))
+    )
+    if found.goal.in_volts:
+        lead: Sentence = ("Largest lie that can hide: ", before, " without protection, ", after, " with it.")
+        if math.isnan(found.alone):
+            return lead
+        return (*lead, " Unprotected, one meter hides up to ", alone, " by itself with its powers true.")
+    lead = ("Fewest liars that stay invisible: ", before, " without protection, ", after, " with it")
+    return (*lead, ", however many lie." if math.isinf(found.after) else ".")
+
+
+def _cell(value: float, goal: Goal) -> str:
     if math.isnan(value):
-        return Value(value, "not known", source)
+        return "not known"
     if goal.in_volts:
-        return Value(value, f"{number(value, 2, Side.ABOVE)} V", source)
-    return Value(value, "none, however many" if math.isinf(value) else number(value), source)
+        return f"{number(value, 2, Side.ABOVE)} V"
+    return "none" if math.isinf(value) else number(value)
 
 
 def _protect_map(site: Site, chosen: set[Any], width: float) -> Drawing:

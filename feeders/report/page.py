@@ -34,15 +34,24 @@ MOST_COLUMNS: Final = 13
 """It shows so many columns at most, and more than FEW_COLUMNS in small print."""
 FEW_COLUMNS: Final = 8
 OPEN_ROWS: Final = 14
-"""Tables up to this many rows are open."""
+"""Tables up to this many rows are open, and printed."""
+LOST_ROWS: Final = 40
+"""The same of what a conversion did not carry over."""
+LONG_WORD: Final = 24
+"""Words of tables that are longer may be broken on paper."""
+DIGITS: Final = 4
+"""Numbers of tables have so many significant digits, and decimals, at most."""
 MOST_ROWS: Final = 500
 HEAD_ROWS: Final = 60
 """Of tables with more than MOST_ROWS rows the page shows the first ones; the files beside it have all."""
 
 MEANING: Final = (
-    "Proved: follows from the feeder's model under the assumptions that each section states. Measured: seen "
-    "in simulation or in readings. Not proved, no answer, not studied: it may be either way."
+    "Proved: follows from the feeder's model under the assumptions that each section states. Partly proved: "
+    "some of it does, or follows from the linear model only; the answer says what. Measured: seen in "
+    "simulation or in readings. Not proved, no answer, not studied: it may be either way."
 )
+
+UNKNOWN: Final = "not known, or nothing to be known: it was not asked, or there was no case of it"
 
 MARK: Final = Markup(
     '<svg viewBox="0 0 24 24" aria-hidden="true"><path d="M3 4v16M3 8h11M3 16h7"/>'
@@ -149,7 +158,12 @@ def _front(title: str, facts: Mapping[str, str], chapters: Sequence[Chapter], ab
         "section",
         el("div", MARK, "gridsec", class_="brand"),
         el("h1", title),
-        el("p", f"How far its meters can be trusted. {few}. {about.made}", class_="lead"),
+        el(
+            "p",
+            f"How far its meters can be trusted. {few}. ",
+            el("span", about.made, class_="once"),
+            class_="lead",
+        ),
         el("ul", [_answer(*each) for each in _answers(chapters)], class_="answers"),
         el("p", MEANING, class_="meaning"),
         class_="card front",
@@ -227,7 +241,7 @@ def _feeder(facts: Mapping[str, str], chart: Figure, source: Sequence[Markup]) -
 def _origin(origin: Origin, folder: str) -> list[Markup]:
     """What a conversion did not carry over, and what that does to the voltages."""
     fates = [f"{count} {fate}" for fate, count in origin.changes["done"].value_counts(sort=False).items()]
-    table = _table(FEEDER, CONVERSION, origin.changes, folder, ())
+    table = _table(FEEDER, CONVERSION, origin.changes, folder, (), most_open=LOST_ROWS)
     return [
         el("h3", "What was not carried over from its source"),
         el(
@@ -254,7 +268,8 @@ def _chapter(chapter: Chapter, folder: str) -> Markup:
         for question, finding in told.answers.items()
     ]
     pill = [_standing(finding) for finding in told.answers.values()] if alone else None
-    meanings = [join([el("dt", name), el("dd", text)]) for name, text in told.columns.items()]
+    columns = {**told.columns, **({"?": UNKNOWN} if _has_gaps(told.tables) else {})}
+    meanings = [join([el("dt", name), el("dd", text)]) for name, text in columns.items()]
     return el(
         "section",
         el("div", el("h2", told.title), pill, class_="head"),
@@ -269,7 +284,7 @@ def _chapter(chapter: Chapter, folder: str) -> Markup:
         el("h3", "What was assumed") if told.assumptions else None,
         el("ul", [el("li", each) for each in told.assumptions], class_="plain") if told.assumptions else None,
         el("h3", "To run it again") if outcome.command else None,
-        el("pre", outcome.command) if outcome.command else None,
+        _command(outcome.command) if outcome.command else None,
         class_="card",
         id=_id(outcome.study),
     )
@@ -291,9 +306,18 @@ def _figure(figure: Figure) -> Markup:
     return el("figure", caption, drawings, id=figure.name)
 
 
-def _table(study: str, name: str, table: pd.DataFrame, folder: str, chosen: Sequence[str]) -> Markup:
+def _table(
+    study: str,
+    name: str,
+    table: pd.DataFrame,
+    folder: str,
+    chosen: Sequence[str],
+    *,
+    most_open: int = OPEN_ROWS,
+) -> Markup:
     """A table; long ones are closed, and what is too long or too wide for a page stays in its file."""
-    said = [column for column in table.columns if table.empty or not table[column].map(_silent).all()]
+    own = [column for column in table.columns if column != FEEDER]  # the page is about one
+    said = [column for column in own if table.empty or not table[column].map(_silent).all()]
     kept = [column for column in chosen or said if column in said][:MOST_COLUMNS]
     shown = table[kept].head(len(table) if len(table) <= MOST_ROWS else HEAD_ROWS)
     numeric = {column: _numeric(shown[column]) for column in kept}
@@ -306,19 +330,27 @@ def _table(study: str, name: str, table: pd.DataFrame, folder: str, chosen: Sequ
         )
         for column in kept
     ]
-    body = [el("tr", [_td(cell) for cell in row]) for row in shown.itertuples(index=False, name=None)]
-    crowded = "wide" if len(kept) > FEW_COLUMNS else None
+    decimals = [_decimals(shown[column]) for column in kept]
+    body = [
+        el("tr", [_td(*each) for each in zip(row, decimals, strict=True)])
+        for row in shown.itertuples(index=False, name=None)
+    ]
     crowded = "wide" if len(kept) > FEW_COLUMNS else None
     rows = el("table", el("thead", el("tr", head)), el("tbody", body), class_=crowded)
     grid = el("div", rows, class_="scroll", tabindex="0")
     size = f"{name.replace('_', ' ')}: {len(table)} row{'s' * (len(table) != 1)}"
-    if len(table) > MOST_ROWS:
-        size += f", the first {HEAD_ROWS} shown"
-    if len(kept) < len(said):
-        size += f", {len(kept)} of {len(said)} columns"
     where = f"{folder}/tables/{study}-{name}.csv" if folder else ""
     note = el("span", f" · {where}", class_="quiet") if where else None
-    return el("details", el("summary", size, note), grid, open=0 < len(table) <= OPEN_ROWS)
+    parts = [f"{len(kept)} of {len(said)} columns"] * (len(kept) < len(said))
+    parts += [f"the first {len(shown)} of {len(table)} rows"] * (len(shown) < len(table))
+    part = el("p", f"Shown: {', '.join(parts)}.", class_="quiet part") if parts else None
+    long = "long" if len(table) > OPEN_ROWS else None
+    is_open = 0 < len(table) <= most_open
+    return el("details", el("summary", size, note), grid, part, class_=long, open=is_open)
+
+
+def _has_gaps(tables: Mapping[str, pd.DataFrame]) -> bool:
+    return any(bool(table.select_dtypes("number").isna().to_numpy().any()) for table in tables.values())
 
 
 def _silent(cell: Any) -> bool:
@@ -330,22 +362,38 @@ def _numeric(column: pd.Series[Any]) -> bool:
     return bool(kind != np.bool_ and np.issubdtype(kind, np.number)) if isinstance(kind, np.dtype) else False
 
 
-def _td(cell: Any) -> Markup:
+def _decimals(column: pd.Series[Any]) -> int:
+    """How many decimals a column needs: all its numbers have as many, so that their points stand in line."""
+    if not _numeric(column):
+        return 0
+    sizes = [abs(v) for v in column.astype(float).tolist() if math.isfinite(v) and not v.is_integer()]
+    needed = [min(max(DIGITS - 1 - math.floor(math.log10(v)), 0), DIGITS) for v in sizes]
+    written = [f"{v:.{digits}f}" for v, digits in zip(sizes, needed, strict=True)]
+    digits = max((len(text.rstrip("0").partition(".")[2]) for text in written), default=0)
+    return digits or DIGITS * any(v < 0.5 * 10.0**-DIGITS for v in sizes)
+
+
+def _td(cell: Any, decimals: int) -> Markup:
     if isinstance(cell, bool | np.bool_):
         return el("td", "yes" if cell else "no")
     if isinstance(cell, float | np.floating):
         key = "" if math.isnan(cell) else repr(float(cell)).replace("inf", "Infinity")
-        return el("td", _written(float(cell)), class_="n", data_key=key)
+        return el("td", _written(float(cell), decimals), class_="n", data_key=key)
     if isinstance(cell, int | np.integer):
         return el("td", str(cell).replace("-", "−"), class_="n", data_key=str(cell))
-    return el("td", "–" if cell is None or cell == "" else str(cell))
+    text = "–" if cell is None or cell == "" else str(cell)
+    long = any(len(word) > LONG_WORD for word in text.split())
+    return el("td", text, class_="long" if long else None)
 
 
-def _written(value: float) -> str:
-    """A number of a table, to four digits."""
-    if not math.isfinite(value) or value.is_integer():
+def _written(value: float, decimals: int) -> str:
+    """A number of a table; what is there but too small for its column does not become nothing."""
+    if not math.isfinite(value) or value == 0.0:
         return number(value)
-    return f"{value:.4g}".replace("-", "−")
+    least = 10.0**-decimals
+    if abs(value) < 0.5 * least:
+        return f"<{least:.{decimals}f}" if value > 0.0 else f">−{least:.{decimals}f}"
+    return f"{value:.{decimals}f}".replace("-", "−")
 
 
 # --- the last page ------------------------------------------------------------------------------
@@ -364,7 +412,8 @@ def _made(about: About, chapters: Sequence[Chapter]) -> Markup:
     files_ = (
         el(
             "p",
-            f"Every table as CSV and Parquet, every figure as SVG (and PNG, if drawn): {about.folder}.",
+            f"Beside this page, in {about.folder}: every table as CSV and Parquet, every figure as SVG, and "
+            "as PNG where matplotlib was installed.",
         )
         if about.folder
         else None
@@ -373,17 +422,24 @@ def _made(about: About, chapters: Sequence[Chapter]) -> Markup:
         "section",
         el("div", el("h2", "How this was made"), class_="head"),
         el("h3", "The whole report again"),
-        el("pre", about.command),
+        _command(about.command),
         el("h3", "Versions"),
         el("p", ", ".join(f"{name} {version}" for name, version in about.versions.items())),
         el("h3", "Seeds"),
         el("p", seeds),
         el("h3", "Duration"),
         el("ul", took, class_="plain"),
+        el("h3", "Files") if files_ else None,
         files_,
         class_="card",
         id="made",
     )
+
+
+def _command(text: str) -> Markup:
+    """A command whose options are not broken at their hyphens."""
+    words = [join([" " if k else "", el("span", word)]) for k, word in enumerate(text.split(" "))]
+    return el("pre", words)
 
 
 def _seconds(seconds: float) -> str:

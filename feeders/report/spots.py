@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from feeders.load import Site
 
-__all__ = ["names_of", "single_phase", "size_map", "spots_by_size"]
+__all__ = ["comparable", "names_of", "single_phase", "size_map", "spots_by_size"]
 
 FEW: Final = 40
 """Up to so many numbers stand in a map themselves."""
@@ -66,12 +66,33 @@ def spots_by_size(
             tip = f"{name}: {number(value)} {unit}"
             label = _short(name, names) + (f": {number(value)}" if len(sizes) <= FEW else "")
             spots.append(Spot(Shape.STEP, label, tip, scale.step(value), value))
-    legend = {} if scale is None else {n: Spot(Shape.STEP, step=k) for k, n in enumerate(scale.names())}
+    used = {spot.step for spot in spots if spot.shape is Shape.STEP}
+    steps = enumerate(scale.names()) if scale is not None else ()
+    legend = {name: Spot(Shape.STEP, step=k) for k, name in steps if k in used}
     if any(spot.shape is Shape.ALARM for spot in spots):
         legend["no bound"] = Spot(Shape.ALARM)
     if any(spot.shape is Shape.NONE for spot in spots):
         legend["no number"] = Spot(Shape.NONE)
     return spots, legend
+
+
+def comparable(site: Site, table: pd.DataFrame) -> tuple[pd.DataFrame, str]:
+    """A table of volts and their unit: in parts of the nominal voltage where there are several.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    table
+        With a column `customer`; columns of numbers whose name ends in `_s` stay as they are.
+    """
+    if bool((site.nominal_volt == site.nominal_volt[0]).all()):
+        return table, "V"
+    nominal = dict(zip(site.feeder.customers, site.customer_nominal, strict=True))
+    share = 100.0 / table["customer"].map(nominal).astype(float)
+    sizes = table.select_dtypes("number").mul(share, axis="index")
+    volts = {str(name): sizes[name] for name in sizes if not str(name).endswith("_s")}
+    return table.assign(**volts), "% of nominal"
 
 
 def single_phase(site: Site) -> bool:

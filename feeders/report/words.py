@@ -103,7 +103,7 @@ def number(value: Any, digits: int = 2, side: Side = Side.NEAR) -> str:
     if math.isinf(value):
         return "∞" if value > 0 else "−∞"
     if float(value).is_integer():
-        return f"{value:.0f}".replace("-", "−")
+        return f"{value + 0.0:.0f}".replace("-", "−")  # no −0
     scale, slack = 10.0**digits, 1e-9 * max(1.0, abs(value))
     if side is Side.BELOW:
         value = math.floor((value + slack) * scale) / scale

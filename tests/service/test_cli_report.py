@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+from html import unescape
 from pathlib import Path
 
 import pandas as pd
@@ -35,9 +36,8 @@ def test_a_report_and_everything_beside_it(
         kept, pd.read_csv(folder / "tables" / "detectable-meters.csv", float_precision="round_trip")
     )
     assert len(list((folder / "journals").iterdir())) == 3
-    command = re.search(r"<pre>(gridsec study report .*?)</pre>", html)
-    assert command is not None
-    again = shlex.split(command[1].replace("&#x27;", "'"))
+    commands = [unescape(re.sub("<[^>]*>", "", each)) for each in re.findall(r"<pre>(.*?)</pre>", html)]
+    again = shlex.split(next(each for each in commands if each.startswith("gridsec study report ")))
     assert again[3:] == [
         "cigre-lv",
         "--out",

@@ -230,6 +230,26 @@ def test_a_study_without_a_section_of_its_own_loses_nothing(site: Site) -> None:
     assert "findings (2 rows)" in said(finding.sentences[0])
 
 
+def test_numbers_of_a_column_stand_in_line_and_do_not_become_nothing(site: Site) -> None:
+    columns = {
+        "whole": [1.0, 20.0, math.inf],
+        "shares": [0.5, 0.1234567, 3e-7],
+        "large": [19403.2, 12.5, -3.0],
+        "noise": [0.0, 4e-9, -4e-9],
+    }
+
+    class Columns:
+        feeder = "cigre-lv"
+        tables: ClassVar = {"findings": pd.DataFrame(columns)}
+
+    page = Page(report(site, [Outcome("strange", Columns())], ABOUT).html)
+    cells = [text for tag, text in page.texts if tag == "td"]
+    assert cells[0::4] == ["1", "20", "∞"]
+    assert cells[1::4] == ["0.5000", "0.1235", "<0.0001"]
+    assert cells[2::4] == ["19403.2", "12.5", "−3.0"]
+    assert cells[3::4] == ["0", "<0.0001", ">−0.0001"]
+
+
 def test_png_has_the_size_of_the_drawing(made: Report) -> None:
     image = pytest.importorskip("matplotlib.image")
     pixels = image.imread(io.BytesIO(made.pictures["feeder-map.png"]))

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 
+import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
@@ -16,7 +17,7 @@ from feeders.load import Site, load, names
 from feeders.report.drawing import STEPS, Disc, Line, Text, width_of
 from feeders.report.figure import NARROW, WIDE
 from feeders.report.layout import has_places, place
-from feeders.report.maps import Shape, Spot, draw_map, steps_of
+from feeders.report.maps import Shape, Spot, _crossed, draw_map, steps_of
 
 
 @pytest.fixture(scope="module", params=names())
@@ -107,6 +108,29 @@ def test_labels_do_not_cover_each_other(feeder: Site) -> None:
         assert a[0] >= 0.0
         assert a[2] <= WIDE
         assert not any(a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3] for b in boxes[k + 1 :])
+
+
+@given(*[st.floats(-20.0, 20.0)] * 4)
+def test_a_line_crosses_a_box_if_a_point_of_it_is_inside(x0: float, y0: float, x1: float, y1: float) -> None:
+    box = (-5.0, -3.0, 5.0, 3.0)
+    along = np.linspace(0.0, 1.0, 2001)
+    x, y = x0 + along * (x1 - x0), y0 + along * (y1 - y0)
+    depth = float(np.max(np.minimum(np.minimum(x + 5.0, 5.0 - x), np.minimum(y + 3.0, 3.0 - y))))
+    assume(abs(depth) > 0.1)  # not where points 0.03 apart cannot tell
+    assert _crossed(box, np.array([[x0, y0, x1, y1]])) == (depth > 0.0)
+
+
+def test_labels_keep_off_the_lines_where_there_is_room() -> None:
+    site = load("cigre-lv")
+    names_ = [Spot(Shape.METER, f"{name}: 2.19") for name in site.meter_ids]
+    drawing = draw_map(site, names_, WIDE, legend={})
+    lines = np.array([(*a, *b) for wire in place(site, WIDE).wires for a, b in pairwise(wire)])
+    labels = [mark for mark in drawing.marks if isinstance(mark, Text) and mark.look == "label"]
+    assert len(labels) == len(names_)
+    for mark in labels:
+        long = width_of(mark.text, mark.size)
+        left = mark.x - {"start": 0.0, "middle": 0.5, "end": 1.0}[mark.anchor] * long
+        assert not _crossed((left, mark.y - 9.0, left + long, mark.y + 2.0), lines)
 
 
 @given(st.lists(st.floats(0.0, 1e6), min_size=1, max_size=20))

@@ -145,6 +145,42 @@ def test_sizes_on_two_levels_are_drawn_in_parts_of_the_nominal_voltage() -> None
     assert "6 %" in drawn
 
 
+def test_limits_on_two_levels_share_an_axis(studied: DroopStudy) -> None:
+    """Proved limits of 20 kV and of 400 V are compared as parts of what is nominal."""
+    two = from_tables(stations.tables())
+    nominal = pd.Series(two.customer_nominal)
+    customers = pd.DataFrame({"customer": list(two.feeder.customers)})
+    for name, share in (("low", 0.955), ("low_rest", 0.97), ("high_rest", 1.01), ("high", 1.025)):
+        customers[f"{name}_volt"] = share * nominal
+    runs = pd.DataFrame({"step": "load", "t_s": [0.0, 1.0], "customer": "dairy", "v_volt": stations.MV})
+    tables = {**studied.tables, "customers": customers, "trajectories": runs}
+    tables["steps"] = studied.tables["steps"].assign(worst_customer="dairy")
+    section = fleet(two, replace(studied, tables=tables))
+    drawn = {figure.name: str(figure.draw(WIDE).marks) for figure in section.figures}
+    assert drawn["droop-band"].count("95.5 to 102.5 %") == len(customers)
+    assert "voltage, % of nominal" in drawn["droop-steps"]
+    assert "11547.0 V and 230.9 V" in told(section, Question.FLEET)
+
+
+def test_a_broken_band_is_told_with_a_voltage(site: Site, studied: DroopStudy) -> None:
+    witness = pd.DataFrame(
+        {
+            "when": "at rest",
+            "customer": site.feeder.customers[:3],
+            "v_volt": site.customer_nominal[:3] * [0.7, 1.15, 0.86],
+            "beyond": [False, True, True],
+        }
+    )
+    band = studied.tables["band"].assign(rest="violated", always="violated")
+    tables = {**studied.tables, "band": band, "witness": witness}
+    finding = fleet(site, replace(studied, rest=Kept.VIOLATED, always=Kept.VIOLATED, tables=tables)).answers
+    sentence = finding[Question.FLEET].sentences[1]
+    volt = next(part for part in sentence if not isinstance(part, str))
+    assert volt.source == "droop-witness:v_volt:row 1"
+    assert volt.value == witness["v_volt"][1]
+    assert f"at {site.feeder.customers[1]}, by AC power flow" in said(sentence)
+
+
 def test_a_search_that_gave_up_is_not_an_all_clear(site: Site, outcomes: list[Outcome]) -> None:
     found = result(outcomes, "redundancy")
     assert isinstance(found, Redundancy)
@@ -179,7 +215,26 @@ def test_protection_against_false_powers_is_told(site: Site) -> None:
     text = told(protection(site, found), Question.PROTECT)
     assert text.startswith("Protect 2 of 6 meters: m03 and m06.")
     assert "whatever powers they report" in text
+    assert "Unprotected, one meter hides up to" in text
     assert "by itself with its powers true" in text
+
+
+def test_nobody_among_none_left_invisible_is_told_as_such(site: Site, outcomes: list[Outcome]) -> None:
+    found = result(outcomes, "protect")
+    assert isinstance(found, Protect)
+    goal = {"goal": Goal.IDENTIFY, "before": 1.0, "after": math.inf, "alone": math.nan}
+    text = told(protection(site, replace(found, **goal)), Question.PROTECT)
+    assert "Fewest liars that stay invisible: 1 without protection, none with it, however many lie." in text
+
+
+def test_who_lies_alone_has_nobody_with_it(site: Site, outcomes: list[Outcome]) -> None:
+    found = result(outcomes, "detectable")
+    assert isinstance(found, Detectable)
+    for liars, words in (
+        (1, "Each meter lying alone."),
+        (3, "Each meter lying together with at most 2 more."),
+    ):
+        assert sizes(site, replace(found, max_attacked=liars)).figures[0].text.startswith(words)
 
 
 def test_protection_with_a_gap_is_not_called_the_fewest(site: Site, outcomes: list[Outcome]) -> None:
