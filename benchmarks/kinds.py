@@ -129,10 +129,10 @@ def cost(name: str, ticks: int = 4200) -> str:
         begin = process_time()
         heard = kinds.listen(shapes, state, y, live)
         kinds.suspicious(heard)
-        state = kinds.describe(shapes, heard, y, nobody, y)
+        state = kinds.describe(shapes, heard, y, y, nobody, y)
         times.append(process_time() - begin)
     kept = state.memory.blocks
-    size = sum(b.code.nbytes + b.hash.nbytes + b.model.nbytes for b in kept) / 1e6
+    size = sum(b.code.nbytes + b.hash.nbytes + b.model.nbytes + b.own.nbytes for b in kept) / 1e6
     last = np.array(times[-256:]) * 1e6
     return f"{name:20} {p} meters: {last.mean():.0f} us per tick, {size:.1f} MB"
 

@@ -26,7 +26,7 @@ from gridsec.sequential.conditional import Prior
 from gridsec.sequential.decoder import Decoder
 from gridsec.sequential.dictionary import Dictionary
 from gridsec.sequential.effects import Effects
-from gridsec.sequential.kinds import Shapes, Traces
+from gridsec.sequential.kinds import Shapes, Traces, pace
 from gridsec.sequential.loads import LoadDoubt, injection_doubt, prior
 from gridsec.sequential.repeats import rules
 
@@ -357,10 +357,14 @@ def _shapes(plant: Plant, effects: Effects, rate: float, step_s: float, lengths:
     """What manipulations look like at this feeder's meters."""
     accuracy, slope = plant.accuracy, 2.0 * _HIGH * plant.droop.vbar
     tests = plant.meters.size * (len(lengths) + _REPEATS) * YEAR_S / step_s
+    active, reactive = (2.0 * own(plant.feeder, power)[plant.meters] for power in Power)
     return Shapes(
         rules=rules(accuracy.resolution, accuracy.jitter, min(rate / tests, 0.5), step_s),
         traces=Traces(effects, plant.feeder.bus[plant.meters]),
         noise=slope**2 * (accuracy.jitter**2 + accuracy.resolution**2 / 12.0),
+        active=active,
+        reactive=reactive,
+        every=pace(step_s),
     )
 
 

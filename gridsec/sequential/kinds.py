@@ -4,6 +4,7 @@ Stuck and replaying meters are evidence of their own and come from `gridsec.sequ
 that are named, whatever the evidence, the last readings are compared with what the *other* meters say, by
 the question that explains most first:
 
+    replay         the last readings are an earlier stretch, reading by reading
     clock shift    y(t) = v2(t - lag):  reading and reconstruction agree at another time, level included
     drift          y(t) - v2(t) is a ramp, and no step explains it nearly as well
     offset         y(t) - v2(t) is a constant, perhaps after a step
@@ -28,24 +29,22 @@ from scipy.stats import chi2
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.network import Power
 from gridsec.online import Kind
-from gridsec.sequential import repeats
+from gridsec.sequential import clocks, repeats
 from gridsec.sequential.effects import Effects
 from gridsec.sequential.repeats import Memory, Rules
 
-# A named meter's readings are looked at every so many ticks.
-_EVERY = 16
-# Surprise from which a run of a meter that is named anyway is called stuck.
-_CALLED_STUCK = 12.0
+# A named meter's readings are looked at every so many ticks, and every so many seconds where ticks are long.
+_EVERY, _EVERY_S = 16, 900.0
+# At every so many of these looks they are looked for in the past.
+_SELDOM = 4
+# Surprise from which repetition of a meter that is named anyway is called stuck, or a replay.
+_CALLED = 12.0
 # Means that the shape of a lie is judged by, and fewest ticks for it.
 _BINS, _SHORTEST = 32, 8
 # A drift must last this part of what is seen, and a ramp leave this part of what the best step leaves.
 _LASTS, _BETTER = 0.25, 0.5
 # A shape explains a lie if this part of its size is the most that is left, as a standard deviation.
 _LEFT = 0.5
-# Readings that are looked for at other times: fewest and most; lags from two ticks on.
-_FEW, _MANY, _NEAREST = 64, 512, 2
-# Readings follow each other slowly: so many count as one. And surprise asked for beyond the number of lags.
-_ALIKE, _SURE = 4.0, 5.0
 # The linear model of a load's trace is off by this part.
 _TRACE = 0.05
 # Entries of two columns this close, as a part, are equal.
@@ -90,11 +89,18 @@ class Shapes:
         What each customer's power would do to the meters.
     noise : (p,)
         Variance of a squared reading from tick to tick, squared pu^2.
+    active, reactive : (p,)
+        What the squared voltage at a meter changes by per power of its own customer, 2 R_jj and 2 X_jj.
+    every
+        Ticks between two looks at a named meter.
     """
 
     rules: Rules
     traces: Traces
     noise: Floats
+    active: Floats
+    reactive: Floats
+    every: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,6 +151,17 @@ def empty(meters: int) -> Kinds:
     )
 
 
+def pace(step_s: float) -> int:
+    """Ticks between two looks at a named meter.
+
+    Parameters
+    ----------
+    step_s
+        Expected time between readings, s.
+    """
+    return int(np.clip(_EVERY_S // step_s, 1, _EVERY))
+
+
 def listen(shapes: Shapes, before: Kinds, y: Floats, live: Bools) -> Kinds:
     """Take readings in; `describe` has to follow before the next.
 
@@ -175,7 +192,9 @@ def suspicious(kinds: Kinds) -> Bools:
     return repeats.suspicious(kinds.memory)
 
 
-def describe(shapes: Shapes, heard: Kinds, model: Floats, named: Bools, variance: Floats) -> Kinds:
+def describe(  # noqa: PLR0917  # what each meter says, and what the others say of it
+    shapes: Shapes, heard: Kinds, model: Floats, own: Floats, named: Bools, variance: Floats
+) -> Kinds:
     """Say what the manipulation of every named meter looks like.
 
     Parameters
@@ -186,30 +205,32 @@ def describe(shapes: Shapes, heard: Kinds, model: Floats, named: Bools, variance
         From `listen`.
     model : (p,)
         What each meter should read by what the *others* say, its fixed error included, squared pu.
+    own : (p,)
+        What each meter's own reported powers contribute to `model`, squared pu.
     named : (p,)
         Who is named.
     variance : (p,)
         Of `model`, fixed errors included, squared pu^2.
     """
-    memory = repeats.keep(heard.memory, model)
+    memory = repeats.keep(heard.memory, model, own)
     if not named.any():
         return Kinds(memory, *(_nobody(named.size)))
     tick = memory.tick
     since = np.where(named, np.where(heard.since < 0, tick, heard.since), -1)
     alone = [kind if there else None for kind, there in zip(heard.alone, named.tolist(), strict=True)]
     told, new = heard.told & named, bool((since == tick).any())
-    stuck = named & (memory.stuck | (memory.run * shapes.rules.surprise >= _CALLED_STUCK))
+    stuck = named & (memory.stuck | (memory.run * shapes.rules.surprise >= _CALLED))
     replays = named & ~stuck & (memory.lag > 0)
     for kind, which in ((Kind.STUCK, stuck), (Kind.REPLAY, replays)):
         for j in np.flatnonzero(which).tolist():
             alone[j] = kind
-    due = named & ~stuck & ~replays & ((since == tick) | ((tick + np.arange(named.size)) % _EVERY == 0))
+    due = named & ~stuck & ~replays & ((since == tick) | ((tick + np.arange(named.size)) % shapes.every == 0))
     for age in np.unique(tick - since[due]).tolist():
         meters = np.flatnonzero(due & (since == tick - age))
         found = _alone(shapes, memory, meters, age, variance, heard.alone)
         for j, looks in zip(meters.tolist(), found, strict=True):
             alone[j] = looks
-    if new or tick % _EVERY == 0:
+    if new or tick % shapes.every == 0:
         told = _together(shapes, memory, since, variance)
     return Kinds(memory, since, tuple(alone), told)
 
@@ -230,28 +251,40 @@ def _alone(  # noqa: PLR0917  # some meters, and what is known of them
 ) -> Iterator[Kind | None]:
     """What the lies of meters named at the same time look like, each by itself."""
     start = max(memory.first, memory.tick - 2 * age - 4 * _BINS)
-    code, model = repeats.past(memory, meters, start, memory.kept)
+    code, model, _ = repeats.past(memory, meters, start, memory.kept)
     lies = (code * shapes.rules.step[meters]) ** 2 - model
     found = _shapes(lies, np.sqrt(shapes.noise[meters]), age)
     for meter, looks in zip(meters.tolist(), found, strict=True):
         # What takes a long look to see stays true when the lie rests: a drift that has arrived, a clock in
         # calm.
         kind = before[meter]
-        if kind is not Kind.CLOCK_SHIFT and _of_another_time(shapes, memory, meter, age, variance):
-            kind = Kind.CLOCK_SHIFT
+        # The past is long, and those that are named at once may be many: each has its turn.
+        if kind is not Kind.REPLAY and (memory.tick + meter) % (_SELDOM * shapes.every) == 0:
+            kind = _of_the_past(shapes, memory, meter, variance, kind)
         yield kind if kind in _LASTING else looks
 
 
-_LASTING = (Kind.CLOCK_SHIFT, Kind.DRIFT)
+_LASTING = (Kind.REPLAY, Kind.CLOCK_SHIFT, Kind.DRIFT)
 
 
-def _of_another_time(shapes: Shapes, memory: Memory, meter: int, age: int, variance: Floats) -> bool:
-    heard = min(age, _MANY)
-    if heard < _FEW:
-        return False
-    code, model = repeats.past(memory, meter, memory.first, memory.kept)
-    room = 3.0 * float(np.sqrt(variance[meter]))
-    return bool(shifted((code * shapes.rules.step[meter]) ** 2, model, heard, age, room))
+def _of_the_past(
+    shapes: Shapes, memory: Memory, meter: int, variance: Floats, before: Kind | None
+) -> Kind | None:
+    """Replay or clock shift if a meter's readings are of another time; else what it was before.
+
+    A clock that is off, or set wrong, never makes a meter say again what it has said: that comes first.
+    """
+    code, model, own = repeats.past(memory, meter, memory.first, memory.kept)
+    same = repeats.recurring(code) * repeats.surprise(shapes.rules, memory)[meter]
+    if same >= _CALLED + np.log(code.size):
+        return Kind.REPLAY
+    turn = (memory.tick + meter) // (_SELDOM * shapes.every) % len(clocks.WINDOWS)
+    heard = min(clocks.WINDOWS[turn], code.size // 2)
+    if before is Kind.CLOCK_SHIFT or heard < clocks.WINDOWS[0]:
+        return before
+    y, spread = (code * shapes.rules.step[meter]) ** 2, float(variance[meter])
+    lag = clocks.shifted(y, model, own, heard, 3.0 * np.sqrt(spread), spread + float(shapes.noise[meter]))
+    return Kind.CLOCK_SHIFT if lag else before
 
 
 def shape(lie: Floats, noise: float, age: int) -> Kind | None:
@@ -320,73 +353,6 @@ def _ramps(n: int) -> tuple[Floats, Floats, Ints]:
     return ramps / size[:, None], size, np.asarray(end - begin)
 
 
-def shifted(y: Floats, model: Floats, heard: int, age: int, room: float) -> int:
-    """Lag in ticks at which readings agree with the reconstruction far better than at their own time.
-
-    At each lag the mean square of ``y(t) - v2(t - lag)`` about a level within what a meter's fixed error
-    allows is compared with that at lag 0 about *any* level and slope; n readings that follow each other
-    slowly count as n / 4. The lag is believed if
-
-        (n / 8) log(left at 0 / left at lag) > log(lags) + 5
-
-    Parameters
-    ----------
-    y, model : (n,)
-        Readings, NaN where there is none, and what the others say; squared pu, up to now.
-    heard
-        How many of the last are looked for.
-    age
-        How long the readings have been wrong, ticks: the reconstruction is looked for among that many of
-        them where a clock is behind.
-    room
-        Largest difference of the levels that a fixed error explains, squared pu.
-
-    Returns
-    -------
-    int
-        Negative where readings are ahead of their time; 0 for none.
-    """
-    if np.isnan(y[-heard:]).mean() > 1.0 / _ALIKE:
-        return 0
-    y = _filled(y)
-    at = np.arange(heard)
-    lie = y[-heard:] - model[-heard:]
-    lie = lie - lie.mean()
-    slope = at - at.mean()
-    own = float(lie @ lie - (slope @ lie) ** 2 / (slope @ slope)) / heard
-    late = _lags(y[-heard:], model, room)
-    early = _lags(model[-heard:], y[-max(age, heard) :], room)
-    lags = np.concatenate([late[_NEAREST:], early[_NEAREST:]])
-    if not lags.size:
-        return 0
-    best = int(lags.argmin())
-    surprise = 0.5 * heard / _ALIKE * np.log(own / max(float(lags[best]), np.finfo(np.float64).tiny))
-    if not surprise > np.log(lags.size) + _SURE:
-        return 0
-    split = max(late.size - _NEAREST, 0)
-    return best + _NEAREST if best < split else -(best - split + _NEAREST)
-
-
-def _lags(short: Floats, long: Floats, room: float) -> Floats:
-    """Mean square of the difference of `short` and each stretch of `long`, the newest first."""
-    n = short.size
-    level = long.mean()
-    short, long = short - level, long - level
-    sums = np.cumsum(np.concatenate([[0.0], long]))
-    squares = np.cumsum(np.concatenate([[0.0], long**2]))
-    mean = short.mean() - (sums[n:] - sums[:-n]) / n
-    whole = (short @ short + squares[n:] - squares[:-n] - 2.0 * np.correlate(long, short, "valid")) / n
-    # About the level that is nearest to the mean and within the room.
-    return np.asarray(whole - mean**2 + np.maximum(np.abs(mean) - room, 0.0) ** 2)[::-1]
-
-
-def _filled(y: Floats) -> Floats:
-    """Missing readings repeat the one before; those at the beginning the first one."""
-    there = np.isfinite(y)
-    last = np.maximum.accumulate(np.where(there, np.arange(y.size), 0))
-    return np.where(there[last], y[last], y[there.argmax()])
-
-
 def _together(shapes: Shapes, memory: Memory, since: Ints, variance: Floats) -> Bools:
     """Named meters whose lies are one load's trace."""
     named = since >= 0
@@ -395,7 +361,7 @@ def _together(shapes: Shapes, memory: Memory, since: Ints, variance: Floats) -> 
         return np.zeros_like(named)
     # From when all of them are named; evidence is a tick older than a name.
     start = max(memory.first, memory.kept - _EVERY, int(since.max()) - 1)
-    code, model = repeats.past(memory, who, start, memory.kept)
+    code, model, _ = repeats.past(memory, who, start, memory.kept)
     lies = (code * shapes.rules.step[who]) ** 2 - model
     heard = np.isfinite(lies).sum(axis=0)
     if not heard.all():

@@ -43,8 +43,11 @@ ROWS = 64
 BLOCKS = 60
 """Blocks that are kept: a little more than an hour at one reading per second."""
 
-MOST_BYTES = 36e6
-"""What the past may cost, at 12 bytes per meter and tick: very many meters are remembered for less long."""
+BYTES = 16
+"""What one meter's tick costs."""
+
+MOST_BYTES = 48e6
+"""What the past may cost: very many meters are remembered for less long."""
 
 SPAN = 32
 """Ticks that a hash covers: one bit leaves it with every tick."""
@@ -103,11 +106,14 @@ class Block:
         Of the SPAN ticks that end here.
     model : (ROWS, p)
         Squared voltage that the others' reconstruction gives each meter, squared pu.
+    own : (ROWS, p)
+        What each meter's own reported powers contribute to that, squared pu.
     """
 
     code: _Codes
     hash: _Hashes
     model: NDArray[np.float32]
+    own: NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,7 +145,7 @@ class Memory:
     blocks
         The past, oldest first; at most BLOCKS, fewer where that would be more than MOST_BYTES.
     tail
-        Rows (code, hash, model) after the last whole block.
+        Rows (code, hash, model, own) after the last whole block.
     """
 
     tick: int
@@ -153,7 +159,7 @@ class Memory:
     stuck: Bools
     lag: Ints
     blocks: tuple[Block, ...]
-    tail: tuple[tuple[_Codes, _Hashes, NDArray[np.float32]], ...]
+    tail: tuple[tuple[_Codes, _Hashes, NDArray[np.float32], NDArray[np.float32]], ...]
 
     @property
     def first(self) -> int:
@@ -273,7 +279,7 @@ def listen(law: Rules, before: Memory, y: Floats, live: Bools) -> Memory:
     return _search(law, after)
 
 
-def keep(memory: Memory, model: Floats) -> Memory:
+def keep(memory: Memory, model: Floats, own: Floats) -> Memory:
     """Remember the tick that was just heard, with what the others say of it.
 
     Parameters
@@ -282,19 +288,20 @@ def keep(memory: Memory, model: Floats) -> Memory:
         From `listen`.
     model : (p,)
         Squared voltage that the others' reconstruction gives each meter, squared pu.
+    own : (p,)
+        What each meter's own reported powers contribute to that, squared pu.
     """
-    tail = (*memory.tail, (memory.now, memory.hash, model.astype(np.float32)))
+    tail = (*memory.tail, (memory.now, memory.hash, model.astype(np.float32), own.astype(np.float32)))
     if len(tail) < ROWS:
         return replace(memory, kept=memory.kept + 1, tail=tail)
-    code, hashes, models = zip(*tail, strict=True)
-    block = Block(np.stack(code), np.stack(hashes), np.stack(models))
+    block = Block(*(np.stack(rows) for rows in zip(*tail, strict=True)))
     blocks = (*memory.blocks, block)[-_kept(memory.now.size) :]
     return replace(memory, kept=memory.kept + 1, blocks=blocks, tail=())
 
 
 def _kept(meters: int) -> int:
     """How many blocks are kept."""
-    return int(min(BLOCKS, max(1, MOST_BYTES // (12 * ROWS * max(meters, 1)))))
+    return int(min(BLOCKS, max(1, MOST_BYTES // (BYTES * ROWS * max(meters, 1)))))
 
 
 def suspicious(memory: Memory) -> Bools:
@@ -308,8 +315,8 @@ def suspicious(memory: Memory) -> Bools:
     return memory.stuck | (memory.lag > 0)
 
 
-def past(memory: Memory, meter: int | Ints, start: int, stop: int) -> tuple[Floats, Floats]:
-    """Readings, in steps, and models of one meter, or some, at the ticks start to stop - 1.
+def past(memory: Memory, meter: int | Ints, start: int, stop: int) -> tuple[Floats, Floats, Floats]:
+    """Readings, in steps, models and own parts of one meter, or some, at the ticks start to stop - 1.
 
     Parameters
     ----------
@@ -322,13 +329,54 @@ def past(memory: Memory, meter: int | Ints, start: int, stop: int) -> tuple[Floa
 
     Returns
     -------
-    code, model : (stop - start, …)
+    code, model, own : (stop - start, …)
         Readings are NaN where there was none.
     """
     code = _column(memory, "code", meter, start, stop).astype(np.float64)
-    model = _column(memory, "model", meter, start, stop)
+    model, own = (_column(memory, name, meter, start, stop).astype(np.float64) for name in ("model", "own"))
     code[code == SILENT] = np.nan
-    return code, model.astype(np.float64)
+    return code, model, own
+
+
+def recurring(code: Floats) -> int:
+    """How many of the last readings are an earlier stretch, without a difference between, at the best lag.
+
+    Parameters
+    ----------
+    code : (n,)
+        Readings, NaN where there was none.
+
+    Returns
+    -------
+    int
+        Pairs of which one reading is missing are passed over; at most SPAN are counted.
+    """
+    lags = np.arange(1, code.size)
+    count, best = np.zeros(lags.size, dtype=np.intp), 0
+    for newest in range(code.size - 1, 0, -1):
+        heard = lags <= newest
+        lags, count = lags[heard], count[heard]
+        if not lags.size or best >= SPAN:
+            break
+        old = code[newest - lags]
+        differ = (old != code[newest]) & np.isfinite(old) & np.isfinite(code[newest])
+        count = count + (old == code[newest])
+        best = max(best, int(count.max()))
+        lags, count = lags[~differ], count[~differ]
+    return best
+
+
+def surprise(law: Rules, memory: Memory) -> Floats:
+    """How little one repetition is expected of each meter, by its data sheet and its past, (p,).
+
+    Parameters
+    ----------
+    law
+        When repetition is evidence.
+    memory
+        What is known of the meters.
+    """
+    return _surprise(law, memory.count, memory.longest)
 
 
 def _surprise(law: Rules, count: Ints, longest: Ints) -> Floats:
@@ -417,7 +465,7 @@ def repeated(memory: Memory, meter: int, lag: int, most: int) -> int:
 
 def _column(memory: Memory, name: str, meter: int | Ints, start: int, stop: int) -> NDArray[Any]:
     """One meter's past, or some meters', at the ticks start to stop - 1, from the blocks and the tail."""
-    place = ("code", "hash", "model").index(name)
+    place = ("code", "hash", "model", "own").index(name)
     begin = memory.first
     skip, last = (start - begin) // ROWS, (stop - 1 - begin) // ROWS
     parts = [getattr(block, name)[:, meter] for block in memory.blocks[skip : last + 1]]

@@ -95,7 +95,7 @@ def step(
         fits=seen.fits,
         doubts=doubts,
         curves=compare(design, state.curves, reports),
-        kinds=_kinds(design, state, kinds, seen, window, v2_bus[at]),
+        kinds=_kinds(design, state, kinds, seen, window, v2_bus[at], _own(design, frame.p, heard.q)),
     )
     after = _learn(design, after, residual, heard.live, frame.t - state.t)
     given = heard.told, heard.y, heard.live, heard.v0_squared, heard.busbar
@@ -222,7 +222,13 @@ def _reports(  # noqa: PLR0917  # everything known of the injections
 
 
 def _kinds(  # noqa: PLR0917  # everything that lies are compared with
-    design: SequentialDesign, state: SequentialState, kinds: Kinds, seen: Examined, window: Window, v2: Floats
+    design: SequentialDesign,
+    state: SequentialState,
+    kinds: Kinds,
+    seen: Examined,
+    window: Window,
+    v2: Floats,
+    own: Floats,
 ) -> Kinds:
     """What the manipulations look like, by what the other meters say of each."""
     view, prior_ = seen.views[0], state.doubts.prior
@@ -232,7 +238,13 @@ def _kinds(  # noqa: PLR0917  # everything that lies are compared with
     else:
         mean = window.sums[0] / np.maximum(window.counts[0], 1)
         expected, variance = expected + mean - view.judged.offset, view.judged.std**2
-    return describe(design.shapes, kinds, expected, seen.trust.named, variance)
+    return describe(design.shapes, kinds, expected, own, seen.trust.named, variance)
+
+
+def _own(design: SequentialDesign, p: Floats, q: Floats) -> Floats:
+    """What each meter's own reported powers contribute to what the model says of it, (p,)."""
+    shapes, meters = design.shapes, design.plant.meters
+    return np.asarray(shapes.active * p[meters] + shapes.reactive * q[meters])
 
 
 def _learn(
