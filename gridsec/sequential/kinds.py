@@ -34,7 +34,7 @@ from gridsec.sequential.effects import Effects
 from gridsec.sequential.repeats import Memory, Rules
 
 # A named meter's readings are looked at every so many ticks, and every so many seconds where ticks are long.
-_EVERY, _EVERY_S = 16, 900.0
+_EVERY, _EVERY_S = 16, 240.0
 # At every so many of these looks they are looked for in the past.
 _SELDOM = 4
 # Surprise from which repetition of a meter that is named anyway is called stuck, or a replay.
