@@ -51,8 +51,8 @@ def calibrate(
     Only what is sure gets into the copy that `--write` makes; the feeder itself is never touched.
     """
     from feeders.studies.calibrate import calibrate as study
+    from feeders.studies.calibrate_corrections import Kind
     from feeders.studies.calibrate_feeder import site_of
-    from feeders.studies.calibrate_search import Kind
 
     for name in look_for or ():
         if name not in tuple(Kind):

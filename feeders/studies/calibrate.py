@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -20,16 +20,14 @@ import pandas as pd
 from feeders.equipment import digest, find
 from feeders.schema import write
 from feeders.studies import calibrate_tables
+from feeders.studies.calibrate_corrections import Correction, Kind, apply, as_filed, left
 from feeders.studies.calibrate_readings import Frames, frames
 from feeders.studies.calibrate_search import (
     LENGTH_SPREAD,
     SHORTEST,
-    Correction,
-    Kind,
     Round,
     State,
     Verdict,
-    apply,
     compare,
     correction,
     prepare,
@@ -40,6 +38,7 @@ if TYPE_CHECKING:
     from feeders.load import Site
     from feeders.load_phases import ThreePhaseSite
     from feeders.recording import Recording
+    from feeders.schema import FeederTables
 
 __all__ = ["Calibrate", "OtherFeeder", "calibrate"]
 
@@ -82,9 +81,10 @@ class Calibrate:
         `quantity`, `estimate`, `low`, `high`, `unit`, `verdict`: standard deviations and correlation time of
         the errors of the customers' powers, and the meters' noise relative to what they promise.
     proposals
-        What to correct, in the order it was found: `kind`, `what`, `now`, `proposed`, `estimate`, `std` (of a
-        length, the factor; otherwise how much of the proposed change the readings show: 1 is all), `low`,
-        `high`, `log_factor` (gain of the log-likelihood), `confidence`, `verdict`, `alternatives`.
+        What to correct, in the order it was found: `kind`, `what` (of a lateral its first line and its
+        customers), `now`, `proposed`, `estimate`, `std` (of a length, the factor; otherwise how much of the
+        proposed change the readings show: 1 is all), `low`, `high`, `log_factor` (gain of the
+        log-likelihood), `confidence`, `verdict`, `alternatives`.
     corrections
         The proposals that are sure, in the words of the files.
     """
@@ -205,7 +205,7 @@ def calibrate(
         risk=risk,
         meters=calibrate_tables.meters(now, risk),
         lines=lines,
-        customers=calibrate_tables.customers(now, verdict, rows, risk),
+        customers=calibrate_tables.customers(now, verdict, wrongs, risk),
         loads=calibrate_tables.loads(now),
         errors=calibrate_tables.errors(now),
         proposals=rows,
@@ -232,13 +232,14 @@ def _searched(
 ) -> tuple[Round, Verdict, list[dict[str, Any]]]:
     """One error after the other, until the readings speak for none; with the last round and what it said."""
     state, found = files, list[dict[str, Any]]()
+    been = [files]
     for step in range(MOST_ERRORS + 1):
         now = fitted(state)
         said: list[Verdict] = []
 
         def work(now: Round = now, said: list[Verdict] = said) -> dict[str, Any] | None:
             said.append(weighed(now))
-            return _best(now, said[0], risk)
+            return _best(now, said[0], risk, files.tables)
 
         row = kept.get(f"error {step}", work)
         if row is None or step == MOST_ERRORS:
@@ -247,11 +248,42 @@ def _searched(
         if wrong.kind is Kind.METER:
             # What its readings may have been taken for until now is forgotten: all begins again without it.
             state = State(files.tables, (*state.excluded, *wrong.names))
-            found = [each for each in found if each["correction"]["kind"] == Kind.METER]
+            found = [*(each for each in found if each["correction"]["kind"] == Kind.METER), row]
+        elif any(state.after(wrong).same(before) for before in been):
+            # The readings speak for each of two places once the other one is taken for right.
+            found = [_doubted(each, wrong) for each in found]
+            break
         else:
             state = state.after(wrong)
-        found.append(row)
+            found = _together(found, row, files.tables, now.net.site.bus_of_file)
+        been.append(state)
     return now, said[0] if said else weighed(now), found
+
+
+def _together(
+    found: list[dict[str, Any]], row: dict[str, Any], files: FeederTables, bus_of_file: Mapping[str, int]
+) -> list[dict[str, Any]]:
+    """Errors that do not contradict each other: of a customer's place the last one holds.
+
+    Its gain includes that of those it replaces. One that leads back to what the files say is none.
+    """
+    wrong, gain, rest = _read(row["correction"]), row["log_factor"], []
+    for each in found:
+        earlier = _read(each["correction"])
+        kept = left(earlier, wrong)
+        if kept is None:
+            gain += each["log_factor"]
+        else:
+            rest.append(each if kept == earlier else each | {"correction": asdict(kept)})
+    return rest if as_filed(files, wrong, bus_of_file) else [*rest, row | {"log_factor": gain}]
+
+
+def _doubted(row: dict[str, Any], wrong: Correction) -> dict[str, Any]:
+    """An error that cannot be told from another one, if it is about the same customers."""
+    told = _read(row["correction"])
+    if (told.kind, told.names) != (wrong.kind, wrong.names):
+        return row
+    return row | {"alternatives": [*row["alternatives"], calibrate_tables.told(wrong)]}
 
 
 def _quiet(done: int, total: int) -> None:
@@ -272,7 +304,7 @@ def _subject(site: Site | ThreePhaseSite, given: Frames, risk: float, tolerance:
     }
 
 
-def _best(now: Round, said: Verdict, risk: float) -> dict[str, Any] | None:
+def _best(now: Round, said: Verdict, risk: float, files: FeederTables) -> dict[str, Any] | None:
     """The error that the readings speak for most; None where they speak for none."""
     if said.any < math.log(1.0 / risk):
         return None
@@ -287,7 +319,8 @@ def _best(now: Round, said: Verdict, risk: float) -> dict[str, Any] | None:
         "std": h**-0.5 if h > 0.0 else math.inf,
         "log_factor": float(said.found.log_factor[best]),
         "confidence": float(said.confidence[best]),
-        "now": calibrate_tables.present(now, wrong),
+        # Swaps build on each other; a place is compared with that in the files.
+        "now": calibrate_tables.present(now.state.tables if wrong.kind is Kind.SWAP else files, wrong),
         "since": guess.since,
         "until": guess.until,
         "alternatives": [calibrate_tables.told(other) for other in others],
@@ -295,4 +328,11 @@ def _best(now: Round, said: Verdict, risk: float) -> dict[str, Any] | None:
 
 
 def _read(row: dict[str, Any]) -> Correction:
-    return Correction(Kind(row["kind"]), tuple(row["names"]), row["bus"], row["phases"], row["factor"])
+    return Correction(
+        Kind(row["kind"]),
+        tuple(row["names"]),
+        row["bus"],
+        row["phases"],
+        row["factor"],
+        tuple(row["lines"]),
+    )

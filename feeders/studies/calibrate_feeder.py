@@ -12,6 +12,7 @@ import numpy as np
 from feeders.load import Site, find, from_tables
 from feeders.load_phases import ThreePhaseSite, spanned
 from feeders.studies.bases import line_rows
+from feeders.studies.calibrate_laterals import Lateral, laterals
 from gridsec import phases as three
 from gridsec.arrays import Bools, Floats, Ints, Phasors
 from gridsec.droop import voltage_curve
@@ -67,6 +68,8 @@ class Network:
         Bus of the feeder and phase of each place.
     places
         What readings see of it.
+    laterals
+        Its single-phase laterals.
     """
 
     site: Site | ThreePhaseSite
@@ -75,6 +78,7 @@ class Network:
     ends: Ints
     place: Ints
     places: Places
+    laterals: tuple[Lateral, ...]
 
     @property
     def meter_of(self) -> dict[int, int]:
@@ -135,12 +139,14 @@ def network(tables: FeederTables) -> Network:
     """
     site = _site(tables)
     feeder, rows = _merged(_model(site), tuple((row,) for row in line_rows(site)))
+    single: tuple[Lateral, ...] = ()
     if isinstance(feeder, ThreePhaseFeeder):
         place, ends = np.argwhere(feeder.phases), _branches(feeder)
+        single = laterals(feeder, rows, place)
     else:
         place = np.column_stack([np.arange(len(feeder.buses)), np.zeros(len(feeder.buses))]).astype(np.intp)
         ends = lines(feeder)[0]
-    return Network(site, feeder, rows, ends, place, _places(site, feeder, place))
+    return Network(site, feeder, rows, ends, place, _places(site, feeder, place), single)
 
 
 Model = Feeder | MeshedFeeder | ThreePhaseFeeder

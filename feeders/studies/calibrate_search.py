@@ -9,16 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field, replace
-from enum import StrEnum
 from functools import partial
 from itertools import combinations
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from feeders.columns import MATRIX_NAMES
-from feeders.schema import LineRow
 from feeders.studies import calibrate_feeder as model
+from feeders.studies.calibrate_corrections import Correction, Kind, apply
 from gridsec.arrays import Floats, Ints
 from gridsec.phases import PHASES, ThreePhaseFeeder
 from gridsec.studies.calibrate import Evidence, Fit, evidence, fit, weigh
@@ -30,19 +28,7 @@ if TYPE_CHECKING:
     from feeders.studies.calibrate_feeder import Network, Powers
     from feeders.studies.calibrate_readings import Frames
 
-__all__ = [
-    "Correction",
-    "Guess",
-    "Kind",
-    "Round",
-    "State",
-    "Verdict",
-    "apply",
-    "compare",
-    "correction",
-    "longer",
-    "prepare",
-]
+__all__ = ["Guess", "Round", "State", "Verdict", "compare", "concerned", "correction", "prepare"]
 
 LENGTH_SPREAD: Final = 0.3
 """Prior standard deviation of the relative error of a length that is a mistake."""
@@ -64,16 +50,6 @@ _REFIT: Final = 3
 _NOISE_ROUNDS: Final = 2
 
 
-class Kind(StrEnum):
-    """What may be wrong."""
-
-    BUS = "bus"
-    PHASE = "phase"
-    SWAP = "swap"
-    LENGTH = "length"
-    METER = "meter"
-
-
 @dataclass(frozen=True, slots=True)
 class Guess:
     """An error of the files that is looked at.
@@ -85,9 +61,11 @@ class Guess:
     subject
         Customer, customer and customer of a swap, meter, or branch; by index in the present network.
     other
-        The second customer, the bus of the merged tree, or nothing: -1.
+        The second customer, the bus of the merged tree, the lateral, or nothing: -1.
     phases
         Phases of the customer.
+    lateral
+        Whether `other` is a lateral, which is on these phases with all its customers.
     since, until
         When the meter's error is different, Unix s.
     """
@@ -96,31 +74,9 @@ class Guess:
     subject: int
     other: int = -1
     phases: str = ""
+    lateral: bool = False
     since: float = np.nan
     until: float = np.nan
-
-
-@dataclass(frozen=True, slots=True)
-class Correction:
-    """An error of the files in their own words.
-
-    Attributes
-    ----------
-    kind
-        What it is.
-    names
-        The customer, both customers of a swap, the meter, or the lines.
-    bus, phases
-        Where the customer is.
-    factor
-        On the lines' length.
-    """
-
-    kind: Kind
-    names: tuple[str, ...]
-    bus: str = ""
-    phases: str = ""
-    factor: float = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,6 +96,11 @@ class State:
     tables: FeederTables
     excluded: tuple[str, ...] = ()
     lengths: dict[str, float] = field(default_factory=dict)
+
+    def same(self, other: State) -> bool:
+        """Whether both say the same."""
+        mine, others = ((each.tables.lines, each.tables.customers, each.excluded) for each in (self, other))
+        return mine == others
 
     def after(self, wrong: Correction) -> State:
         """Correct one error more."""
@@ -292,14 +253,41 @@ def compare(
     g, h, factor = (np.concatenate([getattr(part, n) for part in parts]) for n in ("g", "h", "log_factor"))
     kind = np.array([list(Kind).index(guess.kind) for guess in guesses], dtype=np.intp)
     exact = factor.copy()
-    for k in [k for k in np.argsort(-factor)[: 2 * _REFIT] if guesses[k].kind in _MOVES][:_REFIT]:
-        if factor[k] > 0.0:
-            exact[k] = _exactly(now, frames, guesses[k])
+    for k in _close(now, guesses, factor):
+        exact[k] = _exactly(now, frames, guesses[k])
     weighed = weigh(exact, kind, risk)
     return Verdict(guesses, Evidence(g, h, exact), weighed.confidence, weighed.any, weighed.kept)
 
 
 _MOVES: Final = (Kind.BUS, Kind.PHASE, Kind.SWAP)
+
+
+def _close(now: Round, guesses: list[Guess], factor: Floats) -> list[int]:
+    """Moves that the linear flow makes likely, and before a meter is excluded its customer's likeliest."""
+    order = np.argsort(-factor).tolist()
+    moves = [k for k in order if guesses[k].kind in _MOVES]
+    likely = [k for k in moves[:_REFIT] if factor[k] > 0.0]
+    best = guesses[order[0]]
+    if best.kind is Kind.METER:
+        customer = int(now.net.site.meters[best.subject])
+        likely += [k for k in moves if customer in concerned(now, guesses[k])][:1]
+    return list(dict.fromkeys(likely))
+
+
+def concerned(now: Round, guess: Guess) -> list[int]:
+    """Customers that a move is about.
+
+    Parameters
+    ----------
+    now
+        The files that it is about.
+    guess
+        The move.
+    """
+    if guess.lateral:
+        return list(map(int, now.net.laterals[guess.other].customers))
+    return [guess.subject, guess.other] if guess.kind is Kind.SWAP else [guess.subject]
+
 
 Chunk = tuple[list[Guess], Callable[[], Floats], float]
 
@@ -350,6 +338,9 @@ def _phases(net: Network, trusted: list[int]) -> list[Guess]:
             if len(phases) == 1:
                 others = [phase for phase in PHASES if phase != phases and net.reaches(bus, phase)]
                 out += [Guess(Kind.PHASE, customer, bus, phase) for phase in others]
+        for k, lateral in enumerate(net.laterals):
+            seen = np.intersect1d(net.site.meters[trusted], lateral.customers).tolist()
+            out += [Guess(Kind.PHASE, seen[0], k, phase, lateral=True) for phase in lateral.others if seen]
     return out
 
 
@@ -363,6 +354,10 @@ def _moves(now: Round, guesses: list[Guess]) -> Floats:
     net, series = now.net, now.series
     out = np.empty((*series.y.shape, len(guesses)))
     for h, guess in enumerate(guesses):
+        if guess.lateral:
+            one = net.laterals[guess.other]
+            out[:, :, h] = net.places.rephased(series, one.customers, one.place, one.others[guess.phases])
+            continue
         if guess.kind is Kind.SWAP:
             W = net.places.weight
             change = {guess.subject: W[guess.other], guess.other: W[guess.subject]}
@@ -407,52 +402,12 @@ def correction(now: Round, guess: Guess, factor: float = 1.0) -> Correction:
         return Correction(
             guess.kind, tuple(tables.lines[k].line for k in net.lines[guess.subject]), factor=factor
         )
-    names = tables.customers[guess.subject].customer
+    if guess.lateral:
+        one = net.laterals[guess.other]
+        customers = tuple(tables.customers[k].customer for k in one.customers.tolist())
+        lines = tuple(tables.lines[k].line for k in one.lines)
+        return Correction(guess.kind, customers, phases=guess.phases, lines=lines)
+    name = tables.customers[guess.subject].customer
     if guess.kind is Kind.SWAP:
-        return Correction(guess.kind, (names, tables.customers[guess.other].customer))
-    return Correction(guess.kind, (names,), net.feeder.buses[guess.other], guess.phases)
-
-
-def apply(tables: FeederTables, wrong: Correction) -> FeederTables:
-    """Correct the files.
-
-    Parameters
-    ----------
-    tables
-        The files.
-    wrong
-        Their error; that of a meter changes nothing in them.
-    """
-    if wrong.kind is Kind.METER:
-        return tables
-    if wrong.kind is Kind.LENGTH:
-        rows = (longer(row, wrong.factor) if row.line in wrong.names else row for row in tables.lines)
-        return replace(tables, lines=tuple(rows))
-    customers = {row.customer: row for row in tables.customers}
-    one = customers[wrong.names[0]]
-    if wrong.kind is Kind.SWAP:
-        other = customers[wrong.names[1]]
-        changed = [replace(one, meter=other.meter), replace(other, meter=one.meter)]
-    elif wrong.kind is Kind.PHASE:
-        changed = [replace(one, phases=wrong.phases)]
-    else:
-        changed = [replace(one, bus=wrong.bus)]
-    customers |= {row.customer: row for row in changed}
-    return replace(tables, customers=tuple(customers.values()))
-
-
-def longer(line: LineRow, factor: float) -> LineRow:
-    """A line of another length.
-
-    Parameters
-    ----------
-    line
-        The line.
-    factor
-        On its length.
-    """
-    scaled: dict[str, Any] = {
-        name: None if (value := getattr(line, name)) is None else value * factor
-        for name in ("r_ohm", "x_ohm", "r0_ohm", "x0_ohm", "b_us", *MATRIX_NAMES)
-    }
-    return replace(line, **scaled)
+        return Correction(guess.kind, (name, tables.customers[guess.other].customer))
+    return Correction(guess.kind, (name,), net.feeder.buses[guess.other], guess.phases)

@@ -9,11 +9,13 @@ import numpy as np
 import pandas as pd
 from scipy.stats import norm
 
-from feeders.studies.calibrate_search import LENGTH_SPREAD, SHORTEST, Correction, Kind
+from feeders.studies.calibrate_corrections import PLACES, Correction, Kind
+from feeders.studies.calibrate_search import LENGTH_SPREAD, SHORTEST, concerned
 from gridsec.studies.calibrate import explain
 from gridsec.studies.calibrate_model import lengthened
 
 if TYPE_CHECKING:
+    from feeders.schema import FeederTables
     from feeders.studies.calibrate_search import Round, Verdict
     from gridsec.arrays import Floats
 
@@ -113,6 +115,12 @@ def final(
     """Proposals, lengths as they were estimated last, and those corrections that are sure."""
     rows = zip(length.to_dict("records"), ids, strict=True)
     by_line = {name: row for row, chain in rows for name in chain}
+    vague = {
+        name
+        for row, wrong in zip(found, wrongs, strict=True)
+        if row["alternatives"] and wrong.kind in PLACES
+        for name in wrong.names
+    }
     out, sure, told_of = [], [], set[tuple[str, ...]]()
     for row, first in zip(found, wrongs, strict=True):
         wrong = first
@@ -134,13 +142,15 @@ def final(
                 "high": estimate + WIDE * std,
             }
         decided = not row["alternatives"] and wrong.factor >= SHORTEST
+        # A customer's bus and phases belong together: one is not written without the other.
+        decided &= wrong.kind not in PLACES or vague.isdisjoint(wrong.names)
         verdict = EXCLUDED if wrong.kind is Kind.METER else PROPOSED if decided else UNTOLD
         if decided and wrong.kind is not Kind.METER:
             sure.append(wrong)
         out.append(
             {
                 "kind": str(wrong.kind),
-                "what": " ".join(wrong.names) if wrong.kind is not Kind.SWAP else " and ".join(wrong.names),
+                "what": _who(wrong) if wrong.kind is not Kind.LENGTH else " ".join(wrong.names),
                 "now": row["now"],
                 "proposed": _proposed(wrong, row),
                 **{name: numbers[name] for name in ("estimate", "std", "low", "high")},
@@ -162,11 +172,20 @@ def _proposed(wrong: Correction, row: dict[str, Any]) -> str:
     return {Kind.BUS: wrong.bus, Kind.PHASE: wrong.phases}.get(wrong.kind, "meters exchanged")
 
 
-def present(now: Round, wrong: Correction) -> str:
-    """What the files say about it."""
-    rows = {row.customer: row for row in now.state.tables.customers}
+def _who(wrong: Correction) -> str:
+    """Whom an error is about; of a lateral its first line, and who is on it."""
+    if wrong.lines:
+        return f"{wrong.lines[0]} with {_some(wrong.names)}"
+    return " and ".join(wrong.names[:2])
+
+
+def present(tables: FeederTables, wrong: Correction) -> str:
+    """What files say about it."""
+    rows = {row.customer: row for row in tables.customers}
     if wrong.kind is Kind.BUS:
         return rows[wrong.names[0]].bus
+    if wrong.lines:
+        return next(row.phases for row in tables.lines if row.line == wrong.lines[0])
     if wrong.kind is Kind.PHASE:
         return rows[wrong.names[0]].phases
     if wrong.kind is Kind.SWAP:
@@ -176,7 +195,7 @@ def present(now: Round, wrong: Correction) -> str:
 
 def told(wrong: Correction) -> str:
     """An alternative in a few words."""
-    who = " and ".join(wrong.names[:2])
+    who = _who(wrong)
     if wrong.kind is Kind.BUS:
         return f"{who} at {wrong.bus}"
     if wrong.kind is Kind.PHASE:
@@ -186,21 +205,17 @@ def told(wrong: Correction) -> str:
     )
 
 
-def customers(now: Round, said: Verdict, proposals: pd.DataFrame, risk: float) -> pd.DataFrame:
+def customers(now: Round, said: Verdict, wrongs: Sequence[Correction], risk: float) -> pd.DataFrame:
     """Place of every customer, and which others the readings do not rule out."""
     net = now.net
-    moved = {
-        name
-        for kind, what in zip(proposals["kind"], proposals["what"], strict=True)
-        for name in (what.split(" and ") if kind == Kind.SWAP else [what])
-    }
+    moved = {name for wrong in wrongs if wrong.kind in (*PLACES, Kind.SWAP) for name in wrong.names}
     open_from = -float(np.log(1.0 / risk))
     others: dict[int, list[tuple[float, str]]] = {}
     for guess, factor in zip(said.guesses, said.found.log_factor, strict=True):
-        if guess.kind in (Kind.BUS, Kind.PHASE):
-            bus = net.feeder.buses[guess.other]
+        for customer in concerned(now, guess) if guess.kind in PLACES else ():
+            bus = net.feeder.buses[net.feeder.bus[customer] if guess.lateral else guess.other]
             place = f"{bus} {guess.phases}" if guess.kind is Kind.PHASE else bus
-            others.setdefault(guess.subject, []).append((float(factor), place))
+            others.setdefault(customer, []).append((float(factor), place))
     out = []
     for k, row in enumerate(now.state.tables.customers):
         ranked = sorted(others.get(k, []), reverse=True)

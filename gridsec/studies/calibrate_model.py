@@ -109,6 +109,33 @@ class Places:
                 away += np.outer(power[:, customer], gain)
         return away
 
+    def rephased(self, series: Series, customers: Ints, one: int, other: int) -> Floats:
+        """How the meters' squared voltages change when a single-phase lateral is on another phase, (T, p).
+
+        The customers' powers leave the place where the lateral begins and come to another phase of its
+        bus. The drop along the lateral stays, and so do the ratios of its bases.
+
+        Parameters
+        ----------
+        series
+            Voltages and powers.
+        customers
+            All on the lateral.
+        one, other
+            The places above its first line, as it is and on the other phase.
+        """
+        W = self.read(self.weight[self.meters])
+        shift: Floats = np.zeros_like(series.places)
+        for matrix, power in ((self.active, series.p), (self.reactive, series.q)):
+            shift += np.outer(power[:, customers].sum(axis=1), matrix[:, other] - matrix[:, one])
+        away = shift @ W.T
+        on = np.flatnonzero(np.isin(self.meters, customers))
+        was = series.places @ W[on].T
+        rise = series.places[:, other] + shift[:, other] - series.places[:, one]
+        base = (self.volt[other] / self.volt[one]) ** 2
+        away[:, on] = base * (was + np.outer(rise, W[on].sum(axis=1))) - was
+        return np.asarray(away)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Series:

@@ -13,7 +13,7 @@ from feeders.load import find, from_tables, load
 from feeders.load_phases import ThreePhaseSite, load_three_phase, three_phase, three_phase_names
 from feeders.powerflow_unbalanced import UnbalancedPowerFlow
 from feeders.schema import FeederTables, LineRow, examine, from_json, read, to_json
-from feeders.studies.calibrate_search import longer
+from feeders.studies.calibrate_corrections import longer
 from gridsec import feeder as balanced
 from gridsec.arrays import Floats, Phasors
 from gridsec.errors import FeederInvalid

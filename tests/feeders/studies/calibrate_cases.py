@@ -15,7 +15,7 @@ from feeders.powerflow_unbalanced import UnbalancedPowerFlow
 from feeders.recording import Recording, record
 from feeders.scenario import START, Scenario
 from feeders.schema import FeederTables
-from feeders.studies.calibrate_search import longer
+from feeders.studies.calibrate_corrections import longer
 from feeders.variation import Customers, Variation
 from gridsec.arrays import Floats
 from gridsec.attack import Attack

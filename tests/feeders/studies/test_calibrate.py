@@ -15,7 +15,7 @@ from feeders.recording import RecordingInvalid
 from feeders.scenario import START
 from feeders.schema import read, write
 from feeders.studies.calibrate import OtherFeeder, calibrate
-from feeders.studies.calibrate_search import Kind
+from feeders.studies.calibrate_corrections import Kind
 from feeders.studies.journal import OtherStudy
 from gridsec.attack import Attack, Bias, Drift, Replay, Stuck
 from tests.feeders.studies.calibrate_cases import (

@@ -16,9 +16,9 @@ from feeders.recording import record
 from feeders.scenario import START
 from feeders.schema import FeederTables
 from feeders.studies.calibrate import Calibrate, calibrate
+from feeders.studies.calibrate_corrections import Kind, longer
 from feeders.studies.calibrate_feeder import network, powers, series
 from feeders.studies.calibrate_readings import Frames
-from feeders.studies.calibrate_search import Kind, longer
 from gridsec.attack import Attack, Bias
 from gridsec.errors import FeederInvalid
 from gridsec.studies.calibrate_model import lengthened
