@@ -79,6 +79,27 @@ def submatrix(matrix: Floats, rows: Ints, columns: Ints) -> Floats:
     return matrix.take(columns, axis=1).take(rows, axis=0)
 
 
+def unit_rows(matrix: Floats, *, tol: float) -> Floats:
+    """Rows scaled to length one; those that are rounding errors are zero instead.
+
+    Parameters
+    ----------
+    matrix : (k, n)
+        Any matrix.
+    tol
+        Rows up to this part of the longest are zero. A row that should be zero comes out of a decomposition
+        as some 1e-17, and scaled to length one it would point anywhere.
+
+    Returns
+    -------
+    (k, n)
+        Rows of length one or zero.
+    """
+    length = np.linalg.norm(matrix, axis=1, keepdims=True)
+    nothing = length <= tol * np.max(length, initial=0.0)
+    return np.asarray(np.where(nothing, 0.0, matrix) / np.where(nothing, 1.0, length))
+
+
 def symmetry_defect(matrix: Floats) -> float:
     """Largest `|M - M^T|`, relative to the largest `|M|`; 0 for the zero matrix.
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, Ints
+from gridsec.arrays import Bools, Floats, Ints, unit_rows
 from gridsec.lure import close_loop
 from gridsec.studies.patterns import Patterns, patterns, unknown_pair, unknown_voltages
 
@@ -19,7 +19,10 @@ if TYPE_CHECKING:
 __all__ = ["TOLERANCE", "Attack", "Curves", "Knowledge", "customer_indices", "knowledge", "meter_mask"]
 
 TOLERANCE: Final = 1e-9
-"""Products of unit vectors up to this count as zero. Feeders' smallest singular values are above 1e-6."""
+"""Products of unit vectors up to this count as zero, and rows up to this part of the longest.
+
+Feeders' smallest singular values are above 1e-6.
+"""
 
 
 class Curves(StrEnum):
@@ -49,7 +52,7 @@ class Knowledge:
     found
         The patterns for each kind of attack.
     everywhere : (N, n)
-        What a meter at each customer would see, rows of length one.
+        What a meter at each customer would see, rows of length one; zero where nothing moves the voltage.
     """
 
     unknown: tuple[str, ...]
@@ -104,18 +107,18 @@ def knowledge(
         open_[customer_indices(site, unknown)] = True
     open_[site.meters[gone]] = True
     which = np.flatnonzero(open_)
-    lure = close_loop(site.feeder, site.droop, site.meters)
     W = unknown_voltages(site.feeder, which, busbar=not busbar_known, tol=TOLERANCE)
+    # A meter for everybody: what is rounding is so by what the feeder does, not by what its meters see of it.
+    lure = close_loop(site.feeder, site.droop, np.arange(metered.size))
     slope = lure.slope if curves is Curves.STEEPEST else np.zeros_like(lure.slope)
-    A, C = unknown_pair(lure, slope, W)
-    everybody = close_loop(site.feeder, site.droop, np.arange(metered.size))
-    every = unknown_pair(everybody, slope, W)[1]
-    length = np.linalg.norm(every, axis=1, keepdims=True)
+    A, every = unknown_pair(lure, slope, W)
+    everywhere = unit_rows(every, tol=TOLERANCE)
+    C = everywhere[site.meters]
     return Knowledge(
         tuple(site.feeder.customers[k] for k in which),
         gone,
         {each: patterns(A, C, persistent=each is Attack.PERSISTENT, tol=TOLERANCE) for each in Attack},
-        every / np.where(length > 0.0, length, 1.0),
+        everywhere,
     )
 
 

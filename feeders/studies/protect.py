@@ -222,10 +222,9 @@ def protect(
                 _kept(asked.attacker, kept), count, never=fixed, exact=exact, progress=progress
             )
     except Unprotectable as error:
-        who = ", ".join(site.meter_ids[j] for j in error.liars)
         raise DesignInfeasible(
             f"protection of {site.feeder.name} ({goal}, M = {max_attacked})",
-            f"{who} succeed together whatever else is protected, and none of them can be",
+            _unmet([site.meter_ids[j] for j in error.liars]),
         ) from error
     protected = np.zeros(count, dtype=np.bool_)
     protected[found.meters] = True
@@ -244,6 +243,13 @@ def protect(
         attacks=pd.DataFrame({"liars": [" ".join(site.meter_ids[j] for j in a) for a in found.attacks]}),
         share=share,
     )
+
+
+def _unmet(liars: Sequence[str]) -> str:
+    """Who succeeds in spite of all protection."""
+    if len(liars) == 1:
+        return f"{liars[0]} alone succeeds whatever else is protected, and it cannot be"
+    return f"{', '.join(liars)} succeed together whatever else is protected, and none of them can be"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

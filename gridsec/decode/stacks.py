@@ -19,7 +19,7 @@ from math import comb
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints
+from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints, unit_rows
 from gridsec.errors import DesignInfeasible, NotObservable
 from gridsec.index import Sparsest, fewest, kernel, row_space
 
@@ -106,7 +106,7 @@ def cospark(stack: Stack, *, tol: float, below: float = 0.0) -> Sparsest:
     stack
         Phi. Every block is scaled to norm one first, which changes no support.
     tol
-        What counts as zero then.
+        What counts as zero then; blocks shorter than this, relative to the longest, count as zero.
     below
         As in `gridsec.index.fewest`.
 
@@ -114,8 +114,10 @@ def cospark(stack: Stack, *, tol: float, below: float = 0.0) -> Sparsest:
     ----------
     lee2018, Notation and Symbols; Remark 2.2.1.
     """
-    at = np.cumsum(stack.heights)[:-1]
-    rows = [row_space(block, tol) for block in np.split(stack.matrix, at)]
+    blocks = np.split(stack.matrix, np.cumsum(stack.heights)[:-1])
+    size = stack.norms(np.linalg.norm(stack.matrix, axis=1))
+    heard = size > tol * np.max(size, initial=0.0)
+    rows = [row_space(block if some else block[:0], tol) for block, some in zip(blocks, heard, strict=True)]
     return fewest(rows, np.eye(stack.unknowns), tol=tol, below=below)
 
 
@@ -139,11 +141,9 @@ def spark(F: Floats, *, tol: float) -> Sparsest:
     ----------
     lee2018 (2.1.2): `cospark(C) = spark(F)` whenever F annihilates C and nothing else.
     """
-    size = np.linalg.norm(F, axis=0)
-    # A column that is all rounding error must not be blown up to one of norm one.
-    nothing = size <= tol * np.max(size, initial=0.0)
-    size = np.where(nothing, 1.0, size)
-    found = fewest([e[None, :] for e in np.eye(F.shape[1])], kernel(F * ~nothing / size, tol), tol=tol)
+    unit = unit_rows(F.T, tol=tol).T
+    size = np.where(unit.any(axis=0), np.linalg.norm(F, axis=0), 1.0)
+    found = fewest([e[None, :] for e in np.eye(F.shape[1])], kernel(unit, tol), tol=tol)
     x = found.direction / size if np.isfinite(found.count) else found.direction
     return Sparsest(found.count, found.blocks, x)
 

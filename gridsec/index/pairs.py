@@ -17,7 +17,7 @@ from typing import Literal
 
 import numpy as np
 
-from gridsec.arrays import Floats, Ints, frozen_ints
+from gridsec.arrays import Floats, Ints, frozen_ints, unit_rows
 from gridsec.index.blocks import Matrix, fewest, kernel, row_space, span
 from gridsec.index.spectrum import eigenspaces, unstable_subspace
 
@@ -97,7 +97,8 @@ def observable_rows(A: Floats, C: Floats, *, tol: float) -> tuple[Floats, ...]:
     A, C : (n, n), (p, n)
         The pair.
     tol
-        A new row shorter than this times |A| counts as nothing new.
+        A new row shorter than this times |A| counts as nothing new. A sensor whose row is up to this part of
+        the longest measures nothing.
 
     Returns
     -------
@@ -105,14 +106,13 @@ def observable_rows(A: Floats, C: Floats, *, tol: float) -> tuple[Floats, ...]:
         Empty for a sensor that measures nothing.
     """
     size = float(np.linalg.norm(A, 2)) or 1.0
-    return tuple(_arnoldi(A.T / size, c, tol) for c in np.asarray(C, dtype=np.float64))
+    rows = unit_rows(np.asarray(C, dtype=np.float64), tol=tol)
+    return tuple(_arnoldi(A.T / size, row, tol) for row in rows)
 
 
-def _arnoldi(step: Floats, start: Floats, tol: float) -> Floats:
-    basis = np.zeros((0, start.size))
-    length = float(np.linalg.norm(start))
-    row = start / length if length > 0.0 else start
-    while np.linalg.norm(row) > tol and len(basis) < start.size:
+def _arnoldi(step: Floats, row: Floats, tol: float) -> Floats:
+    basis = np.zeros((0, row.size))
+    while np.linalg.norm(row) > tol and len(basis) < row.size:
         basis = np.vstack([basis, row / np.linalg.norm(row)])
         row = step @ basis[-1]
         # Twice: once leaves rounding errors that a third of the rows would inherit.
@@ -121,9 +121,10 @@ def _arnoldi(step: Floats, start: Floats, tol: float) -> Floats:
     return basis
 
 
-def _sensors(C: Floats) -> list[Matrix]:
+def _sensors(C: Floats, tol: float) -> list[Matrix]:
     """Each sensor's row, scaled to length one: the unit of a sensor is no property of the system."""
-    return [row_space(c[None, :], 0.0) for c in np.asarray(C, dtype=np.float64)]
+    rows = unit_rows(np.asarray(C, dtype=np.float64), tol=tol)
+    return [row_space(row[None, :], 0.0) for row in rows]
 
 
 def static_index(C: Floats, *, tol: float) -> Index:
@@ -134,13 +135,14 @@ def static_index(C: Floats, *, tol: float) -> Index:
     C : (p, n)
         Output matrix.
     tol
-        A sensor whose unit row has a product with a unit state up to this does not see it.
+        A sensor whose unit row has a product with a unit state up to this does not see it. A sensor whose row
+        is up to this part of the longest measures nothing.
 
     References
     ----------
     lee2018 (3.2.2).
     """
-    found = fewest(_sensors(C), np.eye(C.shape[1]), tol=tol)
+    found = fewest(_sensors(C, tol), np.eye(C.shape[1]), tol=tol)
     return Index(found.count, frozen_ints(found.blocks), found.direction)
 
 
@@ -156,7 +158,7 @@ def dynamic_index(A: Floats, C: Floats, *, tol: float, by: By = "eigenvectors") 
     A, C : (n, n), (p, n)
         The pair.
     tol
-        What counts as zero, relative to unit vectors and |A|.
+        What counts as zero, relative to unit vectors, |A| and the longest row of C.
     by
         "eigenvectors": over every eigenspace, (3.2.4). "rank": over all states, (3.2.3).
 
@@ -206,7 +208,7 @@ def asymptotic_index(A: Floats, C: Floats, *, discrete: bool, tol: float, by: By
 
 
 def _over(spaces: Sequence[Matrix], C: Floats, tol: float, *, below: float = 0.0) -> Index:
-    rows = _sensors(C)
+    rows = _sensors(C, tol)
     best = fewest(rows, np.zeros((C.shape[1], 0)), tol=tol)
     for space in spaces:
         found = fewest(rows, space, tol=tol, below=below)

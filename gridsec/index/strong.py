@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gridsec.arrays import Floats
+from gridsec.arrays import Floats, unit_rows
 from gridsec.index.blocks import kernel, span
 
 
@@ -107,16 +107,15 @@ def under_attack(A: Floats, C: Floats, manipulated: Sequence[int], *, tol: float
     manipulated
         Sensors under the attacker's control.
     tol
-        As in `hidden`.
+        As in `hidden`. A sensor whose row is up to this part of the longest measures nothing.
 
     References
     ----------
     lee2018 (3.1.6), Propositions 3.1.3 and 3.1.10.
     """
-    lengths = np.linalg.norm(C, axis=1, keepdims=True)
     # Everything the size of A, so that one tolerance fits all: units change no subspace.
     size = float(np.linalg.norm(A, 2)) or 1.0
-    unit = C / np.where(lengths > 0.0, lengths, 1.0) * size
+    unit = unit_rows(C, tol=tol) * size
     D = size * np.eye(C.shape[0])[:, list(manipulated)]
     return hidden(A, np.zeros((A.shape[0], D.shape[1])), unit, D, tol=tol)
 

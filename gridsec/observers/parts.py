@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import LinAlgError, block_diag, schur, solve_discrete_are
 
-from gridsec.arrays import Floats, Ints, frozen, frozen_ints
+from gridsec.arrays import Floats, Ints, frozen, frozen_ints, unit_rows
 from gridsec.errors import DesignInfeasible
 
 
@@ -72,7 +72,7 @@ def decompose(A: Floats, C: Floats, *, slowest: float, tol: float) -> tuple[Part
     tol
         A row of the observability matrix, made orthogonal to those before it, counts as new if longer than
         this times |A|. Too large a value only makes parts smaller; too small a one promises what noise
-        then has to deliver.
+        then has to deliver. A sensor whose row is up to this part of the longest measures nothing.
 
     Returns
     -------
@@ -87,11 +87,12 @@ def decompose(A: Floats, C: Floats, *, slowest: float, tol: float) -> tuple[Part
         raise ValueError(f"A has shape {A.shape} and C {C.shape}; (n, n) and (p, n) are needed")
     if not 0.0 <= slowest <= 1.0:
         raise ValueError(f"slowest is {slowest}; it is the modulus of a decaying mode, in [0, 1]")
-    return tuple(_part(A, c, slowest, tol) for c in C)
+    return tuple(_part(A, c, row, slowest, tol) for c, row in zip(C, unit_rows(C, tol=tol), strict=True))
 
 
-def _part(A: Floats, c: Floats, slowest: float, tol: float) -> Part:
-    seen, unseen = _krylov(A, c, tol)
+def _part(A: Floats, c: Floats, row: Floats, slowest: float, tol: float) -> Part:
+    """Of the sensor with row c, of length one in `row`."""
+    seen, unseen = _krylov(A, row, tol)
     hidden_count, turn = 0, np.zeros((0, 0))
     if unseen.shape[1]:
         # N(G) is invariant: the leading Schur vectors of its slow modes are invariant in their turn,
@@ -105,13 +106,11 @@ def _part(A: Floats, c: Floats, slowest: float, tol: float) -> Part:
     return Part(frozen(seen), frozen(fading), frozen(hidden), frozen(Z.T @ A @ Z), frozen(c @ Z))
 
 
-def _krylov(A: Floats, c: Floats, tol: float) -> tuple[Floats, Floats]:
-    """Orthonormal bases of span{c, A^T c, …} and of its complement, without powers of A."""
+def _krylov(A: Floats, row: Floats, tol: float) -> tuple[Floats, Floats]:
+    """Orthonormal bases of span{c, A^T c, …} and of its complement, without powers of A; c of length one."""
     n = A.shape[0]
     size = float(np.linalg.norm(A, 2)) or 1.0
     basis = np.zeros((n, 0))
-    length = float(np.linalg.norm(c))
-    row = c / length if length > 0.0 else c
     while basis.shape[1] < n and (length := float(np.linalg.norm(row))) > tol:
         basis = np.column_stack([basis, row / length])
         row = A.T @ basis[:, -1] / size

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.linalg import qr
 from scipy.sparse.csgraph import connected_components
 
-from gridsec.arrays import Bools, Floats, Ints
+from gridsec.arrays import Bools, Floats, Ints, unit_rows
 from gridsec.index import Index, Sparsest, eigenspaces, fewest, kernel, linearise
 from gridsec.index.blocks import MOST_NODES, Matrix
 from gridsec.index.rows import fewest_rows
@@ -40,7 +40,7 @@ class Patterns:
     spaces : (n, g) each
         Orthonormal bases of the eigenspaces to search.
     seen : (p, g) each
-        What the meters see of them, each meter's row of C scaled to length one.
+        What the meters see of them, each meter's row of C scaled to length one, or zero.
     tol
         Products of unit vectors up to this are zero.
     """
@@ -79,17 +79,20 @@ def unknown_voltages(feeder: Network, unknown: Ints, *, busbar: bool, tol: float
     busbar
         Whether the busbar's voltage is unknown as well.
     tol
-        Singular values up to this part of the largest, of columns of unit length, are zero.
+        A power moves nothing if its column is up to this part of the longest. Singular values up to this
+        part of the largest, of columns of unit length, are zero.
     """
-    columns = [between(feeder, power)[:, unknown] for power in Power]
+    powers = np.hstack([between(feeder, power)[:, unknown] for power in Power])
+    columns = unit_rows(powers.T, tol=tol).T
     if busbar:
-        columns.append(from_busbar(feeder))
-    whole = np.hstack(columns)
-    length = np.linalg.norm(whole, axis=0)
-    if not length.any():
+        columns = np.hstack([columns, unit_rows(from_busbar(feeder).T, tol=tol).T])
+    if not columns.any():
         return np.zeros((feeder.bus.size, 0))
-    u, s, _ = np.linalg.svd(whole[:, length > 0.0] / length[length > 0.0], full_matrices=False)
-    return np.asarray(u[:, s > tol * s[0]])
+    _, s, vh = np.linalg.svd(columns, full_matrices=False)
+    some = s > tol * s[0]
+    # The left singular vectors, but every row as exact as that of its customer: those of the decomposition
+    # are as exact as the longest, and of a customer beside the busbar nothing would be left but rounding.
+    return np.asarray(columns @ (vh[some].T / s[some]))
 
 
 def from_busbar(feeder: Network) -> Floats:
@@ -119,7 +122,8 @@ def unknown_pair(lure: Lure, slope: Floats, W: Floats) -> tuple[Floats, Floats]:
     """
     A, C = linearise(lure, slope)
     # Injections in units of the voltages that they make: no subspace changes, and ranks become decidable.
-    unit = float(np.linalg.norm(lure.C, 2)) or 1.0
+    # What inverters do to each other is in it, since meters may see none of them.
+    unit = float(np.linalg.norm(np.vstack([lure.C, lure.H]), 2)) or 1.0
     d = W.shape[1]
     whole = np.block([[A, -unit * (lure.G * slope) @ lure.F @ W], [np.zeros((d, A.shape[0] + d))]])
     return whole, np.hstack([C / unit, -lure.D @ W])
@@ -136,13 +140,12 @@ def patterns(A: Floats, C: Floats, *, persistent: bool, tol: float) -> Patterns:
         Only of eigenvalues that do not decay: attacks that die away by themselves are left out, and
         observability becomes detectability.
     tol
-        As in `gridsec.index.dynamic_index`.
+        As in `gridsec.index.dynamic_index`: rows of C up to this part of the longest see nothing, too.
     """
     found = eigenspaces(A, tol=tol) if A.size else ()
     if persistent:
         found = tuple(each for each in found if each.unstable(discrete=False, tol=tol))
-    length = np.linalg.norm(C, axis=1, keepdims=True)
-    rows = C / np.where(length > 0.0, length, 1.0)
+    rows = unit_rows(C, tol=tol)
     spaces: list[Matrix] = []
     for each in found:
         # A real eigenvalue has real eigenvectors, and real arithmetic is four times as fast.

@@ -18,6 +18,7 @@ from gridsec.arrays import (
     spectral_radius,
     submatrix,
     symmetry_defect,
+    unit_rows,
 )
 
 
@@ -51,6 +52,15 @@ def test_a_submatrix_is_picked_entry_by_entry(data: st.DataObject, n: int, m: in
 
 def test_no_indices_at_all_are_integers_of_any_type() -> None:
     assert frozen_ints(np.array([])).dtype == np.intp
+
+
+def test_unit_rows_are_directions_or_nothing() -> None:
+    rows = np.array([[3.0, 4.0], [0.0, 0.0], [1e-16, -2e-17], [0.0, 1e-6]])
+    assert unit_rows(rows, tol=1e-9).tolist() == [[0.6, 0.8], [0.0, 0.0], [0.0, 0.0], [0.0, 1.0]]
+    # The unit of the whole is no property of it, and nothing is divided by zero.
+    np.testing.assert_allclose(unit_rows(1e-100 * rows, tol=1e-9), unit_rows(rows, tol=1e-9), rtol=1e-15)
+    assert unit_rows(np.zeros((2, 3)), tol=1e-9).tolist() == [[0.0] * 3] * 2
+    assert unit_rows(np.zeros((0, 3)), tol=0.0).shape == (0, 3)
 
 
 def test_symmetry_defect() -> None:

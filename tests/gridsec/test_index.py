@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Iterator
 from fractions import Fraction
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from scipy.linalg import block_diag
 from scipy.linalg import orth as scipy_orth
 
 from gridsec.arrays import Floats
+from gridsec.decode.stacks import Stack, cospark
 from gridsec.errors import DesignInfeasible
 from gridsec.index import (
     asymptotic_index,
@@ -36,6 +38,7 @@ from gridsec.index import (
     unstable_subspace,
 )
 from gridsec.lure import equilibrium
+from gridsec.observers.parts import decompose
 from tests.gridsec.exact_pairs import Exact, cases, exact_rank, power
 from tests.gridsec.plants import line, tree
 
@@ -426,3 +429,21 @@ def whole(row: Exact) -> list[int]:
     """A row of fractions as integers, up to a factor."""
     factor = math.lcm(*(f.denominator for f in row))
     return [int(f * factor) for f in row]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_sensor_that_is_rounding_measures_nothing(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((4, 4))
+    A = (A + A.T) / np.linalg.norm(A, 2)
+    C = np.vstack([rng.standard_normal((3, 4)), np.zeros(4)])
+    noisy = C + np.outer([0.0, 0.0, 0.0, 1e-16], rng.standard_normal(4))
+    for ways in ("eigenvectors", "rank"):
+        for index in (dynamic_index, partial(asymptotic_index, discrete=False)):
+            assert index(A, noisy, tol=TOL, by=ways).count == index(A, C, tol=TOL, by=ways).count == 3
+    assert static_index(noisy, tol=TOL).count == static_index(C, tol=TOL).count
+    assert observable_rows(A, noisy, tol=TOL)[3].shape == (0, 4)
+    assert decompose(A, noisy, slowest=0.0, tol=TOL)[3].observable.shape == (4, 0)
+    assert cospark(Stack.of_rows(noisy), tol=TOL).count == cospark(Stack.of_rows(C), tol=TOL).count
+    # Without the three others nothing is left to see with.
+    assert under_attack(A, noisy, (0, 1, 2), tol=TOL).weakly_unobservable.shape[1] == 4

@@ -41,6 +41,17 @@ def test_to_notice_asks_for_no_more_than_to_identify() -> None:
     assert seen[1].after == 3.0
 
 
+def test_who_moves_only_his_own_meter_is_protected_or_nobody_notices() -> None:
+    site = load("cigre-lv")
+    asked = {"max_attacked": 1, "unknown": ["Load R15"], "goal": Goal.NOTICE}
+    found = protect(site, **asked)
+    assert found.meters["meter"].tolist() == ["m03"]
+    assert (found.before, found.least) == (1.0, 1)
+    assert found.after > 1.0
+    with pytest.raises(DesignInfeasible, match="m03 alone succeeds whatever else is protected"):
+        protect(site, **asked, never=["m03"])
+
+
 def test_lies_stay_below_the_bound_in_volts() -> None:
     found = protect(RURAL, max_attacked=2, goal=Goal.BOUND, lie_volt=4.5)
     assert found.before > 4.5 >= found.after > 0.0
@@ -66,7 +77,7 @@ def test_a_bound_is_the_same_part_of_every_level() -> None:
 
 
 def test_what_cannot_be_done_is_told_with_names() -> None:
-    with pytest.raises(DesignInfeasible, match="m08 succeed"):
+    with pytest.raises(DesignInfeasible, match="m08 alone succeeds"):
         protect(RURAL, max_attacked=2, unknown=UNKNOWN, never=["m08"])
     with pytest.raises(ValueError, match="lie_volt is nan"):
         protect(RURAL, max_attacked=2, goal=Goal.BOUND)

@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 
 from gridsec.arrays import Floats
+from gridsec.droop import fleet
 from gridsec.feeder import Feeder
 from gridsec.index import redundant_detectable, redundant_observable
+from gridsec.lure import close_loop
 from gridsec.mesh import MeshedFeeder
+from gridsec.network import Network
 from gridsec.studies.patterns import Patterns, fewest_meters, patterns, unknown_pair, unknown_voltages
 from gridsec.studies.redundancy import meter_redundancy, part_redundancy, parts, tree_bus
-from tests.gridsec.studies.small import TOL, brute, system, tree
+from tests.gridsec.studies.small import TOL, brute, in_phases, system, tree
 
 
 def given(A: Floats, C: Floats, *, persistent: bool) -> Patterns:
@@ -147,6 +150,45 @@ def test_an_unknown_busbar_in_three_phases_moves_the_meters_of_a_phase() -> None
     each = np.bincount(feeder.bus[meters] % 3, minlength=3)
     found = fewest_meters(given(A, C, persistent=True))
     assert found.count == each[each > 0].min() < meters.size
+
+
+@pytest.mark.parametrize("form", ["radial", "phases", "meshed"])
+@pytest.mark.parametrize("seed", range(5))
+def test_a_meter_that_no_unknown_load_moves_has_no_index(seed: int, form: str) -> None:
+    """At the busbar, and on a street that has nothing in common with that of the unknown load."""
+    rng = np.random.default_rng(seed)
+    feeder: Network = Feeder(
+        name="streets",
+        parent=np.array([0, 1, 0, 3, 4, 3]),
+        r=rng.uniform(0.01, 0.2, 6),
+        x=rng.uniform(0.005, 0.05, 6),
+        bus=np.array([0, 1, 2, 3, 4, 5, 6]),
+        customers=tuple(f"c{i}" for i in range(7)),
+        buses=tuple(f"b{i}" for i in range(7)),
+        base_volt=230.0,
+        base_kva=100.0,
+        charging=np.zeros(6),
+    )
+    assert isinstance(feeder, Feeder)
+    if form == "phases":
+        feeder = in_phases(feeder, np.zeros(7, dtype=np.intp), mutual=0.4)
+    elif form == "meshed":
+        feeder = MeshedFeeder(feeder, np.array([[5, 6]]), np.array([0.07]), np.array([0.02]), np.zeros(1))
+    droop = fleet(np.array([2, 4]), "ieee1547-b", np.array([5.0, 9.0]), 100.0, tau=np.array([2.0, 3.1]))
+    lure = close_loop(feeder, droop, np.arange(7))
+    W = unknown_voltages(feeder, np.array([5]), busbar=False, tol=TOL)
+    np.testing.assert_allclose(W.T @ W, np.eye(2), atol=1e-12)
+    A, C = unknown_pair(lure, lure.slope, W)
+    found, nobody = given(A, C, persistent=True), np.zeros(7, dtype=np.bool_)
+    counts = [meter_redundancy(found, j, nobody).own.count for j in range(7)]
+    assert counts[:3] == [np.inf] * 3
+    everybody = list(range(7))
+    # Oracle: ranks of what stays, without the meters that hear nothing.
+    assert min(counts[3:]) == brute(A, C[3:], everybody[:4], everybody[:4], persistent=True)
+    # Nobody with a meter feels it: there is nothing to imitate, however it is rounded.
+    lure = close_loop(feeder, droop, np.arange(3))
+    A, C = unknown_pair(lure, lure.slope, W)
+    assert fewest_meters(given(A, C, persistent=True)).count == np.inf
 
 
 def test_a_liar_must_be_there() -> None:
