@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from feeders import outside
-from feeders.columns import ESTIMATORS
+from feeders.columns import ESTIMATORS, OWN_ESTIMATORS
 from feeders.design_cache import bank_gains
 from feeders.doubts import load_doubt, unread
 from feeders.load import Site, from_tables, plant
@@ -113,7 +113,8 @@ class Family:
     summary
         One line for people.
     design
-        `design(site, job)` prepares; raises `NotObservable` or `DesignInfeasible`.
+        `design(site, job)` prepares; raises `NotObservable` or `DesignInfeasible`. Whatever else another
+        package's raises becomes `EstimatorUnusable` in the function `design` of this module.
     init
         `init(design, t)` begins to watch.
     step
@@ -225,10 +226,14 @@ def design(
     ------
     NotObservable, DesignInfeasible
         If the feeder cannot be watched as its file asks for.
+    EstimatorUnusable
+        If the estimator is another package's, and its code fails.
     """
     settings = site.tables.meta.monitor
-    family = FAMILIES[settings.estimator]
-    return Watcher(family, family.design(site, Job(workers, where, progress)), settings.max_attacked)
+    family, job = FAMILIES[settings.estimator], Job(workers, where, progress)
+    if family.name in OWN_ESTIMATORS:
+        return Watcher(family, family.design(site, job), settings.max_attacked)
+    return Watcher(family, outside.design(family.name, family.design, site, job), settings.max_attacked)
 
 
 def _sequential(site: Site, _: Job) -> sequential.SequentialDesign:

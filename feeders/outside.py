@@ -7,11 +7,15 @@ that name. Names are known without running anybody's code; a family is loaded wh
 from __future__ import annotations
 
 import re
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-from gridsec.errors import GridsecError
+from gridsec.errors import DesignInfeasible, GridsecError, NotObservable
+
+if TYPE_CHECKING:
+    from feeders.estimators import Job
+    from feeders.load import Site
 
 GROUP: Final = "gridsec.estimators"
 
@@ -65,6 +69,36 @@ def load(name: str, kind: type) -> Any:
             f"estimator {name!r} ({_where(points[0])}) is no {kind.__name__} of that name"
         )
     return made
+
+
+def design(name: str, make: Callable[[Site, Job], Any], site: Site, job: Job) -> Any:
+    """What an estimator of another package prepares for a feeder.
+
+    Parameters
+    ----------
+    name
+        The estimator's name.
+    make
+        Its function.
+    site, job
+        What it is given.
+
+    Raises
+    ------
+    NotObservable, DesignInfeasible
+        If it says so.
+    EstimatorUnusable
+        If it raises anything else.
+    """
+    try:
+        return make(site, job)
+    except (NotObservable, DesignInfeasible):
+        raise
+    except Exception as failure:  # the code of others may do anything
+        why = " ".join(f"{type(failure).__name__}: {failure}".split())
+        raise EstimatorUnusable(
+            f"estimator {name!r} cannot be designed for {site.feeder.name}: {why}"
+        ) from failure
 
 
 def _where(point: EntryPoint) -> str:

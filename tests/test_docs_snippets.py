@@ -10,16 +10,22 @@ import subprocess
 import sys
 import tomllib
 import warnings
+from collections.abc import Callable
 from contextlib import redirect_stdout
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from feeders.estimators import Job
-from feeders.load import load
+from benchmarks.mesh import european, landnetz
+from feeders import trials
+from feeders.estimators import Family, Job, Watcher
+from feeders.lies import Lie, Trick
+from feeders.load import Site, load
+from feeders.trials import Meters, Trial
 from gridsec.online import Decision
 from tests.acceptance.live import serve
 from tests.feeders.test_bad_frames import BEFORE, frames, put
@@ -124,10 +130,37 @@ def test_the_estimator_serves(installed: Path) -> None:
         assert live.get("/api/v1/feeders/simbench-lv-rural1/commissioning")["estimator"] == "neighbours"
 
 
-def test_the_estimator_owes_what_the_page_says() -> None:
+def neighbours() -> Family:
+    """The estimator of the page."""
     space: dict[str, Any] = {"__name__": "neighbours"}
     exec(compile(MODULE[1], "neighbours", "exec", dont_inherit=True), space)
     family = space["FAMILY"]
+    assert isinstance(family, Family)
+    return family
+
+
+@pytest.mark.parametrize("make", [partial(load, "ieee-european-lv"), landnetz, european])
+def test_the_estimator_watches_three_phases_and_meshes(make: Callable[[], Site]) -> None:
+    family, lie = neighbours(), Lie(Trick.BIAS, count=1, size=6.0, onset_s=5.0)
+    trial = Trial(make(), seed=1, lie=lie, meters=Meters.SITE, duration_s=10.0)
+    made, played = family.design(trial.stated, Job()), list(trials.frames(trial))
+    outcome = trials.judge(Watcher(family, made), trial, settling_s=3.0, played=played)
+    assert (outcome.missed, outcome.false_names.max()) == (0, 0)
+    assert outcome.delay_s.tolist() == [2.0]
+    # The model is wrong by far less than the 6 % of the lie.
+    assert outcome.error_all.max() < 1.0
+    first = played[0][0]
+    lost = replace(first, v0_squared=np.nan, v0_phases=None)
+    if first.v0_phases is not None:
+        lost = replace(first, v0_phases=np.array([np.nan, 1.0, 1.0]))
+    for bad in (lost, put(first, "p", np.inf)):
+        _, estimate, verdict = family.step(made, family.init(made, first.t), bad)
+        assert verdict.decision is Decision.UNDECIDED
+        assert np.isfinite([*estimate.v2, *estimate.v2_bus, *estimate.bound]).all()
+
+
+def test_the_estimator_owes_what_the_page_says() -> None:
+    family = neighbours()
     made, t = family.design(load("simbench-lv-rural1"), Job()), frames()[0].t - 1.0
     last = frames()[-1]
     silent = replace(last, y=np.full(last.y.shape, np.nan), seen=np.zeros(last.seen.shape, dtype=np.bool_))

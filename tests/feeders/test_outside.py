@@ -5,14 +5,17 @@ from __future__ import annotations
 import importlib
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from feeders import estimators, outside
 from feeders.columns import ESTIMATORS, OWN_ESTIMATORS
-from feeders.estimators import Families, Family
+from feeders.estimators import Families, Family, Job
+from feeders.load import Site, load
 from feeders.outside import EstimatorUnusable
+from gridsec.errors import DesignInfeasible, FeederInvalid, NotObservable
 
 GOOD = """
 from feeders.estimators import Family
@@ -76,28 +79,63 @@ def test_what_cannot_be_used_is_refused_by_name(place: Path) -> None:
             outside.load(name, Family)
 
 
+def test_what_a_design_says_on_purpose_is_passed_on_and_all_else_is_one_line() -> None:
+    site, job = load("cigre-lv"), Job()
+
+    def failing(error: Exception) -> Callable[[Site, Job], None]:
+        def design(_: Site, __: Job) -> None:
+            raise error
+
+        return design
+
+    assert outside.design("mine", lambda site, job: (site, job), site, job) == (site, job)
+    for known in (NotObservable((0,), 1, "too few"), DesignInfeasible("design", "not found")):
+        with pytest.raises(type(known)) as told:
+            outside.design("mine", failing(known), site, job)
+        assert told.value is known
+    for other in (FeederInvalid(["of two", "reasons"]), KeyError("x"), MemoryError()):
+        with pytest.raises(EstimatorUnusable, match="'mine' cannot be designed for cigre-lv: ") as told:
+            outside.design("mine", failing(other), site, job)
+        assert type(other).__name__ in str(told.value)
+        assert "\n" not in str(told.value)
+        assert told.value.__cause__ is other
+
+
 def test_a_broken_one_leaves_the_others_alone(place: Path) -> None:
     install(place, "pkg_f", "raise RuntimeError('out of order')", "broken = pkg_f:FAMILY")
+    install(place, "pkg_g", GOOD.replace("lambda s, j: s", "lambda s, j: s.nothing"), "mine = pkg_g:FAMILY")
     code = (
         "from service.cli import main\n"
         "from feeders.comparison import Plan, compare\n"
         "from feeders.load import load\n"
-        "who = ('broken', 'l0-decoder')\n"
+        "who = ('broken', 'mine', 'l0-decoder')\n"
         "plan = Plan(max_attacked=1, seeds=1, duration_s=70, cases=('bias',), families=who)\n"
         "print([(row.family, row.reason, row.liars) for row in compare(load('simbench-lv-rural1'), plan)])\n"
         "main()\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code, "feeders", "estimators"],
+    done = run(place, code, "feeders", "estimators")
+    assert done.returncode == 0, done.stderr
+    _, rows, listing = done.stdout.split("\n", 2)
+    why = "estimator 'mine' cannot be designed for simbench-lv-rural1: AttributeError: 'Site' object has no"
+    assert why in rows
+    assert "('l0-decoder', '', 1)" in rows
+    assert "out of order" in rows
+    assert "out of order" in listing
+    assert all(name in listing for name in OWN_ESTIMATORS)
+    code = "from service.cli import main\nmain()\n"
+    few = ("--scenarios", "16", "--duration", "60", "--workers", "1", "--no-journal")
+    done = run(place, code, "study", "campaign", "simbench-lv-rural1", "--estimator", "mine", *few)
+    assert done.returncode == 1
+    assert why in " ".join(done.stderr.split())
+    assert "Traceback" not in done.stderr
+
+
+def run(place: Path, code: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", code, *arguments],
         capture_output=True,
         text=True,
         timeout=120,
         check=False,
         env={"PYTHONPATH": str(place), "COLUMNS": "200", "OPENBLAS_NUM_THREADS": "1"},
     )
-    assert done.returncode == 0, done.stderr
-    rows, listing = done.stdout.split("\n", 1)
-    assert "('l0-decoder', '', 1)" in rows
-    assert "out of order" in rows
-    assert "out of order" in listing
-    assert all(name in listing for name in OWN_ESTIMATORS)
