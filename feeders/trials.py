@@ -1,9 +1,9 @@
 """Trials: short simulated runs with known liars, by which any estimator family is judged.
 
 A trial is a `feeders.scenario.Scenario` with one load situation that varies slowly. Its frames hold the
-powers of the profiles of all customers with a meter, and the true loads differ from these by an
+powers of the profiles of all customers whose meter is heard, and the true loads differ from these by an
 Ornstein-Uhlenbeck process; of all others they know what the service does, the range that these can draw or
-feed in. The truth is full AC power flow with the droop inverters in closed loop.
+feed in, or a forecast. The truth is full AC power flow with the droop inverters in closed loop.
 """
 
 from __future__ import annotations
@@ -217,8 +217,8 @@ def frames(
     ------
     Frame, Truth
         One pair per tick. Frames hold the powers of the profiles (as falsified where the lie says so), and
-        intervals of `LoadError.half_width`, of customers with a meter; the others', and all where there is
-        no `load_error`, are those of `to_frame`.
+        intervals of `LoadError.half_width`, of customers whose meter is heard; the others', and all where
+        there is no `load_error`, are those of `to_frame`.
 
     Raises
     ------
@@ -241,15 +241,16 @@ def frames(
     for sample, snapshot, (p_kw, q_kvar) in zip(samples, snapshots(samples), told, strict=True):
         frame = to_frame(site, snapshot)
         if trial.load_error is not None:
-            frame = _powers(trial.load_error, site, frame, p_kw, q_kvar)
+            read = np.isfinite(snapshot.p_kw)
+            frame = _powers(trial.load_error, site, frame, (p_kw, q_kvar), read)
         yield frame, _truth(site, scenario, sample)
 
 
-def _powers(error: LoadError, site: Site, frame: Frame, p_kw: Floats, q_kvar: Floats) -> Frame:
-    """The frame with powers as told; those that nobody would believe, or meters, stay what they are."""
-    base = site.feeder.base_kva
+def _powers(error: LoadError, site: Site, frame: Frame, powers: tuple[Floats, Floats], read: Bools) -> Frame:
+    """The frame with powers as told; those that nobody reads, or would believe, stay what they are."""
+    (p_kw, q_kvar), base = powers, site.feeder.base_kva
     believed = np.zeros(frame.p.size, dtype=np.bool_)
-    believed[site.meters] = (np.abs(p_kw) <= site.loads.credible * base)[site.meters]
+    believed[site.meters] = read & (np.abs(p_kw) <= site.loads.credible * base)[site.meters]
     p_error = np.full(frame.p.size, error.half_width * error.p_kw / base)
     # Registers are exact here, so that what a frame does not believe of them is what no connection carries.
     p_error[site.meters] = np.maximum(p_error[site.meters], frame.p_error[site.meters])

@@ -14,7 +14,8 @@ from feeders.campaign import NoSuchAttack
 from feeders.doubts import load_doubt
 from feeders.estimators import FAMILIES, Family, Watcher, choose, design
 from feeders.lies import Lie, Trick, manipulations
-from feeders.load import Site, from_tables, load
+from feeders.load import Site, Snapshot, from_tables, load, to_frame
+from feeders.meters import Channel, Silence
 from feeders.scenario import START, simulate
 from feeders.trials import LoadError, Meters, Trial, Truth, frames, judge
 from feeders.variation import Customers
@@ -303,6 +304,27 @@ def test_a_load_that_nobody_would_believe_is_no_measurement() -> None:
     peak = site.loads.load_peak[customer] + site.loads.pv_peak[customer]
     assert after.p_error[customer] == pytest.approx(0.5 * peak)
     assert before.p_error[customer] < 0.1 * after.p_error[customer]
+
+
+@pytest.mark.parametrize("ask", ["none", "profiles"])
+def test_a_silent_meter_tells_no_powers(ask: str) -> None:
+    """Oracle: the frame of a feeder that nobody reads. All others are those of the run without silence."""
+    tables = small().tables
+    meta = replace(tables.meta, load=replace(tables.meta.load, forecast=ask))
+    made = trial(site=from_tables(replace(tables, meta=meta)), duration_s=4.0, profile_s=0.0)
+    mute = Silence(small().meter_ids[5], START + 2.0, START + 3.0)
+    scenario = replace(made.scenario, channel=Channel(silences=(mute,)))
+    nobody = np.full(13, np.nan)
+    lost = to_frame(made.stated, Snapshot(START + 2.0, nobody, nobody, nobody, np.nan))
+    customer = small().meters[5]
+    names = ("p", "p_error", "q", "q_error", *(("p_std", "q_std") if ask == "profiles" else ()))
+    for tick, ((frame, _), (plain, _)) in enumerate(zip(frames(made, scenario), frames(made), strict=True)):
+        silent = np.arange(frame.p.size) == customer if tick == 2 else np.zeros(frame.p.size, np.bool_)
+        np.testing.assert_array_equal(~frame.seen, silent[small().meters])
+        for name in names:
+            found, told, unread = (getattr(each, name) for each in (frame, plain, lost))
+            np.testing.assert_array_equal(found, np.where(silent, unread, told))
+    assert lost.p_error[customer] > plain.p_error[customer]
 
 
 def test_inverters_move_the_truth_and_no_report() -> None:
