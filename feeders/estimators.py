@@ -24,7 +24,7 @@ from gridsec.gains import CircleOptions, options_for
 from gridsec.lure import Lure, close_loop
 from gridsec.network import linear
 from gridsec.online import Estimate, Frame, Verdict
-from gridsec.sequential import Commission
+from gridsec.sequential import Commission, Distrust
 from gridsec.sequential.decoder import Decoder
 
 __all__ = [
@@ -35,6 +35,7 @@ __all__ = [
     "Family",
     "Job",
     "Learner",
+    "Memory",
     "Watcher",
     "choose",
     "design",
@@ -103,6 +104,22 @@ class Learner:
 
 
 @dataclass(frozen=True, slots=True)
+class Memory:
+    """What a family can do besides that can go on distrusting who was.
+
+    Attributes
+    ----------
+    distrusted
+        `distrusted(design, state)`: who is not believed now.
+    restore
+        `restore(design, state, distrust)`: a state from `init`, in which these are not believed.
+    """
+
+    distrusted: Callable[[Any, Any], Distrust]
+    restore: Callable[[Any, Any, Distrust], Any]
+
+
+@dataclass(frozen=True, slots=True)
 class Family:
     """An estimator family: three functions and a name.
 
@@ -127,6 +144,8 @@ class Family:
         How many manipulated meters a design tells apart; None: as many as the feeder's file asks for.
     learner
         How it learns its meters' fixed errors; None: it does not.
+    memory
+        How it goes on distrusting who was; None: it begins anew.
     """
 
     name: str
@@ -138,6 +157,7 @@ class Family:
     proof: Callable[[Any], str]
     withstands: Callable[[Any], int] | None = None
     learner: Learner | None = None
+    memory: Memory | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -440,6 +460,7 @@ FAMILIES: Final = Families(
                 renew=sequential.renew,
                 read=sequential.from_arrays,
             ),
+            Memory(sequential.distrusted, sequential.restore),
         ),
         _bank(DIRECT, "banks of circle-criterion observers, direct injection (chong2020)", _direct_bank),
         _bank(LMI, "the same banks, gains by matrix inequality (chong2020)", _lmi_bank),

@@ -1,4 +1,6 @@
-"""What is kept of a feeder's commissioning: a typed, versioned JSON text, and whether it still fits.
+"""What is kept of a feeder: typed, versioned JSON texts, and whether they still fit.
+
+Its commissioning, and whom its monitor does not believe.
 
 Numbers are written with as many digits as give the same float64 back, NaN as null.
 """
@@ -8,9 +10,11 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Final
+from enum import StrEnum
+from typing import Annotated, Any, Final, TypeVar
 
 import msgspec
 import numpy as np
@@ -19,12 +23,20 @@ from feeders.load import Site
 from feeders.schema import to_json
 from gridsec.arrays import Floats
 from gridsec.errors import GridsecError
+from gridsec.sequential import Distrust
 
 FORMAT: Final = 1
 """Version of the text; it changes when its fields do."""
 _Finite = Annotated[float, msgspec.Meta(gt=-1e300, lt=1e300)]
 # Of the feeder's file, what says how it is watched and shown, not what it is.
 _BESIDE = ("title", "accept", "busbar_xy", "limits", "monitor")
+
+
+class Matter(StrEnum):
+    """What a text is about."""
+
+    COMMISSION = "commission"
+    DISTRUST = "distrust"
 
 
 class KeptInvalid(GridsecError):
@@ -42,16 +54,19 @@ class Kept:
     t
         Unix time of the tick that it belongs to, s.
     text
-        What `encode` wrote.
+        What `encode` or `encode_distrust` wrote.
+    matter
+        Which of them.
     """
 
     feeder: str
     t: float
     text: str
+    matter: Matter = Matter.COMMISSION
 
 
 class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What the text holds.
+    """What the text of a commissioning holds.
 
     Attributes
     ----------
@@ -134,15 +149,7 @@ def decode(site: Site, now: Mapping[str, str], kept: Kept) -> dict[str, Floats]:
     KeptInvalid
         If the text is damaged, newer than this program, or of a feeder that has changed since.
     """
-    try:
-        version = msgspec.json.decode(kept.text, type=_Version).format
-        if version > FORMAT:
-            raise KeptInvalid(f"it is of format {version}, and this program knows {FORMAT}")
-        record = msgspec.json.decode(kept.text, type=Record)
-    except msgspec.DecodeError as error:
-        raise KeptInvalid(f"it is damaged: {error}") from error
-    if record.feeder != site.feeder.name:
-        raise KeptInvalid(f"it is of feeder {record.feeder!r}")
+    record = _read(site, kept, Record)
     changed = [name for name in now if record.fingerprint.get(name) != now[name]]
     if changed:
         raise KeptInvalid(f"the feeder has changed since ({', '.join(changed)})")
@@ -155,10 +162,138 @@ def decode(site: Site, now: Mapping[str, str], kept: Kept) -> dict[str, Floats]:
     }
 
 
+class Suspect(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A meter that is not believed.
+
+    Attributes
+    ----------
+    meter
+        Its id.
+    scale_s
+        Time scale on which it was caught, s.
+    named
+        Whether it was named as manipulated.
+    """
+
+    meter: str
+    scale_s: Annotated[float, msgspec.Meta(gt=0.0, lt=1e300)]
+    named: bool
+
+
+class Deviant(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """An inverter that was named as manipulated.
+
+    Attributes
+    ----------
+    customer
+        Whose.
+    number
+        Which of them, in the order of the feeder's file.
+    """
+
+    customer: str
+    number: Annotated[int, msgspec.Meta(ge=0)]
+
+
+class DistrustRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What the text about who is not believed holds.
+
+    Attributes
+    ----------
+    format
+        Its version.
+    feeder, t
+        As in `Kept`.
+    meters, inverters
+        Who; nobody else.
+    """
+
+    format: int
+    feeder: str
+    t: _Finite
+    meters: list[Suspect]
+    inverters: list[Deviant]
+
+
+def encode_distrust(site: Site, t: float, distrust: Distrust) -> Kept:
+    """Write who is not believed.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    t
+        Unix time of the tick, s.
+    distrust
+        Who.
+    """
+    name, scale_s, owners = site.feeder.name, distrust.scale_s, _owners(site)
+    suspects = [
+        Suspect(site.meter_ids[k], float(scale_s[k]), bool(distrust.named[k]))
+        for k in np.flatnonzero(np.isfinite(scale_s)).tolist()
+    ]
+    deviants = [Deviant(*owners[k]) for k in np.flatnonzero(distrust.inverters).tolist()]
+    record = DistrustRecord(FORMAT, name, t, suspects, deviants)
+    return Kept(name, t, msgspec.json.encode(record).decode(), Matter.DISTRUST)
+
+
+def decode_distrust(site: Site, kept: Kept) -> Distrust:
+    """Read who is not believed of the meters and inverters that the feeder has now.
+
+    Parameters
+    ----------
+    site, kept
+        The feeder, and the text.
+
+    Raises
+    ------
+    KeptInvalid
+        If the text is damaged, newer than this program, or of another feeder.
+    """
+    record, owners = _read(site, kept, DistrustRecord), _owners(site)
+    who = {suspect.meter: suspect for suspect in record.meters}
+    if len(who) < len(record.meters):
+        raise KeptInvalid("it is damaged: a meter is in it twice")
+    deviants = {(deviant.customer, deviant.number) for deviant in record.inverters}
+    found = [who.get(meter) for meter in site.meter_ids]
+    return Distrust(
+        np.array([math.nan if one is None else one.scale_s for one in found], dtype=np.float64),
+        np.array([one is not None and one.named for one in found], dtype=np.bool_),
+        np.array([owner in deviants for owner in owners], dtype=np.bool_),
+    )
+
+
+def _owners(site: Site) -> list[tuple[str, int]]:
+    """Customer of every inverter, and which of that customer's it is."""
+    count: Counter[str] = Counter()
+    owners = []
+    for name in (site.feeder.customers[k] for k in site.droop.customer):
+        owners.append((name, count[name]))
+        count[name] += 1
+    return owners
+
+
 class _Version(msgspec.Struct, frozen=True):
     """What every version of the text has."""
 
     format: Annotated[int, msgspec.Meta(ge=1)]
+
+
+_Text = TypeVar("_Text", Record, DistrustRecord)
+
+
+def _read(site: Site, kept: Kept, kind: type[_Text]) -> _Text:
+    """What a text of this feeder holds."""
+    try:
+        version = msgspec.json.decode(kept.text, type=_Version).format
+        if version > FORMAT:
+            raise KeptInvalid(f"it is of format {version}, and this program knows {FORMAT}")
+        record = msgspec.json.decode(kept.text, type=kind)
+    except msgspec.DecodeError as error:
+        raise KeptInvalid(f"it is damaged: {error}") from error
+    if record.feeder != site.feeder.name:
+        raise KeptInvalid(f"it is of feeder {record.feeder!r}")
+    return record
 
 
 def _digest(part: Any) -> str:

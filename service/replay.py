@@ -14,6 +14,7 @@ from service.align import Clock, Outcome
 from service.commissioning import Commissioning
 from service.kept import Kept
 from service.reading import Findings, Known, Reading, judge, to_reading
+from service.suspicions import Suspicions
 from service.watch import TickResult, Watch, align_rules, design, known_of
 
 
@@ -33,6 +34,7 @@ def replay(
     *,
     grace_s: float | None = None,
     kept: Kept | None = None,
+    distrust: Kept | None = None,
 ) -> Iterator[TickResult]:
     """Yield what the service would have made of recorded readings.
 
@@ -48,6 +50,8 @@ def replay(
         As in `align.rules`.
     kept
         What was known of the meters when the recording began, as in `Commissioning`; None: nothing.
+    distrust
+        Who was not believed then, as in `Suspicions`; None: nobody.
 
     Raises
     ------
@@ -55,7 +59,8 @@ def replay(
         If the feeder cannot be watched.
     """
     rules = align_rules(site, Clock.EVENTS, grace_s=grace_s)
-    watch = Watch(site, rules, AlarmBook(site.feeder.name), Commissioning(site, kept))
+    book = AlarmBook(site.feeder.name)
+    watch = Watch(site, rules, book, Commissioning(site, kept), Suspicions(site, distrust))
     watch.install(design(site))
     known = known_of(site)
     for reading in (_checked(watch.name, known, one, tally) for one in recorded):

@@ -32,6 +32,7 @@ from service.reading import HEAD_BYTES, BadReading, BadReason, Reading, head_of,
 from service.report import FeederReport
 from service.report import to_json as report_json
 from service.store import Rejected, Store, StoreUnavailable
+from service.suspicions import Suspicions
 from service.watch import TickResult, Watch, align_rules, known_of
 from service.wire import Decoded, Wire
 
@@ -123,7 +124,8 @@ class Rounds:
         stored = self.store.active(name, cleared_since=self._wall() - AlarmRules().memory_s)
         rules = align_rules(site, config.clock, max_skew_s=config.max_skew_s, grace_s=config.grace_s)
         commissioning = Commissioning(site, self.store.commission(name))
-        watch = Watch(site, rules, restore(name, stored), commissioning)
+        suspicions = Suspicions(site, self.store.distrust(name))
+        watch = Watch(site, rules, restore(name, stored), commissioning, suspicions)
         self.watches = {**self.watches, name: watch}
         self._learn()
         return watch
@@ -196,15 +198,15 @@ class Rounds:
         for result in results:
             self.keeper.waiting.add(transitions=result.transitions, reports=(result.report,))
             self._count_tick(result.report, now)
-        self.keep_commissions()
+        self.keep_states()
         self.keeper.commit()
         self._publish_estimates(results)
         if samples or results:
             self.metrics.cycle.observe(time.perf_counter() - started)
         return bool(results)
 
-    def keep_commissions(self, *, at_once: bool = False) -> None:
-        """Let what is known of the meters' errors be stored, where it is time.
+    def keep_states(self, *, at_once: bool = False) -> None:
+        """Let what is known of the meters' errors, and who is not believed, be stored, where it is time.
 
         Parameters
         ----------
@@ -213,7 +215,7 @@ class Rounds:
         """
         for watch in self.watches.values():
             kept, happened = watch.commissioning.due(at_once=at_once)
-            self.keeper.waiting.add(kept=kept, happened=happened)
+            self.keeper.waiting.add(kept=(*kept, *watch.suspicions.due()), happened=happened)
             for one in happened:
                 _say(one)
             if happened:
@@ -346,7 +348,7 @@ class Rounds:
         take_back = watch.recommission(meters, t, who, reason)
         kept, happened = watch.commissioning.due()
         try:
-            self.keeper.store_now(kept=kept, happened=happened)
+            self.keeper.store_now(kept=(*kept, *watch.suspicions.due()), happened=happened)
         except StoreUnavailable:
             take_back()
             raise

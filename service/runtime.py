@@ -186,7 +186,7 @@ class Runtime:
     async def _last_commit(self) -> None:
         """Store what is left, after what is on its way."""
         await self._landed()
-        await self._in_worker(partial(self._rounds.keep_commissions, at_once=True))
+        await self._in_worker(partial(self._rounds.keep_states, at_once=True))
         await self._in_worker(partial(self._rounds.keeper.commit, at_once=True))
         await self._landed()
 
@@ -381,7 +381,7 @@ class Runtime:
 
         def install() -> None:
             self._make_room(name)
-            self._rounds.keep_commissions(at_once=True)
+            self._rounds.keep_states(at_once=True)
             self._rounds.keeper.store_now()
             self._rounds.store.put_feeder(name, tables)
             _install(self._rounds.add(site), finished, "")
@@ -471,6 +471,8 @@ def _install(watch: Watch, finished: Watcher | None, problem: str) -> None:
             _log.info("commissioning goes on from what was kept", feeder=watch.name)
         elif watch.commissioning.note:
             _log.warning("commissioning begins anew", feeder=watch.name, reason=watch.commissioning.note)
+        if watch.suspicions.note:
+            _log.warning("nobody is suspected from before", feeder=watch.name, reason=watch.suspicions.note)
 
 
 def _said(feeder: str) -> Callable[[int, int], None]:

@@ -16,7 +16,7 @@ from typing import TypeVar
 
 from service.alarms import Change, Transition
 from service.commissioning import Happened
-from service.kept import Kept
+from service.kept import Kept, Matter
 from service.report import FeederReport
 from service.store import Rejected
 
@@ -63,7 +63,7 @@ class Waiting:
         self._transitions: list[Transition] = []
         self._reports: deque[FeederReport] = deque()
         self._rejected: deque[Rejected] = deque()
-        self._kept: dict[str, Kept] = {}
+        self._kept: dict[tuple[str, Matter], Kept] = {}
         self._happened: deque[Happened] = deque()
         # Alarms of which the database knows nothing; those of a batch on its way may be known any moment.
         self._unheard: set[str] = set()
@@ -97,7 +97,7 @@ class Waiting:
             self._transitions.append(item)
         self._reports.extend(reports)
         self._rejected.extend(rejected)
-        self._kept.update((item.feeder, item) for item in kept)
+        self._kept.update(((item.feeder, item.matter), item) for item in kept)
         self._happened.extend(happened)
         self._bound()
 
@@ -139,8 +139,8 @@ class Waiting:
         self._transitions[:0] = batch.transitions
         self._reports.extendleft(reversed(batch.reports))
         self._rejected.extendleft(reversed(batch.rejected))
-        # Of each feeder only the newest is of use.
-        self._kept = {item.feeder: item for item in batch.kept} | self._kept
+        # Of each feeder and matter only the newest is of use.
+        self._kept = {(item.feeder, item.matter): item for item in batch.kept} | self._kept
         self._happened.extendleft(reversed(batch.happened))
         self._bound()
 

@@ -22,6 +22,7 @@ from service.commissioning import Commissioning
 from service.conditions import conditions
 from service.reading import Known, Reading
 from service.report import FeederReport, blind, build
+from service.suspicions import Suspicions
 from service.voltages import snapshot
 
 POWER_MAX_FACTOR = 100.0
@@ -117,6 +118,8 @@ class Watch:
         Its alarms so far.
     commissioning
         What is known of its meters; None: nothing.
+    suspicions
+        Who was not believed; None: nobody.
 
     Attributes
     ----------
@@ -127,7 +130,12 @@ class Watch:
     """
 
     def __init__(
-        self, site: Site, rules: AlignRules, book: AlarmBook, commissioning: Commissioning | None = None
+        self,
+        site: Site,
+        rules: AlignRules,
+        book: AlarmBook,
+        commissioning: Commissioning | None = None,
+        suspicions: Suspicions | None = None,
     ) -> None:
         self.site = site
         self.name = site.feeder.name
@@ -135,6 +143,7 @@ class Watch:
         self.aligner = Aligner(site.meter_ids, rules)
         self.book = book
         self.commissioning = commissioning or Commissioning(site)
+        self.suspicions = suspicions or Suspicions(site)
         self.phase = Phase.DESIGNING
         self.problem = ""
         self.report: FeederReport | None = None
@@ -153,6 +162,7 @@ class Watch:
         self._watcher, self._state = finished, None
         self.max_attacked = finished.max_attacked
         self.commissioning.install(finished)
+        self.suspicions.install(finished)
         self.phase, self.problem = Phase.WATCHING, ""
 
     def fail(self, problem: str) -> None:
@@ -215,11 +225,12 @@ class Watch:
         callable
             Takes it back, as long as nothing else has happened.
         """
-        state, before = self._state, copy(self.commissioning)
+        state, before, believed = self._state, copy(self.commissioning), copy(self.suspicions)
         self._state = self.commissioning.renew(state, meters, t, who, reason)
+        self.suspicions.forget(meters, t)
 
         def take_back() -> None:
-            self._state, self.commissioning = state, before
+            self._state, self.commissioning, self.suspicions = state, before, believed
 
         return take_back
 
@@ -241,9 +252,11 @@ class Watch:
                 cause, reason = Cause.SETTLING, "the monitor is still being designed"
             return blind(self.site, tick, self.max_attacked, cause, reason)
         if self._state is None or (self.report is not None and tick.t <= self.report.t):
-            # The first tick, or the clock was set back: what was known belongs to another time.
-            self._state = self._watcher.init(tick.t, self.commissioning.known)
+            # The first tick, or the clock was set back: readings from before belong to another time.
+            begun = self._watcher.init(tick.t, self.commissioning.known)
+            self._state = self.suspicions.restore(begun)
         frame = to_frame(self.site, snapshot(self.site, tick))
         self._state, estimate, verdict = self._watcher.step(self._state, frame)
         self.commissioning.follow(self._state, tick.t)
+        self.suspicions.follow(self._state, tick.t)
         return build(self.site, tick, self.max_attacked, estimate, verdict)

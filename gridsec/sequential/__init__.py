@@ -11,20 +11,25 @@ way that neighbours share, by meters' errors, and, where these do not suffice, b
 
 from gridsec.sequential.commission import Commission, from_arrays, to_arrays
 from gridsec.sequential.design import SequentialDesign, SequentialOptions, design
+from gridsec.sequential.distrust import Distrust, distrusted, nobody, restore
 from gridsec.sequential.loads import LoadDoubt
 from gridsec.sequential.state import SequentialState, init, renew
 from gridsec.sequential.step import step
 
 __all__ = [
     "Commission",
+    "Distrust",
     "LoadDoubt",
     "SequentialDesign",
     "SequentialOptions",
     "SequentialState",
     "design",
+    "distrusted",
     "from_arrays",
     "init",
+    "nobody",
     "renew",
+    "restore",
     "step",
     "to_arrays",
 ]

@@ -88,7 +88,9 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats) -> 
             view = view_of(design, here, now)
         bad[s] = still[s] = False
         if not trust.trusted.all():
-            bad[s], still[s] = view.over & ~trust.trusted, view.still & ~trust.trusted
+            # A scale that has caught somebody and does not know enough yet has not changed its mind.
+            stands = view.still | ((trust.owed > 0) & (trust.scale == s))
+            bad[s], still[s] = view.over & ~trust.trusted, stands & ~trust.trusted
         views.append(view)
         after.append(now)
     return Examined(trust, tuple(after), tuple(views), found)

@@ -46,7 +46,8 @@ class Search:
     better, so they decide anew about what shorter ones suspected.
 
     Meters against which other scales have evidence are not admitted, or lies that have just begun would
-    be believed again. Unless the explanation that does admit them is cheaper over all scales together.
+    be believed again. Unless the explanation that does admit them is cheaper over all scales together, and
+    the scales that caught them have readings enough to know.
 
     Parameters
     ----------
@@ -75,6 +76,7 @@ class Search:
         sigmas = min(design.suspect, here.limits.sigmas)
         self.here = replace(here, limits=replace(here.limits, sigmas=sigmas))
         self.keep = _held(trust, s)
+        self.owed = ~trust.trusted & (trust.owed > 0)
         self.accused = tuple(suspicion for suspicion in trust.accused if suspicion[1] > s)
         self.turned: list[Explanation] = []
 
@@ -107,7 +109,8 @@ class Search:
         for other in self._turned(best):
             free = likelier(free, Found(other))
         if free is not None:
-            better = free.best.cost < best.cost and self._total(free.best) < self._total(best)
+            unknown = (self.owed & self._trusted(free.best)).any()
+            better = not unknown and free.best.cost < best.cost and self._total(free.best) < self._total(best)
             first, second = (free, found) if better else (found, free)
             found = Found(first.best, (second.best.bare(), *first.others, *second.others))
         rivals = (*found.others, *self.turned, *self._instead(found.best))

@@ -20,7 +20,7 @@ from gridsec.sequential.search import swaps
 from gridsec.sequential.state import Trust
 
 # An accusation of an inverter counts up with every tick that repeats it, and down with every other.
-_MOST_COUNTED = 12
+MOST_COUNTED = 12
 
 
 def name(
@@ -47,6 +47,7 @@ def name(
     trusted = (trust.trusted & ~before.named) | (quiet >= design.options.release)
     # Who is caught again within the longest scale was never cleared.
     age = np.where(trusted & (quiet > design.lengths[-1]), 0, trust.age + ~trusted)
+    owed = np.where(trusted, 0, np.maximum(trust.owed - live, 0))
     need = confirmed(design)[trust.scale]
     fresh = ~trusted & ~before.named & trust.bad.any(axis=0) & (age >= need) & _accused(seen, trusted.size)
     named = before.named & (quiet < design.options.release)
@@ -56,7 +57,7 @@ def name(
     for rival in rivals:
         fresh = fresh & rival.meters
         inverters = inverters & (before.inverters | rival.inverters)
-    trust = replace(trust, trusted=trusted, age=age, quiet=quiet, named=named | fresh)
+    trust = replace(trust, trusted=trusted, age=age, quiet=quiet, owed=owed, named=named | fresh)
     return replace(trust, counted=count, inverters=inverters), rivals
 
 
@@ -74,11 +75,13 @@ def _inverters(design: SequentialDesign, before: Trust, trust: Trust) -> tuple[I
     if not accused and not before.counted.any():
         return before.counted, before.inverters
     now = inverters_of(design, accused)
-    count = np.clip(before.counted + np.where(now, 1, -1), 0, _MOST_COUNTED)
-    need = np.full(now.size, _MOST_COUNTED)
+    # Who was named before the monitor began anew is counted beyond that, down from there.
+    most = np.maximum(MOST_COUNTED, before.counted - 1)
+    count = np.clip(before.counted + np.where(now, 1, -1), 0, most)
+    need = np.full(now.size, MOST_COUNTED)
     for k, s in trust.accused:
         if k >= design.customers:
-            need[k - design.customers] = min(confirm(design.lengths[s]), _MOST_COUNTED)
+            need[k - design.customers] = min(confirm(design.lengths[s]), MOST_COUNTED)
     return count, (before.inverters & (count > 0)) | (now & (count >= need))
 
 

@@ -81,6 +81,19 @@ class Scale:
     limits: Limits
 
 
+def needed(design: SequentialDesign, s: int) -> int:
+    """Readings of a meter that a scale judges it by at least.
+
+    Parameters
+    ----------
+    design
+        The design.
+    s
+        The scale.
+    """
+    return max(1, int(np.ceil(design.options.enough * design.lengths[s])))
+
+
 class Scales:
     """All scales at one tick, by index.
 
@@ -102,7 +115,7 @@ class Scales:
 
     def __getitem__(self, s: int) -> Scale:
         design, counts = self.design, self.window.counts[s]
-        need = max(1, int(np.ceil(design.options.enough * design.lengths[s])))
+        need = needed(design, s)
         return Scale(
             noise=design.white / need + self.learned.variance,
             m=self.window.sums[s] / np.maximum(counts, 1),

@@ -42,6 +42,8 @@ class Trust:
         Evidence at the last look on each scale.
     still : (s, p)
         Evidence enough to go on distrusting a meter.
+    owed : (p,)
+        Readings that a meter distrusted from before still has to give until its scale can speak for it.
     named : (p,)
         Meters named as manipulated.
     accused : tuple of (k, s)
@@ -58,6 +60,7 @@ class Trust:
     quiet: Ints
     bad: Bools
     still: Bools
+    owed: Ints
     named: Bools
     accused: tuple[tuple[int, int], ...]
     counted: Ints
@@ -207,6 +210,7 @@ def init(
             zeros,
             none,
             none,
+            zeros,
             no,
             (),
             np.zeros(m, dtype=np.intp),
@@ -252,6 +256,7 @@ def renew(design: SequentialDesign, state: SequentialState, which: Bools) -> Seq
             quiet=np.where(which, 0, trust.quiet),
             bad=trust.bad & ~which,
             still=trust.still & ~which,
+            owed=np.where(which, 0, trust.owed),
             named=trust.named & ~which,
         ),
     )

@@ -12,7 +12,7 @@ import sqlalchemy as sa
 from service.alarms import Alarm, AlarmState, Change, from_json
 from service.commissioning import Happened, Step
 from service.history import unpack
-from service.kept import Kept
+from service.kept import Kept, Matter
 from service.store.connect import Connections
 from service.store.records import Event, Rejected
 from service.store.schema import (
@@ -20,6 +20,7 @@ from service.store.schema import (
     BAD,
     COMMISSION,
     COMMISSION_EVENT,
+    DISTRUST,
     EVENT,
     FEEDER,
     HISTORY,
@@ -246,10 +247,23 @@ class Reader:
         feeder
             Its name.
         """
-        c = COMMISSION.c
+        return self._kept(COMMISSION, feeder, Matter.COMMISSION)
+
+    def distrust(self, feeder: str) -> Kept | None:
+        """Return what is kept of whom a feeder's monitor does not believe, or None.
+
+        Parameters
+        ----------
+        feeder
+            Its name.
+        """
+        return self._kept(DISTRUST, feeder, Matter.DISTRUST)
+
+    def _kept(self, table: sa.Table, feeder: str, matter: Matter) -> Kept | None:
+        c = table.c
         with self._read() as connection:
             row = connection.execute(sa.select(c.feeder, c.t, c.data).where(c.feeder == feeder)).first()
-            return None if row is None else Kept(*row)
+            return None if row is None else Kept(*row, matter)
 
     def commission_events(self, feeder: str, limit: int = 100) -> list[Happened]:
         """Return the newest entries of a feeder's record of commissioning, oldest first.

@@ -83,6 +83,13 @@ COMMISSION = sa.Table(
     sa.Column("t", sa.Double, nullable=False),
     sa.Column("data", sa.Text, nullable=False),
 )
+DISTRUST = sa.Table(
+    "distrust",
+    META,
+    sa.Column("feeder", sa.String(64), primary_key=True),
+    sa.Column("t", sa.Double, nullable=False),
+    sa.Column("data", sa.Text, nullable=False),
+)
 COMMISSION_EVENT = sa.Table(
     "commission_event",
     META,
@@ -102,7 +109,11 @@ def _add_commissioning(connection: sa.Connection) -> None:
         table.create(connection)
 
 
-MIGRATIONS: tuple[Callable[[sa.Connection], None], ...] = (_add_commissioning,)
+def _add_distrust(connection: sa.Connection) -> None:
+    DISTRUST.create(connection)
+
+
+MIGRATIONS: tuple[Callable[[sa.Connection], None], ...] = (_add_commissioning, _add_distrust)
 """Step k leads from schema version k + 1 to k + 2. A new database starts at the newest version."""
 
 

@@ -13,7 +13,7 @@ import sqlalchemy as sa
 from service.alarms import AlarmUnknown, Transition, acknowledged, to_json
 from service.commissioning import Happened
 from service.history import HistoryRules, Mark, mark, pack, worth_keeping
-from service.kept import Kept
+from service.kept import Kept, Matter
 from service.report import FeederReport
 from service.store.connect import Connections
 from service.store.reads import Reader
@@ -23,6 +23,7 @@ from service.store.schema import (
     BAD,
     COMMISSION,
     COMMISSION_EVENT,
+    DISTRUST,
     EVENT,
     FEEDER,
     HISTORY,
@@ -35,6 +36,7 @@ from service.store.schema import (
 BAD_READINGS_KEPT = 1000
 _PAYLOAD_KEPT = 256
 _PRUNE_EVERY = 500
+_KEPT = {Matter.COMMISSION: COMMISSION, Matter.DISTRUST: DISTRUST}
 
 
 class Store(Reader):
@@ -113,9 +115,10 @@ class Store(Reader):
         rejected
             Readings that could not be used; the newest `BAD_READINGS_KEPT` are kept.
         kept, happened
-            What goes on of the feeders' commissioning, and what happened to it.
+            What goes on of the feeders' commissioning and of who is not believed, and what happened to the
+            former.
         without
-            Forget the tables of this feeder, and what was learned of its meters.
+            Forget the tables of this feeder, and what was learned and believed of its meters.
 
         Returns
         -------
@@ -146,7 +149,8 @@ class Store(Reader):
                     connection.execute(COMMISSION_EVENT.insert(), [_happened(item) for item in happened])
                 if without is not None:
                     connection.execute(FEEDER.delete().where(FEEDER.c.name == without))
-                    connection.execute(COMMISSION.delete().where(COMMISSION.c.feeder == without))
+                    for table in _KEPT.values():
+                        connection.execute(table.delete().where(table.c.feeder == without))
             self._marks = marks
             self._last_event = max((self._last_event, *numbers))
             return numbers
@@ -262,7 +266,7 @@ class Store(Reader):
 
     def _put_kept(self, connection: sa.Connection, kept: Kept) -> None:
         row = {"feeder": kept.feeder, "t": kept.t, "data": kept.text}
-        statement = self._connections.insert(COMMISSION).values(row)
+        statement = self._connections.insert(_KEPT[kept.matter]).values(row)
         connection.execute(statement.on_conflict_do_update(index_elements=["feeder"], set_=row))
 
     def _worth(self, marks: dict[str, Mark], report: FeederReport) -> bool:

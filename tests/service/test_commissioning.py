@@ -129,7 +129,7 @@ def test_half_of_a_commissioning_survives_but_for_the_last_interval(
         assert latest is not None
         assert latest.t - 10.0 <= kept.t <= latest.t
         # Whoever stops the service properly loses nothing at all.
-        live.keep_commissions(at_once=True)
+        live.keep_states(at_once=True)
         live.keeper.commit(at_once=True)
         assert (store.commission(FEEDER) or kept).t == latest.t
         gathered = known(live)

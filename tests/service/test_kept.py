@@ -10,7 +10,17 @@ import numpy as np
 import pytest
 
 from feeders.load import Site, from_tables, load
-from service.kept import FORMAT, Kept, KeptInvalid, decode, encode, fingerprint
+from gridsec.sequential import Distrust
+from service.kept import (
+    FORMAT,
+    Kept,
+    KeptInvalid,
+    decode,
+    decode_distrust,
+    encode,
+    encode_distrust,
+    fingerprint,
+)
 from tests.service.running import FEEDER
 
 START = 1_795_212_000.0
@@ -54,3 +64,34 @@ def test_damaged_or_newer_texts_are_refused_in_words(site: Site) -> None:
     ):
         with pytest.raises(KeptInvalid, match=said):
             decode(site, now, bad)
+
+
+def test_who_is_not_believed_comes_back_by_name(site: Site) -> None:
+    p, m = len(site.meter_ids), site.droop.tau.size
+    which, inverters = np.arange(p) % 5 == 1, np.arange(m) == m - 1
+    before = Distrust(np.where(which, 1.0 / 3.0, np.nan), which & (np.arange(p) > 5), inverters)
+    kept = encode_distrust(site, START, before)
+    assert decode_distrust(site, kept).same(before)
+    whole = json.loads(kept.text)
+    suspect, deviant = whole["meters"][0], whole["inverters"][0]
+    # Whoever does not exist any more is nobody.
+    more = _damaged(
+        kept,
+        meters=[*whole["meters"], suspect | {"meter": "gone"}],
+        inverters=[*whole["inverters"], deviant | {"number": 7}],
+    )
+    assert decode_distrust(site, more).same(before)
+    for bad, said in (
+        (replace(kept, text="{"), "damaged"),
+        (_damaged(kept, format=FORMAT + 1), f"format {FORMAT + 1}, and this program knows {FORMAT}"),
+        (_damaged(kept, feeder="other"), "feeder 'other'"),
+        (_damaged(kept, more=1), "damaged.*more"),
+        (_damaged(kept, t=1e400), "damaged"),
+        (_damaged(kept, meters=[suspect, suspect]), "twice"),
+        (_damaged(kept, meters=[suspect | {"scale_s": 0.0}]), "damaged.*scale_s"),
+        (_damaged(kept, meters=[suspect | {"scale_s": None}]), "damaged.*scale_s"),
+        (_damaged(kept, meters=[suspect | {"named": 1}]), "damaged.*named"),
+        (_damaged(kept, inverters=[deviant | {"number": -1}]), "damaged.*number"),
+    ):
+        with pytest.raises(KeptInvalid, match=said):
+            decode_distrust(site, bad)

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from service.commissioning import Happened, Step
-from service.kept import Kept
+from service.kept import Kept, Matter
 from service.store import Store, StoreUnavailable, connect, schema
 from tests.service.databases import Cluster, both
 from tests.service.stored import T0, a_report, an_alarm, raised
@@ -148,11 +148,12 @@ def test_what_was_learned_is_kept_as_it_is(store: Store) -> None:
     wish = Happened("village", T0 + 5, Step.RECOMMISSIONED, ("m2",), "Ada", 'm2 replaced; it "hummed"')
     store.commit(kept=[Kept("village", T0 + 5, '{"a": 2.0}')], happened=[wish])
     assert store.commission("village") == Kept("village", T0 + 5, '{"a": 2.0}')
+    store.commit(kept=[Kept("village", T0, "{}", Matter.DISTRUST)])
     assert store.commission_events("village") == [begun, wish]
     assert store.commission_events("village", 1) == [wish]
     # A feeder that is deleted is forgotten, what happened to it is not, and others stay.
     store.commit(without="village")
-    assert store.commission("village") is None
+    assert (store.commission("village"), store.distrust("village")) == (None, None)
     assert store.commission_events("village") == [begun, wish]
     assert store.commission("town") == other
 
@@ -160,12 +161,25 @@ def test_what_was_learned_is_kept_as_it_is(store: Store) -> None:
 @both
 def test_a_database_from_before_commissioning_was_kept_is_brought_forward(url: str) -> None:
     with Store(url) as old, old._write() as connection:
-        for table in (schema.COMMISSION, schema.COMMISSION_EVENT):
+        for table in (schema.COMMISSION, schema.COMMISSION_EVENT, schema.DISTRUST):
             table.drop(connection)
         connection.execute(schema.VERSION.update().values(version=1))
     with Store(url) as new:
         new.commit(kept=[Kept("village", T0, "{}")])
         assert new.commission("village") == Kept("village", T0, "{}")
+
+
+@both
+def test_a_database_from_before_suspicions_were_kept_is_brought_forward(url: str) -> None:
+    learned, suspected = Kept("village", T0, "{}"), Kept("village", T0, "[]", Matter.DISTRUST)
+    with Store(url) as old, old._write() as connection:
+        old._put_kept(connection, learned)
+        schema.DISTRUST.drop(connection)
+        connection.execute(schema.VERSION.update().values(version=2))
+    with Store(url) as new:
+        assert new.distrust("village") is None
+        new.commit(kept=[suspected])
+        assert (new.commission("village"), new.distrust("village")) == (learned, suspected)
 
 
 @both
@@ -184,7 +198,7 @@ def test_older_schemas_are_brought_forward_and_newer_ones_refused(
         with Store(url) as two:
             assert two.alarm(an_alarm().id) == an_alarm()
     monkeypatch.setattr(schema, "MIGRATIONS", known)
-    with pytest.raises(StoreUnavailable, match=r"version 3.* too old"):
+    with pytest.raises(StoreUnavailable, match=r"version 4.* too old"):
         Store(url)
 
 
@@ -216,7 +230,7 @@ FULL_DISK = """
     from service.store import Rejected, Store, StoreUnavailable
     store = Store({url!r})
     bad = [Rejected(0.0, "k" * 500, "r" * 500) for _ in range(100)]
-    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, resource.RLIM_INFINITY))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, resource.RLIM_INFINITY))
     done = 0
     try:
         while True:
