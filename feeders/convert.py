@@ -29,7 +29,7 @@ from feeders.convert_pgm import read_pgm
 from feeders.convert_source import SOURCE_FILE, feeder_source, profiles_source
 from feeders.load import from_tables
 from feeders.profiles import ENVELOPES, Season
-from feeders.schema import read, validate, write
+from feeders.schema import FeederTables, read, write
 from gridsec.errors import FeederInvalid, GridsecError
 
 PROFILES = "profiles"
@@ -183,7 +183,8 @@ def convert(
     Raises
     ------
     FeederInvalid
-        If the result is no valid feeder: a loop, an island, ...
+        If the result is no feeder that can be loaded: a loop, an island, no zero sequence where one is
+        needed, ...
     GridsecError
         If the source does not exist, its own tool cannot read it, or the extra `convert` is not installed.
     """
@@ -197,13 +198,11 @@ def convert(
     )
     extent = Extent(one_voltage, meshed)
     converted, package = _converted(source, chosen[:64], root=root, droop=droop, opened=opened, extent=extent)
-    problems = validate(converted.tables)
+    problems = _problems(converted.tables)
     if problems:
         raise FeederInvalid(
             [*problems, *(f"while converting: {note}" for note in sentences(converted.changes))]
         )
-    if meshed:
-        from_tables(converted.tables)  # Not every feeder can be: a folder that nothing loads is none.
     write(converted.tables, folder)
     done = _checked(converted, folder)
     (folder / CHANGES_FILE).write_text(changes_csv(done.changes), encoding="utf-8", newline="\n")
@@ -220,6 +219,15 @@ def convert(
     )
     (folder / SOURCE_FILE).write_text(text, encoding="utf-8", newline="\n")
     return done
+
+
+def _problems(tables: FeederTables) -> tuple[str, ...]:
+    """Everything that is wrong with a feeder: not every valid one can be loaded, and a folder must be."""
+    try:
+        from_tables(tables)
+    except FeederInvalid as error:
+        return error.problems
+    return ()
 
 
 def check_against_source(

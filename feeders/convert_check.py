@@ -72,6 +72,8 @@ class SourceCheck:
         Bus of the largest difference.
     as_found_pu
         Largest difference from the source with its loads' dependence on the voltage, pu; None: there is none.
+    unmatched
+        Buses where, in a phase at least, only one of the two has a voltage.
     """
 
     tool: str
@@ -80,11 +82,13 @@ class SourceCheck:
     largest_pu: float
     at: str
     as_found_pu: float | None
+    unmatched: tuple[str, ...] = ()
 
     @property
     def exact(self) -> bool:
-        """Whether the difference is no more than that of two solvers."""
-        return self.largest_pu <= (UNBALANCED_PU if self.three_phase else BALANCED_PU)
+        """Whether the difference is no more than that of two solvers, and no voltage is without the other."""
+        limit = UNBALANCED_PU if self.three_phase else BALANCED_PU
+        return not self.unmatched and self.largest_pu <= limit
 
     @property
     def sentence(self) -> str:
@@ -98,6 +102,9 @@ class SourceCheck:
             text += f" (bus {self.at})"
         if self.as_found_pu is not None:
             text += f"; with the loads' dependence on the voltage by less than {_above(self.as_found_pu)} pu"
+        if self.unmatched:
+            more = f" and {len(self.unmatched) - 1} more" if len(self.unmatched) > 1 else ""
+            text += f"; only one of them has a voltage at bus {self.unmatched[0]}{more}"
         return text
 
 
@@ -121,6 +128,8 @@ def compare(state: SourceState, tables: FeederTables) -> SourceCheck:
         When the feeder has no solution at these loads.
     FeederInvalid
         If neither the balanced nor the three-phase model takes the feeder.
+    GridsecError
+        If there is no bus where both have a voltage.
     """
     power = np.array([state.power_kva.get(row.customer, 0.0) for row in tables.customers])
     size = np.abs(state.busbar_volt)
@@ -136,25 +145,30 @@ def compare(state: SourceState, tables: FeederTables) -> SourceCheck:
         volts, index = np.repeat(single_phase[:, None], 3, axis=1), site.bus_of_file
         level = site.nominal_volt
     common = [bus for bus in state.volts if bus in index]
+    ours = volts[[index[bus] for bus in common]].reshape(-1, 3)
+    theirs = np.array([state.volts[bus] for bus in common]).reshape(-1, 3)
+    one_sided = (np.isnan(ours) != np.isnan(theirs)).any(axis=1)
+    unmatched = tuple(bus for bus, alone in zip(common, one_sided, strict=True) if alone)
+    both = np.isfinite(ours - theirs).any(axis=1)
+    common, ours = [bus for bus, compared in zip(common, both, strict=True) if compared], ours[both]
     if not common:
-        raise GridsecError("the source's power flow and the feeder have no bus in common")
-    ours = volts[[index[bus] for bus in common]]
+        raise GridsecError("there is no bus where the source's power flow and the feeder both have a voltage")
     nominal = level[[index[bus] for bus in common]]
     apart = _apart(ours, [state.volts[bus] for bus in common]) / nominal
     found = None
     if state.as_found:
         found = float((_apart(ours, [state.as_found[bus] for bus in common]) / nominal).max())
     worst = int(apart.argmax())
-    return SourceCheck(state.tool, len(common), phases, float(apart[worst]), common[worst], found)
+    return SourceCheck(state.tool, len(common), phases, float(apart[worst]), common[worst], found, unmatched)
 
 
 def _apart(ours: Floats, theirs: list[Floats]) -> Floats:
-    """Largest difference at each bus over the phases that the source has."""
-    there = np.array(theirs)
-    missing = np.isnan(ours) & ~np.isnan(there)
-    return np.asarray(np.where(missing, np.inf, np.nan_to_num(np.abs(ours - there))).max(axis=1))
+    """Largest difference at each bus over the phases in which both have a voltage."""
+    return np.asarray(np.nan_to_num(np.abs(ours - np.array(theirs))).max(axis=1))
 
 
 def _uniform(state: SourceState) -> bool:
+    """Whether all phases are alike wherever there is a voltage; buses without any say nothing."""
     volts = np.array(list(state.volts.values())).reshape(-1, 3)
+    volts = volts[np.isfinite(volts).any(axis=1)]
     return bool((np.ptp(volts, axis=1) <= UNIFORM * volts.max(axis=1)).all())

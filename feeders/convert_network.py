@@ -7,8 +7,9 @@ customers that draw what flows into them.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Final
 
 import numpy as np
 
@@ -23,6 +24,10 @@ from feeders.convert_lines import balanced_charging, merged, turned
 from feeders.schema import FeederMeta, FeederTables, LineRow, LoadDefaults, validate
 from gridsec.arrays import Phasors
 from gridsec.errors import FeederInvalid, GridsecError
+
+UNFED: Final = "not supplied in the source"
+BEYOND: Final = "supplied in the source, but not through what the feeder has: see what is left out or opened"
+"""Why somebody below the busbar is no customer."""
 
 
 @dataclass(slots=True)
@@ -51,6 +56,8 @@ class Network:
         What could not be carried over so far.
     of_bus
         Changes that matter if their bus is in the feeder.
+    connected
+        Buses and labels of loads and generators that are no draws: the reader makes them customers itself.
     unsolved
         Why the source's own power flow gave no voltages.
     """
@@ -66,6 +73,7 @@ class Network:
     as_found: dict[str, Phasors] = field(default_factory=dict)
     changes: list[Change] = field(default_factory=list)
     of_bus: list[tuple[str, Change]] = field(default_factory=list)
+    connected: list[tuple[str, str]] = field(default_factory=list)
     unsolved: str = ""
 
 
@@ -195,7 +203,10 @@ def below(network: Network, root: str | None, opened: Sequence[str], extent: Ext
     if problems:
         raise FeederInvalid(problems)
     draws = [draw for draw in network.draws if draw.bus in inside]
-    draws += _behind(network, rows, inside, changes)
+    sums, summed = _behind(network, rows, inside, changes)
+    draws += sums
+    elsewhere = above_busbar(busbar, network.sources, rows, network.couplings) | summed | inside.keys()
+    changes.extend(_not_fed(network, elsewhere))
     changes.extend(change for bus, change in network.of_bus if bus in inside)
     return Part(busbar, inside, merged(kept, busbar, changes, network.nominal), draws, changes)
 
@@ -216,6 +227,9 @@ def finished(network: Network, part: Part, tables: FeederTables, power: Mapping[
     changes = tuple(dict.fromkeys(part.changes))
     if not network.volts:
         return Converted(accepted, changes, None, network.unsolved)
+    if not np.isfinite(network.volts[part.busbar]).all():
+        dark = f"the source's power flow has no voltage at the busbar {part.busbar!r}"
+        return Converted(accepted, changes, None, dark)
     state = SourceState(
         tool=network.tool,
         power_kva=power,
@@ -373,17 +387,27 @@ def _kept(
     return kept
 
 
+def _not_fed(network: Network, elsewhere: Collection[str]) -> Iterator[Change]:
+    """Name who is connected neither to the feeder nor, as far as can be seen, `elsewhere`."""
+    everybody = [(draw.bus, draw.label) for draw in network.draws if not draw.idle]
+    for bus, label in dict.fromkeys([*network.connected, *everybody]):
+        if bus not in elsewhere:
+            fed = bool(np.isfinite(network.volts.get(bus, np.nan)).any())
+            yield Change(label, WHOLE, "left out", BEYOND if fed else UNFED)
+
+
 def _buses(count: int) -> str:
     return f"{count} bus{'es' if count != 1 else ''}"
 
 
 def _behind(
     network: Network, rows: list[LineRow], inside: Mapping[str, int], changes: list[Change]
-) -> list[Draw]:
-    """Couplings below the busbar, as what flows into them."""
+) -> tuple[list[Draw], set[str]]:
+    """Couplings below the busbar, as what flows into them, and the buses whose powers that sums up."""
     everything = [*rows, *as_rows(network.couplings)]
     above = above_busbar(next(iter(inside)), network.sources, rows, network.couplings)
-    draws = []
+    draws: list[Draw] = []
+    summed: set[str] = set()
     for each in network.couplings:
         ends = [k for k, bus in enumerate(each.buses) if bus in inside]
         if not ends or any(bus in above and bus not in inside for bus in each.buses):
@@ -400,6 +424,7 @@ def _behind(
             effect = f"{_buses(len(far))}; what flows there is not known"
             changes.append(Change(each.name, "load side", "left out", effect))
             continue
+        summed |= far
         for k in ends:
             power = each.power_kva[k]
             name = each.name if len(ends) == 1 else f"{each.name} {each.buses[k]}"
@@ -415,4 +440,4 @@ def _behind(
                 f"{total.real:.4g} kW and {total.imag:.4g} kvar; exact at these loads only",
             )
         )
-    return draws
+    return draws, summed

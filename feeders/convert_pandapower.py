@@ -26,6 +26,7 @@ from feeders.convert_customers import (
 from feeders.convert_draws import ONLY_REACTIVE, SWITCHED_OFF, customers_of, idle_customers
 from feeders.convert_graph import as_rows, reached
 from feeders.convert_levels import EVERYTHING, Extent
+from feeders.convert_lines import balanced_charging
 from feeders.convert_network import Converted, Network, below, below_source, finished, one_busbar
 from feeders.convert_pandapower_flow import between_phases, phase_powers
 from feeders.convert_pandapower_net import ids, network_of
@@ -139,6 +140,9 @@ def from_pandapower(
         customers = _with_fleet(customers, fleet, part.changes)
     idle, taken = idle_customers(part.draws, {row.customer for row in customers})
     customers += idle
+    lines = part.lines
+    if all(row.phases == "abc" for row in customers):
+        lines = balanced_charging(lines, part.changes)
     load = sum(row.load_kw for row in customers)
     meta = FeederMeta(
         format=1,
@@ -151,7 +155,7 @@ def from_pandapower(
         load=LoadDefaults(power_factor=USUAL_POWER_FACTOR, power_factor_min=0.85),
         monitor=MonitorDefaults(max_attacked=max_attacked),
     )
-    tables = FeederTables(meta, tuple(part.lines), tuple(customers))
+    tables = FeederTables(meta, tuple(lines), tuple(customers))
     return finished(network, part, tables, source.power | drawn | taken)
 
 

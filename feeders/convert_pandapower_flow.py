@@ -18,6 +18,9 @@ CONNECTED: Final = ("load", "sgen", "asymmetric_load", "asymmetric_sgen")
 CONNECTIONS: Final = ("wye", "delta")
 """Tables of what pandapower connects in star or between phases, and how their types say so."""
 
+BASE_MVA: Final = 0.1
+"""Base of power flows of three phases: pandapower ends them at a mismatch of 3e-8 pu of it."""
+
 TURN: Final = np.exp(-2j * np.pi / 3.0 * np.arange(3))
 
 
@@ -57,18 +60,35 @@ def solve(net: Any, buses: dict[int, str], network: Network) -> Any:
             warnings.simplefilter("ignore")
             if unbalanced(net):
                 _named_connections(solved, network)
-                pandapower.runpp_3ph(solved, numba=False, tolerance_mva=1e-11)
+                _three_phases(solved)
             else:
                 if dependent:
                     pandapower.runpp(solved, numba=False, tolerance_mva=1e-10)
                     network.as_found = _volts(solved, buses)
                 pandapower.runpp(solved, numba=False, tolerance_mva=1e-10, voltage_depend_loads=False)
-        network.volts = _volts(solved, buses)
+        volts = _volts(solved, buses)
     except Exception as error:  # noqa: BLE001  # whatever the foreign solver raises on a foreign net
         text = " ".join(str(error).split()) or type(error).__name__
         network.unsolved = f"pandapower's own power flow fails: {text[:200]}"
         return None
+    if not any(np.isfinite(v).all() for v in volts.values()):
+        network.as_found, network.unsolved = {}, "pandapower's own power flow gives no voltages, NaN only"
+        return None
+    network.volts = volts
     return solved
+
+
+def _three_phases(solved: Any) -> None:
+    """Solve in three phases; where lines to buses out of service leave nothing but NaN, without them."""
+    import pandapower
+
+    solved.sn_mva = BASE_MVA
+    pandapower.runpp_3ph(solved, numba=False, tolerance_mva=1e-11)
+    dead = solved.bus.index[~solved.bus.in_service.astype(bool)]
+    ending = solved.line.from_bus.isin(dead) | solved.line.to_bus.isin(dead)
+    if ending.any() and solved.res_bus_3ph.vm_a_pu.isna().all():
+        solved.line.loc[ending, "in_service"] = False
+        pandapower.runpp_3ph(solved, numba=False, tolerance_mva=1e-11)
 
 
 def _named_connections(solved: Any, network: Network) -> None:

@@ -7,6 +7,7 @@ import math
 import warnings
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from importlib.metadata import version
 from numbers import Real
 from typing import Any, Final
@@ -20,13 +21,14 @@ from feeders.convert_lines import ALL, by_sequence, capacitor, charging_cells, o
 from feeders.convert_network import Network
 from feeders.convert_pandapower_flow import between_phases, flow_into, phase_powers, solve, unbalanced
 from feeders.convert_two_ports import TwoPort, coupling_of
+from feeders.levels import same_level
 from feeders.schema import LineRow
 from gridsec.errors import FeederInvalid
 
 # Tables that are carried over, or told about one by one; every other row in the feeder earns a note.
 CARRIED: Final = {
     "bus", "line", "load", "asymmetric_load", "asymmetric_sgen", "sgen", "switch", "trafo", "trafo3w",
-    "ext_grid", "gen", "storage", "motor", "ward", "xward", "shunt",
+    "ext_grid", "gen", "storage", "motor", "ward", "xward", "shunt", "impedance",
 }  # fmt: skip
 FIXED: Final = {"gen": -1.0, "storage": 1.0, "motor": 1.0, "ward": 1.0, "xward": 1.0}
 """Tables of what becomes a customer as the source's power flow has it, and the sign of its results."""
@@ -80,6 +82,9 @@ NUMBERS: Final = {
 UNLIMITED_KA: Final = 1000.0
 SWITCH_RX: Final = 2.0
 """R / X of the impedance of switches between buses, which pandapower's power flow takes by itself."""
+
+SHUNTS: Final = ("gf_pu", "bf_pu", "gt_pu", "bt_pu")
+"""Shunts at the two ends of an impedance."""
 
 SIDES: Final = {"trafo": ("hv", "lv"), "trafo3w": ("hv", "mv", "lv")}
 
@@ -184,20 +189,30 @@ def network_of(net: Any) -> Network:
         raise FeederInvalid(problems)
     buses = ids(net.bus, "bus")
     nominal = {buses[int(i)]: float(kv) * 1000.0 / math.sqrt(3.0) for i, kv in net.bus.vn_kv.items()}
-    feeds = net.ext_grid.bus[net.ext_grid.in_service.astype(bool)]
+    dead = _dead(net)
+    feeds = net.ext_grid.bus[net.ext_grid.in_service.astype(bool) & ~net.ext_grid.bus.isin(dead)]
     network = Network(
         f"pandapower {version('pandapower')}",
         list(dict.fromkeys(buses[int(bus)] for bus in feeds)),
         nominal,
     )
     network.xy = {buses[int(i)]: place for i in net.bus.index if (place := _place(net, int(i))) is not None}
-    network.lines = [*_line_rows(net, buses, network), *_switch_rows(net, buses)]
+    off = "out of service in the source"
+    network.changes.extend(Change(f"bus {buses[bus]}", WHOLE, "left out", off) for bus in sorted(dead))
+    network.lines = [*_line_rows(net, buses, network), *_switch_rows(net, buses, network)]
+    _impedances(net, buses, network)
     solved = solve(net, buses, network)
     _transformers(net, solved, buses, network)
     _fixed(net, solved, buses, network)
     _shunts(net, buses, network)
     _rest(net, buses, network)
+    _connections(net, buses, network)
     return network
+
+
+def _dead(net: Any) -> set[int]:
+    """Buses that are out of service: whatever ends there is open."""
+    return {int(bus) for bus in net.bus.index[~net.bus.in_service.astype(bool)]}
 
 
 def _place(net: Any, bus: int) -> tuple[float, float] | None:
@@ -217,7 +232,7 @@ def _place(net: Any, bus: int) -> tuple[float, float] | None:
 def _line_rows(net: Any, buses: dict[int, str], network: Network) -> Iterator[LineRow]:
     names = ids(net.line, "line")
     opened = _opened(net, "l")
-    dead = {int(bus) for bus in net.bus.index[~net.bus.in_service.astype(bool)]}
+    dead = _dead(net)
     omega = 2.0 * math.pi * float(net.f_hz)
     for i, row in zip(map(int, net.line.index), net.line.to_dict("records"), strict=True):
         length, parallel = float(row["length_km"]), float(row["parallel"])
@@ -266,33 +281,70 @@ def _zero_sequence(row: dict[str, Any], column: str, factor: float) -> float | N
     return rounded(value * factor) if math.isfinite(value) else None
 
 
-def _switch_rows(net: Any, buses: dict[int, str]) -> Iterator[LineRow]:
-    names = ids(net.switch, "switch", ids(net.line, "line").values())
+def _switch_rows(net: Any, buses: dict[int, str], network: Network) -> Iterator[LineRow]:
+    names, dead = _switch_names(net), _dead(net)
     for i in map(int, net.switch.index):
         row = net.switch.loc[i]
         if row.et == "b":
+            ends = int(row.bus), int(row.element)
             ohm = float(row.z_ohm) if "z_ohm" in row and row.z_ohm > 0 else 0.0
-            yield LineRow(
-                line=names[i],
-                from_bus=buses[int(row.bus)],
-                to_bus=buses[int(row.element)],
-                r_ohm=rounded(ohm * SWITCH_RX / math.hypot(1.0, SWITCH_RX)),
-                x_ohm=rounded(ohm / math.hypot(1.0, SWITCH_RX)),
-                closed=bool(row.closed),
-            )
+            r, x = (rounded(ohm * part / math.hypot(1.0, SWITCH_RX)) for part in (SWITCH_RX, 1.0))
+            made = LineRow(names[i], buses[ends[0]], buses[ends[1]], r, x)
+            zero = (r, x) if ohm else (None, None)  # three conductors that know nothing of each other
+            closed = bool(row.closed) and dead.isdisjoint(ends)
+            if ohm and closed and unbalanced(net):
+                effect = "as it stands; pandapower's own power flow of three phases takes a third of it"
+                change = Change(f"switch {names[i]}", "impedance", "changed", effect)
+                network.of_bus.append((buses[ends[0]], change))
+            yield replace(made, r0_ohm=zero[0], x0_ohm=zero[1], closed=closed)
+
+
+def _switch_names(net: Any) -> dict[int, str]:
+    return ids(net.switch, "switch", ids(net.line, "line").values())
+
+
+def _impedances(net: Any, buses: dict[int, str], network: Network) -> None:
+    """Impedances between buses: a line, if it is the same seen from both ends and has no shunts."""
+    table = net.get("impedance")
+    if table is None or not len(table):
+        return
+    names = ids(table, "impedance", [*ids(net.line, "line").values(), *_switch_names(net).values()])
+    dead = _dead(net)
+    for i, row in zip(map(int, table.index), table.to_dict("records"), strict=True):
+        ends = int(row["from_bus"]), int(row["to_bus"])
+        a, b = (buses[bus] for bus in ends)
+        (r, x), back = _series(row, "ft"), _series(row, "tf")
+        plain = (r, x) == back and min(r, x) >= 0 and not any(row.get(name) for name in SHUNTS)
+        if not (plain and same_level(network.nominal[a], network.nominal[b])):
+            effect = "its two ends are not alike, or it has shunts; has no place in a feeder"
+            change = Change(f"impedance {names[i]}", WHOLE, "left out", effect)
+            network.of_bus.extend((bus, change) for bus in (a, b))
+            continue
+        ohm = float(net.bus.at[ends[0], "vn_kv"]) ** 2 / float(row["sn_mva"])
+        r, x, r0, x0 = (ohm * value for value in (r, x, *_series(row, "ft0")))
+        made = LineRow(names[i], a, b, rounded(r), rounded(x))
+        made = replace(made, closed=bool(row["in_service"]) and dead.isdisjoint(ends))
+        known = math.isfinite(r0) and math.isfinite(x0) and _series(row, "tf0") == _series(row, "ft0")
+        network.lines.append(replace(made, r0_ohm=rounded(r0), x0_ohm=rounded(x0)) if known else made)
+
+
+def _series(row: dict[str, Any], way: str) -> tuple[float, float]:
+    """R and X of an impedance, pu of its own base; NaN where they are not known."""
+    r, x = (_number(row.get(f"{part}{way}_pu")) for part in "rx")
+    return r, x
 
 
 # --- transformers ---------------------------------------------------------------------------------
 
 
 def _transformers(net: Any, solved: Any, buses: dict[int, str], network: Network) -> None:
-    ports = _two_ports(net)
+    ports, dead = _two_ports(net), _dead(net)
     for table, sides in SIDES.items():
         names = ids(net[table], table)
         opened = _opened(net, "t" if table == "trafo" else "t3")
         for i, row in net[table].iterrows():
             ends = [(side, int(row[f"{side}_bus"])) for side in sides]
-            ends = [(side, bus) for side, bus in ends if (int(i), bus) not in opened]
+            ends = [(side, bus) for side, bus in ends if (int(i), bus) not in opened and bus not in dead]
             label = f"{'transformer' if table == 'trafo' else 'three-winding transformer'} {names[int(i)]}"
             if not row.in_service or len(ends) < 2:
                 network.changes.append(Change(label, WHOLE, "left out", "switched off in the source"))
@@ -367,6 +419,7 @@ def _fixed(net: Any, solved: Any, buses: dict[int, str], network: Network) -> No
                     else "unknown"
                 )
                 network.of_bus.append((bus, Change(label, WHOLE, "left out", effect)))
+                network.connected.append((bus, label))
                 continue
             plant = table == "gen" and power.real.sum() < 0
             network.draws.append(Draw(label, bus, power, rating_kva=0.0 if plant else None, noun="customer"))
@@ -381,6 +434,19 @@ def _fixed(net: Any, solved: Any, buses: dict[int, str], network: Network) -> No
                 draw = Draw(names[i], buses[row.bus], -power, even=False, rating_kva=0.0)
                 network.draws.append(draw)
                 network.of_bus.extend((draw.bus, change) for change in told)
+
+
+def _connections(net: Any, buses: dict[int, str], network: Network) -> None:
+    """Whose customers `feeders.convert_pandapower` makes, by the names that it tells of them."""
+    loads = ids(net.load, "load")
+    for table, noun, label in (
+        ("load", "load", "load"),
+        ("asymmetric_load", "phase load", "load"),
+        ("sgen", "generator", "generator"),
+    ):
+        names = loads if table == "load" else ids(net[table], noun, loads.values())
+        known = [(i, int(bus)) for i, bus in net[table].bus.items()]
+        network.connected.extend((buses[bus], f"{label} {names[int(i)]}") for i, bus in known)
 
 
 def _shunts(net: Any, buses: dict[int, str], network: Network) -> None:

@@ -159,7 +159,7 @@ def street() -> Any:
     pp.create_sgen(net, bus[4], 0.003, q_mvar=0.001, name="field")
     pp.create_shunt(net, bus[2], 0.01, name="coil")
     pp.create_shunt(net, bus[2], -0.012, p_mw=0.001, name="condenser")
-    pp.create_impedance(net, bus[2], bus[4], 0.01, 0.01, 1.0, name="choke")
+    pp.create_impedance(net, bus[2], bus[4], 0.01, 0.01, 1.0, 0.02, name="choke")
     pp.create_gen(net, bus[4], 0.01)
     pp.create_storage(net, bus[1], 0.001, 0.01)
     return net
@@ -197,7 +197,7 @@ def test_everything_is_carried_over_or_named() -> None:
         "inductance of shunt coil; 10 kvar",
         "connection of shunt condenser; 12 kvar",
         "conductance of shunt condenser; 1 kW",
-        "left out: impedance 0",
+        "left out: impedance choke",
         "control of gen gen-0; a customer that feeds in 10 kW",
         "control of storage storage-0; a customer that draws 1 kW",
         "line across; open towards what the busbar does not feed",

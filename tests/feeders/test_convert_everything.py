@@ -85,7 +85,8 @@ FILLED: dict[str, tuple[Callable[[Any], object], str]] = {
     ),
     "shunt": (lambda net: pp.create_shunt(net, 3, -0.001, name="c"), "shunt c: connection"),
     "impedance": (
-        lambda net: pp.create_impedance(net, 2, 3, 0.1, 0.1, 1.0, in_service=False), "impedance 0"
+        lambda net: pp.create_impedance(net, 2, 3, 0.1, 0.1, 1.0, 0.2, name="i", in_service=False),
+        "impedance i: all of it",
     ),
     "dcline": (
         lambda net: pp.create_dcline(net, 0, 3, 1e-3, 1.0, 0.0, 1.0, 1.0, in_service=False), "dcline 0"
