@@ -186,12 +186,7 @@ def protect(
     InUse
         If another process is writing it.
     """
-    if max_attacked < 1:
-        raise ValueError(f"max_attacked is {max_attacked}; it must be at least 1")
-    if (goal is Goal.BOUND and math.isnan(lie_volt)) or lie_volt <= 0.0:
-        raise ValueError(f"lie_volt is {lie_volt}; to bound lies it must be a positive number of volts")
-    if goal is Goal.CONTAIN and not busbar_known:
-        raise ValueError("to bound lies the busbar's voltage must be known")
+    _check(max_attacked, goal, lie_volt, busbar_known=busbar_known)
     know = partial(knowledge, site, unknown=unknown, silent=(), busbar_known=busbar_known)
     if goal is None:
         bounded = busbar_known and (
@@ -215,18 +210,15 @@ def protect(
         "curves": str(where),
         "share": share,
     }
-    count, fixed = site.meters.size, meter_mask(site, never)
+    fixed = meter_mask(site, never)
     try:
         with Journal(journal, subject) as kept:
-            found = fewest_protected(
-                _kept(asked.attacker, kept), count, never=fixed, exact=exact, progress=progress
-            )
+            attacker = _kept(asked.attacker, kept)
+            found = fewest_protected(attacker, fixed.size, never=fixed, exact=exact, progress=progress)
     except Unprotectable as error:
-        raise DesignInfeasible(
-            f"protection of {site.feeder.name} ({goal}, M = {max_attacked})",
-            _unmet([site.meter_ids[j] for j in error.liars]),
-        ) from error
-    protected = np.zeros(count, dtype=np.bool_)
+        what = f"protection of {site.feeder.name} ({goal}, M = {max_attacked})"
+        raise DesignInfeasible(what, _unmet([site.meter_ids[j] for j in error.liars])) from error
+    protected = np.zeros(fixed.size, dtype=np.bool_)
     protected[found.meters] = True
     return Protect(
         feeder=site.feeder.name,
@@ -243,6 +235,16 @@ def protect(
         attacks=pd.DataFrame({"liars": [" ".join(site.meter_ids[j] for j in a) for a in found.attacks]}),
         share=share,
     )
+
+
+def _check(max_attacked: int, goal: Goal | None, lie_volt: float, *, busbar_known: bool) -> None:
+    """Say what is wrong with a question that has no answer."""
+    if max_attacked < 1:
+        raise ValueError(f"max_attacked is {max_attacked}; it must be at least 1")
+    if (goal is Goal.BOUND and math.isnan(lie_volt)) or lie_volt <= 0.0:
+        raise ValueError(f"lie_volt is {lie_volt}; to bound lies it must be a positive number of volts")
+    if goal is Goal.CONTAIN and not busbar_known:
+        raise ValueError("to bound lies the busbar's voltage must be known")
 
 
 def _unmet(liars: Sequence[str]) -> str:
