@@ -49,14 +49,14 @@ class Released:
         Whose powers, and by how much they may be false, pu.
     share : (l,)
         Part of the standard deviation of a false power that was reckoned with.
-    felt : (p, l)
-        What a false active power does to the trusted meters, as a standard deviation.
+    at : (t,)
+        The trusted meters.
+    seen : (t, 2 l)
+        What false powers do there, as standard deviations; the active ones first.
     form : (l,)
         ``a_T^T Q a_T``.
     gain : (n, 2 l)
         C G^-1.
-    seen : (p, 2 l)
-        U at the trusted meters; zero elsewhere.
     variance : (n,)
         Diagonal of M'.
     """
@@ -65,10 +65,10 @@ class Released:
     customers: Ints
     sizes: Floats
     share: Floats
-    felt: Floats
+    at: Ints
+    seen: Floats
     form: Floats
     gain: Floats
-    seen: Floats
     variance: Floats
 
     def said(self, judged: Judged) -> Floats:
@@ -79,7 +79,8 @@ class Released:
         judged
             What the fit says.
         """
-        return np.asarray(judged.w + self.gain @ (judged.weights @ self.seen))
+        along = np.tile(self.share, 2) * (judged.weights[self.at] @ self.seen)
+        return np.asarray(judged.w + self.gain @ along)
 
     def holds(self, fit: Fit, customers: Ints, sizes: Floats, judged: Judged) -> bool:
         """Whether this is about what `release` would make of the same.
@@ -91,7 +92,7 @@ class Released:
         """
         if not (fit is self.fit and np.array_equal(customers, self.customers)):
             return False
-        share = _share(self.felt, self.form, judged)
+        share = _share(self.seen[:, : self.form.size], self.form, judged.weights[self.at])
         same = (share <= _MORE * self.share) & (share >= _LESS * self.share)
         return bool(same.all()) and np.array_equal(sizes, self.sizes)
 
@@ -115,27 +116,35 @@ def release(effects: Effects, fit: Fit, customers: Ints, sizes: Floats, judged: 
         What the fit says.
     """
     prior, (at, inverse), std = fit.prior, fit.trusting(), sizes / np.sqrt(3.0)
-    scales = std, FALSE_Q * std
-    U = np.hstack([effects.columns(power, customers) * by for power, by in zip(Power, scales, strict=True)])
-    seen, known = np.zeros((2, prior.meters.size, U.shape[1]))
-    seen[at] = U[prior.meters[at]]
-    known[at] = inverse @ seen[at]
-    form = seen.T @ known
-    felt, alone = seen[:, : sizes.size].copy(), form.diagonal()[: sizes.size].copy()
-    share = _share(felt, alone, judged)
+    U = np.empty((prior.variance.size, 2 * sizes.size))
+    U[:, : sizes.size] = effects.columns(Power.ACTIVE, customers) * std
+    U[:, sizes.size :] = effects.columns(Power.REACTIVE, customers) * (FALSE_Q * std)
+    seen = U[prior.meters[at]]
+    known = inverse @ seen
+    G = seen.T @ known
+    form = G.diagonal()[: sizes.size].copy()
+    share = _share(seen[:, : sizes.size], form, judged.weights[at])
     both = np.tile(share, 2)
-    U -= prior.of_meters @ known
-    if fit.loose.shape[1]:
-        U -= fit.loose @ (fit.loose[prior.meters].T @ known)
-    U, seen, form = U * both, seen * both, form * np.multiply.outer(both, both)
-    form[np.diag_indices(both.size)] += 1.0
-    gain = cho_solve(cho_factor(form, lower=True), U.T).T
-    variance = fit.variance + np.einsum("ij,ij->i", gain, U)
-    return Released(fit, customers, sizes, share, felt, alone, gain, seen, variance)
+    G *= np.multiply.outer(both, both)
+    G[np.diag_indices(both.size)] += 1.0
+    factor = cho_factor(G, lower=True, overwrite_a=True)
+    loose = fit.loose[prior.meters[at]].T @ known
+    variance = fit.variance.copy()
+    # C and C G^-1 take the place of U, some rows at a time: they are large where many lie.
+    for first in range(0, len(U), _ROWS):
+        rows = slice(first, first + _ROWS)
+        C = (U[rows] - prior.of_meters[rows, at] @ known - fit.loose[rows] @ loose) * both
+        U[rows] = cho_solve(factor, C.T).T
+        variance[rows] += np.einsum("ij,ij->i", U[rows], C)
+    return Released(fit, customers, sizes, share, at, seen, form, U, variance)
 
 
-def _share(felt: Floats, form: Floats, judged: Judged) -> Floats:
+# Rows that are worked on together.
+_ROWS = 256
+
+
+def _share(seen: Floats, form: Floats, weights: Floats) -> Floats:
     """Root of the probability that each power is false, (l,)."""
-    along = judged.weights @ felt
+    along = weights @ seen
     odds = 0.5 * (along**2 / (1.0 + form) - np.log1p(form))
     return np.asarray(np.maximum(np.sqrt(expit(odds)), _LEAST))

@@ -51,7 +51,10 @@ def test_a_liar_on_each_level_is_named_in_volts(phases: bool, tmp_path: Path) ->
     assert {m.meter for m in last.meters if m.suspect} == {site.meter_ids[k] for k in liars}
     sample = next(sample for sample in samples if sample.t == last.t)
     told = np.array([m.v_volt_estimated for m in last.meters], dtype=float)
-    np.testing.assert_allclose(told, sample.v_volt[site.meters], rtol=3e-3)
+    std = np.array([m.v_volt_std for m in last.meters], dtype=float)
+    assert (np.abs(told - sample.v_volt[site.meters]) <= 3.0 * std).all()
+    # Powers of liars are not believed: without them their voltages, and the street's, are known less well.
+    np.testing.assert_allclose(told, sample.v_volt[site.meters], rtol=8e-3)
     attack = np.array([m.attack_volt_estimated for m in last.meters], dtype=float)
     # Whoever lies by 3 % of its nominal voltage may be off by its class, 0.5 %, besides.
     np.testing.assert_allclose(attack[liars] / nominal[liars], lie.size, atol=6e-3)
