@@ -126,6 +126,16 @@ class Droop:
         """
         return np.asarray(np.bincount(self.customer, weights=of_inverters, minlength=customers), np.float64)
 
+    def saturated(self, customers: int) -> tuple[Floats, Floats]:
+        """The least and the most that each customer's inverters inject, (N,) each, in pu.
+
+        Parameters
+        ----------
+        customers
+            N.
+        """
+        return self.per_customer(self.q[:, 3], customers), self.per_customer(self.q[:, 0], customers)
+
     def take(self, rows: Ints) -> Droop:
         """The droop of the inverters `rows`, in that order and with repetitions.
 

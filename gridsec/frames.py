@@ -259,8 +259,7 @@ def _credible(setting: Setting, frame: Frame) -> Bools:
     plant = setting.plant
     if not setting.believes_q:
         return np.zeros(plant.meters.size, dtype=np.bool_)
-    count_ = frame.q.size
-    most, least = (plant.droop.per_customer(plant.droop.q[:, k], count_) for k in (0, 3))
+    least, most = plant.droop.saturated(frame.q.size)
     room = frame.q_error + np.nan_to_num(frame.q_net_error)
     rest = np.nan_to_num(frame.q_net) - frame.q
     credible = np.isfinite(frame.q_net) & (least - room <= rest) & (rest <= most + room)

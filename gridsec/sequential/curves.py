@@ -115,10 +115,10 @@ class Curves:
         strange = np.argsort(-np.where(open_, np.abs(self.amount), -1.0), kind="stable")
         who = np.sort(strange[: min(int(open_.sum()), _TOGETHER)])
         ways = []
-        for wrong in product((True, False), repeat=who.size):
-            inverters = np.isin(design.meter_of, who[np.array(wrong)])
+        for wrong in map(np.array, product((True, False), repeat=who.size)):
+            inverters = np.isin(design.meter_of, who[wrong])
             powers = np.zeros(design.customers, dtype=np.bool_)
-            powers[design.plant.meters[who[~np.array(wrong)]]] = True
+            powers[design.plant.meters[who[~wrong]]] = True
             each = np.where(wrong, self.share[who], 1.0 - self.share[who])
             ways.append(Explanation(named, inverters, float(each.prod()), powers))
         likely = [way for way in ways if way.probability > 1.0 / design.options.like]
@@ -215,7 +215,7 @@ def compare(design: SequentialDesign, before: Curves, now: Evidence) -> Curves:
     share = np.where(asked, share, before.share * lasts)
     amount = np.where(asked, amount, before.amount) * lasts
     sure = lasts & beyond & ((share >= 1.0 - 1.0 / design.options.like) | (before.sure & (share >= 0.5)))
-    most, least = (droop.per_customer(droop.q[:, k], size)[at] for k in (0, 3))
+    least, most = (of[at] for of in droop.saturated(size))
     enough = asked & (room < np.maximum(most - x, x - least))
     heard = (design.meter_of >= 0) & enough[design.meter_of]
     return Curves(count, lasts, amount, share, sure, heard)

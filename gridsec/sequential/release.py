@@ -49,10 +49,8 @@ class Released:
         Whose powers, and by how much they may be false, pu.
     share : (l,)
         Part of the standard deviation of a false power that was reckoned with.
-    at : (t,)
-        The trusted meters.
     seen : (t, 2 l)
-        What false powers do there, as standard deviations; the active ones first.
+        What false powers do to the trusted meters, as standard deviations; the active ones first.
     form : (l,)
         ``a_T^T Q a_T``.
     gain : (n, 2 l)
@@ -65,7 +63,6 @@ class Released:
     customers: Ints
     sizes: Floats
     share: Floats
-    at: Ints
     seen: Floats
     form: Floats
     gain: Floats
@@ -79,7 +76,7 @@ class Released:
         judged
             What the fit says.
         """
-        along = np.tile(self.share, 2) * (judged.weights[self.at] @ self.seen)
+        along = np.tile(self.share, 2) * (judged.weights[self.fit.trusted] @ self.seen)
         return np.asarray(judged.w + self.gain @ along)
 
     def holds(self, fit: Fit, customers: Ints, sizes: Floats, judged: Judged) -> bool:
@@ -92,7 +89,7 @@ class Released:
         """
         if not (fit is self.fit and np.array_equal(customers, self.customers)):
             return False
-        share = _share(self.seen[:, : self.form.size], self.form, judged.weights[self.at])
+        share = _share(self.seen[:, : self.form.size], self.form, judged.weights[self.fit.trusted])
         same = (share <= _MORE * self.share) & (share >= _LESS * self.share)
         return bool(same.all()) and np.array_equal(sizes, self.sizes)
 
@@ -136,7 +133,7 @@ def release(effects: Effects, fit: Fit, customers: Ints, sizes: Floats, judged: 
         C = (U[rows] - prior.of_meters[rows, at] @ known - fit.loose[rows] @ loose) * both
         U[rows] = cho_solve(factor, C.T).T
         variance[rows] += np.einsum("ij,ij->i", U[rows], C)
-    return Released(fit, customers, sizes, share, at, seen, form, U, variance)
+    return Released(fit, customers, sizes, share, seen, form, U, variance)
 
 
 # Rows that are worked on together.

@@ -311,8 +311,7 @@ def _clean(design: SequentialDesign, state: SequentialState, frame: Frame) -> _H
     if reported.any():
         trusted = np.zeros(frame.q.size, dtype=np.bool_)
         trusted[plant.meters] = live & state.trust.trusted
-        count = frame.q.size
-        most, least = (plant.droop.per_customer(plant.droop.q[:, k], count) for k in (0, 3))
+        least, most = plant.droop.saturated(frame.q.size)
         rest, room = (
             np.where(reported, frame.q_net, 0.0) - frame.q,
             frame.q_error + np.where(reported, frame.q_net_error, 0.0),

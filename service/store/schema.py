@@ -76,20 +76,20 @@ FEEDER = sa.Table(
     sa.Column("name", sa.String(64), primary_key=True),
     sa.Column("tables", sa.Text, nullable=False),
 )
-COMMISSION = sa.Table(
-    "commission",
-    META,
-    sa.Column("feeder", sa.String(64), primary_key=True),
-    sa.Column("t", sa.Double, nullable=False),
-    sa.Column("data", sa.Text, nullable=False),
-)
-DISTRUST = sa.Table(
-    "distrust",
-    META,
-    sa.Column("feeder", sa.String(64), primary_key=True),
-    sa.Column("t", sa.Double, nullable=False),
-    sa.Column("data", sa.Text, nullable=False),
-)
+
+
+def _of_each_feeder(name: str) -> sa.Table:
+    """A table of one text per feeder, the newest."""
+    return sa.Table(
+        name,
+        META,
+        sa.Column("feeder", sa.String(64), primary_key=True),
+        sa.Column("t", sa.Double, nullable=False),
+        sa.Column("data", sa.Text, nullable=False),
+    )
+
+
+COMMISSION, DISTRUST = _of_each_feeder("commission"), _of_each_feeder("distrust")
 COMMISSION_EVENT = sa.Table(
     "commission_event",
     META,

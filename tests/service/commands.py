@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable
+from html import unescape
 
 import pytest
 
@@ -26,6 +28,11 @@ def command(*names: str) -> Run:
         return int(end.value.code or 0), told.out, told.err
 
     return run
+
+
+def text_of(html: str) -> str:
+    """A page, or a part of it, as it is read: without marks."""
+    return unescape(re.sub("<[^>]*>", "", html))
 
 
 def plain(text: str) -> str:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import re
 import shlex
 from dataclasses import replace
-from html import unescape
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +19,7 @@ from feeders.studies.campaign_plan import Kind, Place, Plan
 from feeders.studies.droop import DroopOptions, droop
 from feeders.trials import LoadError
 from tests.feeders.villages import village, village_without_inverters
-from tests.service.commands import command, plain
+from tests.service.commands import command, plain, text_of
 
 FEW = ("--scenarios", "3", "--workers", "1", "--no-journal", "--kind", "bias:3", "--liars", "1")
 KNOWN = ("--load-error-kw", "0.1", "--load-error-kvar", "0.05")
@@ -141,7 +139,7 @@ def test_a_report_takes_limits_of_the_busbar_and_a_preset(
     expected = droop(load(tmp_path / "village"), options, journal=journal).tables["band"]
     written = pd.read_parquet(tmp_path / "page-files" / "tables" / "droop-band.parquet")
     pd.testing.assert_frame_equal(written, expected)
-    html = unescape(re.sub("<[^>]*>", "", page.read_text(encoding="utf-8")))
+    html = text_of(page.read_text(encoding="utf-8"))
     assert "--preset vde4105 --busbar 0.99 1.01 --band 0.95 1.05" in html
     for option, values in (("--busbar", ("1.02", "0.98")), ("--band", ("0.9", "0.9"))):
         code, _, error = run(monkeypatch, capsys, "report", str(tmp_path / "village"), option, *values)
@@ -171,7 +169,7 @@ def test_a_report_tells_what_its_attacks_take_from_the_files(
         "600 readings, one every 5 s (--step), watched by weighted-least-squares (feeder's files)"
         in plain(told)
     )
-    html = unescape(re.sub("<[^>]*>", "", page.read_text(encoding="utf-8")))
+    html = text_of(page.read_text(encoding="utf-8"))
     assert "2 scenarios of 3000 s at 5 s" in html
     assert "powers known within 0.1 kW and 0.05 kvar" in html
     assert shlex.join(("--step", "5", *KNOWN)) in html

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import re
 import shlex
-from html import unescape
 from pathlib import Path
 
 import pandas as pd
 import pytest
 from playwright.sync_api import Browser
 
-from tests.service.commands import command, plain
+from tests.service.commands import command, plain, text_of
 
 FEW = ("--studies", "redundancy,protect")
 
@@ -36,7 +35,7 @@ def test_a_report_and_everything_beside_it(
         kept, pd.read_csv(folder / "tables" / "detectable-meters.csv", float_precision="round_trip")
     )
     assert len(list((folder / "journals").iterdir())) == 3
-    commands = [unescape(re.sub("<[^>]*>", "", each)) for each in re.findall(r"<pre>(.*?)</pre>", html)]
+    commands = [text_of(each) for each in re.findall(r"<pre>(.*?)</pre>", html)]
     again = shlex.split(next(each for each in commands if each.startswith("gridsec study report ")))
     assert again[3:] == [
         "cigre-lv",
