@@ -54,6 +54,14 @@ class Kind(StrEnum):
     COORDINATED = "coordinated"
 
 
+def _none() -> Bools:
+    return np.zeros(0, dtype=np.bool_)
+
+
+def _nothing() -> Floats:
+    return np.zeros(0)
+
+
 @dataclass(frozen=True, slots=True)
 class Explanation:
     """One way to explain the readings. p meters, m inverters, N customers.
@@ -68,20 +76,15 @@ class Explanation:
         Its share among the explanations given, from 0 to 1.
     powers : (N,)
         Whose powers would not be what they are said to be; empty where that is never supposed.
+    busbar : (b,)
+        Phases of the busbar, one on a balanced feeder, whose meter would be manipulated; empty likewise.
     """
 
     meters: Bools
     inverters: Bools
     probability: float
-    powers: Bools = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
-
-
-def _none() -> Bools:
-    return np.zeros(0, dtype=np.bool_)
-
-
-def _nothing() -> Floats:
-    return np.zeros(0)
+    powers: Bools = field(default_factory=_none)
+    busbar: Bools = field(default_factory=_none)
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,6 +200,11 @@ class Verdict:
         Where several explanations fit the data about equally well, those, the likeliest first.
     unjudged : (m,)
         Inverters about which the data say nothing though inverters are judged; (0,) for none.
+    busbar : (b,)
+        Phases of the busbar, one on a balanced feeder, whose meter is named as manipulated; (0,) from
+        estimators that believe it or do without.
+    busbar_attack : (b,)
+        What it reads too much, squared pu; 0 where it is not named; (0,) likewise.
     """
 
     decision: Decision
@@ -211,3 +219,5 @@ class Verdict:
     kinds: tuple[Kind | None, ...] = ()
     explanations: tuple[Explanation, ...] = ()
     unjudged: Bools = field(default_factory=_none)
+    busbar: Bools = field(default_factory=_none)
+    busbar_attack: Floats = field(default_factory=_nothing)

@@ -15,10 +15,13 @@ from gridsec.arrays import Bools, Floats
 from gridsec.judge import Situation, decide
 from gridsec.network import busbar_places, by_place, one_busbar
 from gridsec.online import Cause, Decision, Estimate, Explanation, Frame, Verdict
+from gridsec.sequential import words
 from gridsec.sequential.bounds import Bounded, Grounds, Powers
-from gridsec.sequential.conditional import judge
+from gridsec.sequential.busbar import Busbar, follow
+from gridsec.sequential.conditional import Prior, judge
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.examine import Examined
+from gridsec.sequential.heard import Heard
 from gridsec.sequential.release import Released, release
 from gridsec.sequential.state import SequentialState
 
@@ -31,16 +34,10 @@ class Tick:
     ----------
     frame
         With powers that can be.
+    heard
+        What is believed of it.
     q : (N,)
         Net reactive injections that the model was given, pu.
-    told : (N,)
-        Whose are metered and used.
-    y : (p,)
-        Squared voltages; any finite value where there is none.
-    live : (p,)
-        Which meters have a reading.
-    v0_squared, busbar
-        Squared busbar voltage, and whether it is metered; in three phases (3,) each.
     v2_bus : (n,)
         Squared voltages that the model alone says.
     transient : (p,)
@@ -52,12 +49,8 @@ class Tick:
     """
 
     frame: Frame
+    heard: Heard
     q: Floats
-    told: Bools
-    y: Floats
-    live: Bools
-    v0_squared: Floats | float
-    busbar: Bools | bool
     v2_bus: Floats
     transient: Floats
     seen: Examined
@@ -81,12 +74,13 @@ def conclude(
     SequentialState, Estimate, Verdict
         The state with the answer in it, and the answer.
     """
-    plant, trust = design.plant, state.trust
+    plant, trust, heard = design.plant, state.trust, tick.heard
     estimate, released = _estimate(design, state, tick)
-    score, threshold, judged = _worst(design, tick.seen, tick.live.size)
-    live, beyond = judged & tick.live, score > threshold
+    state = replace(state, released=released, busbar=_busbar(design, state, heard, estimate))
+    score, threshold, judged = _worst(design, tick.seen, heard.live.size)
+    live, beyond = judged & heard.live, score > threshold
     at = plant.feeder.bus[plant.meters]
-    attack = np.where(trust.named & tick.live, tick.y - state.learned.bias - estimate.v2_bus[at], 0.0)
+    attack = np.where(trust.named & heard.live, heard.y - state.learned.bias - estimate.v2_bus[at], 0.0)
     amounts = _amounts(design, state, tick.seen)
     settled = bool((tick.transient <= design.options.settled * threshold).all())
     said = decide(
@@ -103,10 +97,10 @@ def conclude(
         )
     )
     said = _contradicted(design, beyond & ~trust.named, trust.named, said)
-    said = _unvouched(design, tick.busbar, live, said)
+    said = _unvouched(design, heard.busbar, live, said)
     open_ = _open(design, state, said)
-    decision, cause, reason = _beside_meters(design, state, tick, amounts, open_, said)
-    inverters = _inverters(design, state)
+    decision, cause, reason = _beside_meters(design, state, tick, estimate, amounts, open_, said)
+    inverters, busbar = _inverters(design, state), state.busbar.named(design)
     verdict = Verdict(
         decision,
         cause,
@@ -120,8 +114,22 @@ def conclude(
         kinds=state.kinds.kinds,
         explanations=tick.rivals or open_,
         unjudged=design.unseen & ~(state.curves.heard | inverters),
+        busbar=busbar,
+        busbar_attack=np.where(busbar, state.busbar.off, 0.0),
     )
-    return replace(state, released=released, last=(estimate, verdict)), estimate, verdict
+    return replace(state, last=(estimate, verdict)), estimate, verdict
+
+
+def _busbar(design: SequentialDesign, state: SequentialState, heard: Heard, estimate: Estimate) -> Busbar:
+    """What is thought of the busbar's meter now."""
+    before = state.busbar
+    if before.believed.all():
+        return before
+    fits = (state.fits[s] for s in before.scale.tolist())
+    left = np.array([np.nan if fit is None else fit.variance[k] for k, fit in enumerate(fits)])
+    judged = heard.says & np.isfinite(left)
+    v0_squared = estimate.v2_bus[busbar_places(design.plant.feeder)]
+    return follow(design, before, heard.said, judged, v0_squared, np.where(judged, left, 0.0))
 
 
 def _inverters(design: SequentialDesign, state: SequentialState) -> Bools:
@@ -148,20 +156,21 @@ def _estimate(
     design: SequentialDesign, state: SequentialState, tick: Tick
 ) -> tuple[Estimate, Released | None]:
     plant = design.plant
+    heard = tick.heard
     w, variance, released = _reconstructed(design, state, tick)
     v2_bus = tick.v2_bus + w
     first = busbar_places(plant.feeder)
-    v2_bus[first] = np.where(tick.busbar, tick.v0_squared, v2_bus[first])
-    trusted = state.trust.trusted & tick.live
+    v2_bus[first] = np.where(heard.busbar, heard.v0_squared, v2_bus[first])
+    trusted = state.trust.trusted & heard.live
     grounds = Grounds(
         plant=plant,
         powers=Powers(
-            tick.frame, tick.q, tick.told, tick.v0_squared, state.trust.trusted, state.doubts.sizes
+            tick.frame, tick.q, heard.told, heard.v0_squared, state.trust.trusted, state.doubts.sizes
         ),
         injected=state.lag.error,
         model=tick.v2_bus[plant.feeder.bus],
-        busbar=tick.busbar,
-        y=tick.y,
+        busbar=heard.busbar,
+        y=heard.y,
         trusted=trusted,
         sigmas=design.sigmas[0],
     )
@@ -200,8 +209,8 @@ def _unvouched(design: SequentialDesign, busbar: Bools | bool, live: Bools, said
     if count > 2 * most:
         return said
     sentence = (
-        f"The busbar voltage of a phase is missing, and {count:.0f} meters report from there; at least "
-        f"{2 * most + 1} are needed to tell {most} manipulated from the others."
+        f"The busbar voltage of a phase is missing or not believed, and {count:.0f} meters report from "
+        f"there; at least {2 * most + 1} are needed to tell {most} manipulated from the others."
     )
     return Decision.UNDECIDED, Cause.TOO_FEW_METERS, sentence
 
@@ -216,6 +225,7 @@ def _beside_meters(  # noqa: PLR0917  # what was found
     design: SequentialDesign,
     state: SequentialState,
     tick: Tick,
+    estimate: Estimate,
     amounts: dict[int, float],
     open_: tuple[Explanation, ...],
     said: _Said,
@@ -224,66 +234,31 @@ def _beside_meters(  # noqa: PLR0917  # what was found
     decision, cause, reason = said
     plant, inverters = design.plant, _inverters(design, state)
     owners = ", ".join(plant.feeder.customers[c] for c in plant.droop.customer[inverters])
+    busbar, v0_squared = state.busbar, estimate.v2_bus[busbar_places(plant.feeder)]
+    named, doubted = busbar.named(design), ~busbar.believed
+    found = []
+    if owners:
+        found.append((f"the inverters of {owners}", "their reactive power is not that of their curves"))
+    if named.any():
+        found.append((words.busbar_meter(named), f"it {words.busbar_off(busbar.off, v0_squared, named)}"))
     if cause is Cause.RESIDUALS:
-        reason = f"{reason[:-1]}; and the inverters of {owners}." if owners else reason
-        return decision, cause, f"{reason} {_ways(design, open_)}" if open_ else reason
+        reason = f"{reason[:-1]}; and {' and '.join(who for who, _ in found)}." if found else reason
+        return decision, cause, f"{reason} {words.ways(design, open_)}" if open_ else reason
     if cause not in _MILD:
         return said
-    if owners:
-        sentence = (
-            f"Manipulated: the inverters of {owners}; their reactive power is not that of their curves."
-        )
+    if found:
+        sentence = f"Manipulated: {'; and '.join('; '.join(each) for each in found)}."
         return Decision.ATTACKED, Cause.RESIDUALS, sentence
     sentence = ""
     ways = tick.rivals or open_
-    if ways:
-        sentence = _ways(design, ways)
+    if doubted.any():
+        off = words.busbar_off(busbar.off, v0_squared, doubted)
+        sentence = f"{words.busbar_meter(doubted).capitalize()} {off}, but not for long enough to be named."
+    elif ways:
+        sentence = words.ways(design, ways)
     elif amounts:
-        sentence = _doubt(design, *next(iter(amounts.items())))
+        sentence = words.doubt(design, *next(iter(amounts.items())))
     return (Decision.UNDECIDED, Cause.AMBIGUOUS, sentence) if sentence else said
-
-
-def _doubt(design: SequentialDesign, k: int, amount: float) -> str:
-    """What a suspicion besides meters means, in one sentence."""
-    plant = design.plant
-    power = f"{abs(amount) * plant.feeder.base_kva:.1f}"
-    if k < design.customers:
-        way = "feeds in" if amount > 0 else "draws"
-        return f"It looks as if {plant.feeder.customers[k]} {way} {power} kW more than its readings say."
-    who = plant.feeder.customers[plant.droop.customer[k - design.customers]]
-    return f"The inverter of {who} may inject {power} kvar that its curve does not ask for."
-
-
-# So many explanations, and so many names in each, are told in a sentence.
-_SHOWN = 5
-
-
-def _ways(design: SequentialDesign, explanations: tuple[Explanation, ...]) -> str:
-    """What may be the case, in one sentence."""
-    ways = [_way(design, each) for each in explanations[:_SHOWN]]
-    if len(explanations) == 1:
-        return f"Wrong is {ways[0]}; nothing else explains the readings."
-    more = len(explanations) - len(ways)
-    each = "both explain" if len(explanations) == 2 else "each of these explains"
-    return (
-        f"Wrong are either {' or else '.join(ways)}{f' or {more} more' if more else ''}; {each} the readings."
-    )
-
-
-def _way(design: SequentialDesign, explanation: Explanation) -> str:
-    customers, owner = design.plant.feeder.customers, design.plant.droop.customer
-    accused = (
-        ("meter", [name for name, bad in zip(design.names, explanation.meters, strict=True) if bad]),
-        ("inverter", [customers[c] for c in owner[explanation.inverters]]),
-        ("reported power", [customers[c] for c in np.flatnonzero(explanation.powers)]),
-    )
-    parts = [f"the {what}{'s' * (len(who) > 1)} of {_list(who)}" for what, who in accused if who]
-    return " and ".join(parts) if parts else "none of them"
-
-
-def _list(names: list[str]) -> str:
-    rest = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return ", ".join(names[:_SHOWN]) + rest
 
 
 def _amounts(design: SequentialDesign, state: SequentialState, seen: Examined) -> dict[int, float]:
@@ -309,8 +284,8 @@ def _reconstructed(
     design: SequentialDesign, state: SequentialState, tick: Tick
 ) -> tuple[Floats, Floats, Released | None]:
     """What the trusted meters add to the model at every bus, its variance, and what is kept of the work."""
-    prior_, told = state.doubts.prior, tick.frame.p_std
     s, moved = _best(design, state)
+    prior_, told = state.doubts.priors[max(s, 0)], tick.frame.p_std
     now, view = (None, None) if s < 0 else (state.fits[s], tick.seen.views[s])
     if now is None:
         return np.zeros_like(prior_.variance), prior_.variance, None
@@ -318,8 +293,8 @@ def _reconstructed(
     judged = judge(now, m) if view is None else view.judged
     # The model begins at this reading of the busbar, a mean takes only its part of that one's jitter off.
     jitter = (1.0 - 1.0 / design.lengths[s]) * design.flicker
-    flicker = by_place(design.plant.feeder, np.where(tick.busbar, jitter, 0.0))
-    after = moved * prior_.variance + _hidden(state) + flicker
+    flicker = by_place(design.plant.feeder, np.where(tick.heard.busbar, jitter, 0.0))
+    after = moved * prior_.variance + _hidden(state, prior_) + flicker
     liars = design.plant.meters[~state.trust.trusted]
     # Nobody lies about powers that nobody told, which are known by a standard deviation.
     liars = liars if told is None else liars[np.isnan(told[liars])]
@@ -336,20 +311,20 @@ def _best(design: SequentialDesign, state: SequentialState) -> tuple[int, float]
 
     A mean over many ticks does not know what the loads did meanwhile.
     """
-    whole, at, least, moved = float(state.doubts.prior.variance.sum()), -1, np.inf, 0.0
+    at, least, moved = -1, np.inf, 0.0
     for s, (now, length) in enumerate(zip(state.fits, design.lengths, strict=True)):
         if now is None:
             continue
         lag = min(1.0, length * design.step_s / design.doubt.time_s) * (length > 1)
-        total = float(now.variance.sum()) + lag * whole
+        total = float(now.variance.sum()) + lag * float(now.prior.variance.sum())
         if total < least:
             at, least, moved = s, total, lag
     return at, moved
 
 
-def _hidden(state: SequentialState) -> Floats:
+def _hidden(state: SequentialState, prior_: Prior) -> Floats:
     """What learning could not tell from errors of the loads that last, at every bus, (n,)."""
-    hidden, prior_ = state.learned.hidden, state.doubts.prior
+    hidden = state.learned.hidden
     out = np.full(prior_.variance.size, hidden.max(initial=0.0))
     out[prior_.meters] = hidden
     return np.asarray(np.minimum(out, prior_.variance))

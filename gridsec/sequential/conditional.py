@@ -83,6 +83,8 @@ class Fit:
         Changes of rank one since the last factorisation.
     pivot, std : (p,) or None
         Diagonal of Q, 1 where not trusted, and the standard deviation of each offset; None until asked for.
+    together : (b,) or None
+        Sum of the entries of Q between meters of one phase of the busbar; None until asked for.
     """
 
     prior: Prior
@@ -94,6 +96,7 @@ class Fit:
     changes: int = 0
     pivot: Floats | None = None
     std: Floats | None = None
+    together: Floats | None = None
 
     @property
     def Q(self) -> Floats:  # noqa: N802  # its name in the theory
@@ -426,7 +429,7 @@ def _change(now: Fit, move: Move) -> None:
     now.variance -= move.factor * move.spread * move.spread
     np.maximum(now.variance, 0.0, out=now.variance)
     now.changes += 1
-    now.pivot = now.std = None
+    now.pivot = now.std = now.together = None
 
 
 def follow(now: Fit, m: Floats, judged: Judged, move: Move) -> Judged:

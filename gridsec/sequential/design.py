@@ -20,7 +20,7 @@ from gridsec.detect import curve_mismatch
 from gridsec.errors import DesignInfeasible, NotObservable
 from gridsec.lmi import contraction
 from gridsec.lure import Lure, close_loop
-from gridsec.network import Network, Power, own, sizes
+from gridsec.network import Network, Power, hangs_on, own, sizes
 from gridsec.plant import Plant
 from gridsec.sequential.conditional import Prior
 from gridsec.sequential.decoder import Decoder
@@ -124,6 +124,8 @@ class SequentialDesign:
         Variance of a squared reading from tick to tick, and of its unknown fixed part, squared pu^2.
     allowed : (p,)
         Largest fixed part by the accuracy class, squared pu.
+    hangs_on : (p, b)
+        1 where a meter hangs on a phase of the busbar, else 0; b is 1 on a balanced feeder.
     reach : (p,)
         What all inverters between their limits can do to the voltage at each meter, squared pu.
     meter_of : (m,)
@@ -166,6 +168,7 @@ class SequentialDesign:
     white: Floats
     fixed: Floats
     allowed: Floats
+    hangs_on: Floats
     reach: Floats
     meter_of: Ints
     heard: ToldError
@@ -189,6 +192,11 @@ class SequentialDesign:
     def effects(self) -> Effects:
         """What every customer's powers do to the voltages."""
         return self.shapes.traces.effects
+
+    @property
+    def confirmed(self) -> Ints:
+        """Ticks that evidence on each scale must last before anybody is named, (s,)."""
+        return 2 + np.array(self.lengths) // 6
 
     @property
     def observers(self) -> int:
@@ -241,7 +249,7 @@ def design(
     fixed = slope**2 * accuracy.class_fraction**2 / 3.0
     known = prior(plant.feeder, plant.feeder.bus[meters], doubt, busbar=busbar, inverters=injections)
     suspect = float(norm.isf(0.5 * options.suspect / meters.size))
-    sigmas = tuple(_sigmas(options.alarms_per_year, meters.size, n, step_s, lengths) for n in lengths)
+    sigmas = tuple(_sigmas(options.alarms_per_year, plant, n, step_s, lengths) for n in lengths)
     return SequentialDesign(
         plant=plant,
         names=tuple(plant.feeder.customers[c] for c in meters),
@@ -258,6 +266,7 @@ def design(
         white=white,
         fixed=fixed,
         allowed=slope * accuracy.class_fraction,
+        hangs_on=hangs_on(plant.feeder)[meters],
         reach=np.abs(lure.C) @ (2.0 * plant.droop.limit),
         meter_of=_meter_of(plant),
         mismatch=curve_mismatch(plant.droop),
@@ -344,11 +353,13 @@ def _lengths(scales_s: tuple[float, ...], step_s: float) -> tuple[int, ...]:
 _REPEATS = 2
 
 
-def _sigmas(rate: float, meters: int, length: int, step_s: float, lengths: tuple[int, ...]) -> float:
+def _sigmas(rate: float, plant: Plant, length: int, step_s: float, lengths: tuple[int, ...]) -> float:
     """Two-sided Gaussian limit such that all scales together exceed it `rate` times a year by chance.
 
-    Means over `length` ticks are new once in that time; between, they hardly change.
+    Means over `length` ticks are new once in that time; between, they hardly change. The busbar is judged as
+    the meters are.
     """
+    meters = plant.meters.size + hangs_on(plant.feeder).shape[1]
     tests = meters * (len(lengths) + _REPEATS) * YEAR_S / (step_s * length)
     return float(norm.isf(min(rate / tests, 0.5) / 2.0))
 

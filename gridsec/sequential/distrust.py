@@ -17,7 +17,6 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.sequential.design import SequentialDesign
-from gridsec.sequential.examine import confirmed
 from gridsec.sequential.kinds import suspicious
 from gridsec.sequential.naming import MOST_COUNTED
 from gridsec.sequential.scales import needed
@@ -132,7 +131,7 @@ def restore(design: SequentialDesign, state: SequentialState, before: Distrust) 
             trust,
             trusted=~which,
             scale=scale,
-            age=np.where(before.named, confirmed(design)[scale], which),
+            age=np.where(before.named, design.confirmed[scale], which),
             still=still,
             owed=np.where(which, np.maximum(need[scale], settling), 0),
             named=before.named & which,

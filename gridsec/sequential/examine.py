@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, Ints
+from gridsec.arrays import Bools, Floats
+from gridsec.sequential.busbar import opposed
 from gridsec.sequential.conditional import Fit, drop, judge
 from gridsec.sequential.decoder import Accused, Evidence
 from gridsec.sequential.design import SequentialDesign
@@ -34,12 +35,16 @@ class Examined:
         By scale; a view is None where the scale was not looked at.
     found
         The likeliest explanation that a search came to, and the others, by scale.
+    busbar
+        The phase of the busbar whose meter lies, and the scale that found it: then nothing else counts, and
+        the tick has to begin anew without it.
     """
 
     trust: Trust
     fits: tuple[Fit | None, ...]
     views: tuple[View | None, ...]
     found: dict[int, Found]
+    busbar: tuple[int, int] | None = None
 
 
 # A long scale hardly changes from tick to tick: it is looked at this many times per length.
@@ -60,13 +65,13 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats) -> 
     model : (p,)
         What the model may be off, squared pu.
     """
-    fits, window, prior, tick = state.fits, state.window, state.doubts.prior, state.ticks
+    fits, tick = state.fits, state.ticks
     bad, still = state.trust.bad.copy(), state.trust.still.copy()
     trust = replace(state.trust, bad=bad, still=still)
     views: list[View | None] = []
     after: list[Fit | None] = []
     found: dict[int, Found] = {}
-    scales = Scales(design, prior, window, state.learned, model)
+    scales = Scales(design, state.doubts.priors, state.window, state.learned, model)
     book = replace(design.book, std=state.doubts.sizes)
     for s, length in enumerate(design.lengths):
         before = fits[s]
@@ -76,14 +81,21 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats) -> 
             after.append(before)
             continue
         here = scales[s]
-        now = adapt(before, prior, here.noise, trust.trusted & here.enough, directions(book, trust.accused))
+        now = adapt(before, here, trust.trusted & here.enough, directions(book, trust.accused))
         view = view_of(design, here, now)
         if design.decoder is not None:
             found[s], trust = _decoded(design, here, now, trust, s)
-            now = found[s].best.fit
-            view = view_of(design, here, now)
-        elif (view.over & trust.trusted).any() or _due(design, trust, view, s, tick, searched=bool(found)):
-            found[s], trust = Search(design, scales, book, fits, trust, s)(now, view)
+        else:
+            phase = opposed(design, s, now, view.judged, model, state.doubts.busbar)
+            over = phase is not None or bool((view.over & trust.trusted).any())
+            if over or _due(design, trust, view, s, tick, searched=bool(found)):
+                search = Search(design, scales, book, fits, trust, s)
+                found[s], trust = search(now, view)
+                if phase is not None:
+                    found[s], lies = _without_busbar(search, found[s], now, phase)
+                    if lies:
+                        return Examined(state.trust, fits, (None,) * len(fits), {}, (phase, s))
+        if s in found:
             now = found[s].best.fit
             view = view_of(design, here, now)
         bad[s] = still[s] = False
@@ -94,6 +106,21 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats) -> 
         views.append(view)
         after.append(now)
     return Examined(trust, tuple(after), tuple(views), found)
+
+
+def _without_busbar(search: Search, found: Found, now: Fit, phase: int) -> tuple[Found, bool]:
+    """What was found, and whether it is far likelier that the meter of a phase of the busbar lies.
+
+    If that is about as likely it is one of the other explanations.
+    """
+    design, here = search.design, search.scales[search.s]
+    other = search.beside_busbar(now, phase)
+    if np.count_nonzero(here.enough & ~other.trusted) > design.most:
+        return found, False
+    worse, like = other.cost - found.best.cost, 2.0 * float(np.log(design.options.like))
+    if worse < -like:
+        return found, True
+    return replace(found, others=(*found.others, other)) if worse <= like else found, False
 
 
 def ended(design: SequentialDesign, trust: Trust, seen: Examined, window: Window) -> Bools:
@@ -140,7 +167,7 @@ def _due(design: SequentialDesign, trust: Trust, view: View, s: int, tick: int, 
         return True
     if trust.trusted.all():
         return False
-    since = trust.age + 1 - confirmed(design)[trust.scale]
+    since = trust.age + 1 - design.confirmed[trust.scale]
     about = ~trust.trusted & ~trust.named & view.over & (since >= 0)
     first = (since < max(_every(design.lengths[s]), _AGAIN)) | ~trust.bad[s]
     if (about & first).any() or (tick % _AGAIN == 0 and about.any()):
@@ -154,34 +181,12 @@ def _every(length: int) -> int:
     return max(1, round(length / _LOOKS))
 
 
-def confirm(length: int) -> int:
-    """Ticks that evidence on a scale must last before a meter is named.
-
-    Parameters
-    ----------
-    length
-        Ticks of the scale.
-    """
-    return 2 + length // 6
-
-
-def confirmed(design: SequentialDesign) -> Ints:
-    """The same for every scale, (s,).
-
-    Parameters
-    ----------
-    design
-        The design.
-    """
-    return np.array([confirm(length) for length in design.lengths])
-
-
 def _decoded(design: SequentialDesign, here: Scale, now: Fit, trust: Trust, s: int) -> tuple[Found, Trust]:
     """What the design's decoder says, as explanations, and whom that leaves trusted."""
     judged = judge(now, here.m)
     over = here.enough & (np.abs(judged.offset) > here.limits.of(judged.std))
     tight = now if not now.loose.shape[1] else None
-    whole = adapt(tight, now.prior, here.noise, here.enough, None)
+    whole = adapt(tight, here, here.enough, None)
     evidence = Evidence(
         whole=whole,
         m=here.m,

@@ -12,11 +12,13 @@ from dataclasses import replace
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints
+from gridsec.network import by_place
 from gridsec.sequential import search
-from gridsec.sequential.conditional import Fit, fit, judge, misfit
+from gridsec.sequential.conditional import Fit, fit, judge, loosen, misfit
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.dictionary import Dictionary
-from gridsec.sequential.scales import Scales, View, believe, directions
+from gridsec.sequential.loads import UNMETERED
+from gridsec.sequential.scales import Scales, View, believe, directions, view_of
 from gridsec.sequential.search import Explanation, Found, Limits, Solution, likelier
 from gridsec.sequential.state import Trust
 
@@ -59,6 +61,8 @@ class Search:
         Who is believed.
     s
         The scale.
+    beside : (n, k)
+        Directions that are loosened whatever else is, times their standard deviations.
     """
 
     def __init__(  # noqa: PLR0917  # what is known, in the order it becomes known
@@ -69,8 +73,10 @@ class Search:
         fits: tuple[Fit | None, ...],
         trust: Trust,
         s: int,
+        *,
+        beside: Floats | None = None,
     ) -> None:
-        self.design, self.scales, self.book = design, scales, book
+        self.design, self.scales, self.book, self.beside = design, scales, book, beside
         self.fits, self.trust, self.s = fits, trust, s
         here = scales[s]
         sigmas = min(design.suspect, here.limits.sigmas)
@@ -87,6 +93,18 @@ class Search:
         ----------
         now, view
             The fit of those who were believed, and what the scale says then.
+        """
+        found = self.likeliest(now, view)
+        rivals = (*found.others, *self.turned, *self._instead(found.best))
+        return replace(found, others=self._compared(found.best, rivals)), self._believe(found.best)
+
+    def likeliest(self, now: Fit, view: View) -> Found:
+        """What is found, before rivals are looked for and compared.
+
+        Parameters
+        ----------
+        now, view
+            As in a call.
         """
         start = now if len(self.accused) == len(self.trust.accused) else self._fit(now.trusted)
         few = np.count_nonzero(view.over & now.trusted) <= _FEW
@@ -113,8 +131,28 @@ class Search:
             better = not unknown and free.best.cost < best.cost and self._total(free.best) < self._total(best)
             first, second = (free, found) if better else (found, free)
             found = Found(first.best, (second.best.bare(), *first.others, *second.others))
-        rivals = (*found.others, *self.turned, *self._instead(found.best))
-        return replace(found, others=self._compared(found.best, rivals)), self._believe(found.best)
+        return found
+
+    def beside_busbar(self, now: Fit, phase: int) -> Explanation:
+        """The likeliest explanation in which the busbar's meter lies.
+
+        Parameters
+        ----------
+        now
+            The fit of those who were believed.
+        phase
+            Of the busbar; among what is loosened it comes after all that is in the book.
+        """
+        design, there = self.design, now.copy()
+        here = UNMETERED * (np.arange(design.hangs_on.shape[1]) == phase)
+        direction = by_place(design.plant.feeder, here)
+        loosen(there, direction, 1.0)
+        beside = direction[:, None]
+        lying = Search(design, self.scales, self.book, self.fits, self.trust, self.s, beside=beside)
+        best = lying.likeliest(there, view_of(design, self.scales[self.s], there)).best
+        charge = search.price(int(np.count_nonzero(self.here.enough)), 1)
+        loosened = (*best.loosened, self.book.std.size + phase)
+        return Explanation(best.trusted, loosened, best.charge + charge, best.cost + charge)
 
     def _instead(self, best: Solution) -> list[Explanation]:
         """Explanations in which one of those who might be named is honest."""
@@ -155,7 +193,7 @@ class Search:
 
     def _believing(self, best: Solution, group: Ints) -> list[Solution]:
         """The nearest explanation in which a group that `best` accuses is honest; none if that is absurd."""
-        here, prior, loose, most = self.here, self.scales.prior, best.fit.loose, self.design.most
+        here, prior, loose, most = self.here, self.here.prior, best.fit.loose, self.design.most
         if np.count_nonzero(self._contradict(group[group.size // 2], loose)) > most:
             return []
         among = np.zeros_like(best.trusted)
@@ -196,7 +234,8 @@ class Search:
 
     def _contradict(self, j: int, loose: Floats) -> Bools:
         """Meters that cannot be honest if meter j is, as far as the two of them alone can tell, (p,)."""
-        here, prior, more = self.here, self.scales.prior, loose[self.scales.prior.meters]
+        here, prior = self.here, self.here.prior
+        more = loose[prior.meters]
         column = prior.of_meters[prior.meters, j] + more @ more[j]
         own = prior.variance[prior.meters] + here.noise + (more * more).sum(axis=1)
         apart = np.maximum(own + own[j] - 2.0 * column, 0.0)
@@ -267,7 +306,7 @@ class Search:
 
     def _together(self, at: Ints) -> Bools:
         """Which of some meters are moved by the same loads, (k, k)."""
-        prior = self.scales.prior
+        prior = self.here.prior
         between = prior.among(at)
         std = np.sqrt(between.diagonal())
         limit = _TOGETHER * np.multiply.outer(std, std)
@@ -303,7 +342,7 @@ class Search:
 
     def _starts(self) -> tuple[Bools, Bools]:
         """A robust fit, and the meters close to the model."""
-        here, prior = self.here, self.scales.prior
+        here, prior = self.here, self.here.prior
         focus, std = self.design.options.focus, np.sqrt(here.noise)
         chosen = search.robust(prior, here.noise, here.m, here.enough, here.limits.model + focus * std)
         alone = np.sqrt(prior.variance[prior.meters] + here.noise)
@@ -334,8 +373,12 @@ class Search:
         )
 
     def _fit(self, trusted: Bools) -> Fit:
-        loose = directions(self.book, self.accused)
-        return fit(self.scales.prior, self.here.noise, trusted & self.here.enough, loose)
+        loose = self._loose(self.accused)
+        return fit(self.here.prior, self.here.noise, trusted & self.here.enough, loose)
+
+    def _loose(self, accused: tuple[tuple[int, int], ...]) -> Floats | None:
+        loose, beside = directions(self.book, accused), self.beside
+        return loose if beside is None else beside if loose is None else np.hstack([loose, beside])
 
     def _total(self, found: Explanation) -> float:
         """The misfit on all scales and, once, what the accusations cost."""
@@ -354,14 +397,14 @@ class Search:
         """What an explanation leaves unexplained on each scale; of `more` meters, which may be off alike."""
         trusted, out = self._trusted(found), []
         trusted = trusted if more is None else trusted | more
-        loose = directions(self.book, (*self.accused, *((k, self.s) for k in found.loosened)))
+        loose = self._loose((*self.accused, *((k, self.s) for k in found.loosened)))
         for s in range(len(self.fits)):
             there = self.scales[s]
             if s == self.s and more is None and isinstance(found, Solution):
                 out.append(found.judged.misfit)
             else:
                 wanted = trusted & there.enough
-                out.append(misfit(self.scales.prior, there.noise, there.m, wanted, loose, alike))
+                out.append(misfit(there.prior, there.noise, there.m, wanted, loose, alike))
         return out
 
     def _believe(self, best: Explanation) -> Trust:

@@ -21,6 +21,9 @@ from gridsec.droop import Droop
 from gridsec.network import Network, Power, bus_voltages, by_place, covariance, one_busbar, variances
 from gridsec.sequential.conditional import Prior
 
+UNMETERED = 0.1
+"""Standard deviation of a squared busbar voltage that nobody reads, squared pu."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadDoubt:

@@ -15,7 +15,7 @@ import numpy as np
 from gridsec.arrays import Bools, Ints
 from gridsec.online import Explanation
 from gridsec.sequential.design import SequentialDesign
-from gridsec.sequential.examine import Examined, confirm, confirmed
+from gridsec.sequential.examine import Examined
 from gridsec.sequential.search import swaps
 from gridsec.sequential.state import Trust
 
@@ -48,7 +48,7 @@ def name(
     # Who is caught again within the longest scale was never cleared.
     age = np.where(trusted & (quiet > design.lengths[-1]), 0, trust.age + ~trusted)
     owed = np.where(trusted, 0, np.maximum(trust.owed - live, 0))
-    need = confirmed(design)[trust.scale]
+    need = design.confirmed[trust.scale]
     fresh = ~trusted & ~before.named & trust.bad.any(axis=0) & (age >= need) & _accused(seen, trusted.size)
     named = before.named & (quiet < design.options.release)
     count, inverters = _inverters(design, before, trust)
@@ -78,10 +78,10 @@ def _inverters(design: SequentialDesign, before: Trust, trust: Trust) -> tuple[I
     # Who was named before the monitor began anew is counted beyond that, down from there.
     most = np.maximum(MOST_COUNTED, before.counted - 1)
     count = np.clip(before.counted + np.where(now, 1, -1), 0, most)
-    need = np.full(now.size, MOST_COUNTED)
+    need, confirmed = np.full(now.size, MOST_COUNTED), design.confirmed
     for k, s in trust.accused:
         if k >= design.customers:
-            need[k - design.customers] = min(confirm(design.lengths[s]), MOST_COUNTED)
+            need[k - design.customers] = min(confirmed[s], MOST_COUNTED)
     return count, (before.inverters & (count > 0)) | (now & (count >= need))
 
 
@@ -95,7 +95,7 @@ def inverters_of(design: SequentialDesign, accused: Sequence[int]) -> Bools:
     accused
         Indices of its book.
     """
-    return _suspicions(design, accused)[design.customers :]
+    return _suspicions(design, accused)[design.customers : design.book.std.size]
 
 
 def powers_of(design: SequentialDesign, accused: Sequence[int]) -> Bools:
@@ -111,9 +111,14 @@ def powers_of(design: SequentialDesign, accused: Sequence[int]) -> Bools:
     return _suspicions(design, accused)[: design.customers]
 
 
+def _busbar_of(design: SequentialDesign, accused: Sequence[int]) -> Bools:
+    """Phases of the busbar among other suspicions, (b,)."""
+    return _suspicions(design, accused)[design.book.std.size :]
+
+
 def _suspicions(design: SequentialDesign, accused: Sequence[int]) -> Bools:
-    """The book's powers and inverters, (N + m,): which are accused."""
-    out = np.zeros(design.customers + design.plant.droop.tau.size, dtype=np.bool_)
+    """The book's powers and inverters, and phases of the busbar, (N + m + b,): which are accused."""
+    out = np.zeros(design.book.std.size + design.hangs_on.shape[1], dtype=np.bool_)
     out[list(accused)] = True
     return out
 
@@ -142,6 +147,8 @@ def _rivals(design: SequentialDesign, seen: Examined, fresh: Bools, new: Bools) 
         return ()
     total = sum(way[2] for way in ways)
     return tuple(
-        Explanation(meters, inverters, weight / total, powers_of(design, loosened))
+        Explanation(
+            meters, inverters, weight / total, powers_of(design, loosened), _busbar_of(design, loosened)
+        )
         for meters, inverters, weight, loosened in ways
     )

@@ -65,6 +65,8 @@ class Scale:
 
     Attributes
     ----------
+    prior
+        What the powers may do.
     noise : (p,)
         Variance of each meter's mean, squared pu^2.
     m : (p,)
@@ -75,6 +77,7 @@ class Scale:
         What is evidence.
     """
 
+    prior: Prior
     noise: Floats
     m: Floats
     enough: Bools
@@ -101,22 +104,28 @@ class Scales:
     ----------
     design
         The design.
-    prior, window, learned
-        What the powers may do, the last residuals, and what is known of the meters' errors.
+    priors, window, learned
+        What the powers may do on each scale, the last residuals, and what is known of the meters' errors.
     model : (p,)
         What the model may be off, squared pu.
     """
 
-    def __init__(
-        self, design: SequentialDesign, prior: Prior, window: Window, learned: Learned, model: Floats
+    def __init__(  # what every scale is made of
+        self,
+        design: SequentialDesign,
+        priors: tuple[Prior, ...],
+        window: Window,
+        learned: Learned,
+        model: Floats,
     ) -> None:
-        self.design, self.prior, self.window, self.model = design, prior, window, model
+        self.design, self.priors, self.window, self.model = design, priors, window, model
         self.learned = learned
 
     def __getitem__(self, s: int) -> Scale:
         design, counts = self.design, self.window.counts[s]
         need = needed(design, s)
         return Scale(
+            prior=self.priors[s],
             noise=design.white / need + self.learned.variance,
             m=self.window.sums[s] / np.maximum(counts, 1),
             enough=counts >= need,
@@ -156,20 +165,21 @@ def directions(book: Dictionary, accused: tuple[tuple[int, int], ...]) -> Floats
     return np.asarray(book.columns(which) * book.std[which])
 
 
-def adapt(before: Fit | None, prior: Prior, noise: Floats, wanted: Bools, loose: Floats | None) -> Fit:
+def adapt(before: Fit | None, here: Scale, wanted: Bools, loose: Floats | None) -> Fit:
     """A fit of the wanted meters, from the last one where that is cheaper.
 
     Parameters
     ----------
     before
         The last fit of this scale.
-    prior, noise
-        As in `conditional.fit`.
+    here
+        The scale.
     wanted : (p,)
         The meters to rest on.
     loose : (n, k)
         Loosened directions.
     """
+    prior, noise = here.prior, here.noise
     if before is None or before.prior is not prior:
         return fit(prior, noise, wanted, loose)
     if before.loose.shape[1] if loose is None else not np.array_equal(before.loose, loose):

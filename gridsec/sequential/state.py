@@ -10,12 +10,16 @@ from gridsec.arrays import Bools, Floats, Ints
 from gridsec.online import Estimate, Verdict
 from gridsec.sequential.bounds import Lag
 from gridsec.sequential.bounds import start as no_lag
+from gridsec.sequential.busbar import Busbar
+from gridsec.sequential.busbar import believed as believed_busbar
 from gridsec.sequential.commission import Commission, Learned, Learning, fresh
 from gridsec.sequential.commission import renew as learn_anew
-from gridsec.sequential.conditional import Fit, Prior
+from gridsec.sequential.conditional import Fit
 from gridsec.sequential.curves import Curves
 from gridsec.sequential.curves import empty as no_curves
 from gridsec.sequential.design import SequentialDesign
+from gridsec.sequential.doubts import Doubts
+from gridsec.sequential.doubts import none as no_doubts
 from gridsec.sequential.drive import Free
 from gridsec.sequential.kinds import Kinds
 from gridsec.sequential.kinds import empty as no_kinds
@@ -68,38 +72,6 @@ class Trust:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Doubts:
-    """How much less the frames know than the design assumes. N customers.
-
-    Attributes
-    ----------
-    p, q : (N,)
-        Factors, powers of two, on the standard deviations of the design: the largest that any residual which
-        is remembered was made with.
-    p_calm, q_calm : (N,)
-        For how many ticks a smaller one would have done.
-    busbar
-        Whether there is a busbar voltage; in three phases (3,).
-    prior
-        What follows.
-    sizes : (k,)
-        How much there may be of whatever else is in the book of the design, pu: false powers are of the size
-        of what the customers claim, rounded up.
-    heard
-        While no meter is heard: the same when one was, for the last time.
-    """
-
-    p: Floats
-    q: Floats
-    p_calm: Ints
-    q_calm: Ints
-    busbar: Bools | bool
-    prior: Prior
-    sizes: Floats
-    heard: Doubts | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class SequentialState:
     """What is carried from frame to frame. N customers, m inverters, p meters, s scales.
 
@@ -116,9 +88,11 @@ class SequentialState:
     lag
         How far the injections may be from the true ones.
     v0_squared
-        Last squared busbar voltage, pu; in three phases (3,).
+        Last squared busbar voltage that was believed, pu; in three phases (3,).
     unmetered
         For how many frames there has been none; in three phases (3,).
+    busbar
+        What is thought of its meter.
     window
         The last residuals.
     trust
@@ -153,6 +127,7 @@ class SequentialState:
     lag: Lag
     v0_squared: Floats | float
     unmetered: Ints | int
+    busbar: Busbar
     window: Window
     trust: Trust
     fits: tuple[Fit | None, ...]
@@ -187,12 +162,11 @@ def init(
         What is known of the meters' fixed errors and what was gathered, if there is anything from before.
     """
     known = fresh(design, t) if learned is None else Commission(learned, learning)
-    p, s, customers = design.plant.meters.size, len(design.lengths), design.plant.feeder.bus.size
+    p, s = design.plant.meters.size, len(design.lengths)
     m = design.plant.droop.tau.size
     zeros = np.zeros(p, dtype=np.intp)
     no = np.zeros(p, dtype=np.bool_)
     none = np.zeros((s, p), dtype=np.bool_)
-    one, never = np.ones(customers), np.zeros(customers, dtype=np.intp)
     return SequentialState(
         t=t,
         since=t,
@@ -202,6 +176,7 @@ def init(
         lag=no_lag(design.plant, np.zeros(m)),
         v0_squared=design.plant.droop.vbar**2,
         unmetered=0,
+        busbar=believed_busbar(design.hangs_on.shape[1]),
         window=empty(design.lengths, p),
         trust=Trust(
             ~no,
@@ -218,7 +193,7 @@ def init(
         ),
         fits=(None,) * s,
         released=None,
-        doubts=Doubts(one, one, never, never, True, design.prior, design.book.std),
+        doubts=no_doubts(design),
         learning=known.learning,
         learned=known.learned,
         model_error=np.zeros(p),

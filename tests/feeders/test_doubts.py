@@ -102,7 +102,7 @@ def test_a_step_counts_what_is_not_metered_once_and_errs_by_what_it_says() -> No
             state, estimate, verdict = watcher.step(state, frame)
             truth = (sample.v_volt / CIGRE.customer_volt) ** 2
         assert isinstance(state, SequentialState)
-        assert state.doubts.prior is watcher.design.prior
+        assert state.doubts.priors[-1] is watcher.design.prior
         assert not verdict.suspects.any()
         assert estimate.std is not None
         ratios.append(((estimate.v2 - truth) / estimate.std)[some])

@@ -273,7 +273,7 @@ def test_a_told_deviation_is_believed_although_the_interval_is_wide() -> None:
         state = watcher.init(snapshot.t) if state is None else state
         state, _, _ = watcher.step(state, to_frame(site, snapshot))
         assert isinstance(state, SequentialState)
-        assert state.doubts.prior is watcher.design.prior
+        assert state.doubts.priors[-1] is watcher.design.prior
 
 
 @pytest.mark.parametrize("estimator", [SEQUENTIAL, "weighted-least-squares", "exact-bank"])

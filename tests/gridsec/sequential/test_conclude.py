@@ -11,7 +11,7 @@ from gridsec import sequential
 from gridsec.online import Cause, Decision, Explanation
 from gridsec.plant import Plant
 from gridsec.sequential import LoadDoubt, SequentialDesign, SequentialOptions
-from gridsec.sequential.conclude import _ways
+from gridsec.sequential.words import ways
 from tests.gridsec.sequential.test_monitor import prepare, watch
 from tests.gridsec.street import BASE_KVA, Street, accuracy, make_plant
 
@@ -29,16 +29,16 @@ def way(
 
 
 def test_every_explanation_is_told_as_what_it_is(design: SequentialDesign) -> None:
-    assert _ways(design, (way((1,)), way())) == (
+    assert ways(design, (way((1,)), way())) == (
         "Wrong are either the meter of c1 or else none of them; both explain the readings."
     )
-    three = _ways(design, (way((1, 2)), way((3,), (4,)), way(powers=(5,))))
+    three = ways(design, (way((1, 2)), way((3,), (4,)), way(powers=(5,))))
     assert three == (
         "Wrong are either the meters of c1, c2 or else the meter of c3 and the inverter of c4 or else the "
         "reported power of c5; each of these explains the readings."
     )
-    assert "c11" not in _ways(design, (way(tuple(range(12))), way()))
-    assert "or 3 more; each of these" in _ways(design, (way((1,)),) * 8)
+    assert "c11" not in ways(design, (way(tuple(range(12))), way()))
+    assert "or 3 more; each of these" in ways(design, (way((1,)),) * 8)
 
 
 def twins() -> Plant:

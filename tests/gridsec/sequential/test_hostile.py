@@ -98,7 +98,7 @@ class TestNumbersThatAreNone:
         for error in (0.05, 50.0, np.inf):
             given = replace(frame, p_error=np.full(12, error))
             state, _, _ = sequential.step(made, sequential.init(made, frame.t - 1.0), given)
-            assert (state.doubts.prior.variance[1:] > made.prior.variance[1:]).all()
+            assert (state.doubts.priors[-1].variance[1:] > made.prior.variance[1:]).all()
 
 
 @pytest.mark.parametrize(("factor", "before"), [(4.0, 30), (30.0, 21)])

@@ -204,7 +204,7 @@ class TestGaps:
 
         state, answers = watch(street, design, 60, change=guess)
         assert not any(verdict.suspects.any() for _, verdict in answers)
-        assert state.doubts.p[6] > 1.0
+        assert state.doubts.p[-1, 6] > 1.0
         state, _ = watch(street, design, design.lengths[-1], state=state)
         assert (state.doubts.p == 1.0).all()
 

@@ -1,0 +1,169 @@
+"""The busbar's own meter, judged by all others.
+
+What it reads is in every residual: if it is off by b, all residuals of its phase are off by -b, and whoever
+takes its word suspects everybody else. It is a meter like any other, only with more weight. With d one at the
+meters of its phase and zero elsewhere, letting the busbar differ by any amount lowers the misfit by
+
+    z^2 = (d^T Q m)^2 / (d^T Q d),
+
+and z is its leave-one-out residual in standard deviations: Q already contains its honest error. Where that is
+beyond chance, the likeliest explanation in which the busbar's meter lies is compared with that in which only
+others do (`gridsec.sequential.examine`). If it wins, the tick begins anew as one at which nobody reads the
+busbar, from the last voltage that was believed. The meters then say where the busbar is, and its own meter is
+compared with that until both agree again.
+
+References
+----------
+docs/theory-sequential.md, section 5.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats, Ints
+from gridsec.sequential.conditional import Fit, Judged
+from gridsec.sequential.design import SequentialDesign
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Busbar:
+    """What is thought of the busbar's meter. b phases, one on a balanced feeder.
+
+    Attributes
+    ----------
+    believed : (b,)
+        Whether its voltage is used.
+    scale : (b,)
+        Scale on which it was caught.
+    age : (b,)
+        For how many ticks it has not been believed.
+    quiet : (b,)
+        Ticks in a row, of these, in which it agreed with the meters.
+    off : (b,)
+        What it reads too much, the mean over its scale, squared pu.
+    """
+
+    believed: Bools
+    scale: Ints
+    age: Ints
+    quiet: Ints
+    off: Floats
+
+    def caught(self, phase: int, scale: int) -> Busbar:
+        """A phase is believed no more.
+
+        Parameters
+        ----------
+        phase, scale
+            Which, and the scale that found it.
+        """
+        here = np.arange(self.believed.size) == phase
+        zero = np.where(here, 0, self.age)
+        return Busbar(
+            self.believed & ~here,
+            np.where(here, scale, self.scale),
+            zero,
+            np.where(here, 0, self.quiet),
+            np.where(here, 0.0, self.off),
+        )
+
+    def named(self, design: SequentialDesign) -> Bools:
+        """Phases whose reading is called manipulated: evidence has lasted, (b,).
+
+        Parameters
+        ----------
+        design
+            The design.
+        """
+        return np.asarray(~self.believed & (self.age >= design.confirmed[self.scale]))
+
+
+def believed(phases: int) -> Busbar:
+    """Nothing speaks against the busbar's meter.
+
+    Parameters
+    ----------
+    phases
+        b.
+    """
+    zero = np.zeros(phases, dtype=np.intp)
+    return Busbar(np.ones(phases, dtype=np.bool_), zero, zero, zero, np.zeros(phases))
+
+
+def opposed(  # noqa: PLR0917  # what there is to judge by
+    design: SequentialDesign, s: int, now: Fit, judged: Judged, model: Floats, metered: Bools | bool
+) -> int | None:
+    """The phase whose busbar voltage the trusted meters contradict beyond chance, most of all; None for none.
+
+    Parameters
+    ----------
+    design
+        The design.
+    s
+        The scale.
+    now, judged
+        The trusted meters, and what they say.
+    model : (p,)
+        What the model may be off, squared pu.
+    metered
+        Whether there is a busbar voltage that is believed; in three phases (3,).
+    """
+    # Weights are zero where nobody is trusted.
+    along = judged.weights @ design.hangs_on
+    if now.together is None:
+        at, Q = now.trusting()
+        hangs = design.hangs_on[at]
+        now.together = np.einsum("ij,ij->j", hangs, Q @ hangs)
+    form = np.maximum(now.together, _TINY)
+    excess = metered * np.abs(along) / (design.sigmas[s] * np.sqrt(form) + model.max() * form)
+    worst = int(excess.argmax())
+    return worst if excess[worst] > 1.0 else None
+
+
+_TINY = float(np.finfo(np.float64).tiny)
+
+
+def follow(  # noqa: PLR0917  # what was thought, what it says, and what the others say
+    design: SequentialDesign,
+    before: Busbar,
+    reported: Floats,
+    heard: Bools,
+    v0_squared: Floats,
+    variance: Floats,
+) -> Busbar:
+    """Compare what a meter that is not believed reports with what the meters say.
+
+    It is believed again once the mean over the scale on which it was caught has been within what is expected
+    of an honest one for as long as that scale, and for as long as any meter has to.
+
+    Parameters
+    ----------
+    design, before
+        The design, and what was thought of it.
+    reported, heard : (b,)
+        Its squared voltages, and where there are any, pu.
+    v0_squared, variance : (b,)
+        What the meters say, and the variance of that on the scale on which it was caught.
+    """
+    out = ~before.believed
+    if not out.any():
+        return before
+    length = np.array(design.lengths)[before.scale]
+    age = before.age + out
+    off = np.where(heard, reported - v0_squared, before.off)
+    off = before.off + (off - before.off) / np.clip(age, 1, length)
+    std = np.sqrt(variance + design.busbar**2 + design.flicker)
+    limit = design.options.lower * np.array(design.sigmas)[before.scale] * std
+    agrees = out & heard & (np.abs(off) <= limit)
+    quiet = np.where(heard, (before.quiet + 1) * agrees, before.quiet)
+    again = out & (quiet >= np.maximum(design.options.release, length))
+    return replace(
+        before,
+        believed=before.believed | again,
+        age=np.where(again, 0, age),
+        quiet=np.where(again, 0, quiet),
+        off=np.where(out & ~again, off, 0.0),
+    )

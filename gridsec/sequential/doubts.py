@@ -1,0 +1,170 @@
+"""How much less the frames know of powers than the design supposes, and what then holds on every scale.
+
+A mean over some ticks contains residuals of all of them, so on each scale a customer's power is as uncertain
+as it was at worst within the ticks of that scale.
+
+References
+----------
+docs/theory-sequential.md, section 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats, Ints
+from gridsec.online import Frame
+from gridsec.sequential.conditional import Prior
+from gridsec.sequential.design import SequentialDesign
+from gridsec.sequential.loads import UNMETERED, prior
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Doubts:
+    """How much less the frames know than the design supposes. N customers, s scales.
+
+    Attributes
+    ----------
+    p, q : (s, N)
+        Factors, powers of two, on the standard deviations of the design: the largest that any residual in the
+        mean of a scale was made with.
+    p_calm, q_calm : (s, N)
+        For how many ticks a smaller one would have done.
+    busbar
+        Whether there is a busbar voltage; in three phases (3,).
+    priors : (s,)
+        What follows.
+    sizes : (k,)
+        How much there may be of whatever else is in the book of the design, pu: false powers are of the size
+        of what the customers claim, rounded up.
+    heard
+        While no meter is heard: the same when one was, for the last time.
+    """
+
+    p: Floats
+    q: Floats
+    p_calm: Ints
+    q_calm: Ints
+    busbar: Bools | bool
+    priors: tuple[Prior, ...]
+    sizes: Floats
+    heard: Doubts | None = None
+
+
+def none(design: SequentialDesign) -> Doubts:
+    """The frames know what the design supposes.
+
+    Parameters
+    ----------
+    design
+        The design.
+    """
+    shape = (len(design.lengths), design.customers)
+    one, never = np.ones(shape), np.zeros(shape, dtype=np.intp)
+    return Doubts(one, one, never, never, True, (design.prior,) * len(design.lengths), design.book.std)
+
+
+# Frames that claim to know loads so much less well than the design assumes are believed.
+_MUCH_LESS = 4.0
+# Powers are known no better than this, pu.
+_EXACT = 1e-6
+
+
+def doubted(
+    design: SequentialDesign, before: Doubts, frame: Frame, live: Bools, busbar: Bools | bool
+) -> Doubts:
+    """What is not known at this frame, and of the residuals that are remembered.
+
+    Where no meter is heard there is no residual that was made with what this frame does not know: once one is
+    heard again, doubts go on as they were before.
+
+    Parameters
+    ----------
+    design, before
+        The design, and the doubts so far.
+    frame
+        With powers that can be.
+    live : (p,)
+        Which meters have a reading.
+    busbar
+        Whether there is a busbar voltage that is believed; in three phases (3,).
+    """
+    last = before if before.heard is None else before.heard
+    if live.any():
+        return _doubts(design, last, frame, busbar)
+    found = _doubts(design, before, frame, busbar)
+    return found if found.heard is last else replace(found, heard=last)
+
+
+def _doubts(design: SequentialDesign, before: Doubts, frame: Frame, busbar: Bools | bool) -> Doubts:
+    """What this frame does not know; new priors only where that changed."""
+    lengths = np.array(design.lengths)[:, None]
+    p, p_calm = _factors(frame.p_error, design.doubt.p, before.p, before.p_calm, lengths)
+    q, q_calm = _factors(frame.q_error, design.doubt.q, before.q, before.q_calm, lengths)
+    sizes = _claims(np.abs(frame.p), design.options.hidden_power, before.sizes)
+    same = np.ones(lengths.size, dtype=np.bool_)
+    for new, old in ((p, before.p), (q, before.q)):
+        if new is not old:
+            same &= (new == old).all(axis=1)
+    if np.array_equal(busbar, before.busbar) and same.all():
+        if sizes is before.sizes and p_calm is before.p_calm and q_calm is before.q_calm:
+            return before
+        return replace(before, sizes=sizes, p_calm=p_calm, q_calm=q_calm)
+    kept = same & np.array_equal(busbar, before.busbar)
+    priors: list[Prior] = []
+    for s, known in enumerate(before.priors):
+        # Scales that are in doubt about the same share what follows.
+        alike = [k for k in range(s) if np.array_equal(p[k], p[s]) and np.array_equal(q[k], q[s])]
+        if kept[s]:
+            priors.append(known)
+        else:
+            priors.append(priors[alike[0]] if alike else _prior(design, p[s], q[s], busbar))
+    return Doubts(p, q, p_calm, q_calm, busbar, tuple(priors), sizes)
+
+
+def _prior(design: SequentialDesign, p: Floats, q: Floats, busbar: Bools | bool) -> Prior:
+    if np.all(busbar) and (p == 1.0).all() and (q == 1.0).all():
+        return design.prior
+    doubt = replace(
+        design.doubt,
+        p=np.where(p > 1.0, np.maximum(design.doubt.p, _EXACT) * p, design.doubt.p),
+        q=np.where(q > 1.0, np.maximum(design.doubt.q, _EXACT) * q, design.doubt.q),
+    )
+    return prior(
+        design.plant.feeder,
+        design.prior.meters,
+        doubt,
+        busbar=design.busbar if np.all(busbar) else np.where(busbar, design.busbar, UNMETERED),
+        inverters=design.injections,
+    )
+
+
+def _claims(power: Floats, least: float, before: Floats) -> Floats:
+    """False powers as large as what is claimed, in powers of two, and kept while they are close to that."""
+    old = before[: power.size]
+    fine = (power <= old) & ((old <= least) | (4.0 * power >= old))
+    if fine.all():
+        return before
+    new = np.where(fine, old, np.exp2(np.ceil(np.log2(np.maximum(power, least)))))
+    return np.concatenate([new, before[power.size :]])
+
+
+def _factors(error: Floats, std: Floats, old: Floats, calm: Ints, lengths: Ints) -> tuple[Floats, Ints]:
+    """`_factor`, but as long as residuals are remembered that were made with a larger one, that one."""
+    new = _factor(error, std, old)
+    if new is old:
+        return old, calm
+    held = (new < old) & (calm + 1 < lengths)
+    return np.where(held, old, new), np.where(held, calm + 1, 0)
+
+
+def _factor(error: Floats, std: Floats, old: Floats) -> Floats:
+    """Power of two by which a frame knows a power less well than the design assumes, with hysteresis."""
+    ratio = error / np.sqrt(3.0) / np.maximum(std, _EXACT)
+    if ratio.max(initial=0.0) <= _MUCH_LESS and old.max(initial=1.0) <= 1.0:
+        return old
+    keep = (ratio <= old * _MUCH_LESS) & (ratio * _MUCH_LESS >= old) & (old > 1.0)
+    raised = np.exp2(np.ceil(np.log2(np.maximum(ratio, 1.0))))
+    return np.where(keep, old, np.where(ratio > _MUCH_LESS, raised, 1.0))
