@@ -95,8 +95,8 @@ def believed(phases: int) -> Busbar:
 
 def opposed(  # noqa: PLR0917  # what there is to judge by
     design: SequentialDesign, s: int, now: Fit, judged: Judged, model: Floats, metered: Bools | bool
-) -> int | None:
-    """The phase whose busbar voltage the trusted meters contradict beyond chance, most of all; None for none.
+) -> list[int]:
+    """The phases of the busbar whose meter the trusted ones contradict beyond chance.
 
     Parameters
     ----------
@@ -112,15 +112,24 @@ def opposed(  # noqa: PLR0917  # what there is to judge by
         Whether there is a busbar voltage that is believed; in three phases (3,).
     """
     # Weights are zero where nobody is trusted.
-    along = judged.weights @ design.hangs_on
+    along, form = judged.weights @ design.hangs_on, np.maximum(weight(design, now), _TINY)
+    excess = metered * np.abs(along) / (design.sigmas[s] * np.sqrt(form) + model.max() * form)
+    return np.flatnonzero(excess > 1.0).tolist()
+
+
+def weight(design: SequentialDesign, now: Fit) -> Floats:
+    """d^T Q d of every phase of the busbar, (b,); kept with the fit.
+
+    Parameters
+    ----------
+    design, now
+        The design, and the trusted meters.
+    """
     if now.together is None:
         at, Q = now.trusting()
         hangs = design.hangs_on[at]
         now.together = np.einsum("ij,ij->j", hangs, Q @ hangs)
-    form = np.maximum(now.together, _TINY)
-    excess = metered * np.abs(along) / (design.sigmas[s] * np.sqrt(form) + model.max() * form)
-    worst = int(excess.argmax())
-    return worst if excess[worst] > 1.0 else None
+    return now.together
 
 
 _TINY = float(np.finfo(np.float64).tiny)

@@ -49,6 +49,17 @@ class Prior:
         """Covariance between the meters' buses, (p, p)."""
         return np.asarray(self.of_meters[self.meters])
 
+    def wider(self, direction: Floats) -> Prior:
+        """The same with one more direction left open: ``S + d d^T``.
+
+        Parameters
+        ----------
+        direction : (n,)
+            d, times the standard deviation of the amount.
+        """
+        open_ = self.of_meters + np.multiply.outer(direction, direction[self.meters])
+        return Prior(open_, self.meters, self.variance + direction**2)
+
     def among(self, at: Ints) -> Floats:
         """Covariance between the buses of some meters, (k, k), in the order of LAPACK.
 

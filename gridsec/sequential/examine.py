@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gridsec.arrays import Bools, Floats
-from gridsec.sequential.busbar import opposed
+from gridsec.sequential.busbar import opposed, weight
 from gridsec.sequential.conditional import Fit, drop, judge
 from gridsec.sequential.decoder import Accused, Evidence
 from gridsec.sequential.design import SequentialDesign
@@ -86,18 +86,18 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats) -> 
         if design.decoder is not None:
             found[s], trust = _decoded(design, here, now, trust, s)
         else:
-            phase = opposed(design, s, now, view.judged, model, state.doubts.busbar)
-            over = phase is not None or bool((view.over & trust.trusted).any())
+            phases = opposed(design, s, now, view.judged, model, state.doubts.busbar)
+            over = bool(phases) or bool((view.over & trust.trusted).any())
             if over or _due(design, trust, view, s, tick, searched=bool(found)):
                 search = Search(design, scales, book, fits, trust, s)
                 found[s], trust = search(now, view)
-                if phase is not None:
-                    found[s], lies = _without_busbar(search, found[s], now, phase)
-                    if lies:
-                        return Examined(state.trust, fits, (None,) * len(fits), {}, (phase, s))
+                found[s], liar = _without_busbar(search, found[s], now, phases)
+                if liar is not None:
+                    return Examined(state.trust, fits, (None,) * len(fits), {}, (liar, s))
         if s in found:
             now = found[s].best.fit
             view = view_of(design, here, now)
+            weight(design, now)
         bad[s] = still[s] = False
         if not trust.trusted.all():
             # A scale that has caught somebody and does not know enough yet has not changed its mind.
@@ -108,19 +108,24 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats) -> 
     return Examined(trust, tuple(after), tuple(views), found)
 
 
-def _without_busbar(search: Search, found: Found, now: Fit, phase: int) -> tuple[Found, bool]:
-    """What was found, and whether it is far likelier that the meter of a phase of the busbar lies.
+def _without_busbar(search: Search, found: Found, now: Fit, phases: list[int]) -> tuple[Found, int | None]:
+    """What was found, and the phase of the busbar of which it is far likelier that its meter lies.
 
-    If that is about as likely it is one of the other explanations.
+    If that is about as likely it is one of the other explanations. It is none if it accuses more meters than
+    can be told apart where the others do without.
     """
+    if not phases:
+        return found, None
     design, here = search.design, search.scales[search.s]
-    other = search.beside_busbar(now, phase)
-    if np.count_nonzero(here.enough & ~other.trusted) > design.most:
-        return found, False
-    worse, like = other.cost - found.best.cost, 2.0 * float(np.log(design.options.like))
+    each = [search.beside_busbar(now, phase) for phase in phases]
+    best = min(range(len(each)), key=lambda k: each[k].cost)
+    suspects = [int(np.count_nonzero(here.enough & ~one.trusted)) for one in (each[best], found.best)]
+    if suspects[0] > max(design.most, suspects[1]):
+        return found, None
+    worse, like = each[best].cost - found.best.cost, 2.0 * float(np.log(design.options.like))
     if worse < -like:
-        return found, True
-    return replace(found, others=(*found.others, other)) if worse <= like else found, False
+        return found, phases[best]
+    return replace(found, others=(*found.others, each[best])) if worse <= like else found, None
 
 
 def ended(design: SequentialDesign, trust: Trust, seen: Examined, window: Window) -> Bools:

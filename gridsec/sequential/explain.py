@@ -14,11 +14,11 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.network import by_place
 from gridsec.sequential import search
-from gridsec.sequential.conditional import Fit, fit, judge, loosen, misfit
+from gridsec.sequential.conditional import Fit, fit, judge, misfit
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.dictionary import Dictionary
 from gridsec.sequential.loads import UNMETERED
-from gridsec.sequential.scales import Scales, View, believe, directions, view_of
+from gridsec.sequential.scales import Scales, View, adapt, believe, directions, view_of
 from gridsec.sequential.search import Explanation, Found, Limits, Solution, likelier
 from gridsec.sequential.state import Trust
 
@@ -61,8 +61,6 @@ class Search:
         Who is believed.
     s
         The scale.
-    beside : (n, k)
-        Directions that are loosened whatever else is, times their standard deviations.
     """
 
     def __init__(  # noqa: PLR0917  # what is known, in the order it becomes known
@@ -73,10 +71,8 @@ class Search:
         fits: tuple[Fit | None, ...],
         trust: Trust,
         s: int,
-        *,
-        beside: Floats | None = None,
     ) -> None:
-        self.design, self.scales, self.book, self.beside = design, scales, book, beside
+        self.design, self.scales, self.book = design, scales, book
         self.fits, self.trust, self.s = fits, trust, s
         here = scales[s]
         sigmas = min(design.suspect, here.limits.sigmas)
@@ -143,13 +139,12 @@ class Search:
         phase
             Of the busbar; among what is loosened it comes after all that is in the book.
         """
-        design, there = self.design, now.copy()
-        here = UNMETERED * (np.arange(design.hangs_on.shape[1]) == phase)
-        direction = by_place(design.plant.feeder, here)
-        loosen(there, direction, 1.0)
-        beside = direction[:, None]
-        lying = Search(design, self.scales, self.book, self.fits, self.trust, self.s, beside=beside)
-        best = lying.likeliest(there, view_of(design, self.scales[self.s], there)).best
+        design, trust = self.design, self.trust
+        here = np.arange(design.hangs_on.shape[1]) == phase
+        scales = self.scales.wider(UNMETERED * by_place(design.plant.feeder, here))
+        there = adapt(None, scales[self.s], now.trusted, directions(self.book, trust.accused))
+        lying = Search(design, scales, self.book, self.fits, trust, self.s)
+        best = lying.likeliest(there, view_of(design, scales[self.s], there)).best
         charge = search.price(int(np.count_nonzero(self.here.enough)), 1)
         loosened = (*best.loosened, self.book.std.size + phase)
         return Explanation(best.trusted, loosened, best.charge + charge, best.cost + charge)
@@ -373,12 +368,8 @@ class Search:
         )
 
     def _fit(self, trusted: Bools) -> Fit:
-        loose = self._loose(self.accused)
+        loose = directions(self.book, self.accused)
         return fit(self.here.prior, self.here.noise, trusted & self.here.enough, loose)
-
-    def _loose(self, accused: tuple[tuple[int, int], ...]) -> Floats | None:
-        loose, beside = directions(self.book, accused), self.beside
-        return loose if beside is None else beside if loose is None else np.hstack([loose, beside])
 
     def _total(self, found: Explanation) -> float:
         """The misfit on all scales and, once, what the accusations cost."""
@@ -397,7 +388,7 @@ class Search:
         """What an explanation leaves unexplained on each scale; of `more` meters, which may be off alike."""
         trusted, out = self._trusted(found), []
         trusted = trusted if more is None else trusted | more
-        loose = self._loose((*self.accused, *((k, self.s) for k in found.loosened)))
+        loose = directions(self.book, (*self.accused, *((k, self.s) for k in found.loosened)))
         for s in range(len(self.fits)):
             there = self.scales[s]
             if s == self.s and more is None and isinstance(found, Solution):

@@ -134,6 +134,18 @@ class Scales:
             ),
         )
 
+    def wider(self, direction: Floats) -> Scales:
+        """The same with priors that leave one more direction open.
+
+        Parameters
+        ----------
+        direction : (n,)
+            As in `Prior.wider`.
+        """
+        each = {id(prior): prior.wider(direction) for prior in self.priors}
+        priors = tuple(each[id(prior)] for prior in self.priors)
+        return Scales(self.design, priors, self.window, self.learned, self.model)
+
 
 def view_of(design: SequentialDesign, here: Scale, now: Fit) -> View:
     """What a scale says of every meter when it rests on a fit.

@@ -264,8 +264,8 @@ class TestDesign:
         rng = np.random.default_rng(32)
         made = prepare(make_plant(rng))
         assert made.lengths == (1, 5, 15, 60)
-        looks = [9 * 365.25 * 86400.0 / length for length in made.lengths]
+        looks = [(9 + 1) * 365.25 * 86400.0 / length for length in made.lengths]
         rate = sum(n * erfc(z / sqrt(2.0)) for n, z in zip(looks, made.sigmas, strict=True))
-        # Stuck meters and replays have a share each, as every scale has.
+        # Stuck meters and replays have a share each, as every scale has; the busbar is judged as meters are.
         assert rate == pytest.approx(4.0 / 6.0, rel=1e-6)
         assert prepare(make_plant(rng), step_s=900.0).lengths == (1,)
