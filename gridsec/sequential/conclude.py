@@ -97,9 +97,10 @@ def conclude(
         )
     )
     said = _contradicted(design, beyond & ~trust.named, trust.named, said)
-    said = _unvouched(design, heard.busbar, live, said)
+    differs = _differs(design, state.busbar, estimate)
+    said = _unvouched(design, heard.busbar, live, differs, said)
     open_ = _open(design, state, said)
-    decision, cause, reason = _beside_meters(design, state, tick, estimate, amounts, open_, said)
+    decision, cause, reason = _beside_meters(design, state, tick, differs, amounts, open_, said)
     inverters, busbar = _inverters(design, state), state.busbar.named(design)
     verdict = Verdict(
         decision,
@@ -194,7 +195,18 @@ def _contradicted(design: SequentialDesign, beyond: Bools, named: Bools, said: _
     return Decision.UNDECIDED, Cause.TOO_MANY_SUSPECTS, sentence
 
 
-def _unvouched(design: SequentialDesign, busbar: Bools | bool, live: Bools, said: _Said) -> _Said:
+def _differs(design: SequentialDesign, busbar: Busbar, estimate: Estimate) -> tuple[str, str]:
+    """Whose reading of the busbar's voltage is not believed, and what it says; nothing if all is."""
+    doubted = ~busbar.believed
+    if not doubted.any():
+        return "", ""
+    v0_squared = estimate.v2_bus[busbar_places(design.plant.feeder)]
+    return words.busbar_meter(doubted), words.busbar_off(busbar.off, v0_squared, doubted)
+
+
+def _unvouched(
+    design: SequentialDesign, busbar: Bools | bool, live: Bools, differs: tuple[str, str], said: _Said
+) -> _Said:
     """The answer, unless nobody would notice that a phase without a busbar voltage is lied about as a whole.
 
     On a balanced feeder most meters are honest, and they say where the busbar is. In three phases those of
@@ -208,9 +220,10 @@ def _unvouched(design: SequentialDesign, busbar: Bools | bool, live: Bools, said
     most = max(1, min(design.most, meters.size // 3))
     if count > 2 * most:
         return said
+    why = " ".join(differs).capitalize() if any(differs) else "The busbar voltage of a phase is missing"
     sentence = (
-        f"The busbar voltage of a phase is missing or not believed, and {count:.0f} meters report from "
-        f"there; at least {2 * most + 1} are needed to tell {most} manipulated from the others."
+        f"{why}, and {count:.0f} meters report from there; "
+        f"at least {2 * most + 1} are needed to tell {most} manipulated from the others."
     )
     return Decision.UNDECIDED, Cause.TOO_FEW_METERS, sentence
 
@@ -225,7 +238,7 @@ def _beside_meters(  # noqa: PLR0917  # what was found
     design: SequentialDesign,
     state: SequentialState,
     tick: Tick,
-    estimate: Estimate,
+    differs: tuple[str, str],
     amounts: dict[int, float],
     open_: tuple[Explanation, ...],
     said: _Said,
@@ -234,13 +247,12 @@ def _beside_meters(  # noqa: PLR0917  # what was found
     decision, cause, reason = said
     plant, inverters = design.plant, _inverters(design, state)
     owners = ", ".join(plant.feeder.customers[c] for c in plant.droop.customer[inverters])
-    busbar, v0_squared = state.busbar, estimate.v2_bus[busbar_places(plant.feeder)]
-    named, doubted = busbar.named(design), ~busbar.believed
+    meter, off = differs
     found = []
     if owners:
         found.append((f"the inverters of {owners}", "their reactive power is not that of their curves"))
-    if named.any():
-        found.append((words.busbar_meter(named), f"it {words.busbar_off(busbar.off, v0_squared, named)}"))
+    if state.busbar.named(design).any():
+        found.append((meter, f"it {off}"))
     if cause is Cause.RESIDUALS:
         reason = f"{reason[:-1]}; and {' and '.join(who for who, _ in found)}." if found else reason
         return decision, cause, f"{reason} {words.ways(design, open_)}" if open_ else reason
@@ -251,9 +263,8 @@ def _beside_meters(  # noqa: PLR0917  # what was found
         return Decision.ATTACKED, Cause.RESIDUALS, sentence
     sentence = ""
     ways = tick.rivals or open_
-    if doubted.any():
-        off = words.busbar_off(busbar.off, v0_squared, doubted)
-        sentence = f"{words.busbar_meter(doubted).capitalize()} {off}, but not for long enough to be named."
+    if meter:
+        sentence = f"{meter.capitalize()} {off}, but not for long enough to be named."
     elif ways:
         sentence = words.ways(design, ways)
     elif amounts:
