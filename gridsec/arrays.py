@@ -58,6 +58,28 @@ def frozen_ints(values: Ints) -> Ints:
     return out
 
 
+def any_of(mask: Bools | Ints) -> bool:
+    """``mask.any()``, in a fifth of the time where the array is small.
+
+    Parameters
+    ----------
+    mask : (…)
+        What is looked through.
+    """
+    return bool(np.count_nonzero(mask))
+
+
+def all_of(mask: Bools) -> bool:
+    """``mask.all()``, in a fifth of the time where the array is small.
+
+    Parameters
+    ----------
+    mask : (…)
+        What is looked through.
+    """
+    return bool(np.count_nonzero(mask) == mask.size)
+
+
 def submatrix(matrix: Floats, rows: Ints, columns: Ints) -> Floats:
     """``matrix[np.ix_(rows, columns)]``, several times as fast where most of a matrix is picked.
 

@@ -50,6 +50,8 @@ class Feeder:
     start, stop : (b + 1,)
         Derived. Depth-first numbering: the buses fed through bus k, itself included, are those whose
         `start` lies in `[start[k], stop[k])`.
+    order : (b + 1,)
+        Derived. The buses by these numbers.
     depth : (b + 1,)
         Derived. Number of branches between bus k and the busbar.
     enter, leave : (b + 1,)
@@ -75,6 +77,7 @@ class Feeder:
     charging: Floats
     start: Ints = field(init=False, repr=False)
     stop: Ints = field(init=False, repr=False)
+    order: Ints = field(init=False, repr=False)
     depth: Ints = field(init=False, repr=False)
     enter: Ints = field(init=False, repr=False)
     leave: Ints = field(init=False, repr=False)
@@ -89,7 +92,7 @@ class Feeder:
         if problems:
             raise FeederInvalid(problems)
         found = walk(self.parent)
-        for name in ("start", "stop", "depth", "enter", "leave"):
+        for name in ("start", "stop", "order", "depth", "enter", "leave"):
             object.__setattr__(self, name, getattr(found, name))
         half: Floats = np.zeros(found.start.size)
         np.add.at(half, self.parent, 0.5 * self.charging)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, Ints
+from gridsec.arrays import Bools, Floats, Ints, any_of
 from gridsec.online import Cause, Decision
 
 
@@ -98,7 +98,7 @@ def decide(now: Situation) -> tuple[Decision, Cause, str]:
     blind = _blind(now)
     if blind is not None:
         return Decision.UNDECIDED, *blind
-    if now.named.any():
+    if any_of(now.named):
         far = "further off than meter accuracy and load uncertainty allow"
         return Decision.ATTACKED, Cause.RESIDUALS, f"Manipulated: {_list(now, now.named)}; {far}."
     doubt = _doubt(now)
@@ -139,14 +139,14 @@ def _blind(now: Situation) -> tuple[Cause, str] | None:
 def _doubt(now: Situation) -> tuple[Cause, str] | None:
     """What keeps the feeder from being called clean though nobody is named."""
     silent, pending = ~now.live, now.suspected & ~now.named
-    if silent.any():
+    if any_of(silent):
         return Cause.SILENT_METERS, f"No reading from {_list(now, silent)}."
     if not now.settled:
         return Cause.SETTLING, "The observers have not forgotten their initial state yet."
-    if pending.any():
+    if any_of(pending):
         reason = f"{_list(now, pending)}: further off than allowed lately, but not often enough to be named."
         return Cause.AMBIGUOUS, reason
-    if now.wide.any():
+    if any_of(now.wide):
         return Cause.AMBIGUOUS, f"The loads are not known well enough to judge {_list(now, now.wide)}."
     return None
 
@@ -162,7 +162,7 @@ _SHOWN = 5
 
 def _list(now: Situation, which: Bools) -> str:
     """The meters' names, the first few of many."""
-    if not which.any():
+    if not any_of(which):
         return ""
     names = [now.names[j] for j in np.flatnonzero(which).tolist()]
     rest = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""

@@ -23,6 +23,8 @@ class Walked(Protocol):
     @property
     def stop(self) -> Ints: ...  # noqa: D102
     @property
+    def order(self) -> Ints: ...  # noqa: D102
+    @property
     def enter(self) -> Ints: ...  # noqa: D102
     @property
     def leave(self) -> Ints: ...  # noqa: D102
@@ -76,6 +78,8 @@ class Walk:
     ----------
     start, stop : (b + 1,)
         Depth-first numbering: the subtree of bus k is the buses whose `start` lies in `[start[k], stop[k])`.
+    order : (b + 1,)
+        The buses by these numbers.
     depth : (b + 1,)
         Number of branches between bus k and the root.
     enter, leave : (b + 1,)
@@ -84,6 +88,7 @@ class Walk:
 
     start: Ints
     stop: Ints
+    order: Ints
     depth: Ints
     enter: Ints
     leave: Ints
@@ -111,7 +116,7 @@ def walk(parent: Ints) -> Walk:
         free[k] = start[k] + 1
         depth[k] = depth[above] + 1
     enter = 2 * start - depth
-    numbers = (start, start + size, depth, enter, enter + 2 * size - 1)
+    numbers = (start, start + size, np.argsort(start), depth, enter, enter + 2 * size - 1)
     return Walk(*(frozen_ints(each) for each in numbers))
 
 
@@ -119,9 +124,10 @@ def below(tree: Walked, values: Values) -> Values:
     """Sum of bus values (…, b + 1) over the subtree of each bus, itself included; O(b)."""
     total = np.zeros((*values.shape[:-1], values.shape[-1] + 1), dtype=values.dtype)
     # Depth-first order makes a subtree one interval, and its sum the difference of two running sums.
-    total[..., tree.start + 1] = values
-    total = total.cumsum(axis=-1)
-    return np.asarray(total[..., tree.stop] - total[..., tree.start])
+    np.cumsum(values.take(tree.order, axis=-1), axis=-1, out=total[..., 1:])
+    out = total.take(tree.stop, axis=-1)
+    out -= total.take(tree.start, axis=-1)
+    return np.asarray(out)
 
 
 def from_root(tree: Walked, values: Values) -> Values:
@@ -130,7 +136,7 @@ def from_root(tree: Walked, values: Values) -> Values:
     tour = np.zeros((*values.shape[:-1], 2 * tree.enter.size), dtype=values.dtype)
     tour[..., tree.enter[1:]] = values
     tour[..., tree.leave[1:]] = -values
-    return np.asarray(tour.cumsum(axis=-1)[..., tree.enter])
+    return np.asarray(np.cumsum(tour, axis=-1, out=tour).take(tree.enter, axis=-1))
 
 
 def meetings(parent: Ints, tree: Walked, buses: Ints) -> Ints:

@@ -31,7 +31,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gridsec.accuracy import told_error
-from gridsec.arrays import Bools, Floats
+from gridsec.arrays import Bools, Floats, any_of
 from gridsec.frames import NO_VOLTAGE, busbar_errors, losses
 from gridsec.network import by_place, hangs_on, reach
 from gridsec.online import Estimate, Frame
@@ -74,7 +74,7 @@ class Lag:
         which : (m,)
             Their inverters.
         """
-        return replace(self, error=np.where(which, self.span, self.error)) if which.any() else self
+        return replace(self, error=np.where(which, self.span, self.error)) if any_of(which) else self
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -23,7 +23,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, Ints
+from gridsec.arrays import Bools, Floats, Ints, all_of, any_of
 from gridsec.sequential.conditional import Fit, Judged
 from gridsec.sequential.design import SequentialDesign
 
@@ -112,9 +112,11 @@ def opposed(  # noqa: PLR0917  # what there is to judge by
         Whether there is a busbar voltage that is believed; in three phases (3,).
     """
     # Weights are zero where nobody is trusted.
-    along, form = judged.weights @ design.hangs_on, np.maximum(weight(design, now), _TINY)
-    excess = metered * np.abs(along) / (design.sigmas[s] * np.sqrt(form) + model.max() * form)
-    return np.flatnonzero(excess > 1.0).tolist()
+    along, form = np.abs(judged.weights @ design.hangs_on), weight(design, now)
+    chance = design.sigmas[s] * np.sqrt(form)
+    if all_of(along <= chance):
+        return []
+    return np.flatnonzero(metered & (along > chance + model.max() * form)).tolist()
 
 
 def weight(design: SequentialDesign, now: Fit) -> Floats:
@@ -130,9 +132,6 @@ def weight(design: SequentialDesign, now: Fit) -> Floats:
         hangs = design.hangs_on[at]
         now.together = np.einsum("ij,ij->j", hangs, Q @ hangs)
     return now.together
-
-
-_TINY = float(np.finfo(np.float64).tiny)
 
 
 def follow(  # noqa: PLR0917  # what was thought, what it says, and what the others say
@@ -158,7 +157,7 @@ def follow(  # noqa: PLR0917  # what was thought, what it says, and what the oth
         What the meters say, and the variance of that on the scale on which it was caught.
     """
     out = ~before.believed
-    if not out.any():
+    if not any_of(out):
         return before
     length = np.array(design.lengths)[before.scale]
     age = before.age + out

@@ -27,7 +27,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, Ints, submatrix
+from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, submatrix
 from gridsec.network import one_busbar
 from gridsec.sequential.conditional import invert
 from gridsec.sequential.design import SequentialDesign
@@ -157,7 +157,7 @@ def renew(design: SequentialDesign, before: Commission, which: Bools, t: float) 
     t
         Unix time, s.
     """
-    if not which.any() or not design.options.commission_s > 0:
+    if not any_of(which) or not design.options.commission_s > 0:
         return before
     known, blank = before.learned, nothing(design)
     learned = Learned(
@@ -232,7 +232,7 @@ def conclude(
     """
     heard = np.flatnonzero(gathered.count * gathered.time_s > 0)
     done = which & (gathered.count > 0) & (gathered.time_s > 0)
-    if not done.any():
+    if not any_of(done):
         return Commission(known, gathered)
     B, n = known.variance[heard], gathered.count[heard]
     # One matrix of this size, inverted where it is.
@@ -262,7 +262,7 @@ def conclude(
         hidden=np.where(done, hidden, known.hidden),
     )
     rest = gathered.open & ~done
-    if not rest.any():
+    if not any_of(rest):
         return Commission(learned, None)
     # What the others gathered is in what is known now; they begin anew as witnesses of the loads.
     start = begin(rest, t)
@@ -347,7 +347,7 @@ def from_arrays(design: SequentialDesign, arrays: Mapping[str, Floats]) -> Commi
     if problems:
         raise ValueError("; ".join(problems))
     learned = Learned(*(arrays[name] for name in _KNOWN))
-    if not np.isfinite(arrays["since"]).any():
+    if not any_of(np.isfinite(arrays["since"])):
         return Commission(learned, None)
     count = arrays["count"].astype(np.intp)
     return Commission(learned, Learning(arrays["total"], count, arrays["time_s"], arrays["since"]))
@@ -386,5 +386,5 @@ def _problems(design: SequentialDesign, arrays: Mapping[str, Floats]) -> list[st
     return [
         f"{what} (meters {', '.join(map(str, np.flatnonzero(~good)))})"
         for what, good in rules.items()
-        if not good.all()
+        if not all_of(good)
     ]

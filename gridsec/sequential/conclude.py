@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats
+from gridsec.arrays import Bools, Floats, all_of, any_of
 from gridsec.judge import Situation, decide
 from gridsec.network import busbar_places, by_place, one_busbar
 from gridsec.online import Cause, Decision, Estimate, Explanation, Frame, Verdict
@@ -76,13 +76,13 @@ def conclude(
     """
     plant, trust, heard = design.plant, state.trust, tick.heard
     estimate, released = _estimate(design, state, tick)
-    state = replace(state, released=released, busbar=_busbar(design, state, heard, estimate))
+    busbar, inverters = _busbar(design, state, heard, estimate), _inverters(design, state)
     score, threshold, judged = _worst(design, tick.seen, heard.live.size)
     live, beyond = judged & heard.live, score > threshold
     at = plant.feeder.bus[plant.meters]
     attack = np.where(trust.named & heard.live, heard.y - state.learned.bias - estimate.v2_bus[at], 0.0)
     amounts = _amounts(design, state, tick.seen)
-    settled = bool((tick.transient <= design.options.settled * threshold).all())
+    settled = all_of(tick.transient <= design.options.settled * threshold)
     said = decide(
         Situation(
             names=design.names,
@@ -97,11 +97,10 @@ def conclude(
         )
     )
     said = _contradicted(design, beyond & ~trust.named, trust.named, said)
-    differs = _differs(design, state.busbar, estimate)
+    differs = _differs(design, busbar, estimate)
     said = _unvouched(design, heard.busbar, live, differs, said)
     open_ = _open(design, state, said)
-    decision, cause, reason = _beside_meters(design, state, tick, differs, amounts, open_, said)
-    inverters, busbar = _inverters(design, state), state.busbar.named(design)
+    decision, cause, reason = _beside_meters(design, inverters, differs, amounts, tick.rivals, open_, said)
     verdict = Verdict(
         decision,
         cause,
@@ -115,16 +114,17 @@ def conclude(
         kinds=state.kinds.kinds,
         explanations=tick.rivals or open_,
         unjudged=design.unseen & ~(state.curves.heard | inverters),
-        busbar=busbar,
-        busbar_attack=np.where(busbar, state.busbar.off, 0.0),
+        busbar=differs.named,
+        busbar_attack=np.where(differs.named, busbar.off, 0.0),
     )
-    return replace(state, last=(estimate, verdict)), estimate, verdict
+    last = estimate, verdict
+    return replace(state, released=released, busbar=busbar, last=last), estimate, verdict
 
 
 def _busbar(design: SequentialDesign, state: SequentialState, heard: Heard, estimate: Estimate) -> Busbar:
     """What is thought of the busbar's meter now."""
     before = state.busbar
-    if before.believed.all():
+    if all_of(before.believed):
         return before
     fits = (state.fits[s] for s in before.scale.tolist())
     left = np.array([np.nan if fit is None else fit.variance[k] for k, fit in enumerate(fits)])
@@ -144,7 +144,7 @@ def _injected(
 ) -> Floats:
     """What named inverters inject that their curves do not ask for, as metered where that is so, (m,)."""
     out = np.zeros(inverters.size)
-    if inverters.any():
+    if any_of(inverters):
         for k, amount in amounts.items():
             if k >= design.customers:
                 out[k - design.customers] = amount
@@ -195,17 +195,29 @@ def _contradicted(design: SequentialDesign, beyond: Bools, named: Bools, said: _
     return Decision.UNDECIDED, Cause.TOO_MANY_SUSPECTS, sentence
 
 
-def _differs(design: SequentialDesign, busbar: Busbar, estimate: Estimate) -> tuple[str, str]:
-    """Whose reading of the busbar's voltage is not believed, and what it says; nothing if all is."""
-    doubted = ~busbar.believed
-    if not doubted.any():
-        return "", ""
-    v0_squared = estimate.v2_bus[busbar_places(design.plant.feeder)]
-    return words.busbar_meter(doubted), words.busbar_off(busbar.off, v0_squared, doubted)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Differs:
+    """What there is to say of the busbar's meter. b phases.
+
+    named: which are named, (b,). meter, off: whose reading is not believed, and what it says; empty where all
+    is believed.
+    """
+
+    named: Bools
+    meter: str = ""
+    off: str = ""
+
+
+def _differs(design: SequentialDesign, busbar: Busbar, estimate: Estimate) -> _Differs:
+    if all_of(busbar.believed):
+        return _Differs(~busbar.believed)
+    doubted, v0_squared = ~busbar.believed, estimate.v2_bus[busbar_places(design.plant.feeder)]
+    off = words.busbar_off(busbar.off, v0_squared, doubted)
+    return _Differs(busbar.named(design), words.busbar_meter(doubted), off)
 
 
 def _unvouched(
-    design: SequentialDesign, busbar: Bools | bool, live: Bools, differs: tuple[str, str], said: _Said
+    design: SequentialDesign, busbar: Bools | bool, live: Bools, differs: _Differs, said: _Said
 ) -> _Said:
     """The answer, unless nobody would notice that a phase without a busbar voltage is lied about as a whole.
 
@@ -220,7 +232,9 @@ def _unvouched(
     most = max(1, min(design.most, meters.size // 3))
     if count > 2 * most:
         return said
-    why = " ".join(differs).capitalize() if any(differs) else "The busbar voltage of a phase is missing"
+    why = "The busbar voltage of a phase is missing"
+    if differs.meter:
+        why = f"{differs.meter.capitalize()} {differs.off}"
     sentence = (
         f"{why}, and {count:.0f} meters report from there; "
         f"at least {2 * most + 1} are needed to tell {most} manipulated from the others."
@@ -236,23 +250,21 @@ def _open(design: SequentialDesign, state: SequentialState, said: _Said) -> tupl
 
 def _beside_meters(  # noqa: PLR0917  # what was found
     design: SequentialDesign,
-    state: SequentialState,
-    tick: Tick,
-    differs: tuple[str, str],
+    inverters: Bools,
+    differs: _Differs,
     amounts: dict[int, float],
+    rivals: tuple[Explanation, ...],
     open_: tuple[Explanation, ...],
     said: _Said,
 ) -> _Said:
     """The answer, with what was found besides meters."""
     decision, cause, reason = said
-    plant, inverters = design.plant, _inverters(design, state)
-    owners = ", ".join(plant.feeder.customers[c] for c in plant.droop.customer[inverters])
-    meter, off = differs
-    found = []
-    if owners:
+    plant, found = design.plant, []
+    if any_of(inverters):
+        owners = ", ".join(plant.feeder.customers[c] for c in plant.droop.customer[inverters])
         found.append((f"the inverters of {owners}", "their reactive power is not that of their curves"))
-    if state.busbar.named(design).any():
-        found.append((meter, f"it {off}"))
+    if any_of(differs.named):
+        found.append((differs.meter, f"it {differs.off}"))
     if cause is Cause.RESIDUALS:
         reason = f"{reason[:-1]}; and {' and '.join(who for who, _ in found)}." if found else reason
         return decision, cause, f"{reason} {words.ways(design, open_)}" if open_ else reason
@@ -262,11 +274,10 @@ def _beside_meters(  # noqa: PLR0917  # what was found
         sentence = f"Manipulated: {'; and '.join('; '.join(each) for each in found)}."
         return Decision.ATTACKED, Cause.RESIDUALS, sentence
     sentence = ""
-    ways = tick.rivals or open_
-    if meter:
-        sentence = f"{meter.capitalize()} {off}, but not for long enough to be named."
-    elif ways:
-        sentence = words.ways(design, ways)
+    if differs.meter:
+        sentence = f"{differs.meter.capitalize()} {differs.off}, but not for long enough to be named."
+    elif rivals or open_:
+        sentence = words.ways(design, rivals or open_)
     elif amounts:
         sentence = words.doubt(design, *next(iter(amounts.items())))
     return (Decision.UNDECIDED, Cause.AMBIGUOUS, sentence) if sentence else said

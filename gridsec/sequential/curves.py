@@ -26,7 +26,7 @@ from itertools import product
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, Ints
+from gridsec.arrays import Bools, Floats, Ints, any_of
 from gridsec.online import Explanation, Frame
 from gridsec.sequential.bounds import Lag
 from gridsec.sequential.conditional import Fit, Judged
@@ -63,7 +63,7 @@ class Curves:
     @property
     def idle(self) -> bool:
         """Whether nobody's reports are compared with anything."""
-        return not (self.heard.any() or self.count.any())
+        return not (any_of(self.heard) or any_of(self.count))
 
     def named(self, design: SequentialDesign) -> Bools:
         """Inverters that do not follow their curves, (m,)."""
@@ -72,7 +72,7 @@ class Curves:
     def amounts(self, design: SequentialDesign) -> Floats:
         """What each inverter injects that its curve does not ask for, (m,) in pu."""
         metered, at = design.meter_of >= 0, design.meter_of
-        if not metered.any():
+        if not any_of(metered):
             return np.zeros(at.size)
         # Several inverters of a customer are metered together.
         share = np.bincount(at[metered], minlength=self.amount.size)
@@ -110,7 +110,7 @@ class Curves:
             Meters that are manipulated in any case.
         """
         open_ = self.off & ~self.sure
-        if self.idle or not open_.any():
+        if self.idle or not any_of(open_):
             return ()
         strange = np.argsort(-np.where(open_, np.abs(self.amount), -1.0), kind="stable")
         who = np.sort(strange[: min(int(open_.sum()), _TOGETHER)])
@@ -190,13 +190,17 @@ def compare(design: SequentialDesign, before: Curves, now: Evidence) -> Curves:
     now
         One tick.
     """
-    if before.idle and not now.reported.any():
+    if before.idle and not any_of(now.reported):
         return before
     droop, at, size = design.plant.droop, design.plant.meters, design.customers
     own = np.bincount(droop.customer, minlength=size) > 0
     asked = now.reported[at] & now.trusted & own[at]
-    if now.fit is None or now.judged is None or not (asked.any() or before.count.any()):
-        return before if not before.count.any() and not before.heard.any() else empty(at.size, droop.tau.size)
+    if now.fit is None or now.judged is None or not (any_of(asked) or any_of(before.count)):
+        return (
+            before
+            if not any_of(before.count) and not any_of(before.heard)
+            else empty(at.size, droop.tau.size)
+        )
     x, error, slope, span = (
         droop.per_customer(of, size)[at] for of in (now.x, now.lag.error, droop.slope, now.lag.span)
     )

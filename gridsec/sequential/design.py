@@ -116,6 +116,8 @@ class SequentialDesign:
         Variance of what its meter says from tick to tick, squared pu^2.
     lengths : (s,)
         Ticks of each scale.
+    confirmed : (s,)
+        Ticks that evidence on each scale must last before anybody is named.
     sigmas : (s,)
         Standard deviations beyond which an offset is evidence, for the false-alarm rate asked for.
     suspect
@@ -163,6 +165,7 @@ class SequentialDesign:
     busbar: float
     flicker: float
     lengths: tuple[int, ...]
+    confirmed: Ints
     sigmas: tuple[float, ...]
     suspect: float
     white: Floats
@@ -192,11 +195,6 @@ class SequentialDesign:
     def effects(self) -> Effects:
         """What every customer's powers do to the voltages."""
         return self.shapes.traces.effects
-
-    @property
-    def confirmed(self) -> Ints:
-        """Ticks that evidence on each scale must last before anybody is named, (s,)."""
-        return 2 + np.array(self.lengths) // 6
 
     @property
     def observers(self) -> int:
@@ -261,6 +259,7 @@ def design(
         busbar=busbar,
         flicker=slope**2 * (accuracy.busbar_jitter**2 + accuracy.busbar_resolution**2 / 12.0),
         lengths=lengths,
+        confirmed=2 + np.array(lengths) // 6,
         sigmas=sigmas,
         suspect=suspect,
         white=white,

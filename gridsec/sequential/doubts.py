@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, Ints
+from gridsec.arrays import Bools, Floats, Ints, all_of, any_of
 from gridsec.online import Frame
 from gridsec.sequential.conditional import Prior
 from gridsec.sequential.design import SequentialDesign
@@ -92,7 +92,7 @@ def doubted(
         Whether there is a busbar voltage that is believed; in three phases (3,).
     """
     last = before if before.heard is None else before.heard
-    if live.any():
+    if any_of(live):
         return _doubts(design, last, frame, busbar)
     found = _doubts(design, before, frame, busbar)
     return found if found.heard is last else replace(found, heard=last)
@@ -108,7 +108,7 @@ def _doubts(design: SequentialDesign, before: Doubts, frame: Frame, busbar: Bool
     for new, old in ((p, before.p), (q, before.q)):
         if new is not old:
             same &= (new == old).all(axis=1)
-    if np.array_equal(busbar, before.busbar) and same.all():
+    if np.array_equal(busbar, before.busbar) and all_of(same):
         if sizes is before.sizes and p_calm is before.p_calm and q_calm is before.q_calm:
             return before
         return replace(before, sizes=sizes, p_calm=p_calm, q_calm=q_calm)
@@ -125,7 +125,7 @@ def _doubts(design: SequentialDesign, before: Doubts, frame: Frame, busbar: Bool
 
 
 def _prior(design: SequentialDesign, p: Floats, q: Floats, busbar: Bools | bool) -> Prior:
-    if np.all(busbar) and (p == 1.0).all() and (q == 1.0).all():
+    if np.all(busbar) and all_of(p == 1.0) and all_of(q == 1.0):
         return design.prior
     doubt = replace(
         design.doubt,
@@ -145,7 +145,7 @@ def _claims(power: Floats, least: float, before: Floats) -> Floats:
     """False powers as large as what is claimed, in powers of two, and kept while they are close to that."""
     old = before[: power.size]
     fine = (power <= old) & ((old <= least) | (4.0 * power >= old))
-    if fine.all():
+    if all_of(fine):
         return before
     new = np.where(fine, old, np.exp2(np.ceil(np.log2(np.maximum(power, least)))))
     return np.concatenate([new, before[power.size :]])

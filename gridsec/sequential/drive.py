@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, Ints, submatrix
+from gridsec.arrays import Bools, Floats, Ints, all_of, submatrix
 from gridsec.errors import DesignInfeasible
 from gridsec.lure import POLICY, Lure, Transition, advance, step, transition
 from gridsec.sequential.design import SequentialDesign
@@ -79,7 +79,7 @@ def drive(  # noqa: PLR0917  # state, what drives it, and for how long
     droop = design.plant.droop
     decay = np.exp(-h / droop.tau)
     target = droop(droop.vbar**2 - y)
-    if w is None or driven.all():
+    if w is None or all_of(driven):
         return np.asarray(target + decay * (x - target)), before
     out = np.where(driven, target + decay * (x - target), x)
     free = _prepared(design, np.flatnonzero(~driven), h, before)

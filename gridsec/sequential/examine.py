@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats
+from gridsec.arrays import Bools, Floats, all_of, any_of
 from gridsec.sequential.busbar import opposed, weight
 from gridsec.sequential.conditional import Fit, drop, judge
 from gridsec.sequential.decoder import Accused, Evidence
@@ -66,30 +66,32 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats) -> 
         What the model may be off, squared pu.
     """
     fits, tick = state.fits, state.ticks
-    bad, still = state.trust.bad.copy(), state.trust.still.copy()
-    trust = replace(state.trust, bad=bad, still=still)
+    trust = state.trust
+    calm = all_of(trust.trusted) and not (any_of(trust.bad) or any_of(trust.still))
+    trust = trust if calm else _own(trust)
     views: list[View | None] = []
     after: list[Fit | None] = []
     found: dict[int, Found] = {}
-    scales = Scales(design, state.doubts.priors, state.window, state.learned, model)
-    book = replace(design.book, std=state.doubts.sizes)
+    scales = Scales(design, state.doubts, state.window, state.learned, model)
     for s, length in enumerate(design.lengths):
         before = fits[s]
-        stale = before is None or bool((before.trusted & ~trust.trusted).any())
+        stale = before is None or any_of(before.trusted & ~trust.trusted)
         if tick % _every(length) and not stale:
             views.append(None)
             after.append(before)
             continue
         here = scales[s]
-        now = adapt(before, here, trust.trusted & here.enough, directions(book, trust.accused))
+        now = adapt(before, here, trust.trusted & here.enough, directions(scales.book, trust.accused))
         view = view_of(design, here, now)
         if design.decoder is not None:
+            trust, calm = _own(trust) if calm else trust, False
             found[s], trust = _decoded(design, here, now, trust, s)
         else:
             phases = opposed(design, s, now, view.judged, model, state.doubts.busbar)
-            over = bool(phases) or bool((view.over & trust.trusted).any())
+            over = bool(phases) or any_of(view.over & trust.trusted)
             if over or _due(design, trust, view, s, tick, searched=bool(found)):
-                search = Search(design, scales, book, fits, trust, s)
+                trust, calm = _own(trust) if calm else trust, False
+                search = Search(design, scales, fits, trust, s)
                 found[s], trust = search(now, view)
                 found[s], liar = _without_busbar(search, found[s], now, phases)
                 if liar is not None:
@@ -98,14 +100,18 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats) -> 
             now = found[s].best.fit
             view = view_of(design, here, now)
             weight(design, now)
-        bad[s] = still[s] = False
-        if not trust.trusted.all():
+        if not calm:
             # A scale that has caught somebody and does not know enough yet has not changed its mind.
             stands = view.still | ((trust.owed > 0) & (trust.scale == s))
-            bad[s], still[s] = view.over & ~trust.trusted, stands & ~trust.trusted
+            trust.bad[s], trust.still[s] = view.over & ~trust.trusted, stands & ~trust.trusted
         views.append(view)
         after.append(now)
     return Examined(trust, tuple(after), tuple(views), found)
+
+
+def _own(trust: Trust) -> Trust:
+    """The same, with evidence that can be written into."""
+    return replace(trust, bad=trust.bad.copy(), still=trust.still.copy())
 
 
 def _without_busbar(search: Search, found: Found, now: Fit, phases: list[int]) -> tuple[Found, int | None]:
@@ -145,7 +151,7 @@ def ended(design: SequentialDesign, trust: Trust, seen: Examined, window: Window
     """
     out = np.zeros_like(trust.trusted)
     suspected = ~trust.trusted & ~seen.trust.trusted
-    if not suspected.any():
+    if not any_of(suspected):
         return out
     means = window.sums / np.maximum(window.counts, 1)
     wander = 2.0 * design.prior.variance[design.prior.meters] * design.step_s / design.doubt.time_s
@@ -154,7 +160,7 @@ def ended(design: SequentialDesign, trust: Trust, seen: Examined, window: Window
             continue
         quiet = suspected & short.enough & ~short.still
         for later in range(s + 1, len(design.lengths)):
-            if not (quiet & seen.trust.still[later]).any():
+            if not any_of(quiet & seen.trust.still[later]):
                 continue
             variance = design.white / np.maximum(window.counts[s], 1) + wander * design.lengths[later]
             far = np.abs(means[later] - means[s]) > design.sigmas[s] * np.sqrt(variance)
@@ -170,12 +176,12 @@ def _due(design: SequentialDesign, trust: Trust, view: View, s: int, tick: int, 
     """
     if any(scale <= s for _, scale in trust.accused):
         return True
-    if trust.trusted.all():
+    if all_of(trust.trusted):
         return False
     since = trust.age + 1 - design.confirmed[trust.scale]
     about = ~trust.trusted & ~trust.named & view.over & (since >= 0)
     first = (since < max(_every(design.lengths[s]), _AGAIN)) | ~trust.bad[s]
-    if (about & first).any() or (tick % _AGAIN == 0 and about.any()):
+    if any_of(about & first) or (tick % _AGAIN == 0 and any_of(about)):
         return True
     last = len(design.lengths) - 1
     return s == last and tick % design.lengths[last] == 0 and not searched

@@ -53,8 +53,8 @@ class Search:
 
     Parameters
     ----------
-    design, scales, book
-        The design, the scales, and what else but meters can be wrong now.
+    design, scales
+        The design, and the scales.
     fits
         The last fit of each scale.
     trust
@@ -63,16 +63,15 @@ class Search:
         The scale.
     """
 
-    def __init__(  # noqa: PLR0917  # what is known, in the order it becomes known
+    def __init__(  # what is known, in the order it becomes known
         self,
         design: SequentialDesign,
         scales: Scales,
-        book: Dictionary,
         fits: tuple[Fit | None, ...],
         trust: Trust,
         s: int,
     ) -> None:
-        self.design, self.scales, self.book = design, scales, book
+        self.design, self.scales, self.book = design, scales, scales.book
         self.fits, self.trust, self.s = fits, trust, s
         here = scales[s]
         sigmas = min(design.suspect, here.limits.sigmas)
@@ -143,7 +142,7 @@ class Search:
         here = np.arange(design.hangs_on.shape[1]) == phase
         scales = self.scales.wider(UNMETERED * by_place(design.plant.feeder, here))
         there = adapt(None, scales[self.s], now.trusted, directions(self.book, trust.accused))
-        lying = Search(design, scales, self.book, self.fits, trust, self.s)
+        lying = Search(design, scales, self.fits, trust, self.s)
         best = lying.likeliest(there, view_of(design, scales[self.s], there)).best
         charge = search.price(int(np.count_nonzero(self.here.enough)), 1)
         loosened = (*best.loosened, self.book.std.size + phase)

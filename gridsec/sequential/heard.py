@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats
+from gridsec.arrays import Bools, Floats, all_of, any_of
 from gridsec.frames import NO_VOLTAGE
 from gridsec.network import InPhases
 from gridsec.online import Frame
@@ -66,7 +66,7 @@ def possible(design: SequentialDesign, frame: Frame) -> Frame:
 def _possible(power: Floats, error: Floats, most: Floats) -> tuple[Floats, Floats]:
     good = np.abs(power) <= most
     known = good & (np.abs(error) <= most)
-    if known.all():
+    if all_of(known):
         return power, error
     return np.where(good, power, 0.0), np.where(known, error, most)
 
@@ -86,7 +86,7 @@ def clean(design: SequentialDesign, state: SequentialState, frame: Frame) -> Hea
     told = np.zeros(frame.q.size, dtype=np.bool_)
     # As `possible` has it: who is sure of nothing tells nothing.
     reported = (np.abs(frame.q_net) <= design.most_q) & (np.abs(frame.q_net_error) <= design.most_q)
-    if reported.any():
+    if any_of(reported):
         trusted = np.zeros(frame.q.size, dtype=np.bool_)
         trusted[plant.meters] = live & state.trust.trusted
         least, most = plant.droop.saturated(frame.q.size)

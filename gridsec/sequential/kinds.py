@@ -26,7 +26,7 @@ from functools import cache
 import numpy as np
 from scipy.stats import chi2
 
-from gridsec.arrays import Bools, Floats, Ints
+from gridsec.arrays import Bools, Floats, Ints, all_of, any_of
 from gridsec.network import Power
 from gridsec.online import Kind
 from gridsec.sequential import clocks, repeats
@@ -127,7 +127,7 @@ class Kinds:
     @property
     def kinds(self) -> tuple[Kind | None, ...]:
         """What each named meter's manipulation looks like, (p,)."""
-        if not self.told.any():
+        if not any_of(self.told):
             return self.alone
         return tuple(
             Kind.COORDINATED if told and kind is Kind.OFFSET else kind
@@ -213,18 +213,19 @@ def describe(  # noqa: PLR0917  # what each meter says, and what the others say 
         Of `model`, fixed errors included, squared pu^2.
     """
     memory = repeats.keep(heard.memory, model, own)
-    if not named.any():
+    if not any_of(named):
         return Kinds(memory, *(_nobody(named.size)))
     tick = memory.tick
     since = np.where(named, np.where(heard.since < 0, tick, heard.since), -1)
     alone = [kind if there else None for kind, there in zip(heard.alone, named.tolist(), strict=True)]
-    told, new = heard.told & named, bool((since == tick).any())
+    told, new = heard.told & named, any_of(since == tick)
     stuck = named & (memory.stuck | (memory.run * shapes.rules.surprise >= _CALLED))
     replays = named & ~stuck & (memory.lag > 0)
     for kind, which in ((Kind.STUCK, stuck), (Kind.REPLAY, replays)):
         for j in np.flatnonzero(which).tolist():
             alone[j] = kind
-    due = named & ~stuck & ~replays & ((since == tick) | ((tick + np.arange(named.size)) % shapes.every == 0))
+    turn = (tick + np.arange(named.size)) % shapes.every == 0
+    due = named & ~stuck & ~replays & (turn | _turns(since, tick, shapes.every))
     for age in np.unique(tick - since[due]).tolist():
         meters = np.flatnonzero(due & (since == tick - age))
         found = _alone(shapes, memory, meters, age, variance, heard.alone)
@@ -233,6 +234,19 @@ def describe(  # noqa: PLR0917  # what each meter says, and what the others say 
     if new or tick % shapes.every == 0:
         told = _together(shapes, memory, since, variance)
     return Kinds(memory, since, tuple(alone), told)
+
+
+# Meters named at once that are looked at in the same tick; of the others as many in each of the next.
+_FIRST = 16
+
+
+def _turns(since: Ints, tick: int, every: int) -> Bools:
+    """Whose turn it is to be looked at for the first time, (p,): after so many ticks everybody has been."""
+    out = np.zeros(since.size, dtype=np.bool_)
+    for start in np.unique(since[since > tick - every]).tolist():
+        first = (tick - start) * _FIRST
+        out[np.flatnonzero(since == start)[first : first + _FIRST]] = start >= 0
+    return out
 
 
 @cache
@@ -313,7 +327,7 @@ def shape(lie: Floats, noise: float, age: int) -> Kind | None:
 
 def _shapes(lies: Floats, noise: Floats, age: int) -> list[Kind | None]:
     """`shape` of several meters' lies, (n, k)."""
-    if not np.isfinite(lies).all():
+    if not all_of(np.isfinite(lies)):
         return [shape(lie, std, age) for lie, std in zip(lies.T, noise.tolist(), strict=True)]
     now = lies[-(age + 2) :]
     constant = now.std(axis=0) < _LEFT * np.abs(now.mean(axis=0)) + noise
@@ -364,7 +378,7 @@ def _together(shapes: Shapes, memory: Memory, since: Ints, variance: Floats) -> 
     code, model, _ = repeats.past(memory, who, start, memory.kept)
     lies = (code * shapes.rules.step[who]) ** 2 - model
     heard = np.isfinite(lies).sum(axis=0)
-    if not heard.all():
+    if not all_of(heard):
         return np.zeros_like(named)
     spread = variance[who] + shapes.noise[who] / heard
     same = traced(shapes.traces, who, np.nansum(lies, axis=0) / heard, spread)

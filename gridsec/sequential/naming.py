@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gridsec.arrays import Bools, Ints
+from gridsec.arrays import Bools, Ints, all_of, any_of
 from gridsec.online import Explanation
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.examine import Examined
@@ -40,8 +40,8 @@ def name(
         Which meters have a reading: silence clears nobody.
     """
     trust = seen.trust
-    open_ = trust.accused or trust.age.any() or before.named.any() or before.counted.any()
-    if trust.trusted.all() and not open_:
+    open_ = trust.accused or any_of(trust.age) or any_of(before.named) or any_of(before.counted)
+    if all_of(trust.trusted) and not open_:
         return trust, ()
     quiet = np.where(trust.still.any(axis=0), 0, trust.quiet + live)
     trusted = (trust.trusted & ~before.named) | (quiet >= design.options.release)
@@ -53,7 +53,7 @@ def name(
     named = before.named & (quiet < design.options.release)
     count, inverters = _inverters(design, before, trust)
     new = inverters & ~before.inverters
-    rivals = _rivals(design, seen, fresh, new) if fresh.any() or new.any() else ()
+    rivals = _rivals(design, seen, fresh, new) if any_of(fresh) or any_of(new) else ()
     for rival in rivals:
         fresh = fresh & rival.meters
         inverters = inverters & (before.inverters | rival.inverters)
@@ -72,7 +72,7 @@ def _accused(seen: Examined, meters: int) -> Bools:
 def _inverters(design: SequentialDesign, before: Trust, trust: Trust) -> tuple[Ints, Bools]:
     """How long every inverter has been accused, and which are named, (m,) each."""
     accused = [k for k, _ in trust.accused]
-    if not accused and not before.counted.any():
+    if not accused and not any_of(before.counted):
         return before.counted, before.inverters
     now = inverters_of(design, accused)
     # Who was named before the monitor began anew is counted beyond that, down from there.
@@ -137,13 +137,13 @@ def _rivals(design: SequentialDesign, seen: Examined, fresh: Bools, new: Bools) 
             near.append((other, best.loosened, swap.worse))
         for k, (meters, loosened, worse) in enumerate(near):
             inverters = inverters_of(design, loosened)
-            differs = (fresh & ~meters).any() or (new & ~inverters).any()
+            differs = any_of(fresh & ~meters) or any_of(new & ~inverters)
             if not k or (worse <= within and differs):
                 who, weight = meters.tobytes() + inverters.tobytes(), float(np.exp(-0.5 * worse))
                 if who not in out or out[who][2] < weight:
                     out[who] = (meters, inverters, weight, loosened)
     ways = sorted(out.values(), key=lambda way: -way[2])
-    if not any((fresh & ~meters).any() or (new & ~inverters).any() for meters, inverters, *_ in ways):
+    if not any(any_of(fresh & ~meters) or any_of(new & ~inverters) for meters, inverters, *_ in ways):
         return ()
     total = sum(way[2] for way in ways)
     return tuple(

@@ -30,7 +30,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import expit
 
-from gridsec.arrays import Floats, Ints
+from gridsec.arrays import Floats, Ints, all_of
 from gridsec.network import Power
 from gridsec.sequential.bounds import FALSE_Q
 from gridsec.sequential.conditional import Fit, Judged
@@ -91,7 +91,7 @@ class Released:
             return False
         share = _share(self.seen[:, : self.form.size], self.form, judged.weights[self.fit.trusted])
         same = (share <= _MORE * self.share) & (share >= _LESS * self.share)
-        return bool(same.all()) and np.array_equal(sizes, self.sizes)
+        return all_of(same) and np.array_equal(sizes, self.sizes)
 
 
 # Parts of a false power's standard deviation that are as good as one another; and the least.

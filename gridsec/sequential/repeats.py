@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from gridsec.arrays import Bools, Floats, Ints
+from gridsec.arrays import Bools, Floats, Ints, all_of, any_of
 
 _Codes: TypeAlias = NDArray[np.int32]
 _Hashes: TypeAlias = NDArray[np.uint32]
@@ -250,17 +250,17 @@ def listen(law: Rules, before: Memory, y: Floats, live: Bools) -> Memory:
     code = now = told = np.rint(np.sqrt(np.minimum(np.maximum(y, 0.0), _HIGHEST)) / law.step).astype(np.int32)
     same = code == before.code
     run, longest = (before.run + same) * same, before.longest
-    if not live.all():
+    if not all_of(live):
         run = np.where(live, run, before.run)
         # A silent tick is like no other in the hash.
         told = np.where(live, code, np.int32(tick % 2**31))
         now, code = np.where(live, code, np.int32(SILENT)), np.where(live, code, before.code)
     # Rare, so only looked at where there is something to see.
     longer = before.run > longest
-    if longer.any():
+    if any_of(longer):
         longest = np.where(longer & (run == 0) & ~before.stuck, before.run, longest)
     count, stuck = before.count + live, run >= _FEWEST
-    if stuck.any():
+    if any_of(stuck):
         stuck &= (run * _surprise(law, count, longest) >= law.stuck) & (count >= law.known)
     after = Memory(
         tick=tick,
@@ -394,7 +394,7 @@ def _roll(before: _Hashes, told: _Codes) -> _Hashes:
 
 def _follow(before: Memory, now: _Codes, tick: int) -> Ints:
     """Lags at which meters still repeat themselves."""
-    if not before.lag.any():
+    if not any_of(before.lag):
         return before.lag
     lag = before.lag.copy()
     for j in np.flatnonzero(lag).tolist():
@@ -414,7 +414,7 @@ def _search(law: Rules, memory: Memory) -> Memory:
         return memory
     turn = memory.tick % len(memory.blocks)
     hit = memory.blocks[turn].hash == memory.hash
-    if not hit.any():
+    if not any_of(hit):
         return memory
     rows, meters = np.nonzero(hit)
     ask = (memory.lag == 0) & (memory.now != SILENT) & (memory.run < SPAN) & (memory.count >= law.known)

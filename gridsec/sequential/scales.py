@@ -8,6 +8,7 @@ docs/theory-sequential.md, section 3.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from gridsec.sequential.commission import Learned
 from gridsec.sequential.conditional import Fit, Judged, Prior, admit, drop, fit, judge
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.dictionary import Dictionary
+from gridsec.sequential.doubts import Doubts
 from gridsec.sequential.search import Limits
 from gridsec.sequential.state import Trust
 from gridsec.sequential.windows import Window
@@ -104,8 +106,8 @@ class Scales:
     ----------
     design
         The design.
-    priors, window, learned
-        What the powers may do on each scale, the last residuals, and what is known of the meters' errors.
+    doubts, window, learned
+        What is not known of powers, the last residuals, and what is known of the meters' errors.
     model : (p,)
         What the model may be off, squared pu.
     """
@@ -113,19 +115,24 @@ class Scales:
     def __init__(  # what every scale is made of
         self,
         design: SequentialDesign,
-        priors: tuple[Prior, ...],
+        doubts: Doubts,
         window: Window,
         learned: Learned,
         model: Floats,
     ) -> None:
-        self.design, self.priors, self.window, self.model = design, priors, window, model
+        self.design, self.doubts, self.window, self.model = design, doubts, window, model
         self.learned = learned
+
+    @cached_property
+    def book(self) -> Dictionary:
+        """What else but meters can be wrong now."""
+        return replace(self.design.book, std=self.doubts.sizes)
 
     def __getitem__(self, s: int) -> Scale:
         design, counts = self.design, self.window.counts[s]
         need = needed(design, s)
         return Scale(
-            prior=self.priors[s],
+            prior=self.doubts.priors[s],
             noise=design.white / need + self.learned.variance,
             m=self.window.sums[s] / np.maximum(counts, 1),
             enough=counts >= need,
@@ -142,9 +149,9 @@ class Scales:
         direction : (n,)
             As in `Prior.wider`.
         """
-        each = {id(prior): prior.wider(direction) for prior in self.priors}
-        priors = tuple(each[id(prior)] for prior in self.priors)
-        return Scales(self.design, priors, self.window, self.learned, self.model)
+        each = {id(prior): prior.wider(direction) for prior in self.doubts.priors}
+        doubts = replace(self.doubts, priors=tuple(each[id(prior)] for prior in self.doubts.priors))
+        return Scales(self.design, doubts, self.window, self.learned, self.model)
 
 
 def view_of(design: SequentialDesign, here: Scale, now: Fit) -> View:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats
+from gridsec.arrays import Bools, Floats, all_of, any_of
 from gridsec.frames import NO_VOLTAGE, nothing_new
 from gridsec.network import bus_voltages, by_place, model_error_bound
 from gridsec.online import Estimate, Explanation, Frame, Verdict
@@ -137,7 +137,7 @@ def _answer(design: SequentialDesign, look: _Look, frame: Frame) -> tuple[Sequen
 def _lied_to(design: SequentialDesign, before: Trust, now: Trust) -> Bools:
     """Inverters whose meters were believed until now, (m,)."""
     caught = before.trusted & ~now.trusted
-    if not caught.any():
+    if not any_of(caught):
         return np.zeros(design.meter_of.size, dtype=np.bool_)
     return (design.meter_of >= 0) & caught[design.meter_of]
 
@@ -172,7 +172,7 @@ def _remembered(design: SequentialDesign, state: SequentialState, busbar: Bools 
     if not np.any(state.unmetered):
         return state.window
     since = np.where(busbar, state.unmetered, 0)
-    if not since.any():
+    if not any_of(since):
         return state.window
     feeder, at = design.plant.feeder, design.prior.meters
     return forget_last(state.window, design.lengths, by_place(feeder, since)[at].astype(np.intp))
@@ -188,7 +188,7 @@ def _undecided(
     design: SequentialDesign, last: tuple[Estimate, Verdict] | None, before: Trust, trust: Trust
 ) -> tuple[Explanation, ...]:
     """The last explanations, as long as the same are suspected: they are not looked for at every tick."""
-    if last is None or design.decoder is not None or trust.trusted.all():
+    if last is None or design.decoder is not None or all_of(trust.trusted):
         return ()
     names = ("trusted", "named", "inverters")
     same = all(np.array_equal(getattr(trust, name), getattr(before, name)) for name in names)
@@ -198,7 +198,7 @@ def _undecided(
 def _acquit(seen: Examined, over: Bools) -> Examined:
     """Evidence against meters whose manipulation is over counts no more."""
     trust = seen.trust
-    if not over.any():
+    if not any_of(over):
         return seen
     return replace(seen, trust=replace(trust, bad=trust.bad & ~over, still=trust.still & ~over))
 
@@ -225,7 +225,7 @@ def _swing(design: SequentialDesign, v2_bus: Floats, v0_squared: Floats | float)
 
 def _distrust(trust: Trust, copies: Bools) -> Trust:
     """Meters that repeat themselves are named, whatever the others say."""
-    if not copies.any():
+    if not any_of(copies):
         return trust
     return replace(
         trust,
@@ -287,7 +287,7 @@ def _learn(
     # Whoever is named has no say; suspects that report may yet turn out to be right.
     settled = trust.trusted | trust.named | (state.window.counts[-1] == 0)
     ready = ripe(design, learning) & trust.trusted
-    if not ready.any() or not settled.all():
+    if not any_of(ready) or not all_of(settled):
         return replace(state, learning=learning)
     known = learn(design, state.learned, learning, ready, state.t)
     window = shift(state.window, state.learned.bias - known.learned.bias)
@@ -322,7 +322,7 @@ def _inverters(
     if state.x is None:
         return np.asarray(droop(droop.vbar**2 - y)), None, begin(design.plant, y)
     w, follows, h = None, None, frame.t - state.t
-    if not driven.all():
+    if not all_of(driven):
         now = _linear(design, frame, state.x, heard)
         v2 = _linear(design, frame, np.zeros(droop.tau.size), heard)
         if state.last is not None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, Ints
+from gridsec.arrays import Bools, Floats, Ints, any_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,7 +97,7 @@ def forget(window: Window, meters: Bools) -> Window:
     meters : (p,)
         Which.
     """
-    if not meters.any():
+    if not any_of(meters):
         return window
     ring, marks = window.residual.copy(), window.heard.copy()
     ring[:, meters], marks[:, meters] = 0.0, False
@@ -118,7 +118,7 @@ def forget_last(window: Window, lengths: tuple[int, ...], ticks: Ints) -> Window
     ticks : (p,)
         How many of each meter.
     """
-    if not ticks.any():
+    if not any_of(ticks):
         return window
     age = (window.head - 1 - np.arange(len(window.residual))) % len(window.residual)
     kept = window.heard & (age[:, None] >= ticks)

@@ -62,10 +62,10 @@ def prepared(design: SequentialDesign, m: Floats) -> tuple[Search, Fit, View]:
     """The search itself, and what it begins with."""
     state, everybody = sequential.init(design, 0.0), np.ones(m.size, dtype=np.bool_)
     window = push(state.window, design.lengths, m, everybody)
-    scales = Scales(design, (design.prior,) * len(design.lengths), window, state.learned, np.zeros(m.size))
+    scales = Scales(design, state.doubts, window, state.learned, np.zeros(m.size))
     now = adapt(None, scales[0], everybody, None)
     view = view_of(design, scales[0], now)
-    return Search(design, scales, design.book, state.fits, state.trust, 0), now, view
+    return Search(design, scales, state.fits, state.trust, 0), now, view
 
 
 def cost(design: SequentialDesign, m: Floats, liars: Bools, loosened: tuple[int, ...] = ()) -> float:

@@ -377,3 +377,15 @@ class TestFeeders:
         site, watcher = street
         late = (Replay(np.array([2]), START, START + 1e6, delay_s=200.0),)
         assert not watch(site, watcher, Scenario(seed=4, duration_s=900.0, attacks=late)).alone
+
+
+def test_many_who_are_named_at_once_are_looked_at_one_after_the_other() -> None:
+    since = np.full(60, -1)
+    since[:40], since[50] = 100, 101
+    turns = {tick: np.flatnonzero(kinds._turns(since, tick, 16)).tolist() for tick in range(99, 120)}
+    assert turns.pop(100) == list(range(16))
+    assert turns.pop(101) == [*range(16, 32), 50]
+    assert turns.pop(102) == list(range(32, 40))
+    assert not any(turns.values())
+    # Where readings are far apart everybody is looked at anyway.
+    assert kinds._turns(np.zeros(60, dtype=np.intp), 0, 1).sum() == 16
