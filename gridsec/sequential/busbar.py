@@ -44,6 +44,8 @@ class Busbar:
         Ticks in a row, of these, in which it agreed with the meters.
     off : (b,)
         What it reads too much, the mean over its scale, squared pu.
+    named : (b,)
+        Whether it is called manipulated.
     """
 
     believed: Bools
@@ -51,6 +53,7 @@ class Busbar:
     age: Ints
     quiet: Ints
     off: Floats
+    named: Bools
 
     def caught(self, phase: int, scale: int) -> Busbar:
         """A phase is believed no more.
@@ -61,24 +64,7 @@ class Busbar:
             Which, and the scale that found it.
         """
         here = np.arange(self.believed.size) == phase
-        zero = np.where(here, 0, self.age)
-        return Busbar(
-            self.believed & ~here,
-            np.where(here, scale, self.scale),
-            zero,
-            np.where(here, 0, self.quiet),
-            np.where(here, 0.0, self.off),
-        )
-
-    def named(self, design: SequentialDesign) -> Bools:
-        """Phases whose reading is called manipulated: evidence has lasted, (b,).
-
-        Parameters
-        ----------
-        design
-            The design.
-        """
-        return np.asarray(~self.believed & (self.age >= design.confirmed[self.scale]))
+        return replace(self, believed=self.believed & ~here, scale=np.where(here, scale, self.scale))
 
 
 def believed(phases: int) -> Busbar:
@@ -89,8 +75,8 @@ def believed(phases: int) -> Busbar:
     phases
         b.
     """
-    zero = np.zeros(phases, dtype=np.intp)
-    return Busbar(np.ones(phases, dtype=np.bool_), zero, zero, zero, np.zeros(phases))
+    zero, no = np.zeros(phases, dtype=np.intp), np.zeros(phases, dtype=np.bool_)
+    return Busbar(~no, zero, zero, zero, np.zeros(phases), no)
 
 
 def opposed(  # noqa: PLR0917  # what there is to judge by
@@ -141,11 +127,14 @@ def follow(  # noqa: PLR0917  # what was thought, what it says, and what the oth
     heard: Bools,
     v0_squared: Floats,
     variance: Floats,
+    allowed: float,
 ) -> Busbar:
     """Compare what a meter that is not believed reports with what the meters say.
 
-    It is believed again once the mean over the scale on which it was caught has been within what is expected
-    of an honest one for as long as that scale, and for as long as any meter has to.
+    It is named when it still differs from them after as many ticks as evidence has to last, by more than all
+    of them could honestly be off alike. It is believed again once the mean over the scale on which it was
+    caught has been within what is expected of an honest one for as long as that scale, and for as long as any
+    meter has to.
 
     Parameters
     ----------
@@ -155,6 +144,8 @@ def follow(  # noqa: PLR0917  # what was thought, what it says, and what the oth
         Its squared voltages, and where there are any, pu.
     v0_squared, variance : (b,)
         What the meters say, and the variance of that on the scale on which it was caught.
+    allowed
+        Largest honest fixed error of a meter, squared pu.
     """
     out = ~before.believed
     if not any_of(out):
@@ -167,11 +158,13 @@ def follow(  # noqa: PLR0917  # what was thought, what it says, and what the oth
     limit = design.options.lower * np.array(design.sigmas)[before.scale] * std
     agrees = out & heard & (np.abs(off) <= limit)
     quiet = np.where(heard, (before.quiet + 1) * agrees, before.quiet)
-    again = out & (quiet >= np.maximum(design.options.release, length))
-    return replace(
-        before,
-        believed=before.believed | again,
-        age=np.where(again, 0, age),
-        quiet=np.where(again, 0, quiet),
-        off=np.where(out & ~again, off, 0.0),
+    lasts = out & heard & (age >= design.confirmed[before.scale]) & (np.abs(off) > allowed + limit)
+    still = out & (quiet < np.maximum(design.options.release, length))
+    return Busbar(
+        believed=~still,
+        scale=before.scale,
+        age=np.where(still, age, 0),
+        quiet=np.where(still, quiet, 0),
+        off=np.where(still, off, 0.0),
+        named=still & (before.named | lasts),
     )

@@ -130,7 +130,8 @@ def _busbar(design: SequentialDesign, state: SequentialState, heard: Heard, esti
     left = np.array([np.nan if fit is None else fit.variance[k] for k, fit in enumerate(fits)])
     judged = heard.says & np.isfinite(left)
     v0_squared = estimate.v2_bus[busbar_places(design.plant.feeder)]
-    return follow(design, before, heard.said, judged, v0_squared, np.where(judged, left, 0.0))
+    allowed = float(state.learned.allowed.max())
+    return follow(design, before, heard.said, judged, v0_squared, np.where(judged, left, 0.0), allowed)
 
 
 def _inverters(design: SequentialDesign, state: SequentialState) -> Bools:
@@ -210,10 +211,10 @@ class _Differs:
 
 def _differs(design: SequentialDesign, busbar: Busbar, estimate: Estimate) -> _Differs:
     if all_of(busbar.believed):
-        return _Differs(~busbar.believed)
+        return _Differs(busbar.named)
     doubted, v0_squared = ~busbar.believed, estimate.v2_bus[busbar_places(design.plant.feeder)]
     off = words.busbar_off(busbar.off, v0_squared, doubted)
-    return _Differs(busbar.named(design), words.busbar_meter(doubted), off)
+    return _Differs(busbar.named, words.busbar_meter(doubted), off)
 
 
 def _unvouched(
@@ -275,7 +276,7 @@ def _beside_meters(  # noqa: PLR0917  # what was found
         return Decision.ATTACKED, Cause.RESIDUALS, sentence
     sentence = ""
     if differs.meter:
-        sentence = f"{differs.meter.capitalize()} {differs.off}, but not for long enough to be named."
+        sentence = f"{differs.meter.capitalize()} {differs.off}; it is not believed."
     elif rivals or open_:
         sentence = words.ways(design, rivals or open_)
     elif amounts:

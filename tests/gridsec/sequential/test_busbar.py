@@ -135,10 +135,18 @@ class TestStreets:
         assert not any(verdict.busbar.any() for _, verdict in answers)
         assert np.flatnonzero(answers[-1][1].suspects).tolist() == [0, 3, 7, 10]
 
+    @pytest.mark.parametrize("seed", [0, 7])
+    def test_meters_that_are_all_off_alike_within_their_class(self, seed: int) -> None:
+        """They may be right and the busbar wrong, or the reverse: it is not named for that."""
+        rng = np.random.default_rng(seed)
+        plant = make_plant(rng, customers=CUSTOMERS, drop=0.03)
+        _, answers = watch(Street(plant, rng, extreme=True), prepare(plant), 60)
+        assert not any(verdict.busbar.any() or verdict.suspects.any() for _, verdict in answers)
+
     def test_a_small_lie_is_found_on_a_long_scale_and_stays_named(self) -> None:
         road, design = street(7)
         state, _ = watch(road, design, 90)
-        state, answers = watch(road, design, 220, state=state, change=reads(0.0085))
+        state, answers = watch(road, design, 220, state=state, change=reads(0.01))
         named = np.array([verdict.busbar.any() for _, verdict in answers])
         assert named.any()
         assert named[int(named.argmax()) :].all()
@@ -201,7 +209,7 @@ class TestBelieving:
         now, out = believed(1).caught(0, scale), []
         for v0_squared in says:
             there = np.array([heard])
-            now = follow(design, now, np.array([v0_squared]), there, np.ones(1), np.full(1, 1e-6))
+            now = follow(design, now, np.array([v0_squared]), there, np.ones(1), np.full(1, 1e-6), 0.0)
             out.append(now)
         return out
 
@@ -217,6 +225,12 @@ class TestBelieving:
         assert out[29].off[0] == pytest.approx(0.06)
         assert not out[30 + 5].believed.all()
         assert out[-1].believed.all()
+
+    def test_once_is_not_enough_to_be_named(self) -> None:
+        """A step that the meters hear of a tick later."""
+        assert not any(one.named.any() for one in self.played(np.array([1.03, 1.0, 1.0, 1.0]), 0))
+        twice = self.played(np.array([1.03, 1.03, 1.0, 1.0]), 0)
+        assert [one.named.any() for one in twice] == [False, True, True, True]
 
     def test_silence_is_neither(self) -> None:
         assert not any(one.believed.any() for one in self.played(np.ones(200), 0, heard=False))
