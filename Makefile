@@ -18,7 +18,7 @@ test: $(VENV)/.installed
 	$(BIN)/lint-imports
 	$(BIN)/python -m coverage erase
 	$(BIN)/python -m pytest -n auto --cov --cov-report=
-	$(BIN)/python -m coverage report --include='gridsec/*,service/alarms.py' --fail-under=95
+	$(BIN)/python -m coverage report --fail-under=95
 
 quick: $(VENV)/.installed
 	$(BIN)/python -m pytest -n auto -m "not slow"

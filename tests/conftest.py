@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Generator
+from fnmatch import fnmatch
+from pathlib import Path
 
 import hypothesis
 import pytest
@@ -19,6 +21,29 @@ hypothesis.settings.register_profile(
 hypothesis.settings.load_profile("repeatable")
 
 SYSTEM_PARTS = {"browser", "postgresql"}
+
+TESTS = Path(__file__).parent
+MEASURED = (
+    *("gridsec/*", "contracts/*", "service/test_alarms.py"),
+    *("feeders/studies/test_calibrate*", "feeders/studies/test_droop*"),
+)
+"""The tests that by themselves, without the slow ones, have to cover what coverage is asked of."""
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """One more than there are processors: services, browsers and databases are waited for."""
+    return (os.cpu_count() or 1) + 1
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Let coverage trace no other tests: that takes half as much time again."""
+    if not config.pluginmanager.hasplugin("_cov"):
+        return
+    for item in items:
+        name = item.path.relative_to(TESTS).as_posix()
+        if item.get_closest_marker("slow") or not any(fnmatch(name, one) for one in MEASURED):
+            item.add_marker("no_cover")
 
 
 @pytest.hookimpl(wrapper=True)
