@@ -44,23 +44,32 @@ def at(function: Vector, points: Floats) -> Floats:
         (…, k).
     """
     points = np.asarray(points, dtype=np.float64)
-    values = function(list(np.moveaxis(points, -1, 0)))
-    return np.stack([np.broadcast_to(np.asarray(v, float), points.shape[:-1]) for v in values], axis=-1)
+    values = function([points[..., i] for i in range(points.shape[-1])])
+    # Assigned, for a stack of arrays that are broadcast first takes several times as long.
+    made = np.empty((*points.shape[:-1], len(values)), dtype=np.float64)
+    for k, value in enumerate(values):
+        made[..., k] = value
+    return made
 
 
 def jacobian_at(function: Matrix, points: Floats) -> Floats:
-    """Values of a matrix over components at points, (…, k, n).
+    """Values of a matrix over components at points, (…, k, m).
 
     Parameters
     ----------
     function
-        From n components to k rows of n entries.
+        From n components to k rows of m entries.
     points : (…, n)
         Where.
     """
-    rows = len(function(list(np.moveaxis(np.asarray(points, float), -1, 0))))
-    flat = at(lambda x: list(chain.from_iterable(function(x))), points)
-    return flat.reshape(*flat.shape[:-1], rows, -1)
+    points = np.asarray(points, dtype=np.float64)
+    rows = function([points[..., i] for i in range(points.shape[-1])])
+    columns = range(len(rows[0]))
+    made = np.empty((*points.shape[:-1], len(rows), len(columns)), dtype=np.float64)
+    for k, row in enumerate(rows):
+        for i, value in zip(columns, row, strict=True):
+            made[..., k, i] = value
+    return made
 
 
 def sat(z: Floats, bound: Floats | float) -> Floats:
