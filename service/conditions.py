@@ -91,8 +91,9 @@ class Condition:
 def conditions(report: FeederReport) -> list[Condition]:
     """Say what is wrong with a feeder at one tick, and about what the tick says nothing.
 
-    - `meter-manipulated`: the verdict names the meter. Unknown while the verdict is UNDECIDED or the meter
-      is silent, whatever the list of suspects says.
+    - `meter-manipulated`: the verdict names the meter, or that of the busbar. Unknown while the verdict is
+      UNDECIDED or the meter is silent, whatever the list of suspects says; about the busbar's also from an
+      estimator that does not judge it.
     - `inverter-manipulated`: the verdict names the inverter. Unknown while the verdict is UNDECIDED, or from
       an estimator that does not judge inverters.
     - `voltage-limit`: the whole interval around the *reconstructed* voltage is outside the limits, so a
@@ -112,7 +113,8 @@ def conditions(report: FeederReport) -> list[Condition]:
     list of Condition
         What is not in it is known to be absent.
     """
-    found = [*_manipulated(report), *_inverters(report), *_data_loss(report), *_undecided(report)]
+    manipulated = (*_manipulated(report), *_busbar(report), *_inverters(report))
+    found = [*manipulated, *_data_loss(report), *_undecided(report)]
     for meter in report.meters:
         found.extend(_voltage_limit(report, meter))
     return found
@@ -153,6 +155,28 @@ def _manipulated(report: FeederReport) -> Iterable[Condition]:
             f"reports {reported}, but the rest of the feeder says {estimated}",
             known,
         )
+
+
+def _busbar(report: FeederReport) -> Iterable[Condition]:
+    busbar = report.busbar
+    known = report.verdict is not Decision.UNDECIDED and busbar.judged and busbar.seen
+    if known and not busbar.suspect:
+        return
+    reported, estimated = _volt(busbar.v_volt_reported), _volt(busbar.v_volt_estimated)
+    phase = "" if busbar.phase is None else f" in phase {busbar.phase}"
+    yield Condition(
+        AlarmKind.METER_MANIPULATED,
+        report.feeder,
+        BUSBAR,
+        Severity.CRITICAL,
+        Evidence(
+            v_volt_reported=busbar.v_volt_reported,
+            v_volt_estimated=busbar.v_volt_estimated,
+            attack_volt_estimated=busbar.attack_volt_estimated,
+        ),
+        f"reports {reported}{phase}, but the meters of the feeder say {estimated}",
+        known,
+    )
 
 
 def _inverters(report: FeederReport) -> Iterable[Condition]:

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from service.report import FeederReport, MeterReport, finite
+from service.report import BUSBAR, FeederReport, MeterReport, finite
 
 _COLUMNS = ("v_volt_reported", "v_volt_estimated", "score", "threshold")
 _SEEN, _SUSPECT = 1, 2
@@ -50,8 +50,7 @@ class Mark:
 
 def mark(report: FeederReport) -> Mark:
     """Return the mark of a report."""
-    suspects = tuple(meter.meter for meter in report.meters if meter.suspect)
-    return Mark(report.t, str(report.verdict), str(report.cause), suspects)
+    return Mark(report.t, str(report.verdict), str(report.cause), report.suspects)
 
 
 def worth_keeping(last: Mark | None, now: Mark, rules: HistoryRules) -> bool:
@@ -71,6 +70,25 @@ def worth_keeping(last: Mark | None, now: Mark, rules: HistoryRules) -> bool:
     changed = (last.verdict, last.cause, last.suspects) != (now.verdict, now.cause, now.suspects)
     step = rules.step_s
     return changed or step <= 0.0 or math.floor(now.t / step) > math.floor(last.t / step)
+
+
+def rows(report: FeederReport) -> tuple[MeterReport, ...]:
+    """Return whose numbers are kept: the meters, and the busbar's as `BUSBAR`, without a score."""
+    now = report.busbar
+    busbar = MeterReport(
+        meter=BUSBAR,
+        bus=report.bus_v_volt[0][0] if report.bus_v_volt else "",
+        seen=now.seen,
+        suspect=now.suspect,
+        score=None,
+        threshold=None,
+        v_volt_reported=now.v_volt_reported,
+        v_volt_estimated=now.v_volt_estimated,
+        v_volt_std=None,
+        v2_pu_estimated=None,
+        attack_volt_estimated=now.attack_volt_estimated,
+    )
+    return (*report.meters, busbar)
 
 
 def pack(meters: Sequence[MeterReport]) -> bytes:
@@ -99,14 +117,15 @@ def unpack(data: bytes, meters: Sequence[str], only: str | None = None) -> dict[
     -------
     dict
         `seen` (how many), `suspects`, `v_volt_lowest`, `v_volt_highest`, and `meter`: its fields as in REST's
-        `state`, or None.
+        `state`, or None. The busbar's meter may be among the suspects, and is not among the others.
     """
     raw = zlib.decompress(data)
     size = len(meters)
     table = np.frombuffer(raw, dtype="<f4", count=4 * size).reshape(4, size)
     flags = np.frombuffer(raw, dtype=np.uint8, offset=16 * size)
     volts = table[_COLUMNS.index("v_volt_estimated")]
-    volts = volts[np.isfinite(volts)]
+    others = np.array([meter != BUSBAR for meter in meters], dtype=np.bool_)
+    volts = volts[np.isfinite(volts) & others]
     one = None
     if only in meters:
         k = meters.index(only)
@@ -117,7 +136,7 @@ def unpack(data: bytes, meters: Sequence[str], only: str | None = None) -> dict[
             **{name: _short(float(table[row, k])) for row, name in enumerate(_COLUMNS)},
         }
     return {
-        "seen": int(np.count_nonzero(flags & _SEEN)),
+        "seen": int(np.count_nonzero((flags & _SEEN) * others)),
         "suspects": [meters[int(k)] for k in np.flatnonzero(flags & _SUSPECT)],
         "v_volt_lowest": _short(float(volts.min())) if volts.size else None,
         "v_volt_highest": _short(float(volts.max())) if volts.size else None,

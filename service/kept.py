@@ -24,6 +24,7 @@ from feeders.schema import to_json
 from gridsec.arrays import Floats
 from gridsec.errors import GridsecError
 from gridsec.sequential import Distrust
+from service.voltages import Phase, busbar_phases
 
 FORMAT: Final = 1
 """Version of the text; it changes when its fields do."""
@@ -195,6 +196,25 @@ class Deviant(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     number: Annotated[int, msgspec.Meta(ge=0)]
 
 
+class OffPhase(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A phase in which the busbar's meter is not believed.
+
+    Attributes
+    ----------
+    phase
+        Which; None on a balanced feeder.
+    scale_s, named
+        As in `Suspect`.
+    off
+        What it reads too much, squared pu.
+    """
+
+    phase: Phase | None
+    scale_s: Annotated[float, msgspec.Meta(gt=0.0, lt=1e300)]
+    named: bool
+    off: _Finite
+
+
 class DistrustRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What the text about who is not believed holds.
 
@@ -206,6 +226,8 @@ class DistrustRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         As in `Kept`.
     meters, inverters
         Who; nobody else.
+    busbar
+        Where the busbar's meter is not; texts from before it was judged lack it.
     """
 
     format: int
@@ -213,6 +235,7 @@ class DistrustRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     t: _Finite
     meters: list[Suspect]
     inverters: list[Deviant]
+    busbar: list[OffPhase] = []
 
 
 def encode_distrust(site: Site, t: float, distrust: Distrust) -> Kept:
@@ -233,12 +256,20 @@ def encode_distrust(site: Site, t: float, distrust: Distrust) -> Kept:
         for k in np.flatnonzero(np.isfinite(scale_s)).tolist()
     ]
     deviants = [Deviant(*owners[k]) for k in np.flatnonzero(distrust.inverters).tolist()]
-    record = DistrustRecord(FORMAT, name, t, suspects, deviants)
+    each = zip(
+        busbar_phases(site), distrust.busbar_scale_s, distrust.busbar_named, distrust.busbar_off, strict=True
+    )
+    phases = [
+        OffPhase(phase, float(scale), bool(named), float(off))
+        for phase, scale, named, off in each
+        if math.isfinite(scale)
+    ]
+    record = DistrustRecord(FORMAT, name, t, suspects, deviants, phases)
     return Kept(name, t, msgspec.json.encode(record).decode(), Matter.DISTRUST)
 
 
 def decode_distrust(site: Site, kept: Kept) -> Distrust:
-    """Read who is not believed of the meters and inverters that the feeder has now.
+    """Read who is not believed of the meters, inverters and phases that the feeder has now.
 
     Parameters
     ----------
@@ -256,10 +287,17 @@ def decode_distrust(site: Site, kept: Kept) -> Distrust:
         raise KeptInvalid("it is damaged: a meter is in it twice")
     deviants = {(deviant.customer, deviant.number) for deviant in record.inverters}
     found = [who.get(meter) for meter in site.meter_ids]
+    off = {phase.phase: phase for phase in record.busbar}
+    if len(off) < len(record.busbar):
+        raise KeptInvalid("it is damaged: a phase is in it twice")
+    phases = [off.get(phase) for phase in busbar_phases(site)]
     return Distrust(
         np.array([math.nan if one is None else one.scale_s for one in found], dtype=np.float64),
         np.array([one is not None and one.named for one in found], dtype=np.bool_),
         np.array([owner in deviants for owner in owners], dtype=np.bool_),
+        np.array([math.nan if one is None else one.scale_s for one in phases], dtype=np.float64),
+        np.array([one is not None and one.named for one in phases], dtype=np.bool_),
+        np.array([0.0 if one is None else one.off for one in phases], dtype=np.float64),
     )
 
 

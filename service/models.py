@@ -11,6 +11,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StringConstr
 
 from gridsec.online import Cause, Decision
 from service.alarms import AlarmKind, AlarmState, Change, Severity
+from service.busbar import BUSBAR
 from service.commissioning import Stage, Step
 
 
@@ -63,6 +64,26 @@ class MeterState(BaseModel):
     v_max_volt: Number = Field(default=None, description="Highest voltage allowed where it is, V.")
 
 
+class BusbarMeterState(BaseModel):
+    """The busbar's own meter at the latest tick; in three phases the numbers are those of one of them."""
+
+    meter: str = Field(default=BUSBAR, description="Its name in alarms and explanations.")
+    judged: bool = Field(default=False, description="The estimator can tell whether it is manipulated.")
+    seen: bool = Field(default=False, description="A usable reading belongs to this tick.")
+    suspect: bool = Field(default=False, description="The verdict names it as manipulated.")
+    phases: list[str] = Field(
+        default=[], description="In which phases, a, b or c; empty on a balanced feeder."
+    )
+    phase: str | None = Field(
+        default=None, description="Phase that the numbers are of, the one furthest off; null if balanced."
+    )
+    v_volt_reported: Number = Field(default=None, description="Voltage it claims, phase to neutral, V.")
+    v_volt_estimated: Number = Field(default=None, description="Reconstructed voltage of the busbar, V.")
+    attack_volt_estimated: Number = Field(
+        default=None, description="What it reads too much, on average, V; 0 if no suspect."
+    )
+
+
 class CustomerState(BaseModel):
     """One customer at the latest tick, metered or not."""
 
@@ -86,7 +107,7 @@ class InverterState(BaseModel):
 class ExplanationModel(BaseModel):
     """One way to explain the readings, where several do about equally well."""
 
-    meters: list[str] = Field(description="Which meters would lie.")
+    meters: list[str] = Field(description="Which meters would lie; `substation` is the busbar's.")
     inverters: list[str] = Field(description="Whose inverters would inject a wrong reactive power.")
     powers: list[str] = Field(
         default=[], description="Whose powers would not be what they are said to be; accuses nobody."
@@ -127,6 +148,7 @@ class State(BaseModel):
     silent: list[Silence]
     v_min_volt: Number
     v_max_volt: Number
+    busbar: BusbarMeterState = Field(default=BusbarMeterState(), description="The busbar's own meter.")
     customers: list[CustomerState] = []
     inverters: list[InverterState] = []
     explanations: list[ExplanationModel] = []

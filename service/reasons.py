@@ -12,6 +12,7 @@ from feeders.load import Site
 from gridsec.arrays import Bools
 from gridsec.online import Cause, Verdict
 from service.align import Tick
+from service.busbar import busbar_in_words, busbar_off
 
 _SHOWN: Final = 5
 """So many names are listed at most."""
@@ -33,8 +34,7 @@ def reason_of(site: Site, tick: Tick, max_attacked: int, verdict: Verdict) -> st
     unseen = [k for k, reading in enumerate(tick.readings) if reading is None]
     named = _meters(site, suspects)
     if verdict.cause is Cause.RESIDUALS:
-        who = _who(site, verdict.suspects, verdict.inverters)
-        sure = f"Manipulated: {who}; further off than meter accuracy and load uncertainty allow."
+        sure = _named(site, tick, verdict)
         return f"{sure} {_ways(site, verdict)}" if verdict.explanations else sure
     if verdict.cause is Cause.AMBIGUOUS and verdict.explanations:
         return _ways(site, verdict)
@@ -50,10 +50,23 @@ def reason_of(site: Site, tick: Tick, max_attacked: int, verdict: Verdict) -> st
     return verdict.reason
 
 
+def _named(site: Site, tick: Tick, verdict: Verdict) -> str:
+    """Who is manipulated; of the busbar's meter also by how much, since everything else hangs on it."""
+    who = _who(site, verdict.suspects, verdict.inverters, busbar=verdict.busbar)
+    if not verdict.busbar.any():
+        return f"Manipulated: {who}; further off than meter accuracy and load uncertainty allow."
+    off = busbar_off(site, tick, verdict)
+    if not verdict.suspects.any() and not verdict.inverters.any():
+        return f"Manipulated: {who}; it {off}."
+    far = "further off than meter accuracy and load uncertainty allow"
+    return f"Manipulated: {who}; {far}. The substation's meter {off}."
+
+
 def _ways(site: Site, verdict: Verdict) -> str:
     """What may be the case, each with its share."""
     ways = [
-        f"{_who(site, e.meters, e.inverters, e.powers)} ({e.probability:.0%})" for e in verdict.explanations
+        f"{_who(site, e.meters, e.inverters, e.powers, busbar=e.busbar)} ({e.probability:.0%})"
+        for e in verdict.explanations
     ]
     more = f" or {len(ways) - _SHOWN} more" if len(ways) > _SHOWN else ""
     begin = "Several explanations fit" if len(ways) > 1 else "Only this explains the readings"
@@ -66,7 +79,7 @@ def _meters(site: Site, which: Sequence[int]) -> str:
     return ", ".join(site.meter_ids[k] for k in which[:_SHOWN]) + rest
 
 
-def _who(site: Site, meters: Bools, inverters: Bools, powers: Bools | None = None) -> str:
+def _who(site: Site, meters: Bools, inverters: Bools, powers: Bools | None = None, *, busbar: Bools) -> str:
     """Meters by their ids, all else by its customers, as in alarms; the first few of many."""
     found = np.flatnonzero(meters).tolist()
     parts = [_meters(site, found)] if found else []
@@ -76,17 +89,20 @@ def _who(site: Site, meters: Bools, inverters: Bools, powers: Bools | None = Non
         rest = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
         if names:
             parts.append(f"the {what}{'s' if len(names) > 1 else ''} of {', '.join(names[:_SHOWN])}{rest}")
+    if busbar.any():
+        parts.append(busbar_in_words(site, busbar))
     return " and ".join(parts) or "nobody"
 
 
 def _in_ids(site: Site, text: str) -> str:
     """Call customers in a sentence by their meters' ids; longer names first, one may begin another.
 
-    Inverters keep their customer's name, as in alarms.
+    Inverters keep their customer's name, as in alarms, and the busbar's meter is the substation's.
     """
     meter_of = {
         site.feeder.customers[int(customer)]: meter
         for customer, meter in zip(site.meters, site.meter_ids, strict=True)
     }
     names = "|".join(re.escape(name) for name in sorted(meter_of, key=len, reverse=True))
+    text = re.sub(r"([Tt])he meter of the busbar\b", r"\1he substation's meter", text)
     return re.sub(rf"(?<!\w)(?<!nverter of )(?:{names})(?!\w)", lambda found: meter_of[found[0]], text)

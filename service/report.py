@@ -17,11 +17,23 @@ import numpy as np
 from feeders.load import Site, volts
 from gridsec.online import Cause, Decision, Estimate, Verdict
 from service.align import Tick
+from service.busbar import BUSBAR, UNKNOWN_BUSBAR, BusbarReport, busbar_report
 from service.reasons import reason_of
 from service.voltages import attack_volts, bus_volts, std_volts
 
-BUSBAR = "substation"
-"""The name under which the busbar meter is reported among the silent ones (as in its zenoh key)."""
+__all__ = [
+    "BUSBAR",
+    "BusbarReport",
+    "CustomerReport",
+    "ExplanationReport",
+    "FeederReport",
+    "InverterReport",
+    "MeterReport",
+    "blind",
+    "build",
+    "finite",
+    "to_json",
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +153,7 @@ class ExplanationReport:
     Attributes
     ----------
     meters
-        Who would lie, by meter.
+        Who would lie, by meter; the busbar's is `BUSBAR`.
     inverters
         Whose inverters would inject a wrong reactive power, by customer.
     probability
@@ -187,6 +199,8 @@ class FeederReport:
         Where several explanations fit the readings, those, the likeliest first.
     bus_phases
         In three phases, the voltage of each phase of every bus, V; None for one that it does not have.
+    busbar
+        The busbar's own meter.
     """
 
     feeder: str
@@ -204,6 +218,13 @@ class FeederReport:
     inverters: tuple[InverterReport, ...] = ()
     explanations: tuple[ExplanationReport, ...] = ()
     bus_phases: tuple[tuple[float | None, ...], ...] = ()
+    busbar: BusbarReport = UNKNOWN_BUSBAR
+
+    @property
+    def suspects(self) -> tuple[str, ...]:
+        """The meters that the verdict names as manipulated, the busbar's as `BUSBAR`."""
+        named = tuple(meter.meter for meter in self.meters if meter.suspect)
+        return (*named, BUSBAR) if self.busbar.suspect else named
 
 
 def finite(value: float) -> float | None:
@@ -267,6 +288,7 @@ def build(site: Site, tick: Tick, max_attacked: int, estimate: Estimate, verdict
         inverters=_inverters(site, estimate, verdict),
         explanations=_explanations(site, verdict),
         bus_phases=tuple(tuple(map(finite, row)) for row in phases) if phases.size else (),
+        busbar=busbar_report(site, tick, estimate, verdict),
     )
 
 
@@ -310,6 +332,7 @@ def blind(site: Site, tick: Tick, max_attacked: int, cause: Cause, reason: str) 
         customers=tuple(CustomerReport(customer, None, None) for customer in site.feeder.customers),
         inverters=_inverters(site, None, None),
         explanations=(),
+        busbar=busbar_report(site, tick),
     )
 
 
@@ -347,7 +370,7 @@ def _explanations(site: Site, verdict: Verdict) -> tuple[ExplanationReport, ...]
     owners = [site.feeder.customers[int(c)] for c in site.droop.customer]
     return tuple(
         ExplanationReport(
-            tuple(site.meter_ids[k] for k in np.flatnonzero(e.meters)),
+            tuple(site.meter_ids[k] for k in np.flatnonzero(e.meters)) + (BUSBAR,) * bool(e.busbar.any()),
             tuple(owners[i] for i in np.flatnonzero(e.inverters)),
             float(e.probability),
             tuple(site.feeder.customers[c] for c in np.flatnonzero(e.powers)),
@@ -367,6 +390,7 @@ def _whole(
     customers: tuple[CustomerReport, ...],
     inverters: tuple[InverterReport, ...],
     explanations: tuple[ExplanationReport, ...],
+    busbar: BusbarReport,
     bus_phases: tuple[tuple[float | None, ...], ...] = (),
 ) -> FeederReport:
     limits, nominal = site.tables.meta.limits, site.tables.meta.voltage_volt
@@ -387,6 +411,7 @@ def _whole(
         inverters=inverters,
         explanations=explanations,
         bus_phases=bus_phases,
+        busbar=busbar,
     )
 
 
@@ -430,6 +455,7 @@ def to_json(report: FeederReport) -> dict[str, Any]:
             }
             for m in report.meters
         ],
+        "busbar": report.busbar.to_json(),
         "customers": [
             {"customer": c.customer, "v_volt_estimated": c.v_volt_estimated, "v_volt_std": c.v_volt_std}
             for c in report.customers

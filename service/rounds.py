@@ -278,7 +278,7 @@ class Rounds:
         metrics, name = self.metrics, report.feeder
         metrics.ticks.labels(name, report.verdict).inc()
         metrics.seen.labels(name).set(sum(meter.seen for meter in report.meters))
-        metrics.suspects.labels(name).set(sum(meter.suspect for meter in report.meters))
+        metrics.suspects.labels(name).set(len(report.suspects))
         metrics.alarms.labels(name).set(len(self.watches[name].book.active))
         if self.config.clock is Clock.WALL:
             metrics.delay.labels(name).observe(max(0.0, now - report.t))

@@ -15,10 +15,11 @@ from feeders.estimators import Memory, Watcher
 from feeders.load import Site
 from gridsec.sequential import Distrust, nobody
 from service.kept import Kept, KeptInvalid, decode_distrust, encode_distrust
+from service.voltages import busbar_phases
 
 
 class Suspicions:
-    """Who is not believed of one feeder's meters and inverters.
+    """Who is not believed of one feeder's meters and inverters, the busbar's meter among them.
 
     Parameters
     ----------
@@ -36,7 +37,7 @@ class Suspicions:
     """
 
     def __init__(self, site: Site, kept: Kept | None = None) -> None:
-        self.known = nobody(len(site.meter_ids), site.droop.tau.size)
+        self.known = nobody(len(site.meter_ids), site.droop.tau.size, len(busbar_phases(site)))
         self.note = ""
         self._site = site
         self._watcher: Watcher | None = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Literal, TypeAlias
 
 import numpy as np
 
@@ -11,6 +12,8 @@ from gridsec.arrays import Floats
 from gridsec.network import InPhases
 from gridsec.online import Estimate, Verdict
 from service.align import Tick
+
+Phase: TypeAlias = Literal["a", "b", "c"]
 
 
 def snapshot(site: Site, tick: Tick) -> Snapshot:
@@ -40,6 +43,17 @@ def _busbar(site: Site, tick: Tick) -> Floats | float:
     # A balanced feeder has one voltage, and a phase that is not measured does not take it away.
     one = phases is None or not isinstance(site.feeder, InPhases)
     return tick.busbar.v_volt if one else np.array(phases)
+
+
+def busbar_phases(site: Site) -> tuple[Phase | None, ...]:
+    """Return the phases of the busbar, (b,): a, b and c, or a nameless one on a balanced feeder.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    """
+    return ("a", "b", "c") if isinstance(site.feeder, InPhases) else (None,)
 
 
 def bus_volts(site: Site, v2_bus: Floats) -> tuple[Floats, Floats]:

@@ -41,7 +41,8 @@ class Busbar:
     age : (b,)
         For how many ticks it has not been believed.
     quiet : (b,)
-        Ticks in a row, of these, in which it agreed with the meters.
+        Ticks in a row, of these, in which it agreed with the meters; negative after a restart, while so many
+        more are owed.
     off : (b,)
         What it reads too much, the mean over its scale, squared pu.
     named : (b,)

@@ -11,11 +11,12 @@ docs/theory-sequential.md, section 5.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints
+from gridsec.sequential.busbar import Busbar
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.kinds import suspicious
 from gridsec.sequential.naming import MOST_COUNTED
@@ -25,7 +26,7 @@ from gridsec.sequential.state import SequentialState
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Distrust:
-    """Who is not believed. p meters, m inverters.
+    """Who is not believed. p meters, m inverters, b phases of the busbar, one on a balanced feeder.
 
     Attributes
     ----------
@@ -35,19 +36,29 @@ class Distrust:
         Meters named as manipulated; all of them are distrusted.
     inverters : (m,)
         Inverters named as manipulated.
+    busbar_scale_s : (b,)
+        Time scale on which the busbar's meter was caught, s; NaN where it is believed.
+    busbar_named : (b,)
+        Where it is named as manipulated; there it is not believed.
+    busbar_off : (b,)
+        What it reads too much, the mean over its scale, squared pu; 0 where it is believed.
     """
 
     scale_s: Floats
     named: Bools
     inverters: Bools
+    busbar_scale_s: Floats = field(default_factory=lambda: np.full(1, np.nan))
+    busbar_named: Bools = field(default_factory=lambda: np.zeros(1, dtype=np.bool_))
+    busbar_off: Floats = field(default_factory=lambda: np.zeros(1))
 
     @property
     def empty(self) -> bool:
         """Whether everybody is believed."""
-        return not (np.isfinite(self.scale_s).any() or self.inverters.any())
+        scales_s = (self.scale_s, self.busbar_scale_s)
+        return not (self.inverters.any() or any(np.isfinite(scale_s).any() for scale_s in scales_s))
 
     def same(self, other: Distrust) -> bool:
-        """Whether another says the same.
+        """Whether another says the same of everybody; by how much the busbar's meter is off does not count.
 
         Parameters
         ----------
@@ -58,6 +69,8 @@ class Distrust:
             np.array_equal(self.scale_s, other.scale_s, equal_nan=True)
             and np.array_equal(self.named, other.named)
             and np.array_equal(self.inverters, other.inverters)
+            and np.array_equal(self.busbar_scale_s, other.busbar_scale_s, equal_nan=True)
+            and np.array_equal(self.busbar_named, other.busbar_named)
         )
 
     def without(self, which: Bools) -> Distrust:
@@ -71,16 +84,16 @@ class Distrust:
         return replace(self, scale_s=np.where(which, np.nan, self.scale_s), named=self.named & ~which)
 
 
-def nobody(meters: int, inverters: int) -> Distrust:
+def nobody(meters: int, inverters: int, phases: int = 1) -> Distrust:
     """Everybody is believed.
 
     Parameters
     ----------
-    meters, inverters
-        p and m.
+    meters, inverters, phases
+        p, m and b.
     """
-    no, none = np.zeros(meters, dtype=np.bool_), np.zeros(inverters, dtype=np.bool_)
-    return Distrust(np.full(meters, np.nan), no, none)
+    no, none, here = (np.zeros(count, dtype=np.bool_) for count in (meters, inverters, phases))
+    return Distrust(np.full(meters, np.nan), no, none, np.full(phases, np.nan), here, np.zeros(phases))
 
 
 def distrusted(design: SequentialDesign, state: SequentialState) -> Distrust:
@@ -93,19 +106,29 @@ def distrusted(design: SequentialDesign, state: SequentialState) -> Distrust:
     """
     trust = state.trust
     inverters = trust.inverters if state.last is None else state.last[1].inverters
-    if trust.trusted.all() and not inverters.any():
-        return nobody(trust.trusted.size, inverters.size)
+    busbar = state.busbar
+    if trust.trusted.all() and busbar.believed.all() and not inverters.any():
+        return nobody(trust.trusted.size, inverters.size, busbar.believed.size)
     scales_s = np.array(design.lengths) * design.step_s
     # Repetition shows on no scale; the longest is what is left to judge such a meter by.
     scale = np.where(suspicious(state.kinds), len(design.lengths) - 1, trust.scale)
-    return Distrust(np.where(trust.trusted, np.nan, scales_s[scale]), trust.named, inverters)
+    return Distrust(
+        np.where(trust.trusted, np.nan, scales_s[scale]),
+        trust.named,
+        inverters,
+        np.where(busbar.believed, np.nan, scales_s[busbar.scale]),
+        busbar.named,
+        busbar.off,
+    )
 
 
 def restore(design: SequentialDesign, state: SequentialState, before: Distrust) -> SequentialState:
     """Go on distrusting who was, from a state that has not seen any frame.
 
     A meter is trusted again as always, but not before it has given as many readings as its scale needs to
-    judge, and the observer has settled; an inverter that is named, as many as the longest scale needs.
+    judge, and the observer has settled; an inverter that is named, as many as the longest scale needs. The
+    busbar's meter is compared with the others as before, by the mean that was known, and has to agree with
+    them for as much longer.
 
     Parameters
     ----------
@@ -117,16 +140,17 @@ def restore(design: SequentialDesign, state: SequentialState, before: Distrust) 
     if before.empty:
         return state
     trust, which = state.trust, np.isfinite(before.scale_s)
-    scales_s = np.array(design.lengths) * design.step_s
-    # The scales may have changed since: the closest.
-    far = np.abs(np.log(np.where(which, before.scale_s, 1.0)[:, None] / scales_s))
-    scale = np.where(which, far.argmin(axis=1), trust.scale)
-    need, settling = np.array([needed(design, s) for s in range(scales_s.size)]), _settling(design, state)
+    scale = _closest(design, before.scale_s)
+    need, settling = (
+        np.array([needed(design, s) for s in range(len(design.lengths))]),
+        _settling(design, state),
+    )
     still = trust.still.copy()
     still[scale[which], np.flatnonzero(which)] = True
     longest = max(int(need[-1]), int(settling.max(initial=0)))
     return replace(
         state,
+        busbar=_busbar(design, before, need, int(settling.max(initial=0))),
         trust=replace(
             trust,
             trusted=~which,
@@ -139,6 +163,30 @@ def restore(design: SequentialDesign, state: SequentialState, before: Distrust) 
             inverters=before.inverters,
         ),
     )
+
+
+def _busbar(design: SequentialDesign, before: Distrust, need: Ints, settling: int) -> Busbar:
+    """What is thought of the busbar's meter, as far as it was not believed."""
+    out = np.isfinite(before.busbar_scale_s)
+    scale = _closest(design, before.busbar_scale_s)
+    known = before.busbar_named & out
+    # The mean goes on over the whole of its scale.
+    length = np.maximum(design.confirmed, design.lengths)[scale]
+    return Busbar(
+        believed=~out,
+        scale=scale,
+        age=np.where(known, length, 0),
+        quiet=np.where(out, -np.maximum(need[scale], settling), 0),
+        off=np.where(known, before.busbar_off, 0.0),
+        named=known,
+    )
+
+
+def _closest(design: SequentialDesign, scale_s: Floats) -> Ints:
+    """The scales closest to those on which somebody was caught, 0 for NaN: they may have changed since."""
+    scales_s = np.array(design.lengths) * design.step_s
+    far = np.abs(np.log(np.where(np.isfinite(scale_s), scale_s, scales_s[0])[:, None] / scales_s))
+    return np.asarray(far.argmin(axis=1))
 
 
 def _settling(design: SequentialDesign, state: SequentialState) -> Ints:

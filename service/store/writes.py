@@ -12,7 +12,7 @@ import sqlalchemy as sa
 
 from service.alarms import AlarmUnknown, Transition, acknowledged, to_json
 from service.commissioning import Happened
-from service.history import HistoryRules, Mark, mark, pack, worth_keeping
+from service.history import HistoryRules, Mark, mark, pack, rows, worth_keeping
 from service.kept import Kept, Matter
 from service.report import FeederReport
 from service.store.connect import Connections
@@ -284,7 +284,7 @@ class Store(Reader):
             "verdict": str(report.verdict),
             "cause": str(report.cause),
             "layout": self._layout(connection, report),
-            "data": pack(report.meters),
+            "data": pack(rows(report)),
         }
         statement = self._connections.insert(HISTORY).values(row)
         connection.execute(statement.on_conflict_do_update(index_elements=["feeder", "t"], set_=row))
@@ -296,7 +296,7 @@ class Store(Reader):
         self._since_prune[report.feeder] = count
 
     def _layout(self, connection: sa.Connection, report: FeederReport) -> int:
-        meters = json.dumps([meter.meter for meter in report.meters])
+        meters = json.dumps([meter.meter for meter in rows(report)])
         known = connection.scalar(sa.select(LAYOUT.c.id).where(LAYOUT.c.meters == meters))
         if known is None:
             inserted = connection.execute(LAYOUT.insert().values(meters=meters).returning(LAYOUT.c.id))

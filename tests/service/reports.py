@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from gridsec.online import Cause, Decision
-from service.report import FeederReport, InverterReport, MeterReport
+from service.report import BusbarReport, FeederReport, InverterReport, MeterReport
 from tests.service.asking import T0
 
 FEEDER = "village"
@@ -25,7 +25,8 @@ def report(
     verdict = {Cause.AGREEMENT: Decision.CLEAN, Cause.RESIDUALS: Decision.ATTACKED}.get(
         cause, Decision.UNDECIDED
     )
-    return FeederReport(FEEDER, t, verdict, "the reason", cause, 2, meters, (), silent, 207.0, 253.0)
+    made = FeederReport(FEEDER, t, verdict, "the reason", cause, 2, meters, (), silent, 207.0, 253.0)
+    return replace(made, busbar=BusbarReport(judged=True, seen=True, suspect=False))
 
 
 def inverter(customer: str = "Miller", **changes: object) -> InverterReport:
