@@ -32,7 +32,7 @@ from gridsec.attack import (
     most_affected,
 )
 from gridsec.errors import GridsecError
-from gridsec.network import Power, columns
+from gridsec.network import Power, busbar_places, columns
 
 if TYPE_CHECKING:
     from feeders.load import Site
@@ -140,6 +140,37 @@ def random_attacks(
     amount = size * random.uniform(1.0, LARGEST, count)
     signed = amount * random.choice([-1.0, 1.0], count)
     return (_plain(kind, meters, signed, site, t_on=t_on, t_off=t_off, seed=seed),)
+
+
+def busbar_attack(site: Site, kind: Kind | str, size: float, *, t_on: float, t_off: float) -> Attack:
+    """Attack the busbar's own meter, in all of its phases.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    kind
+        Bias, scaling or drift: what it reads is too high by `size`, by this part of it, or comes to be so
+        by `size` after a third of the attack.
+    size
+        Displacement, pu of nominal; negative if it reads too little.
+    t_on, t_off
+        When it lies, Unix s.
+
+    Raises
+    ------
+    NoSuchAttack
+        When it is of another kind.
+    """
+    phases = np.arange(busbar_places(site.feeder).stop)
+    signed = np.full(phases.size, size)
+    match Kind(kind):
+        case Kind.SCALING:
+            return Scaling(phases, t_on, t_off, factor=signed)
+        case Kind.BIAS | Kind.DRIFT as plain:
+            return _plain(plain, phases, signed, site, t_on=t_on, t_off=t_off, seed=0)
+        case other:
+            raise NoSuchAttack(f"the busbar's meter is manipulated by bias, scaling or drift, not by {other}")
 
 
 def fake_load(

@@ -233,17 +233,21 @@ def read_recording(path: Path | str) -> Recording:
         raise RecordingInvalid(f"{path}: its metadata cannot be read: {error!r}") from error
 
 
+_LISTS = ("attacks", "busbar_attacks")
+
+
 def scenario_to_json(scenario: Scenario) -> dict[str, Any]:
     """Turn a scenario into what JSON can hold; infinite times become the text "inf"."""
     plain = {field.name: getattr(scenario, field.name) for field in fields(scenario)}
     plain["variation"] = asdict(scenario.variation)
     plain["errors"] = asdict(scenario.errors)
     plain["channel"] = asdict(scenario.channel)
-    plain["attacks"] = [
-        {"kind": type(attack).__name__}
-        | {field.name: getattr(attack, field.name) for field in fields(attack)}
-        for attack in scenario.attacks
-    ]
+    for name in _LISTS:
+        plain[name] = [
+            {"kind": type(attack).__name__}
+            | {field.name: getattr(attack, field.name) for field in fields(attack)}
+            for attack in getattr(scenario, name)
+        ]
     plain["inverter_attacks"] = [
         {field.name: getattr(attack, field.name) for field in fields(attack)}
         for attack in scenario.inverter_attacks
@@ -260,7 +264,7 @@ def scenario_from_json(obj: dict[str, Any]) -> Scenario:
     KeyError, TypeError, ValueError
         When it is something else.
     """
-    given = dict(obj)
+    given = {"busbar_attacks": ()} | obj
     channel = dict(given["channel"])
     channel["silences"] = tuple(
         Silence(s["meter"], float(s["t_on"]), float(s["t_off"])) for s in channel["silences"]
@@ -268,7 +272,8 @@ def scenario_from_json(obj: dict[str, Any]) -> Scenario:
     given["channel"] = Channel(**channel)
     given["variation"] = Variation(**given["variation"])
     given["errors"] = MeterErrors(**given["errors"])
-    given["attacks"] = tuple(_attack(entry) for entry in given["attacks"])
+    for name in _LISTS:
+        given[name] = tuple(_attack(entry) for entry in given[name])
     given["inverter_attacks"] = tuple(
         attacks.InverterAttack(
             np.array(entry["inverters"], dtype=np.intp),

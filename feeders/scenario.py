@@ -8,7 +8,7 @@ gives the same numbers every time; no clock is read.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from heapq import heappop, heappush
 from itertools import count
 from typing import TYPE_CHECKING, Final
@@ -23,6 +23,7 @@ from feeders.truth import Block, net_reactive, truth
 from feeders.variation import Variation
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.attack import Attack, InverterAttack, Reports, apply_all, manipulated, reach
+from gridsec.network import busbar_places
 
 if TYPE_CHECKING:
     from feeders.load import Site
@@ -77,6 +78,9 @@ class Scenario:
         Which inverters inject a wrong reactive power; they add up. Inverters are indices into `Site.droop`.
     season
         The time of the year of loads and generation; the calendar of `start` plays no part.
+    busbar_attacks
+        How the busbar's meter lies, applied in this order; none may look back. Their meters are its phases, 0
+        to 2, or 0 on a balanced feeder.
     """
 
     seed: int = 0
@@ -91,6 +95,7 @@ class Scenario:
     attacks: tuple[Attack, ...] = ()
     inverter_attacks: tuple[InverterAttack, ...] = ()
     season: Season = Season.SUMMER
+    busbar_attacks: tuple[Attack, ...] = ()
 
     def __post_init__(self) -> None:
         if self.seed < 0:
@@ -249,6 +254,7 @@ def simulate(site: Site, scenario: Scenario) -> Iterator[Sample]:
         past.add(block.ticks, honest.v_volt / nominal)
         lies = manipulated(scenario.attacks, block.t, site.meters.size)
         reported = _attacked(site, scenario, block.t, honest, past=past, lies=lies)
+        reported = _busbar_attacked(site, scenario, block.t, reported)
         delivery = meters.deliver(block.ticks, block.t)
         yield from _samples(site, block, honest, reported, delivery=delivery, lies=lies)
 
@@ -383,12 +389,31 @@ def _attacked(
     return Registers(v, after.p, after.q, honest.v0_volt)
 
 
+def _busbar_attacked(site: Site, scenario: Scenario, t: Floats, reported: Registers) -> Registers:
+    """What is reported, by the busbar's meter too."""
+    nominal = site.nominal_volt[busbar_places(site.feeder)]
+    lies = manipulated(scenario.busbar_attacks, t, nominal.size)
+    if not lies.any():
+        return reported
+    honest = reported.v0_volt.reshape(lies.shape)
+    none = np.zeros_like(honest)
+    after = apply_all(scenario.busbar_attacks, t, Reports(honest / nominal, none, none), lambda _: none)
+    v0_volt = np.where(lies, after.v * nominal, honest).reshape(reported.v0_volt.shape)
+    return replace(reported, v0_volt=v0_volt)
+
+
 def _check(site: Site, scenario: Scenario) -> None:
     for wrong in scenario.inverter_attacks:
         if wrong.inverters.max() >= site.droop.tau.size:
             raise ValueError(
                 f"an attack names inverter {wrong.inverters.max()}, but {site.feeder.name} has "
                 f"{site.droop.tau.size}"
+            )
+    phases = busbar_places(site.feeder).stop
+    for attack in scenario.busbar_attacks:
+        if attack.meters.max() >= phases or reach(attack, attack.t_off) > 0.0:
+            raise ValueError(
+                f"an attack on the busbar's meter looks back, or names phases that {site.feeder.name} has not"
             )
     for attack in scenario.attacks:
         if attack.meters.max() >= site.meters.size:

@@ -158,7 +158,8 @@ Attacks = Annotated[
     typer.Option(
         "--attack",
         help="kind:count:size:from:to, e.g. bias:2:0.03:20:55 (size as a part of nominal, times in s after "
-        "the start); may be repeated.",
+        "the start); may be repeated. With 'substation' in place of the count the busbar's meter lies, by "
+        "just that size, which may be negative: bias:substation:0.03:20:55.",
     ),
 ]
 
@@ -258,31 +259,28 @@ def _season(text: str) -> Season:
 def _with_attacks(site: Site, scenario: Scenario, texts: list[str]) -> Scenario:
     from dataclasses import replace
 
-    from feeders.campaign import Kind, random_attacks
+    from feeders.campaign import Kind, busbar_attack, random_attacks
+    from service.busbar import BUSBAR
 
     attacks: list[Attack] = []
+    on_busbar: list[Attack] = []
     for number, text in enumerate(texts):
         try:
             kind, count, size, begin, end = text.split(":")
-            numbers = int(count), float(size), float(begin), float(end)
+            how_many = 0 if count == BUSBAR else int(count)
+            part, on, off = float(size), scenario.start + float(begin), scenario.start + float(end)
             known = Kind(kind)
         except ValueError:
             kinds = ", ".join(Kind)
             raise typer.BadParameter(
                 f"{text!r}: expected kind:count:size:from:to with a kind of {kinds}", param_hint="--attack"
             ) from None
-        how_many, part, on, off = numbers
-        attacks += random_attacks(
-            site,
-            scenario.seed + number,
-            known,
-            how_many,
-            part,
-            t_on=scenario.start + on,
-            t_off=scenario.start + off,
-            scenario=scenario,
-        )
-    return replace(scenario, attacks=tuple(attacks))
+        if count == BUSBAR:
+            on_busbar.append(busbar_attack(site, known, part, t_on=on, t_off=off))
+            continue
+        seed = scenario.seed + number
+        attacks += random_attacks(site, seed, known, how_many, part, t_on=on, t_off=off, scenario=scenario)
+    return replace(scenario, attacks=tuple(attacks), busbar_attacks=tuple(on_busbar))
 
 
 def _with_inverter_attacks(site: Site, scenario: Scenario, texts: list[str]) -> Scenario:

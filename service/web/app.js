@@ -4,7 +4,7 @@ import { Alarms } from "./alarms.js";
 import { Commissioning } from "./commissioning.js";
 import { showDetail } from "./detail.js";
 import { Diagram } from "./diagram.js";
-import { bare, byId, clock, duration, el, getJson, isKnown, signed, status, volt } from "./dom.js";
+import { bare, busbarWords, byId, clock, duration, el, getJson, isKnown, signed, status, volt } from "./dom.js";
 
 const API = "/api/v1/feeders";
 const KEPT = 600;
@@ -117,6 +117,8 @@ function verdict() {
   byId("sign").setAttribute("d", SIGNS[decision]);
   byId("decision").textContent = report ? decision.toUpperCase() : "NO DATA";
   byId("reason").textContent = report ? report.reason : "Waiting for the first tick.";
+  byId("busbar-meter").hidden = !report?.busbar?.suspect;
+  byId("busbar-meter").textContent = report?.busbar?.suspect ? busbarWords(report.busbar) : "";
   document.title = `${report ? decision.toUpperCase() : "…"} – ${feeder?.title || feeder?.name || ""} – gridsec`;
   if (!report) {
     byId("chips").replaceChildren();
@@ -128,9 +130,10 @@ function verdict() {
     type: "button", class: "chip", "data-status": kind, text, on: { click: () => select(customer.get(meter) ?? null) },
   });
   const suspects = report.meters.filter((m) => m.suspect);
+  const liar = report.busbar?.suspect ? [report.busbar] : [];
   const inverters = (report.inverters ?? []).filter((i) => i.suspect);
   byId("chips").replaceChildren(
-    ...suspects.map((m) => chip(m.meter, "suspect", `${m.meter} ${signed(m.attack_volt_estimated)} V`)),
+    ...[...suspects, ...liar].map((m) => chip(m.meter, "suspect", `${m.meter} ${signed(m.attack_volt_estimated)} V`)),
     ...inverters.map((i) => el("button", {
       type: "button", class: "chip", "data-status": "suspect",
       text: `inverter of ${i.customer} ${signed(i.attack_kvar_estimated)} kvar`, on: { click: () => select(i.customer) },
@@ -143,7 +146,7 @@ function verdict() {
   const fact = (name, value) => el("div", {}, el("dt", { text: name }), el("dd", { text: value }));
   byId("facts").replaceChildren(
     fact("Meters heard", `${report.meters.filter((m) => m.seen).length} of ${report.meters.length}`),
-    fact("Suspects", String(suspects.length + inverters.length)),
+    fact("Suspects", String(suspects.length + liar.length + inverters.length)),
     fact("Tells apart up to", `${report.max_attacked} manipulated`),
     fact("Real voltages", range),
     fact("Tick", clock(report.t)));
@@ -225,10 +228,13 @@ function table() {
   const customer = new Map(page.feeder.layout.customers.map((c) => [c.meter, c.customer]));
   const ratio = (m) => m.score / m.threshold;
   const rank = (m) => (m.suspect ? 1e9 : 0) + (m.seen ? ratio(m) || 0 : 1e6);
-  const rows = [...page.report.meters].sort((a, b) => rank(b) - rank(a)).map((m) => {
+  const busbar = page.report.busbar?.judged ? [page.report.busbar] : [];
+  const rows = [...page.report.meters, ...busbar].sort((a, b) => rank(b) - rank(a)).map((m) => {
     const now = status(m, limits);
     return el("tr", { "data-status": now.key },
-      el("th", { scope: "row" }, el("button", { type: "button", class: "plain", text: m.meter, on: { click: () => select(customer.get(m.meter) ?? null) } })),
+      el("th", { scope: "row" }, customer.has(m.meter)
+        ? el("button", { type: "button", class: "plain", text: m.meter, on: { click: () => select(customer.get(m.meter)) } })
+        : el("span", { text: m.meter })),
       el("td", { class: "num", text: bare(m.v_volt_reported) }),
       el("td", { class: "num", text: bare(m.v_volt_estimated) }),
       el("td", { class: "num", text: signed(isKnown(m.v_volt_reported) && isKnown(m.v_volt_estimated) ? m.v_volt_reported - m.v_volt_estimated : null) }),

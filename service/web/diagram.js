@@ -1,6 +1,6 @@
 // The feeder as a drawing: built once per feeder and width, coloured at every tick.
 
-import { byId, el, isKnown, nominals, signed, status, svg, volt } from "./dom.js";
+import { busbarWords, byId, el, isKnown, nominals, signed, status, svg, volt } from "./dom.js";
 import { hasMap, oneLine } from "./layout.js";
 import { Scale } from "./scale.js";
 
@@ -89,7 +89,7 @@ export class Diagram {
     this.drawn = this.box.clientWidth;
     this.lines = [];
     this.customers = new Map();
-    const { root, spots, wires } = this.view === "map" ? this.mapParts() : this.lineParts();
+    const { root, spots, wires, busbar } = this.view === "map" ? this.mapParts() : this.lineParts();
     const [casing, layer] = [svg("g", {}), svg("g", {})];
     for (const wire of wires) {
       if (wire.kind === "tie") {
@@ -126,7 +126,11 @@ export class Diagram {
       });
       layer.append(group);
     });
-    root.append(casing, layer);
+    const place = { transform: `translate(${busbar.x} ${busbar.y})` };
+    this.liar = svg("g", { class: "busbar-liar", role: "img", hidden: true, ...place },
+      svg("path", { class: "shape", d: SHAPE.suspect }), svg("text", { class: "sign", y: 5, text: SIGN.suspect }),
+      svg("text", { class: "note", x: 17, y: 4 }));
+    root.append(casing, layer, this.liar);
     this.box.replaceChildren(root);
     this.hover(null);
     this.paint();
@@ -193,7 +197,8 @@ export class Diagram {
       "aria-label": `One-line diagram, ${this.feeder.layout.customers.length} customers`,
     }, svg("text", { class: "busbar-name", x: 8, y: 12, text: this.feeder.layout.buses[0] }));
     this.busbarName = root.firstChild;
-    return { root, spots, wires };
+    // Beyond the end of the busbar, where nothing else is.
+    return { root, spots, wires, busbar: upright ? { x: x1 + 27, y: y0 } : { x: x0, y: y1 + 27 } };
   }
 
   mapParts() {
@@ -230,7 +235,7 @@ export class Diagram {
     });
     const root = svg("svg", { width, height, viewBox: `0 0 ${width} ${height}`, role: "group", "aria-label": "Map" });
     this.busbarName = null;
-    return { root, spots, wires };
+    return { root, spots, wires, busbar: { x: bx, y: by - 17 } };
   }
 
   update(report) {
@@ -292,8 +297,16 @@ export class Diagram {
       part.group.setAttribute("aria-label", `${named(part.customer)}: ${now.text}, reconstructed ${volt(v)}`);
       part.group.classList.toggle("selected", id === this.selected);
     }
+    const busbar = this.report.busbar ?? {};
     if (this.busbarName) {
-      this.busbarName.textContent = `Busbar (${buses[0]}): ${volt(this.volts.get(buses[0]))}`;
+      const mark = busbar.suspect ? "◆ " : "";
+      this.busbarName.textContent = `${mark}Busbar (${buses[0]}): ${volt(this.volts.get(buses[0]))}`;
+      this.busbarName.classList.toggle("suspect", Boolean(busbar.suspect));
+    }
+    this.liar.toggleAttribute("hidden", !busbar.suspect);
+    if (busbar.suspect) {
+      this.liar.setAttribute("aria-label", busbarWords(busbar));
+      this.liar.querySelector(".note").textContent = signed(busbar.attack_volt_estimated);
     }
   }
 

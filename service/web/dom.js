@@ -52,6 +52,12 @@ export function status(meter, limits) {
   return { key: "ok", text: "honest" };
 }
 
+// What the busbar's own meter says beside what the others say of the busbar, in a sentence.
+export function busbarWords({ phase, v_volt_reported: said, v_volt_estimated: real, attack_volt_estimated: off }) {
+  const where = phase ? `, phase ${phase}` : "";
+  return `Busbar meter suspect${where}: says ${volt(said)}, reconstructed ${volt(real)} (${signed(off)} V)`;
+}
+
 // Nominal voltage of every bus: another one than the busbar's behind a transformer.
 export function nominals(feeder) {
   const { buses, v_nominal_volt: own = [] } = feeder.layout;

@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from feeders.campaign import Kind, random_attacks
+from feeders.campaign import Kind, busbar_attack, random_attacks
 from feeders.meters import BUSBAR, Channel, MeterErrors, Silence
 from feeders.recording import (
     FORMAT,
@@ -51,6 +51,7 @@ def busy() -> Scenario:
             silences=(Silence("m-c1", START + 5.0, np.inf), Silence(BUSBAR, START, START + 3.0)),
         ),
         attacks=attacks,
+        busbar_attacks=(busbar_attack(site, "scaling", 0.02, t_on=START + 30.0, t_off=START + 70.0),),
     )
 
 
@@ -105,8 +106,9 @@ def test_scenarios_survive_json() -> None:
     assert endless.duration_s == np.inf
     winter = scenario_to_json(Scenario(season=Season.WINTER))
     assert scenario_from_json(json.loads(json.dumps(winter))).season is Season.WINTER
-    older = {name: value for name, value in winter.items() if name != "season"}
+    older = {name: value for name, value in winter.items() if name not in {"season", "busbar_attacks"}}
     assert scenario_from_json(older).season is Season.SUMMER  # all there was
+    assert scenario_from_json(older).busbar_attacks == ()
 
 
 def test_pandas_reads_it(tmp_path: Path) -> None:

@@ -8,9 +8,9 @@ import pytest
 from playwright.sync_api import expect
 
 from gridsec.online import Cause
-from service.report import CustomerReport, InverterReport
+from service.report import BusbarReport, CustomerReport, InverterReport
 from tests.service.asking import T0
-from tests.service.looking import Site, customer
+from tests.service.looking import DESKTOP, PHONE, Site, customer
 
 pytestmark = pytest.mark.browser
 
@@ -37,6 +37,48 @@ def test_a_manipulated_inverter_and_its_alarm(site: Site) -> None:
     expect(page.locator('.alarm:has-text("Meter manipulated")')).to_contain_text("drift")
     page.select_option("#alarm-kind", "inverter-manipulated")
     expect(page.locator(".alarm")).to_have_count(1)
+
+
+@pytest.mark.parametrize("size", [DESKTOP, PHONE])
+def test_a_busbar_meter_that_lies_is_marked(site: Site, size: dict[str, int]) -> None:
+    """In words and shapes, wherever a suspect meter is; and everything is as before once it is believed."""
+    honest = BusbarReport(True, True, False, (), None, 231.0, 231.0, 0.0)
+    site.service.tick(replace(site.village.report(T0), busbar=honest))
+    page = site.open(size)
+    note, mark, name = (
+        page.locator("#busbar-meter"),
+        page.locator(".busbar-liar"),
+        page.locator(".busbar-name"),
+    )
+    expect(page.locator("#decision")).to_have_text("CLEAN")
+    expect(note).to_be_hidden()
+    expect(mark).to_be_hidden()
+    expect(name).to_have_text("Busbar (busbar): 230.9 V")
+    liar = BusbarReport(True, True, True, ("b",), "b", 238.0, 231.0, 7.0)
+    for k in range(1, 5):
+        site.service.tick(replace(site.village.report(T0 + k, cause=Cause.RESIDUALS), busbar=liar))
+    expect(note).to_have_text("Busbar meter suspect, phase b: says 238.0 V, reconstructed 231.0 V (+7.0 V)")
+    expect(mark).to_be_visible()
+    expect(mark.locator(".sign")).to_have_text("!")
+    expect(mark.locator(".note")).to_have_text("+7.0")
+    expect(name).to_have_text("◆ Busbar (busbar): 230.9 V")
+    expect(page.locator("#chips")).to_have_text("substation +7.0 V")
+    alarm = page.locator('.alarm:has-text("Meter manipulated")')
+    expect(alarm).to_contain_text("substation · village")
+    expect(alarm).to_contain_text("238.0 V reported, 231.0 V reconstructed (+7.0 V)")
+    page.locator("#meters-box summary").click()
+    expect(page.locator("#meters tr").first).to_contain_text("substation")
+    expect(page.locator("#meters tr").first).to_contain_text("suspect")
+    box, card = mark.bounding_box(), page.locator("#diagram").bounding_box()
+    assert box is not None
+    assert card is not None
+    assert card["x"] <= box["x"]
+    assert box["x"] + box["width"] <= card["x"] + card["width"]
+    assert page.evaluate("document.documentElement.scrollWidth") <= size["width"]
+    site.service.tick(replace(site.village.report(T0 + 5), busbar=honest))
+    expect(note).to_be_hidden()
+    expect(mark).to_be_hidden()
+    expect(page.locator("#chips")).to_be_empty()
 
 
 def test_an_alarm_is_acknowledged_with_a_name(site: Site) -> None:
