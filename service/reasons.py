@@ -45,9 +45,8 @@ def reason_of(site: Site, tick: Tick, max_attacked: int, verdict: Verdict) -> st
         )
     if verdict.cause is Cause.SILENT_METERS and unseen:
         return f"No reading from {_meters(site, unseen)}."
-    if verdict.cause in {Cause.AMBIGUOUS, Cause.SILENT_METERS}:
-        return _in_ids(site, verdict.reason)
-    return verdict.reason
+    text = re.sub(r"([Tt])he meter of the busbar\b", r"\1he substation's meter", verdict.reason)
+    return _in_ids(site, text) if verdict.cause in {Cause.AMBIGUOUS, Cause.SILENT_METERS} else text
 
 
 def _named(site: Site, tick: Tick, verdict: Verdict) -> str:
@@ -97,12 +96,11 @@ def _who(site: Site, meters: Bools, inverters: Bools, powers: Bools | None = Non
 def _in_ids(site: Site, text: str) -> str:
     """Call customers in a sentence by their meters' ids; longer names first, one may begin another.
 
-    Inverters keep their customer's name, as in alarms, and the busbar's meter is the substation's.
+    Inverters keep their customer's name, as in alarms.
     """
     meter_of = {
         site.feeder.customers[int(customer)]: meter
         for customer, meter in zip(site.meters, site.meter_ids, strict=True)
     }
     names = "|".join(re.escape(name) for name in sorted(meter_of, key=len, reverse=True))
-    text = re.sub(r"([Tt])he meter of the busbar\b", r"\1he substation's meter", text)
     return re.sub(rf"(?<!\w)(?<!nverter of )(?:{names})(?!\w)", lambda found: meter_of[found[0]], text)

@@ -139,11 +139,11 @@ def test_explanations_and_the_monitor_s_own_sentence_name_it_too(site: Site) -> 
     found = build(site, tick(site, 231.0), 2, estimate, doubt)
     assert found.reason == "Several explanations fit: the substation's meter (70%) or else m05 (30%)."
     assert [one["meters"] for one in to_json(found)["explanations"]] == [[BUSBAR], ["m05"]]
-    told = (
-        "The meter of the busbar reads 3.0 % more than the meters of the feeder say, but not for long enough."
-    )
-    found = build(site, tick(site, 231.0), 2, estimate, replace(doubt, explanations=(), reason=told))
-    assert found.reason == told.replace("The meter of the busbar", "The substation's meter")
+    told = "The meter of the busbar (phase b) reads 3.0 % more than the meters of the feeder say, and so on."
+    for cause in (Cause.AMBIGUOUS, Cause.TOO_FEW_METERS):
+        now = replace(doubt, explanations=(), reason=told, cause=cause)
+        found = build(site, tick(site, 231.0), 2, estimate, now)
+        assert found.reason == told.replace("The meter of the busbar", "The substation's meter")
 
 
 def test_the_state_says_it_and_older_ones_can_be_read(site: Site) -> None:
