@@ -114,7 +114,7 @@ class Powers:
         injected : (N,)
             How far the inverters' injections may be off, pu.
         """
-        return reach(plant.feeder, *self._errors(plant, injected))[plant.feeder.bus]
+        return reach(plant.feeder, *self.errors(plant, injected))[plant.feeder.bus]
 
     def lost(self, plant: Plant, injected: Floats) -> tuple[Floats, Floats]:
         """What the loss correction can be off at each customer, (N,), and the correction itself.
@@ -124,13 +124,19 @@ class Powers:
         plant, injected
             As in `linear`.
         """
-        p_error, q_error = self._errors(plant, injected)
+        p_error, q_error = self.errors(plant, injected)
         v0 = self.v0_squared
         correction, off = losses(plant, self.frame.p, self.q, v0, p_error=p_error, q_error=q_error)
         return off, correction[plant.feeder.bus]
 
-    def _errors(self, plant: Plant, injected: Floats) -> tuple[Floats, Floats]:
-        """How far the net powers may be off, (N,) each."""
+    def errors(self, plant: Plant, injected: Floats) -> tuple[Floats, Floats]:
+        """How far the net powers may be off, (N,) each.
+
+        Parameters
+        ----------
+        plant, injected
+            As in `linear`.
+        """
         frame = self.frame
         p_error, q_error = frame.p_error.copy(), np.where(self.told, frame.q_net_error, frame.q_error)
         liars = plant.meters[~self.trusted]

@@ -7,10 +7,11 @@ meters of its phase and zero elsewhere, letting the busbar differ by any amount 
     z^2 = (d^T Q m)^2 / (d^T Q d),
 
 and z is its leave-one-out residual in standard deviations: Q already contains its honest error. Where that is
-beyond chance, the likeliest explanation in which the busbar's meter lies is compared with that in which only
-others do (`gridsec.sequential.examine`). If it wins, the tick begins anew as one at which nobody reads the
-busbar, from the last voltage that was believed. The meters then say where the busbar is, and its own meter is
-compared with that until both agree again.
+beyond chance, and, while no meter is suspected, beyond what honest errors explain that are all at their ends
+and in one direction, the likeliest explanation in which the busbar's meter lies is compared with that in
+which only others do (`gridsec.sequential.examine`). If it wins, the tick begins anew as one at which nobody
+reads the busbar, from the last voltage that was believed. The meters then say where the busbar is, and what
+its own meter says is compared with that until both agree again.
 
 References
 ----------
@@ -24,6 +25,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of
+from gridsec.frames import busbar_errors
+from gridsec.network import Power
+from gridsec.sequential.bounds import Powers
 from gridsec.sequential.conditional import Fit, Judged
 from gridsec.sequential.design import SequentialDesign
 
@@ -81,7 +85,7 @@ def believed(phases: int) -> Busbar:
 
 
 def opposed(  # noqa: PLR0917  # what there is to judge by
-    design: SequentialDesign, s: int, now: Fit, judged: Judged, model: Floats, metered: Bools | bool
+    design: SequentialDesign, sigmas: float, now: Fit, judged: Judged, model: Floats, metered: Bools | bool
 ) -> list[int]:
     """The phases of the busbar whose meter the trusted ones contradict beyond chance.
 
@@ -89,8 +93,8 @@ def opposed(  # noqa: PLR0917  # what there is to judge by
     ----------
     design
         The design.
-    s
-        The scale.
+    sigmas
+        Standard deviations beyond which an offset is none of chance.
     now, judged
         The trusted meters, and what they say.
     model : (p,)
@@ -100,7 +104,7 @@ def opposed(  # noqa: PLR0917  # what there is to judge by
     """
     # Weights are zero where nobody is trusted.
     along, form = np.abs(judged.weights @ design.hangs_on), weight(design, now)
-    chance = design.sigmas[s] * np.sqrt(form)
+    chance = sigmas * np.sqrt(form)
     if all_of(along <= chance):
         return []
     return np.flatnonzero(metered & (along > chance + model.max() * form)).tolist()
@@ -119,6 +123,55 @@ def weight(design: SequentialDesign, now: Fit) -> Floats:
         hangs = design.hangs_on[at]
         now.together = np.einsum("ij,ij->j", hangs, Q @ hangs)
     return now.together
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Honest:
+    """What honest errors are bounded by at one tick, besides those of the meters. m inverters.
+
+    Attributes
+    ----------
+    powers
+        The frame's, and how far they may be off.
+    injected : (m,)
+        How far the observed injections may be off, pu.
+    """
+
+    powers: Powers
+    injected: Floats
+
+
+def aligned(  # who says what, and how far that may be off
+    design: SequentialDesign, now: Fit, m: Floats, fixed: Floats, honest: Honest
+) -> Bools:
+    """Where honest errors at their ends, all in one direction, explain what meters say of the busbar, (b,).
+
+    The trusted meters say ``v^T m`` of it, with ``v = Q d / (d^T Q d)``, and that is off by no more than
+
+        |2 v^T R| dp + 2 |v^T X| dq + |v|^T (fixed + jitter) + error of the busbar's meter,
+
+    were jitter as large as it ever is at all meters at once, and lasting.
+
+    Parameters
+    ----------
+    design, now
+        The design, and the trusted meters.
+    m : (p,)
+        Readings minus what the model explains, squared pu.
+    fixed : (p,)
+        Largest honest fixed error of each meter, with that of the model, squared pu.
+    honest
+        How far all else may be off.
+    """
+    plant, (at, Q) = design.plant, now.trusting()
+    v = Q @ design.hangs_on[at] / np.maximum(weight(design, now), np.finfo(np.float64).tiny)
+    injected = plant.droop.per_customer(honest.injected, design.customers)
+    errors = honest.powers.errors(plant, injected)
+    room = np.abs(v).T @ (fixed + design.sigmas[0] * np.sqrt(design.white))[at]
+    for k, one in enumerate(v.T):
+        for power, error in zip(Power, errors, strict=True):
+            room[k] += np.abs(design.effects.along(power, plant.meters[at], one)) @ error
+    return np.abs(m[at] @ v) <= room + busbar_errors(plant, honest.powers.v0_squared, design.sigmas[0])
 
 
 def follow(  # noqa: PLR0917  # what was thought, what it says, and what the others say

@@ -269,7 +269,8 @@ def _beside_meters(  # noqa: PLR0917  # what was found
     if cause is Cause.RESIDUALS:
         reason = f"{reason[:-1]}; and {' and '.join(who for who, _ in found)}." if found else reason
         return decision, cause, f"{reason} {words.ways(design, open_)}" if open_ else reason
-    if cause not in _MILD:
+    # Silence hides no evidence.
+    if cause not in ((*_MILD, Cause.SILENT_METERS) if found else _MILD):
         return said
     if found:
         sentence = f"Manipulated: {'; and '.join('; '.join(each) for each in found)}."

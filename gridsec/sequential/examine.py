@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, all_of, any_of
-from gridsec.sequential.busbar import opposed, weight
+from gridsec.sequential.busbar import Honest, aligned, opposed, weight
 from gridsec.sequential.conditional import Fit, drop, judge
 from gridsec.sequential.decoder import Accused, Evidence
 from gridsec.sequential.design import SequentialDesign
@@ -53,7 +53,7 @@ _LOOKS = 8
 _AGAIN = 8
 
 
-def examine(design: SequentialDesign, state: SequentialState, model: Floats) -> Examined:
+def examine(design: SequentialDesign, state: SequentialState, model: Floats, honest: Honest) -> Examined:
     """Judge every meter on every scale that is due, shortest first.
 
     Parameters
@@ -64,6 +64,8 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats) -> 
         With this tick's window and doubts, and all else from the last tick.
     model : (p,)
         What the model may be off, squared pu.
+    honest
+        What all other errors are bounded by.
     """
     fits, tick = state.fits, state.ticks
     trust = state.trust
@@ -87,9 +89,15 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats) -> 
             trust, calm = _own(trust) if calm else trust, False
             found[s], trust = _decoded(design, here, now, trust, s)
         else:
-            phases = opposed(design, s, now, view.judged, model, state.doubts.busbar)
-            over = bool(phases) or any_of(view.over & trust.trusted)
-            if over or _due(design, trust, view, s, tick, searched=bool(found)):
+            over = any_of(view.over & trust.trusted)
+            over = over or _due(design, trust, view, s, tick, searched=bool(found))
+            # Once something is beyond chance, less is suspected too.
+            sigmas = min(design.suspect, design.sigmas[s]) if over else design.sigmas[s]
+            phases = opposed(design, sigmas, now, view.judged, model, state.doubts.busbar)
+            if phases and not over:
+                could = aligned(design, now, here.m, here.limits.model + here.limits.allowed, honest)
+                phases = [phase for phase in phases if not could[phase]]
+            if over or phases:
                 trust, calm = _own(trust) if calm else trust, False
                 search = Search(design, scales, fits, trust, s)
                 found[s], trust = search(now, view)

@@ -12,6 +12,7 @@ from gridsec.network import bus_voltages, by_place, model_error_bound
 from gridsec.online import Estimate, Explanation, Frame, Verdict
 from gridsec.sequential.bounds import Lag, Powers, follow
 from gridsec.sequential.bounds import start as begin
+from gridsec.sequential.busbar import Honest
 from gridsec.sequential.commission import conclude as learn
 from gridsec.sequential.commission import gather, ripe
 from gridsec.sequential.conclude import Tick, conclude
@@ -102,7 +103,8 @@ def _look(design: SequentialDesign, state: SequentialState, frame: Frame) -> _Lo
         state = replace(state, model_error=error, swing=swing)
     transient = _transient(design, 0.0 if state.x is None else frame.t - state.since)
     now = replace(state, trust=_distrust(state.trust, copies), window=window, doubts=doubts)
-    seen = examine(design, now, state.model_error + transient)
+    powers = Powers(frame, q, heard.told, heard.v0_squared, state.trust.trusted, doubts.sizes)
+    seen = examine(design, now, state.model_error + transient, Honest(powers, lag.error))
     return _Look(state, heard, doubts, kinds, copies, x, free, lag, q, v2_bus, residual, transient, now, seen)
 
 
