@@ -84,30 +84,41 @@ def believed(phases: int) -> Busbar:
     return Busbar(~no, zero, zero, zero, np.zeros(phases), no)
 
 
-def opposed(  # noqa: PLR0917  # what there is to judge by
-    design: SequentialDesign, sigmas: float, now: Fit, judged: Judged, model: Floats, metered: Bools | bool
-) -> list[int]:
-    """The phases of the busbar whose meter the trusted ones contradict beyond chance.
+@dataclass(frozen=True, slots=True, eq=False)
+class Doubt:
+    """What speaks against the busbar's meter. p meters, b phases.
 
-    Parameters
+    Attributes
     ----------
-    design
-        The design.
     sigmas
         Standard deviations beyond which an offset is none of chance.
-    now, judged
-        The trusted meters, and what they say.
     model : (p,)
         What the model may be off, squared pu.
     metered
         Whether there is a busbar voltage that is believed; in three phases (3,).
     """
+
+    sigmas: float
+    model: Floats
+    metered: Bools | bool
+
+
+def opposed(design: SequentialDesign, doubt: Doubt, now: Fit, judged: Judged) -> list[int]:
+    """The phases of the busbar whose meter the trusted ones contradict beyond chance.
+
+    Parameters
+    ----------
+    design, doubt
+        The design, and what is beyond chance.
+    now, judged
+        The trusted meters, and what they say.
+    """
     # Weights are zero where nobody is trusted.
     along, form = np.abs(judged.weights @ design.hangs_on), weight(design, now)
-    chance = sigmas * np.sqrt(form)
+    chance = doubt.sigmas * np.sqrt(form)
     if all_of(along <= chance):
         return []
-    return np.flatnonzero(metered & (along > chance + model.max() * form)).tolist()
+    return np.flatnonzero(doubt.metered & (along > chance + doubt.model.max() * form)).tolist()
 
 
 def weight(design: SequentialDesign, now: Fit) -> Floats:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, all_of, any_of
-from gridsec.sequential.busbar import Honest, aligned, opposed, weight
+from gridsec.sequential.busbar import Doubt, Honest, aligned, opposed, weight
 from gridsec.sequential.conditional import Fit, drop, judge
 from gridsec.sequential.decoder import Accused, Evidence
 from gridsec.sequential.design import SequentialDesign
@@ -67,8 +67,7 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats, hon
     honest
         What all other errors are bounded by.
     """
-    fits, tick = state.fits, state.ticks
-    trust = state.trust
+    fits, tick, trust, metered = state.fits, state.ticks, state.trust, state.doubts.busbar
     calm = all_of(trust.trusted) and not (any_of(trust.bad) or any_of(trust.still))
     trust = trust if calm else _own(trust)
     views: list[View | None] = []
@@ -92,16 +91,14 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats, hon
             over = any_of(view.over & trust.trusted)
             over = over or _due(design, trust, view, s, tick, searched=bool(found))
             # Once something is beyond chance, less is suspected too.
-            sigmas = min(design.suspect, design.sigmas[s]) if over else design.sigmas[s]
-            phases = opposed(design, sigmas, now, view.judged, model, state.doubts.busbar)
-            if phases and not over:
-                could = aligned(design, now, here.m, here.limits.model + here.limits.allowed, honest)
-                phases = [phase for phase in phases if not could[phase]]
+            doubt = Doubt(min(design.suspect, design.sigmas[s]) if over else design.sigmas[s], model, metered)
+            phases = opposed(design, doubt, now, view.judged)
+            phases = phases if over else _beyond(design, here, now, honest, phases)
             if over or phases:
                 trust, calm = _own(trust) if calm else trust, False
                 search = Search(design, scales, fits, trust, s)
                 found[s], trust = search(now, view)
-                found[s], liar = _without_busbar(search, found[s], now, phases)
+                found[s], liar = _without_busbar(search, found[s], now, doubt, phases)
                 if liar is not None:
                     return Examined(state.trust, fits, (None,) * len(fits), {}, (liar, s))
         if s in found:
@@ -122,15 +119,44 @@ def _own(trust: Trust) -> Trust:
     return replace(trust, bad=trust.bad.copy(), still=trust.still.copy())
 
 
-def _without_busbar(search: Search, found: Found, now: Fit, phases: list[int]) -> tuple[Found, int | None]:
+def _beyond(design: SequentialDesign, here: Scale, now: Fit, honest: Honest, phases: list[int]) -> list[int]:
+    """Phases of the busbar where honest errors that are all alike do not explain what the meters say."""
+    if not phases:
+        return phases
+    could = aligned(design, now, here.m, here.limits.model + here.limits.allowed, honest)
+    return [phase for phase in phases if not could[phase]]
+
+
+def _disputed(
+    design: SequentialDesign, here: Scale, best: Solution, doubt: Doubt, phases: list[int]
+) -> list[int]:
+    """Phases whose busbar those whom an explanation believes contradict too, or where it accuses many."""
+    if not phases:
+        return phases
+    accused = here.enough & ~best.trusted
+    if np.count_nonzero(accused) > design.most:
+        return phases
+    left = opposed(design, doubt, best.fit, best.judged)
+    many = _MANY * (accused @ design.hangs_on) > here.enough @ design.hangs_on
+    return [phase for phase in phases if phase in left or many[phase]]
+
+
+# One in so many at least must be accused on a phase before its busbar's meter is doubted by that alone.
+_MANY = 3
+
+
+def _without_busbar(
+    search: Search, found: Found, now: Fit, doubt: Doubt, phases: list[int]
+) -> tuple[Found, int | None]:
     """What was found, and the phase of the busbar of which it is far likelier that its meter lies.
 
     If that is about as likely it is one of the other explanations. It is none if it accuses more meters than
     can be told apart where the others do without.
     """
+    design, here = search.design, search.scales[search.s]
+    phases = _disputed(design, here, found.best, doubt, phases)
     if not phases:
         return found, None
-    design, here = search.design, search.scales[search.s]
     each = [search.beside_busbar(now, phase) for phase in phases]
     best = min(range(len(each)), key=lambda k: each[k].cost)
     suspects = [int(np.count_nonzero(here.enough & ~one.trusted)) for one in (each[best], found.best)]

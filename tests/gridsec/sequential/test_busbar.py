@@ -12,7 +12,7 @@ from gridsec import sequential
 from gridsec.network import bus_voltages
 from gridsec.online import Cause, Decision, Explanation, Frame
 from gridsec.sequential import SequentialDesign
-from gridsec.sequential.busbar import Busbar, believed, follow, opposed
+from gridsec.sequential.busbar import Busbar, Doubt, believed, follow, opposed
 from gridsec.sequential.conditional import fit, judge
 from gridsec.sequential.loads import prior
 from gridsec.sequential.words import ways
@@ -81,18 +81,17 @@ class TestOneMore:
             at = (limit - self.sigmas(self.m)) / slope
             for part, expected in ((1.0 - 1e-6, []), (1.0 + 1e-6, [0])):
                 judged = judge(now, self.m + part * at * shift)
-                assert opposed(self.design, limit, now, judged, nothing, metered=True) == expected
-                assert opposed(self.design, limit, now, judged, nothing, metered=False) == []
+                assert opposed(self.design, Doubt(limit, nothing, metered=True), now, judged) == expected
+                assert opposed(self.design, Doubt(limit, nothing, metered=False), now, judged) == []
             # What the model may be off comes on top.
             judged = judge(now, self.m + 1.001 * at * shift)
-            assert opposed(self.design, limit, now, judged, nothing + 1e-3, metered=True) == []
+            assert opposed(self.design, Doubt(limit, nothing + 1e-3, metered=True), now, judged) == []
 
     def test_nobody_trusted_contradicts_nobody(self) -> None:
         nobody = np.zeros(CUSTOMERS, dtype=np.bool_)
         now = fit(self.design.prior, self.noise, nobody)
-        assert (
-            opposed(self.design, 3.0, now, judge(now, self.m + 1.0), np.zeros(CUSTOMERS), metered=True) == []
-        )
+        judged, doubt = judge(now, self.m + 1.0), Doubt(3.0, np.zeros(CUSTOMERS), metered=True)
+        assert opposed(self.design, doubt, now, judged) == []
 
 
 class TestStreets:
