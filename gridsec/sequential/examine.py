@@ -97,10 +97,13 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats, hon
             if over or phases:
                 trust, calm = _own(trust) if calm else trust, False
                 search = Search(design, scales, fits, trust, s)
-                found[s], trust = search(now, view)
-                found[s], liar = _without_busbar(search, found[s], now, doubt, phases)
+                outcome, believed = search(now, view)
+                outcome, liar = _without_busbar(search, outcome, now, doubt, phases)
                 if liar is not None:
                     return Examined(state.trust, fits, (None,) * len(fits), {}, (liar, s))
+                # Where no meter was beyond chance nobody is suspected for what is said of the busbar.
+                if over:
+                    found[s], trust = outcome, believed
         if s in found:
             now = found[s].best.fit
             view = view_of(design, here, now)
@@ -164,7 +167,11 @@ def _without_busbar(
         return found, None
     worse, like = each[best].cost - found.best.cost, 2.0 * float(np.log(design.options.like))
     if worse < -like:
-        return found, phases[best]
+        # A false power may look the same: it need not be as unlikely as to accuse somebody of it.
+        power = search.beside_powers(now)
+        if power.cost > each[best].cost + like:
+            return found, phases[best]
+        return replace(found, others=(*found.others, each[best], power)), None
     return replace(found, others=(*found.others, each[best])) if worse <= like else found, None
 
 

@@ -148,6 +148,16 @@ class Search:
         loosened = (*best.loosened, self.book.std.size + phase)
         return Explanation(best.trusted, loosened, best.charge + charge, best.cost + charge)
 
+    def beside_powers(self, now: Fit) -> Explanation:
+        """The likeliest explanation in which powers are false, at the price of a reason not to name anybody.
+
+        Parameters
+        ----------
+        now
+            The fit of those who were believed.
+        """
+        return self._descend(now, self.keep, self.book.doubtful()).bare()
+
     def _instead(self, best: Solution) -> list[Explanation]:
         """Explanations in which one of those who might be named is honest."""
         fresh = self.here.enough & ~best.trusted & ~self.trust.named
