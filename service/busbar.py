@@ -13,7 +13,7 @@ from gridsec.arrays import Bools, Floats
 from gridsec.network import busbar_places
 from gridsec.online import Estimate, Verdict
 from service.align import Tick
-from service.voltages import busbar_phases
+from service.voltages import busbar_phases, busbar_volt, excess_volts
 
 BUSBAR = "substation"
 """The name under which the busbar meter is reported, as in its zenoh key. No other meter may have it."""
@@ -144,15 +144,10 @@ def _furthest(which: Bools, off: Floats) -> int:
 
 def _reported(site: Site, tick: Tick) -> Floats:
     """What the busbar's meter says, V, NaN where nothing, (b,)."""
-    phases = len(busbar_phases(site))
-    if tick.busbar is None:
-        return np.full(phases, math.nan)
-    one = phases == 1 or tick.busbar.v_phases is None
-    return np.full(phases, tick.busbar.v_volt) if one else np.array(tick.busbar.v_phases, dtype=np.float64)
+    return np.broadcast_to(busbar_volt(site, tick), len(busbar_phases(site)))
 
 
 def _attack_volts(site: Site, reported: Floats, verdict: Verdict) -> Floats:
-    """``sqrt(y) - sqrt(y - a)`` in volts, 0 where nobody is named, (b,)."""
+    """What the busbar's meter reads too much where it is named, V, (b,)."""
     base = site.base_volt[busbar_places(site.feeder)]
-    true = volts(base, (reported / base) ** 2 - verdict.busbar_attack)
-    return np.where(verdict.busbar, reported - true, 0.0)
+    return excess_volts(base, reported, verdict.busbar_attack, verdict.busbar)

@@ -8,7 +8,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from feeders.load import Site, Snapshot, volts
-from gridsec.arrays import Floats
+from gridsec.arrays import Bools, Floats
 from gridsec.network import InPhases
 from gridsec.online import Estimate, Verdict
 from service.align import Tick
@@ -32,11 +32,18 @@ def snapshot(site: Site, tick: Tick) -> Snapshot:
         v_volt=columns[:, 0].copy(),
         p_kw=columns[:, 1].copy(),
         q_kvar=columns[:, 2].copy(),
-        v0_volt=_busbar(site, tick),
+        v0_volt=busbar_volt(site, tick),
     )
 
 
-def _busbar(site: Site, tick: Tick) -> Floats | float:
+def busbar_volt(site: Site, tick: Tick) -> Floats | float:
+    """Return what the busbar's meter says, V: one voltage, or in three phases (3,); NaN for none.
+
+    Parameters
+    ----------
+    site, tick
+        The feeder, and the tick.
+    """
     if tick.busbar is None:
         return math.nan
     phases = tick.busbar.v_phases
@@ -96,14 +103,28 @@ def std_volts(site: Site, estimate: Estimate) -> Floats:
 
 
 def attack_volts(site: Site, tick: Tick, verdict: Verdict) -> Floats:
-    """Turn the reconstructed attack on the squared voltage into volts: ``sqrt(y) - sqrt(y - a)``.
+    """Return what every meter that is named reads too much, (p,), see `excess_volts`.
 
     Parameters
     ----------
     site, tick, verdict
         The feeder, what was known, and what the estimator says.
     """
-    base = site.customer_volt[site.meters]
     reported = np.array([math.nan if r is None else r.v_volt for r in tick.readings], dtype=np.float64)
-    true = volts(base, (reported / base) ** 2 - verdict.attack)
-    return np.where(verdict.suspects, reported - true, 0.0)
+    return excess_volts(site.customer_volt[site.meters], reported, verdict.attack, verdict.suspects)
+
+
+def excess_volts(base: Floats, reported: Floats, attack: Floats, named: Bools) -> Floats:
+    """Turn attacks on squared voltages into volts: ``sqrt(y) - sqrt(y - a)``, 0 where nobody is named.
+
+    Parameters
+    ----------
+    base, reported : (k,)
+        1 pu of each, and what is reported, V.
+    attack : (k,)
+        What is too much of the squared voltages, pu.
+    named : (k,)
+        Who is named.
+    """
+    true = volts(base, (reported / base) ** 2 - attack)
+    return np.where(named, reported - true, 0.0)

@@ -74,12 +74,11 @@ def conclude(
     SequentialState, Estimate, Verdict
         The state with the answer in it, and the answer.
     """
-    plant, trust, heard = design.plant, state.trust, tick.heard
+    trust, heard, at = state.trust, tick.heard, design.prior.meters
     estimate, released = _estimate(design, state, tick)
     busbar, inverters = _busbar(design, state, heard, estimate), _inverters(design, state)
     score, threshold, judged = _worst(design, tick.seen, heard.live.size)
     live, beyond = judged & heard.live, score > threshold
-    at = plant.feeder.bus[plant.meters]
     attack = np.where(trust.named & heard.live, heard.y - state.learned.bias - estimate.v2_bus[at], 0.0)
     amounts = _amounts(design, state, tick.seen)
     settled = all_of(tick.transient <= design.options.settled * threshold)

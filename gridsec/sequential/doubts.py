@@ -115,12 +115,13 @@ def _doubts(design: SequentialDesign, before: Doubts, frame: Frame, busbar: Bool
     kept = same & np.array_equal(busbar, before.busbar)
     priors: list[Prior] = []
     for s, known in enumerate(before.priors):
-        # Scales that are in doubt about the same share what follows.
-        alike = [k for k in range(s) if np.array_equal(p[k], p[s]) and np.array_equal(q[k], q[s])]
         if kept[s]:
             priors.append(known)
-        else:
-            priors.append(priors[alike[0]] if alike else _prior(design, p[s], q[s], busbar))
+            continue
+        # Scales that are in doubt about the same share what follows.
+        alike = (k for k in range(s) if np.array_equal(p[k], p[s]) and np.array_equal(q[k], q[s]))
+        k = next(alike, None)
+        priors.append(_prior(design, p[s], q[s], busbar) if k is None else priors[k])
     return Doubts(p, q, p_calm, q_calm, busbar, tuple(priors), sizes)
 
 

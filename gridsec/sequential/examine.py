@@ -85,7 +85,6 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats, hon
         now = adapt(before, here, trust.trusted & here.enough, directions(scales.book, trust.accused))
         view = view_of(design, here, now)
         if design.decoder is not None:
-            trust, calm = _own(trust) if calm else trust, False
             found[s], trust = _decoded(design, here, now, trust, s)
         else:
             over = any_of(view.over & trust.trusted)
@@ -95,9 +94,8 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats, hon
             phases = opposed(design, doubt, now, view.judged)
             phases = phases if over else _beyond(design, here, now, honest, phases)
             if over or phases:
-                trust, calm = _own(trust) if calm else trust, False
                 search = Search(design, scales, fits, trust, s)
-                outcome, believed = search(now, view)
+                outcome, believed = search(now, view) if over else (search.likeliest(now, view), trust)
                 outcome, liar = _without_busbar(search, outcome, now, doubt, phases)
                 if liar is not None:
                     return Examined(state.trust, fits, (None,) * len(fits), {}, (liar, s))
@@ -105,6 +103,7 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats, hon
                 if over:
                     found[s], trust = outcome, believed
         if s in found:
+            trust, calm = _own(trust) if calm else trust, False
             now = found[s].best.fit
             view = view_of(design, here, now)
             weight(design, now)
@@ -144,7 +143,7 @@ def _disputed(
     return [phase for phase in phases if phase in left or many[phase]]
 
 
-# One in so many at least must be accused on a phase before its busbar's meter is doubted by that alone.
+# More than one in so many must be accused on a phase before its busbar's meter is doubted by that alone.
 _MANY = 3
 
 

@@ -94,8 +94,7 @@ def _look(design: SequentialDesign, state: SequentialState, frame: Frame) -> _Lo
     copies = suspicious(kinds) & (design.decoder is None)
     x, free, lag = _inverters(design, state, frame, heard, doubts.sizes)
     q, v2_bus = _voltages(design, frame, heard, x)
-    at = design.plant.feeder.bus[design.plant.meters]
-    residual = heard.y - v2_bus[at] - state.learned.bias
+    residual = heard.y - v2_bus[design.prior.meters] - state.learned.bias
     window = push(_remembered(design, state, heard.busbar), design.lengths, residual, heard.live)
     swing = _swing(design, v2_bus, heard.v0_squared)
     if state.ticks % _STALE == 0 or swing > max(_GROWN * state.swing, _CALM):
@@ -113,7 +112,7 @@ def _answer(design: SequentialDesign, look: _Look, frame: Frame) -> tuple[Sequen
     state, heard = look.state, look.heard
     seen, window, rivals = _judge(design, look, state.trust)
     reports = _reports(design, heard, frame, seen, look.x, look.lag)
-    v2 = look.v2_bus[design.plant.feeder.bus[design.plant.meters]]
+    v2 = look.v2_bus[design.prior.meters]
     own = _own(design, frame.p, heard.q)
     after = replace(
         state,

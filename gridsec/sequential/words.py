@@ -6,6 +6,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats
 from gridsec.online import Explanation
+from gridsec.phases.feeder import PHASES
 from gridsec.sequential.design import SequentialDesign
 
 
@@ -38,7 +39,7 @@ def busbar_meter(which: Bools) -> str:
     """
     if which.size == 1:
         return "the meter of the busbar"
-    names = [phase for phase, one in zip("abc", which, strict=True) if one]
+    names = [phase for phase, one in zip(PHASES, which, strict=True) if one]
     return f"the meter of the busbar (phase{'s' * (len(names) > 1)} {', '.join(names)})"
 
 
