@@ -58,7 +58,7 @@ def frozen_ints(values: Ints) -> Ints:
     return out
 
 
-def any_of(mask: Bools | Ints) -> bool:
+def any_of(mask: Bools | Ints | Floats) -> bool:
     """``mask.any()``, in a fifth of the time where the array is small.
 
     Parameters

@@ -18,7 +18,7 @@ from math import prod
 
 import numpy as np
 
-from gridsec.arrays import Floats, Ints, frozen, frozen_ints
+from gridsec.arrays import Floats, Ints, any_of, frozen, frozen_ints
 from gridsec.errors import FeederInvalid
 from gridsec.trees import below, from_root, shrinking, walk
 
@@ -56,6 +56,8 @@ class Feeder:
         Derived. Number of branches between bus k and the busbar.
     enter, leave : (b + 1,)
         Derived. When a walk around the tree comes to a bus first, and when it has left it.
+    inside : (b + 1, b + 1) or None
+        Derived. 1 where the bus of the row is fed through that of the column; None for large trees.
     half : (b + 1,)
         Derived. Shunt susceptance at the buses, pu.
 
@@ -81,6 +83,7 @@ class Feeder:
     depth: Ints = field(init=False, repr=False)
     enter: Ints = field(init=False, repr=False)
     leave: Ints = field(init=False, repr=False)
+    inside: Floats | None = field(init=False, repr=False)
     half: Floats = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -92,7 +95,7 @@ class Feeder:
         if problems:
             raise FeederInvalid(problems)
         found = walk(self.parent)
-        for name in ("start", "stop", "order", "depth", "enter", "leave"):
+        for name in ("start", "stop", "order", "depth", "enter", "leave", "inside"):
             object.__setattr__(self, name, getattr(found, name))
         half: Floats = np.zeros(found.start.size)
         np.add.at(half, self.parent, 0.5 * self.charging)
@@ -346,17 +349,25 @@ def corrected(
     if steps < 1:
         raise ValueError(f"steps is {steps}; it must be at least 1")
     flows = _linear_flows(feeder, p, q, v0_squared)
-    return _correction(feeder, flows, steps), _remainder(feeder, flows)
+    once = _lossy(feeder, flows, flows)
+    v2 = once.v2 if steps == 1 else flows.v2 + _correction(feeder, flows, steps)
+    return np.asarray(v2 - flows.v2), _remainder(feeder, flows, once)
 
 
 def _correction(feeder: Feeder, flows: _Flows, steps: int) -> Floats:
-    v2, P, Q = flows.v2, flows.P, flows.charged
+    now = flows
     for _ in range(steps):
-        current = (P**2 + Q**2) / v2[..., 1:]
-        loss_p, loss_q, drop = _losses(feeder, current, feeder.half * v2, sign=-1.0)
-        v2 = flows.v2 + from_root(feeder, -drop)
-        P, Q = flows.P + loss_p, flows.Q + loss_q
-    return np.asarray(v2 - flows.v2)
+        now = _lossy(feeder, flows, now)
+    return np.asarray(now.v2 - flows.v2)
+
+
+def _lossy(feeder: Feeder, flows: _Flows, now: _Flows) -> _Flows:
+    """The linear power flow with the losses of another."""
+    current = (now.P**2 + now.charged**2) / now.v2[..., 1:]
+    loss_p, loss_q, drop = _losses(feeder, current, feeder.half * now.v2, sign=-1.0)
+    # Charging is one of the losses here.
+    Q = flows.Q + loss_q
+    return _Flows(flows.P + loss_p, Q, Q, flows.v2 - from_root(feeder, drop))
 
 
 def model_error_bound(feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:
@@ -378,7 +389,9 @@ def model_error_bound(feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats |
     (…, N)
         Bound on the remaining error of `v^2`, pu.
     """
-    return _remainder(feeder, _linear_flows(feeder, p, q, v0_squared))
+    flows = _linear_flows(feeder, p, q, v0_squared)
+    with np.errstate(all="ignore"):
+        return _remainder(feeder, flows, _lossy(feeder, flows, flows))
 
 
 def reach(feeder: Feeder, p: Floats, q: Floats) -> Floats:
@@ -402,18 +415,15 @@ def reach(feeder: Feeder, p: Floats, q: Floats) -> Floats:
     return from_root(feeder, 2.0 * (np.abs(feeder.r) * P + np.abs(feeder.x) * Q))
 
 
-def _remainder(feeder: Feeder, flows: _Flows) -> Floats:
+def _remainder(feeder: Feeder, flows: _Flows, once: _Flows) -> Floats:
     with np.errstate(all="ignore"):
         current = (flows.P**2 + flows.charged**2) / flows.v2[..., 1:]
-        charge = feeder.half * flows.v2
-        loss_p, loss_q, drop = _losses(feeder, current, charge, sign=-1.0)
-        v2 = flows.v2 + from_root(feeder, -drop)
-        later = ((flows.P + loss_p) ** 2 + (flows.Q + loss_q) ** 2) / v2[..., 1:]
-        first = from_root(feeder, _losses(feeder, np.abs(current), np.abs(charge), sign=1.0)[2])
-        change = np.abs(feeder.half * (v2 - flows.v2))
+        later = (once.P**2 + once.Q**2) / once.v2[..., 1:]
+        charge, change = np.abs(feeder.half * np.array([flows.v2, once.v2 - flows.v2]))
+        first = from_root(feeder, _losses(feeder, np.abs(current), charge, sign=1.0)[2])
         second = from_root(feeder, _losses(feeder, np.abs(later - current), change, sign=1.0)[2])
         shrinks = shrinking(first, second, (-1,))
-        shrinks &= np.all(v2 > 0, axis=-1, keepdims=True) & np.all(flows.v2 > 0, axis=-1, keepdims=True)
+        shrinks &= np.all((flows.v2 > 0) & (once.v2 > 0), axis=-1, keepdims=True)
         bound = np.where(shrinks, 2.0 * second, np.inf)
     return np.asarray(bound[..., feeder.bus])
 
@@ -439,7 +449,7 @@ def _linear_flows(feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats | flo
     P, Q = -below(feeder, _at_buses(feeder, both))[..., 1:]
     base = np.asarray(v0_squared, dtype=np.float64)[..., None]
     v2 = base + from_root(feeder, -2.0 * (feeder.r * P + feeder.x * Q))
-    charged = Q - below(feeder, feeder.half * v2)[..., 1:] if feeder.half.any() else Q
+    charged = Q - below(feeder, feeder.half * v2)[..., 1:] if any_of(feeder.half) else Q
     return _Flows(P, Q, charged, v2)
 
 
@@ -449,7 +459,7 @@ def _losses(feeder: Feeder, current: Floats, charge: Floats, *, sign: float) -> 
     np.multiply(feeder.r, current, out=own[0, ..., 1:])
     np.multiply(feeder.x, current, out=own[1, ..., 1:])
     loss_p, loss_q = (below(feeder, own) - own)[..., 1:]
-    if feeder.half.any():
+    if any_of(feeder.half):
         loss_q = loss_q + sign * below(feeder, charge)[..., 1:]
     drop = 2.0 * (feeder.r * loss_p + feeder.x * loss_q) + (feeder.r**2 + feeder.x**2) * current
     return loss_p, loss_q, drop

@@ -10,7 +10,7 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, Ints, Phasors, frozen_ints
+from gridsec.arrays import Bools, Floats, Ints, Phasors, frozen, frozen_ints
 
 Values = TypeVar("Values", Floats, Phasors)
 
@@ -28,6 +28,8 @@ class Walked(Protocol):
     def enter(self) -> Ints: ...  # noqa: D102
     @property
     def leave(self) -> Ints: ...  # noqa: D102
+    @property
+    def inside(self) -> Floats | None: ...  # noqa: D102
 
 
 class Named(Protocol):
@@ -84,6 +86,9 @@ class Walk:
         Number of branches between bus k and the root.
     enter, leave : (b + 1,)
         When the walk comes to a bus first, and when it has left it.
+    inside : (b + 1, b + 1) or None
+        1 where the bus of the row lies in the subtree of that of the column, else 0; None where the tree is
+        so large that sums along the walk cost less than a product with this.
     """
 
     start: Ints
@@ -92,6 +97,11 @@ class Walk:
     depth: Ints
     enter: Ints
     leave: Ints
+    inside: Floats | None
+
+
+# Buses up to which sums of one operating point are products with a matrix, and numbers of one for each bus.
+_DENSE, _FEW = 200, 8
 
 
 def walk(parent: Ints) -> Walk:
@@ -116,12 +126,22 @@ def walk(parent: Ints) -> Walk:
         free[k] = start[k] + 1
         depth[k] = depth[above] + 1
     enter = 2 * start - depth
-    numbers = (start, start + size, np.argsort(start), depth, enter, enter + 2 * size - 1)
-    return Walk(*(frozen_ints(each) for each in numbers))
+    stop = start + size
+    inside: Floats | None = None
+    if count <= _DENSE:
+        inside = frozen(np.where((start <= start[:, None]) & (start[:, None] < stop), 1.0, 0.0))
+    leave = enter + 2 * size - 1
+    start, stop, order, depth, enter, leave = map(
+        frozen_ints, (start, stop, np.argsort(start), depth, enter, leave)
+    )
+    return Walk(start, stop, order, depth, enter, leave, inside)
 
 
 def below(tree: Walked, values: Values) -> Values:
     """Sum of bus values (…, b + 1) over the subtree of each bus, itself included; O(b)."""
+    inside = _dense(tree, values)
+    if inside is not None:
+        return np.asarray(values @ inside)
     total = np.zeros((*values.shape[:-1], values.shape[-1] + 1), dtype=values.dtype)
     # Depth-first order makes a subtree one interval, and its sum the difference of two running sums.
     np.cumsum(values.take(tree.order, axis=-1), axis=-1, out=total[..., 1:])
@@ -132,11 +152,22 @@ def below(tree: Walked, values: Values) -> Values:
 
 def from_root(tree: Walked, values: Values) -> Values:
     """Sum of branch values (…, b) over the path from the root to each bus, (…, b + 1); O(b)."""
+    inside = _dense(tree, values)
+    if inside is not None:
+        return np.asarray(values @ inside[:, 1:].T)
     # A branch counts from when its bus is entered until it is left.
     tour = np.zeros((*values.shape[:-1], 2 * tree.enter.size), dtype=values.dtype)
     tour[..., tree.enter[1:]] = values
     tour[..., tree.leave[1:]] = -values
     return np.asarray(np.cumsum(tour, axis=-1, out=tour).take(tree.enter, axis=-1))
+
+
+def _dense(tree: Walked, values: Values) -> Floats | None:
+    """The matrix that sums few real values of a small tree in the least time; None for others."""
+    inside = tree.inside
+    if inside is None or values.dtype != np.float64 or values.size > _FEW * len(inside):
+        return None
+    return inside
 
 
 def meetings(parent: Ints, tree: Walked, buses: Ints) -> Ints:

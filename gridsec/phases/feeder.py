@@ -64,7 +64,7 @@ class ThreePhaseFeeder:
         Derived. The connections, customer by customer, phase by phase: customer, bus, and phase 0, 1, 2.
     share : (C,)
         Derived. Part of its customer's power in each connection: 1 on a single phase, 1/3 on all three.
-    start, stop, order, depth, enter, leave : (b + 1,)
+    start, stop, order, depth, enter, leave : (b + 1,); inside : (b + 1, b + 1) or None
         Derived. The walk around the tree, see `gridsec.trees.Walk`.
     half : (b + 1, 3, 3)
         Derived. Shunt susceptance at the buses, pu.
@@ -96,6 +96,7 @@ class ThreePhaseFeeder:
     depth: Ints = field(init=False, repr=False)
     enter: Ints = field(init=False, repr=False)
     leave: Ints = field(init=False, repr=False)
+    inside: Floats | None = field(init=False, repr=False)
     half: Floats = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -113,7 +114,7 @@ class ThreePhaseFeeder:
         if problems:
             raise FeederInvalid(problems)
         found = walk(self.parent)
-        for name in ("start", "stop", "order", "depth", "enter", "leave"):
+        for name in ("start", "stop", "order", "depth", "enter", "leave", "inside"):
             put(name, getattr(found, name))
         of, phase = np.nonzero(self.connected)
         put("of", frozen_ints(of))

@@ -224,7 +224,7 @@ def _unvouched(
     On a balanced feeder most meters are honest, and they say where the busbar is. In three phases those of
     the same phase say it, and that most of these are honest takes more than twice as many as may lie.
     """
-    if said[0] is not Decision.CLEAN or np.all(busbar):
+    if said[0] is not Decision.CLEAN or all_of(np.asarray(busbar)):
         return said
     feeder, meters = design.plant.feeder, design.prior.meters[live]
     heard = one_busbar(feeder, np.arange(np.size(busbar)), meters) * np.ones(meters.size)
@@ -339,7 +339,7 @@ def _best(design: SequentialDesign, state: SequentialState) -> tuple[int, float]
         if now is None:
             continue
         lag = min(1.0, length * design.step_s / design.doubt.time_s) * (length > 1)
-        total = float(now.variance.sum()) + lag * float(now.prior.variance.sum())
+        total = now.total() + lag * now.prior.total
         if total < least:
             at, least, moved = s, total, lag
     return at, moved

@@ -18,7 +18,7 @@ Dubrule 1983 (leave-one-out by one inverse), the Schur complement otherwise; doc
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.linalg import blas, lapack
@@ -38,11 +38,17 @@ class Prior:
         Bus of each meter.
     variance : (n,)
         Variance at every bus.
+    total
+        Derived. Its sum.
     """
 
     of_meters: Floats
     meters: Ints
     variance: Floats
+    total: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "total", float(self.variance.sum()))
 
     @property
     def between(self) -> Floats:
@@ -96,6 +102,8 @@ class Fit:
         Diagonal of Q, 1 where not trusted, and the standard deviation of each offset; None until asked for.
     together : (b,) or None
         Sum of the entries of Q between meters of one phase of the busbar; None until asked for.
+    left
+        Sum of `variance`; None until asked for.
     """
 
     prior: Prior
@@ -108,6 +116,7 @@ class Fit:
     pivot: Floats | None = None
     std: Floats | None = None
     together: Floats | None = None
+    left: float | None = None
 
     @property
     def Q(self) -> Floats:  # noqa: N802  # its name in the theory
@@ -123,6 +132,12 @@ class Fit:
         """The trusted meters, and the inverse covariance of these alone, (t,) and (t, t)."""
         at = np.flatnonzero(self.trusted)
         return at, self.inverse if len(self.inverse) == at.size else submatrix(self.inverse, at, at)
+
+    def total(self) -> float:
+        """Sum of what is left open at every bus."""
+        if self.left is None:
+            self.left = float(self.variance.sum())
+        return self.left
 
     def weights(self, m: Floats) -> Floats:
         """Q m, (p,)."""
@@ -440,7 +455,7 @@ def _change(now: Fit, move: Move) -> None:
     now.variance -= move.factor * move.spread * move.spread
     np.maximum(now.variance, 0.0, out=now.variance)
     now.changes += 1
-    now.pivot = now.std = now.together = None
+    now.pivot = now.std = now.together = now.left = None
 
 
 def follow(now: Fit, m: Floats, judged: Judged, move: Move) -> Judged:

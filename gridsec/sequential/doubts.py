@@ -163,9 +163,10 @@ def _factors(error: Floats, std: Floats, old: Floats, calm: Ints, lengths: Ints)
 
 def _factor(error: Floats, std: Floats, old: Floats) -> Floats:
     """Power of two by which a frame knows a power less well than the design assumes, with hysteresis."""
-    ratio = error / np.sqrt(3.0) / np.maximum(std, _EXACT)
-    if ratio.max(initial=0.0) <= _MUCH_LESS and old.max(initial=1.0) <= 1.0:
+    known = np.sqrt(3.0) * np.maximum(std, _EXACT)
+    if all_of(error <= _MUCH_LESS * known) and all_of(old <= 1.0):
         return old
+    ratio = error / known
     keep = (ratio <= old * _MUCH_LESS) & (ratio * _MUCH_LESS >= old) & (old > 1.0)
     raised = np.exp2(np.ceil(np.log2(np.maximum(ratio, 1.0))))
     return np.where(keep, old, np.where(ratio > _MUCH_LESS, raised, 1.0))

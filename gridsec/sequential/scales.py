@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import ceil
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats
+from gridsec.arrays import Bools, Floats, any_of
 from gridsec.sequential.commission import Learned
 from gridsec.sequential.conditional import Fit, Judged, Prior, admit, drop, fit, judge
 from gridsec.sequential.design import SequentialDesign
@@ -96,7 +97,7 @@ def needed(design: SequentialDesign, s: int) -> int:
     s
         The scale.
     """
-    return max(1, int(np.ceil(design.options.enough * design.lengths[s])))
+    return max(1, ceil(design.options.enough * design.lengths[s]))
 
 
 class Scales:
@@ -203,9 +204,10 @@ def adapt(before: Fit | None, here: Scale, wanted: Bools, loose: Floats | None) 
         return fit(prior, noise, wanted, loose)
     if before.loose.shape[1] if loose is None else not np.array_equal(before.loose, loose):
         return fit(prior, noise, wanted, loose)
-    change = np.flatnonzero(before.trusted != wanted)
-    if not change.size:
+    differs = before.trusted != wanted
+    if not any_of(differs):
         return before
+    change = np.flatnonzero(differs)
     if change.size * _ANEW > wanted.size or before.changes + change.size > _MOST_CHANGES:
         return fit(prior, noise, wanted, loose)
     now = before.copy()

@@ -170,7 +170,7 @@ def _remembered(design: SequentialDesign, state: SequentialState, busbar: Bools 
 
     They are as far off as it had moved meanwhile, and all meters alike.
     """
-    if not np.any(state.unmetered):
+    if not any_of(np.asarray(state.unmetered)):
         return state.window
     since = np.where(busbar, state.unmetered, 0)
     if not any_of(since):
@@ -298,6 +298,8 @@ def _learn(
 
 def _known(design: SequentialDesign, doubts: Doubts) -> Bools:
     """Where what is not known is about as large as learning supposes, (p,)."""
+    if doubts.priors[-1] is design.prior:
+        return np.ones(design.prior.meters.size, dtype=np.bool_)
     variance, at = doubts.priors[-1].variance, design.prior.meters
     return np.asarray(variance[at] <= _WIDER**2 * design.prior.variance[at])
 
@@ -324,8 +326,7 @@ def _inverters(
         return np.asarray(droop(droop.vbar**2 - y)), None, begin(design.plant, y)
     w, follows, h = None, None, frame.t - state.t
     if not all_of(driven):
-        now = _linear(design, frame, state.x, heard)
-        v2 = _linear(design, frame, np.zeros(droop.tau.size), heard)
+        now, v2 = _linear(design, frame, state.x, heard)
         if state.last is not None:
             # What losses took off at the last frame is close enough for inverters without a meter.
             v2 += state.last[0].v2 - now
@@ -344,10 +345,10 @@ def _given(
 
 
 def _linear(design: SequentialDesign, frame: Frame, x: Floats, heard: Heard) -> Floats:
-    """Squared voltages by the linear model with injections x, (N,)."""
+    """Squared voltages by the linear model with injections x and without any, (2, N)."""
     feeder = design.plant.feeder
-    q = frame.q + design.plant.droop.per_customer(x, frame.q.size)
-    return np.asarray(bus_voltages(feeder, frame.p, q, heard.v0_squared, steps=0)[feeder.bus])
+    q = np.stack([frame.q + design.plant.droop.per_customer(x, frame.q.size), frame.q])
+    return np.asarray(bus_voltages(feeder, frame.p, q, heard.v0_squared, steps=0)[:, feeder.bus])
 
 
 def _model_error(design: SequentialDesign, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import hypothesis.strategies as st
 import numpy as np
 from hypothesis import given
@@ -10,9 +12,9 @@ from gridsec.arrays import Ints
 from gridsec.trees import below, from_root, meetings, walk
 
 
-def some_tree(seed: int) -> Ints:
+def some_tree(seed: int, most: int = 20) -> Ints:
     rng = np.random.default_rng(seed)
-    return np.array([rng.integers(max(0, k - 3), k + 1) for k in range(rng.integers(0, 20))], dtype=np.intp)
+    return np.array([rng.integers(max(0, k - 3), k + 1) for k in range(rng.integers(0, most))], dtype=np.intp)
 
 
 def ancestors(parent: Ints, bus: int) -> list[int]:
@@ -23,12 +25,14 @@ def ancestors(parent: Ints, bus: int) -> list[int]:
     return out
 
 
-@given(st.integers(0, 100_000))
-def test_sums_of_complex_values(seed: int) -> None:
+@given(st.integers(0, 100_000), st.sampled_from([1, 3, 12]), st.booleans())
+def test_sums_of_few_and_many_real_and_complex_values(seed: int, rows: int, phasors: bool) -> None:
     parent = some_tree(seed)
     tree, count = walk(parent), parent.size + 1
     rng = np.random.default_rng(seed)
-    values = rng.normal(size=(2, 3, count)) + 1j * rng.normal(size=(2, 3, count))
+    values = rng.normal(size=(2, rows, count))
+    if phasors:
+        values = values + 1j * rng.normal(size=(2, rows, count))
     above = [ancestors(parent, bus) for bus in range(count)]
     subtree = [[bus for bus in range(count) if k in above[bus]] for k in range(count)]
     expected = np.stack([values[..., buses].sum(axis=-1) for buses in subtree], axis=-1)
@@ -37,6 +41,20 @@ def test_sums_of_complex_values(seed: int) -> None:
     expected = np.stack([branch[..., [b - 1 for b in path if b > 0]].sum(axis=-1) for path in above], axis=-1)
     np.testing.assert_allclose(from_root(tree, branch), expected, rtol=0, atol=1e-13)
     np.testing.assert_array_equal(tree.depth, [len(path) - 1 for path in above])
+
+
+@given(st.integers(0, 100_000))
+def test_sums_along_the_walk_are_those_by_the_matrix(seed: int) -> None:
+    small = walk(some_tree(seed, most=200))
+    large = replace(small, inside=None)
+    assert small.inside is not None
+    values = np.random.default_rng(seed).normal(size=small.start.size)
+    np.testing.assert_allclose(below(small, values), below(large, values), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(from_root(small, values[1:]), from_root(large, values[1:]), rtol=0, atol=1e-12)
+
+
+def test_no_matrix_is_kept_for_a_large_tree() -> None:
+    assert walk(np.arange(1000)).inside is None
 
 
 @given(st.integers(0, 100_000))
