@@ -224,7 +224,7 @@ def describe(  # noqa: PLR0917  # what each meter says, and what the others say 
     for kind, which in ((Kind.STUCK, stuck), (Kind.REPLAY, replays)):
         for j in np.flatnonzero(which).tolist():
             alone[j] = kind
-    turn = (tick + np.arange(named.size)) % shapes.every == 0
+    _, turn = _looks(shapes, tick, np.arange(named.size))
     due = named & ~stuck & ~replays & (turn | _turns(since, tick, shapes.every))
     for age in np.unique(tick - since[due]).tolist():
         meters = np.flatnonzero(due & (since == tick - age))
@@ -236,6 +236,8 @@ def describe(  # noqa: PLR0917  # what each meter says, and what the others say 
     return Kinds(memory, since, tuple(alone), told)
 
 
+# Parts of the named meters that take turns: one look at several takes hardly longer than one at one.
+_PARTS = 4
 # Meters named at once that are looked at in the same tick; of the others as many in each of the next.
 _FIRST = 16
 
@@ -268,21 +270,44 @@ def _alone(  # noqa: PLR0917  # some meters, and what is known of them
     code, model, _ = repeats.past(memory, meters, start, memory.kept)
     lies = (code * shapes.rules.step[meters]) ** 2 - model
     found = _shapes(lies, np.sqrt(shapes.noise[meters]), age)
-    for meter, looks in zip(meters.tolist(), found, strict=True):
+    numbers, turn = _looks(shapes, memory.tick, meters)
+    back = turn & (numbers % _SELDOM == 0)
+    rows = zip(meters.tolist(), numbers.tolist(), back.tolist(), found, strict=True)
+    for k, (meter, number, far, looks) in enumerate(rows):
         # What takes a long look to see stays true when the lie rests: a drift that has arrived, a clock in
         # calm.
         kind = before[meter]
         # The past is long, and those that are named at once may be many: each has its turn.
-        if kind is not Kind.REPLAY and (memory.tick + meter) % (_SELDOM * shapes.every) == 0:
-            kind = _of_the_past(shapes, memory, meter, variance, kind)
-        yield kind if kind in _LASTING else looks
+        if far and kind is not Kind.REPLAY:
+            window = clocks.WINDOWS[number // _SELDOM % len(clocks.WINDOWS)]
+            kind = _of_the_past(shapes, memory, meter, float(variance[meter]), window, kind)
+        if kind is Kind.STUCK:
+            yield _again(code[:, k], lies[:, k], shapes, meter, age)
+        else:
+            yield kind if kind in _LASTING else looks
+
+
+def _again(code: Floats, lie: Floats, shapes: Shapes, meter: int, age: int) -> Kind | None:
+    """What the lie of a meter that was stuck looks like since it moves again, if that is long enough ago."""
+    moves = np.concatenate([[-1], np.flatnonzero(code[1:] != code[:-1]), [code.size - 1]])
+    stuck = np.flatnonzero((np.diff(moves) - 1) * shapes.rules.surprise[meter] >= _CALLED)
+    free = lie[moves[stuck[-1] + 1] + 1 :] if stuck.size else lie
+    if free.size < shapes.every:
+        return Kind.STUCK
+    return shape(free, float(np.sqrt(shapes.noise[meter])), min(age, free.size))
+
+
+def _looks(shapes: Shapes, tick: int, meters: Ints) -> tuple[Ints, Bools]:
+    """Number of the look at each of some meters, different for those at once, and whether it is due."""
+    look, early = np.divmod(tick + meters % _PARTS * -(-shapes.every // _PARTS), shapes.every)
+    return look + meters // _PARTS, early == 0
 
 
 _LASTING = (Kind.REPLAY, Kind.CLOCK_SHIFT, Kind.DRIFT)
 
 
-def _of_the_past(
-    shapes: Shapes, memory: Memory, meter: int, variance: Floats, before: Kind | None
+def _of_the_past(  # noqa: PLR0917  # one meter, and where to look
+    shapes: Shapes, memory: Memory, meter: int, spread: float, window: int, before: Kind | None
 ) -> Kind | None:
     """Replay or clock shift if a meter's readings are of another time; else what it was before.
 
@@ -292,11 +317,10 @@ def _of_the_past(
     same = repeats.recurring(code) * repeats.surprise(shapes.rules, memory)[meter]
     if same >= _CALLED + np.log(code.size):
         return Kind.REPLAY
-    turn = (memory.tick + meter) // (_SELDOM * shapes.every) % len(clocks.WINDOWS)
-    heard = min(clocks.WINDOWS[turn], code.size // 2)
+    heard = min(window, code.size // 2)
     if before is Kind.CLOCK_SHIFT or heard < clocks.WINDOWS[0]:
         return before
-    y, spread = (code * shapes.rules.step[meter]) ** 2, float(variance[meter])
+    y = (code * shapes.rules.step[meter]) ** 2
     lag = clocks.shifted(y, model, own, heard, 3.0 * np.sqrt(spread), spread + float(shapes.noise[meter]))
     return Kind.CLOCK_SHIFT if lag else before
 

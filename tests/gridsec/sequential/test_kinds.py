@@ -16,7 +16,7 @@ from feeders.load import Site, load, to_frame
 from feeders.meters import MeterErrors
 from feeders.scenario import START, Scenario, simulate, snapshots
 from gridsec.arrays import Bools, Floats
-from gridsec.attack import Replay
+from gridsec.attack import Bias, Replay
 from gridsec.feeder import lindistflow
 from gridsec.online import Kind
 from gridsec.sequential import kinds, repeats
@@ -353,14 +353,31 @@ class TestFeeders:
         assert not seen.honest
         assert not seen.alone
 
+    def test_who_was_stuck_and_then_lies_otherwise_is_told_so(self, street: tuple[Site, Watcher]) -> None:
+        site, watcher = street
+        (stuck, *_), _ = attacks(site, "stuck", 1)
+        end = START + 500.0
+        stuck = replace(stuck, t_off=end)
+        size = np.full(stuck.meters.size, 0.03)
+        both = (stuck, Bias(stuck.meters, end, START + 600.0, size))
+        state, looks = watcher.init(START), []
+        for snapshot in snapshots(simulate(site, Scenario(seed=1, duration_s=530.0, attacks=both))):
+            state, _, verdict = watcher.step(state, to_frame(site, snapshot))
+            if snapshot.t >= end:
+                looks.append({verdict.kinds[j] for j in stuck.meters})
+        assert all(look <= {Kind.STUCK, Kind.OFFSET} for look in looks)
+        assert looks[0] == {Kind.STUCK}
+        assert looks[-1] == {Kind.OFFSET}
+
+    @pytest.mark.parametrize("seed", [1, 5, 6])
     def test_kinds_belong_to_named_meters_and_are_forgotten_with_them(
-        self, street: tuple[Site, Watcher]
+        self, street: tuple[Site, Watcher], seed: int
     ) -> None:
         site, watcher = street
-        stuck, _ = attacks(site, "stuck", 1)
+        stuck, _ = attacks(site, "stuck", seed)
         short = tuple(replace(one, t_off=START + 500.0) for one in stuck)
         state, kinds_seen, verdict = watcher.init(START), set(), None
-        for snapshot in snapshots(simulate(site, Scenario(seed=1, duration_s=560.0, attacks=short))):
+        for snapshot in snapshots(simulate(site, Scenario(seed=seed, duration_s=560.0, attacks=short))):
             state, _, verdict = watcher.step(state, to_frame(site, snapshot))
             assert len(verdict.kinds) == site.meters.size
             for j, kind in enumerate(verdict.kinds):
