@@ -292,7 +292,7 @@ def _again(code: Floats, lie: Floats, shapes: Shapes, meter: int, age: int) -> K
     moves = np.concatenate([[-1], np.flatnonzero(code[1:] != code[:-1]), [code.size - 1]])
     stuck = np.flatnonzero((np.diff(moves) - 1) * shapes.rules.surprise[meter] >= _CALLED)
     free = lie[moves[stuck[-1] + 1] + 1 :] if stuck.size else lie
-    if free.size < shapes.every:
+    if free.size < max(shapes.every, _SHORTEST):
         return Kind.STUCK
     return shape(free, float(np.sqrt(shapes.noise[meter])), min(age, free.size))
 
