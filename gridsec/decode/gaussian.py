@@ -19,9 +19,10 @@ from typing import Literal
 
 import numpy as np
 from scipy.linalg import solve_triangular
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints
+from gridsec.decode.chisquare import log_density, log_tail
 from gridsec.decode.stacks import MOST_SUBSETS, Stack, subsets
 from gridsec.errors import DesignInfeasible, NotObservable
 
@@ -61,7 +62,7 @@ class Test:
         false_alarm
             delta, between 0 and 1.
         """
-        return float(chi2.isf(false_alarm, self.freedom))
+        return float(chdtri(self.freedom, false_alarm))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -270,7 +271,7 @@ def choose(hypotheses: Hypotheses, z: Floats, *, rule: Rule, freedom: Ints | Non
     g = np.square(flat).reshape(*flat.shape[:-1], S, width).sum(axis=-1)
     k = (hypotheses.freedom if freedom is None else freedom).astype(np.float64)
     # Logarithms, because for a real attack every wrong hypothesis underflows.
-    score = chi2.logpdf(g, k) if rule == "density" else chi2.logsf(g, k)
+    score = log_density(g, k) if rule == "density" else log_tail(g, k)
     best = np.argmax(score, axis=-1)
     x = np.einsum("...nj,...j->...n", hypotheses.estimators[best], z)
     return Chosen(x, np.asarray(best), g)

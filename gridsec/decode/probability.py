@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.stats import chi2
+from scipy.special import chdtr
 
 from gridsec.arrays import Floats
 from gridsec.decode.stacks import Stack
@@ -97,12 +97,12 @@ def quadratic_probability(values: Floats, limit: float, *, tol: float) -> float:
     weights = [float(np.sqrt(np.prod(scale / values)))]
     powers = ratio.copy()
     sums: list[float] = []
-    total, used = weights[0] * float(chi2.cdf(limit / scale, k)), weights[0]
+    total, used = weights[0] * float(chdtr(k, limit / scale)), weights[0]
     for j in range(1, _TERMS):
         sums.append(float(powers.sum()))
         powers = powers * ratio
         weights.append(float(np.dot(sums[::-1], weights)) / (2.0 * j))
-        tail = float(chi2.cdf(limit / scale, k + 2 * j))
+        tail = float(chdtr(k + 2 * j, limit / scale))
         total, used = total + weights[j] * tail, used + weights[j]
         if (1.0 - used) * tail <= tol:
             break

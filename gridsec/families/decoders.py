@@ -12,7 +12,7 @@ lee2018, chapters 2, 4 and 5; kim2018; yang2021; docs/theory-snapshot.md.
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import chi2, norm
+from scipy.special import chdtri, ndtr
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.decode.sparse import basis_pursuit, matching_pursuit
@@ -40,13 +40,13 @@ def least_squares(evidence: Evidence) -> tuple[Accused, ...]:
     """
     now, live = evidence.whole.copy(), evidence.live
     accused = np.zeros(live.size, dtype=np.bool_)
-    alarm = float(np.clip(2.0 * norm.sf(evidence.limits.sigmas) * max(live.sum(), 1), 1e-300, 0.5))
+    alarm = float(np.clip(2.0 * ndtr(-evidence.limits.sigmas) * max(live.sum(), 1), 1e-300, 0.5))
     for _ in range(evidence.most):
         judged = judge(now, evidence.m)
         freedom = int(np.count_nonzero(now.trusted))
         offset = np.abs(judged.offset) / evidence.limits.of(judged.std)
         worst = int(np.argmax(np.where(now.trusted, offset, -1.0)))
-        if not freedom or (judged.misfit <= chi2.isf(alarm, freedom) and offset[worst] <= 1.0):
+        if not freedom or (judged.misfit <= chdtri(freedom, alarm) and offset[worst] <= 1.0):
             break
         accused[worst] = True
         drop(now, worst)

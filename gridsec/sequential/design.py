@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.linalg import lapack
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from gridsec.accuracy import ToldError, busbar_error
 from gridsec.arrays import Bools, Floats, Ints
@@ -246,7 +246,7 @@ def design(
     white = slope**2 * (accuracy.jitter**2 + accuracy.resolution**2 / 12.0)
     fixed = slope**2 * accuracy.class_fraction**2 / 3.0
     known = prior(plant.feeder, plant.feeder.bus[meters], doubt, busbar=busbar, inverters=injections)
-    suspect = float(norm.isf(0.5 * options.suspect / meters.size))
+    suspect = -float(ndtri(0.5 * options.suspect / meters.size))
     sigmas = tuple(_sigmas(options.alarms_per_year, plant, n, step_s, lengths) for n in lengths)
     return SequentialDesign(
         plant=plant,
@@ -360,7 +360,7 @@ def _sigmas(rate: float, plant: Plant, length: int, step_s: float, lengths: tupl
     """
     meters = plant.meters.size + hangs_on(plant.feeder).shape[1]
     tests = meters * (len(lengths) + _REPEATS) * YEAR_S / (step_s * length)
-    return float(norm.isf(min(rate / tests, 0.5) / 2.0))
+    return -float(ndtri(min(rate / tests, 0.5) / 2.0))
 
 
 def _shapes(plant: Plant, effects: Effects, rate: float, step_s: float, lengths: tuple[int, ...]) -> Shapes:

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of
 from gridsec.network import Power
@@ -450,4 +450,4 @@ def traced(traces: Traces, who: Ints, lies: Floats, variance: Floats) -> bool:
 @cache
 def _quantile(freedom: int) -> float:
     """Misfit that the right trace exceeds with a probability of 1 %."""
-    return float(chi2.isf(0.01, freedom))
+    return float(chdtri(freedom, 0.01))

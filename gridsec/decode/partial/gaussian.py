@@ -17,7 +17,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from gridsec.arrays import Bools, Floats, frozen, frozen_ints
 from gridsec.decode.gaussian import Hypotheses, Rule, choose
@@ -185,7 +185,7 @@ def design(
     kept = [np.arange(p), *subsets(p, p - max_attacked, most)]
     prepared = tuple(parity(stacked, k, tol=zero) for k in kept)
     freedom = np.arange(1, stacked.matrix.shape[0] + 1)
-    thresholds = frozen(np.concatenate([[1.0], chi2.isf(false_alarm, freedom)]))
+    thresholds = frozen(np.concatenate([[1.0], chdtri(freedom, false_alarm)]))
     return GaussianDesign(filters, steady, prepared, thresholds, rule, readmit, refresh, tol)
 
 
