@@ -272,8 +272,8 @@ def _alone(  # noqa: PLR0917  # some meters, and what is known of them
     found = _shapes(lies, np.sqrt(shapes.noise[meters]), age)
     numbers, turn = _looks(shapes, memory.tick, meters)
     back = turn & (numbers % _SELDOM == 0)
-    rows = zip(meters.tolist(), numbers.tolist(), back.tolist(), found, strict=True)
-    for k, (meter, number, far, looks) in enumerate(rows):
+    turns = zip(meters.tolist(), numbers.tolist(), back.tolist(), strict=True)
+    for (meter, number, far), read, lie, looks in zip(turns, code.T, lies.T, found, strict=True):
         # What takes a long look to see stays true when the lie rests: a drift that has arrived, a clock in
         # calm.
         kind = before[meter]
@@ -282,13 +282,15 @@ def _alone(  # noqa: PLR0917  # some meters, and what is known of them
             window = clocks.WINDOWS[number // _SELDOM % len(clocks.WINDOWS)]
             kind = _of_the_past(shapes, memory, meter, float(variance[meter]), window, kind)
         if kind is Kind.STUCK:
-            yield _again(code[:, k], lies[:, k], shapes, meter, age)
+            yield _again(shapes, meter, read, lie, age)
         else:
             yield kind if kind in _LASTING else looks
 
 
-def _again(code: Floats, lie: Floats, shapes: Shapes, meter: int, age: int) -> Kind | None:
+def _again(shapes: Shapes, meter: int, code: Floats, lie: Floats, age: int) -> Kind | None:
     """What the lie of a meter that was stuck looks like since it moves again, if that is long enough ago."""
+    heard = np.isfinite(code)
+    code, lie = code[heard], lie[heard]
     moves = np.concatenate([[-1], np.flatnonzero(code[1:] != code[:-1]), [code.size - 1]])
     stuck = np.flatnonzero((np.diff(moves) - 1) * shapes.rules.surprise[meter] >= _CALLED)
     free = lie[moves[stuck[-1] + 1] + 1 :] if stuck.size else lie
