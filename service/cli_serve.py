@@ -73,7 +73,10 @@ def serve(
     log_format: LogFormat = None,
     until_eof: UntilEof = False,
 ) -> None:
-    """Watch feeders until interrupted. Every option can also be set as GRIDSEC_..., e.g. GRIDSEC_HTTP."""
+    """Watch feeders until interrupted. Every option can also be set as GRIDSEC_..., e.g. GRIDSEC_HTTP.
+
+    `--feeder` is GRIDSEC_FEEDERS, `--max-skew` GRIDSEC_MAX_SKEW_S and `--grace` GRIDSEC_GRACE_S.
+    """
     from service import logs
     from service.app import serve as run
     from service.settings import settings

@@ -315,6 +315,7 @@ class Bus:
                 self.failure = _first_line(error)
                 continue
             self.counts.published += 1
+            self.failure = None
             if event is not None and event[2] is not None:
                 event[2]()
 

@@ -11,6 +11,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from feeders.outside import EstimatorUnusable
 from gridsec.errors import DesignInfeasible, FeederInvalid, GridsecError, NotObservable
 from service.alarms import AlarmUnknown, AlreadyAcknowledged
 from service.commissioning import NothingToLearn
@@ -110,6 +111,7 @@ _STATUS: dict[type[GridsecError], int] = {
     FeederInvalid: 422,
     NotObservable: 422,
     DesignInfeasible: 422,
+    EstimatorUnusable: 422,
     AlarmUnknown: 404,
     FeederUnknown: 404,
     AlreadyAcknowledged: 409,

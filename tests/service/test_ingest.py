@@ -202,3 +202,13 @@ def test_a_closed_session_says_so() -> None:
         pass
     with pytest.raises(BusUnavailable, match="not open"):
         meters.put("f/meter/a/reading", b"1")
+
+
+def test_what_cannot_be_published_is_said_until_something_is_again() -> None:
+    with pair(Sink()) as (bus, _, _end):
+        bus.telemetry("f//state", b"no key of zenoh")
+        until(lambda: bus.failure)
+        assert bus.counts.publish_failed == 1
+        bus.telemetry("f/state", b"a key")
+        until(lambda: bus.failure is None)
+        assert bus.counts.published == 1
