@@ -204,6 +204,7 @@ class Aligner:
         self._first: int | None = None
         self._refused: list[Reading] = []
         self._now: float | None = None
+        self._latest = -math.inf
         self._arrivals = 0
         self._active: OrderedDict[str | None, float] = OrderedDict()
         self._claims: list[float] = []
@@ -225,14 +226,16 @@ class Aligner:
         outcome, ticks
             What became of the reading; the ticks, in order.
         """
-        ticks = list(self.due(now))
+        # A reading that had to wait came before what is known to be now; that is no clock set back.
+        self._latest = max(self._latest, now)
+        ticks = list(self._let_go(self._latest))
         source = self._sources[reading.meter]
         if self.rules.clock is Clock.EVENTS:
             self._hear(reading, source)
-            ticks.extend(self.due(now))
+            ticks.extend(self._let_go(self._latest))
         outcome = self._place(reading, source, self.now(now))
         self.counts[outcome] += 1
-        ticks.extend(self.due(now))
+        ticks.extend(self._let_go(self._latest))
         return outcome, ticks
 
     def refused(self) -> tuple[Reading, ...]:
@@ -338,19 +341,24 @@ class Aligner:
         Parameters
         ----------
         wall
-            Wall time, Unix s; ignored when the readings tell the time.
+            Wall time up to which all that arrived was taken, Unix s; ignored when the readings tell the time.
         """
-        now = self.now(wall)
-        if now is None:
-            return
-        if self._next is None:
-            self._begin(now)
-        elif now < self._time(self._number() - 1) - self.rules.silence_s:
+        if self.rules.clock is Clock.WALL and wall < self._latest - self.rules.silence_s:
             # The clock was set back. To wait until it is where it was would be to watch nothing meanwhile.
             self.restarts += 1
             for source in self._sources.values():
                 source.held.clear()
                 source.last_t = source.last_heard = -math.inf
+            self._latest = wall
+            self._begin(wall)
+        self._latest = max(self._latest, wall)
+        yield from self._let_go(wall)
+
+    def _let_go(self, wall: float) -> Iterator[Tick]:
+        now = self.now(wall)
+        if now is None:
+            return
+        if self._next is None:
             self._begin(now)
         behind = math.floor(now / self.rules.tick_s) - self._number()
         if behind > BACKLOG_TICKS:

@@ -46,6 +46,11 @@ class Inbox:
         """Return how many samples wait."""
         return len(self._waiting)
 
+    def oldest(self) -> float | None:
+        """Return when the oldest of the waiting samples arrived, Unix s; None if none waits."""
+        with self._room:
+            return self._waiting[0].arrival if self._waiting else None
+
     def put(self, batch: list[Sample]) -> int:
         """Add samples; called from any thread.
 

@@ -168,13 +168,15 @@ class Rounds:
 
     # ---------------------------------------------------------------- one round
 
-    def round(self, samples: list[Sample]) -> bool:
+    def round(self, samples: list[Sample], oldest: Callable[[], float | None] = lambda: None) -> bool:
         """Take samples in, do what is due, store, publish.
 
         Parameters
         ----------
         samples
             In the order of arrival.
+        oldest
+            Says when the oldest of those arrived that still wait, Unix s; None if none does.
 
         Returns
         -------
@@ -189,10 +191,12 @@ class Rounds:
             bad.extend(self._note(problem, sample) for problem in decoded.bad)
             for reading in decoded.readings:
                 results.extend(self._take(reading, sample, bad))
-        now = self._wall()
+        now, waiting = self._wall(), oldest()
+        # No tick goes without readings that only wait here.
+        until = now if waiting is None else min(now, waiting)
         for watch in self.watches.values():
             skipped = watch.aligner.skipped
-            results.extend(self._guarded(watch, partial(watch.due, now)))
+            results.extend(self._guarded(watch, partial(watch.due, until)))
             self.metrics.skipped.labels(watch.name).inc(watch.aligner.skipped - skipped)
         self.keeper.waiting.add(rejected=bad[:BAD_PER_ROUND])
         for result in results:

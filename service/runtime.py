@@ -129,7 +129,7 @@ class Runtime:
             while not self._stopping:
                 await self._execute_commands()
                 samples = self._inbox.drain(SAMPLES_PER_ROUND)
-                news = await self._in_worker(self._rounds.round, samples)
+                news = await self._in_worker(self._rounds.round, samples, self._inbox.oldest)
                 self._last_round = time.monotonic()
                 self._rounds.metrics.queue.set(len(self._inbox))
                 if news:

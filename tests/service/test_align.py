@@ -205,6 +205,28 @@ def test_a_clock_that_is_set_back_does_not_stop_the_ticks(back_s: float) -> None
     assert all(not t.silent for t in w.ticks)
 
 
+@pytest.mark.parametrize("waited_s", [0.5, 5.0, 20.0, 100.0])
+@pytest.mark.parametrize("told", [True, False])
+def test_readings_that_waited_are_no_clock_set_back(waited_s: float, told: bool) -> None:
+    """Rounds of three seconds' readings that lag behind the clock, and it is told what still waits or not."""
+    a = aligner()
+    ticks = list(a.due(T0 - 0.5))
+    arrivals = [(T0 + k + 0.01, reading(m, T0 + k, 230.0, k)) for k in range(60) for m in ALL]
+    size = 3 * len(ALL)
+    for first in range(0, len(arrivals), size):
+        for arrival, one in arrivals[first : first + size]:
+            ticks += a.take(one, arrival)[1]
+        wall, waiting = arrivals[first][0] + waited_s, arrivals[first + size : first + size + 1]
+        ticks += a.due(min([wall, *(arrival for arrival, _ in waiting if told)]))
+    ticks += a.due(T0 + 59.0 + waited_s)
+    assert a.restarts == 0
+    assert [t.t for t in ticks[:60]] == [T0 + k for k in range(60)]
+    assert len({t.t for t in ticks}) == len(ticks)
+    if told:
+        assert {seen(t) for t in ticks[:60]} == {"abcd0"}
+        assert a.counts == {Outcome.ACCEPTED: len(arrivals)}
+
+
 def test_a_small_step_back_is_waited_for() -> None:
     w = Wall(aligner(), T0 - 0.5)
     for k in (*range(20), *range(17, 30)):

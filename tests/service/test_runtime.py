@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import sqlite3
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -101,6 +99,29 @@ def test_alarms_are_stored_before_they_are_published(site: Site, attacked: list[
         assert len(outlet.estimates) >= 39
 
 
+@pytest.mark.parametrize("late_s", [0.0, 30.0])
+def test_a_backlog_makes_no_tick_blind(site: Site, attacked: list[Sample], path: Path, late_s: float) -> None:
+    """The service has fallen behind: of all that arrived each round takes a part, at a much later time."""
+    wall = START - 0.5
+    with Store(f"sqlite:///{path}") as store:
+        live = Rounds(RuntimeConfig(clock=Clock.WALL), store, [site], wall=lambda: wall, stored=lambda: None)
+        live.keeper.publisher = outlet = Outlet()
+        live.watches[FEEDER].install(design(site))
+        live.begin()
+        live.round([])
+        for first in range(0, len(attacked), 100):
+            rest = attacked[first + 100 :]
+            wall = max(wall, attacked[first : first + 100][-1].arrival + late_s)
+            oldest = rest[0].arrival if rest else None
+            live.round(attacked[first : first + 100], lambda oldest=oldest: oldest)
+        assert live.watches[FEEDER].aligner.restarts == 0
+        heard = [e for e in outlet.estimates if e["t"] < START + 39]
+        assert [e["t"] for e in heard] == [START + k for k in range(39)]
+        assert all(meter["seen"] for e in heard for meter in e["meters"])
+        told = [(alarm["state"], last) for alarm, last in outlet.events[:4]]
+        assert told == [("raised", False)] * 2 + [("cleared", True)] * 2
+
+
 def test_what_was_not_published_is_published_after_a_restart(
     site: Site, attacked: list[Sample], path: Path
 ) -> None:
@@ -166,12 +187,12 @@ def test_nobody_who_watches_waits_for_a_locked_database(
 ) -> None:
     """With the wall clock, rounds go on while a write waits; commands wait for it, and nothing is lost."""
     monkeypatch.setattr(connect, "BUSY_S", 3.0)
-    t0 = time.time()
-    shift = t0 - START - 20.0
-    late = [_shifted(sample, shift) for sample in attacked if START + 4 <= sample.arrival < START + 20]
+    some = [sample for sample in attacked if START + 4 <= sample.arrival < START + 20]
+    wall = START + 3.5
 
     async def scene(store: Store) -> None:
-        runtime = Runtime(RuntimeConfig(grace_s=0.0), store, [site])
+        nonlocal wall
+        runtime = Runtime(RuntimeConfig(grace_s=0.0), store, [site], wall=lambda: wall)
         outlet = Outlet()
         runtime.attach(outlet)
         task = asyncio.create_task(runtime.run())
@@ -179,8 +200,9 @@ def test_nobody_who_watches_waits_for_a_locked_database(
             await asyncio.sleep(0.01)
         other = locked()
         begin = time.monotonic()
-        for k in range(0, len(late), 28):
-            runtime.deliver(late[k : k + 28])
+        for k in range(0, len(some), 28):
+            wall = some[k : k + 28][-1].arrival
+            runtime.deliver(some[k : k + 28])
             await asyncio.sleep(0.02)
         while len(outlet.estimates) < 8:  # noqa: ASYNC110
             await asyncio.sleep(0.01)
@@ -202,12 +224,6 @@ def test_nobody_who_watches_waits_for_a_locked_database(
 
     with Store(f"sqlite:///{path}") as store:
         asyncio.run(asyncio.wait_for(scene(store), 20.0))
-
-
-def _shifted(sample: Sample, shift: float) -> Sample:
-    reading = json.loads(sample.payload)
-    reading["t"] += shift
-    return replace(sample, payload=json.dumps(reading).encode(), arrival=sample.arrival + shift)
 
 
 def test_a_write_that_fails_in_an_unforeseen_way_is_shown_and_tried_again(
