@@ -68,6 +68,8 @@ def replay(
             # The arrival times of the recording do not matter: its readings tell the time.
             outcome, results = watch.take(reading, 0.0)
             tally.readings[outcome] += 1
+            if watch.defect is not None:
+                raise watch.defect
             yield from _counted(results, tally)
             refused = len(watch.aligner.refused())
             tally.readings[Outcome.ACCEPTED] -= refused

@@ -259,12 +259,16 @@ class Rounds:
 
     def _guarded(self, watch: Watch, run: Callable[[], list[TickResult]]) -> list[TickResult]:
         """Let a defect in one feeder's chain stop that feeder, visibly, and no other."""
+        results: list[TickResult] = []
         try:
-            return run()
+            results = run()
         except Exception as error:  # noqa: BLE001 - whatever it is, it must not blind the other feeders
-            _log.exception("a feeder's monitor failed", feeder=watch.name)
             watch.fail(f"{type(error).__name__}: {error}")
-            return []
+            watch.defect = error
+        if watch.defect is not None:
+            _log.error("a feeder's monitor failed", feeder=watch.name, exc_info=watch.defect)
+            watch.defect = None
+        return results
 
     def _note(self, problem: BadReading, sample: Sample) -> Rejected:
         self.metrics.bad.labels(problem.feeder or "", problem.reason).inc(problem.count)

@@ -127,6 +127,8 @@ class Watch:
         Whether there is a monitor, and if it failed, why.
     report
         The latest report, or None before the first tick.
+    defect
+        What made the monitor fail, until somebody has seen to it; None: nothing.
     """
 
     def __init__(
@@ -147,6 +149,7 @@ class Watch:
         self.phase = Phase.DESIGNING
         self.problem = ""
         self.report: FeederReport | None = None
+        self.defect: Exception | None = None
         self._alarm_rules = alarm_rules(site)
         self._watcher: estimators.Watcher | None = None
         self._state: Any = None
@@ -237,7 +240,12 @@ class Watch:
     def _run(self, ticks: Iterable[Tick]) -> list[TickResult]:
         results = []
         for tick in ticks:
-            self.report = self._judge(tick)
+            try:
+                self.report = self._judge(tick)
+            except Exception as error:  # noqa: BLE001 - whatever it is, ticks before and after have their answers
+                self.fail(f"{type(error).__name__}: {error}")
+                self.defect = error
+                self.report = self._judge(tick)
             self.book, transitions = advance(
                 self.book, self._alarm_rules, conditions(self.report), self.report.t
             )

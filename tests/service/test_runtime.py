@@ -6,6 +6,7 @@ import asyncio
 import sqlite3
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,8 @@ import pytest
 from feeders.estimators import Watcher
 from feeders.load import Site, load
 from feeders.scenario import Scenario, by_arrival, random_attacks, simulate
-from service.alarms import AlarmState, AlarmUnknown, AlreadyAcknowledged, Change, Transition
+from gridsec.online import Frame
+from service.alarms import AlarmKind, AlarmState, AlarmUnknown, AlreadyAcknowledged, Change, Transition
 from service.align import Clock
 from service.bus import Sample
 from service.errors import FeederUnknown
@@ -431,6 +433,35 @@ def test_a_defect_in_one_feeder_s_monitor_is_shown_and_blinds_no_other(
         assert other.phase is Phase.WATCHING
         assert outlet.estimates[-1]["cause"] == "design-invalid"
         assert outlet.estimates[-1]["verdict"] == "undecided"
+
+
+def test_what_was_found_before_a_defect_is_not_lost(
+    site: Site, attacked: list[Sample], path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All ticks go at once, and the monitor breaks at one of them, while two lie."""
+    step, wall = Watcher.step, START - 0.5
+
+    def breaks(self: Watcher, state: Any, frame: Frame) -> Any:
+        if frame.t >= START + 17:
+            raise ZeroDivisionError("a defect")
+        return step(self, state, frame)
+
+    monkeypatch.setattr(Watcher, "step", breaks)
+    with Store(f"sqlite:///{path}") as store:
+        live = Rounds(RuntimeConfig(clock=Clock.WALL), store, [site], wall=lambda: wall, stored=lambda: None)
+        live.keeper.publisher = outlet = Outlet()
+        live.watches[FEEDER].install(design(site))
+        live.begin()
+        live.round([replace(sample, arrival=wall) for sample in attacked])
+        assert not outlet.estimates
+        wall = START + 30.5
+        live.round([])
+        assert live.watches[FEEDER].phase is Phase.FAILED
+        kinds = [alarm.kind for alarm in store.active(FEEDER)]
+        assert kinds.count(AlarmKind.METER_MANIPULATED) == 2
+        assert [e["t"] for e in outlet.estimates] == [START + k for k in range(31)]
+        assert {e["cause"] for e in outlet.estimates[17:]} == {"design-invalid"}
+        assert "a defect" in live.watches[FEEDER].problem
 
 
 def test_the_task_ends_cleanly_and_refuses_commands_afterwards(site: Site, path: Path) -> None:
