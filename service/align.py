@@ -255,7 +255,10 @@ class Aligner:
         if late and t <= source.last_t:
             return Outcome.LATE
         if len(source.held) >= HELD_PER_SOURCE:
-            return Outcome.OVERFLOW
+            self._thin(source)
+            if len(source.held) >= HELD_PER_SOURCE:
+                return Outcome.OVERFLOW
+            index = bisect_left(source.held, t, key=_time_of)
         source.held.insert(index, reading)
         in_order = t > source.last_t
         source.last_t = max(source.last_t, t)
@@ -267,10 +270,17 @@ class Aligner:
             return Outcome.LATE
         return Outcome.ACCEPTED if in_order else Outcome.OUT_OF_ORDER
 
+    def _thin(self, source: _Source) -> None:
+        """Keep of the readings between two ticks the last one: no tick uses the others."""
+        numbers = [math.ceil((held.t - self.rules.lead_s) / self.rules.tick_s) for held in source.held]
+        pairs = zip(source.held, numbers, [*numbers[1:], None], strict=True)
+        source.held = [held for held, number, after in pairs if number != after]
+
     def _count_gap(self, reading: Reading, source: _Source) -> None:
         # Numbers that go back are a restart or another order, no loss; the ring of the subscription drops
         # the oldest samples, which shows here and nowhere else.
-        if reading.seq is None:
+        # What was overtaken by a later one tells no loss, and nothing of the next.
+        if reading.seq is None or reading.t < source.last_t:
             return
         if source.seq is not None and 0 < (gap := reading.seq - source.seq - 1) <= GAP_MAX:
             self.lost += gap

@@ -9,6 +9,8 @@ from gridsec.arrays import Floats
 
 # Terms of the continued fraction; beyond the largest double's logarithm two would do.
 _TERMS = 20
+# Whatever is beyond is as unlikely as this.
+_MOST = 1e300
 
 
 def log_density(g: Floats, k: Floats) -> Floats:
@@ -26,7 +28,7 @@ def log_density(g: Floats, k: Floats) -> Floats:
     (…)
         ``(k / 2 - 1) ln g - g / 2 - (k / 2) ln 2 - ln Gamma(k / 2)``.
     """
-    half = 0.5 * k
+    g, half = np.minimum(g, _MOST), 0.5 * k
     return np.asarray(xlogy(half - 1.0, g) - 0.5 * g - half * np.log(2.0) - gammaln(half))
 
 
@@ -49,6 +51,7 @@ def log_tail(g: Floats, k: Floats) -> Floats:
     ----------
     NIST Digital Library of Mathematical Functions, 8.9.2.
     """
+    g = np.minimum(g, _MOST)
     above, below = chdtrc(k, g), chdtr(k, g)
     with np.errstate(divide="ignore"):
         likely = np.where(below < 0.5, np.log1p(-below), np.log(above))

@@ -272,8 +272,9 @@ def _alone(  # noqa: PLR0917  # some meters, and what is known of them
     found = _shapes(lies, np.sqrt(shapes.noise[meters]), age)
     numbers, turn = _looks(shapes, memory.tick, meters)
     back = turn & (numbers % _SELDOM == 0)
-    turns = zip(meters.tolist(), numbers.tolist(), back.tolist(), strict=True)
-    for (meter, number, far), read, lie, looks in zip(turns, code.T, lies.T, found, strict=True):
+    moves = _moves(shapes, meters, code)
+    turns = zip(meters.tolist(), numbers.tolist(), back.tolist(), moves.tolist(), strict=True)
+    for (meter, number, far, begin), lie, looks in zip(turns, lies.T, found, strict=True):
         # What takes a long look to see stays true when the lie rests: a drift that has arrived, a clock in
         # calm.
         kind = before[meter]
@@ -281,22 +282,31 @@ def _alone(  # noqa: PLR0917  # some meters, and what is known of them
         if far and kind is not Kind.REPLAY:
             window = clocks.WINDOWS[number // _SELDOM % len(clocks.WINDOWS)]
             kind = _of_the_past(shapes, memory, meter, float(variance[meter]), window, kind)
-        if kind is Kind.STUCK:
-            yield _again(shapes, meter, read, lie, age)
+        if kind in _LASTING:
+            yield kind
         else:
-            yield kind if kind in _LASTING else looks
+            yield _again(shapes, meter, lie[begin:], age) if begin else looks
 
 
-def _again(shapes: Shapes, meter: int, code: Floats, lie: Floats, age: int) -> Kind | None:
-    """What the lie of a meter that was stuck looks like since it moves again, if that is long enough ago."""
-    heard = np.isfinite(code)
-    code, lie = code[heard], lie[heard]
-    moves = np.concatenate([[-1], np.flatnonzero(code[1:] != code[:-1]), [code.size - 1]])
-    stuck = np.flatnonzero((np.diff(moves) - 1) * shapes.rules.surprise[meter] >= _CALLED)
-    free = lie[moves[stuck[-1] + 1] + 1 :] if stuck.size else lie
-    if free.size < max(shapes.every, _SHORTEST):
+def _moves(shapes: Shapes, meters: Ints, code: Floats) -> Ints:
+    """Since which of the readings (n, k) meters move that have been stuck before; 0 for others, (k,)."""
+    out, surprise = np.zeros(meters.size, dtype=np.intp), shapes.rules.surprise[meters]
+    for k in np.flatnonzero((code[1:] == code[:-1]).sum(axis=0) * surprise >= _CALLED).tolist():
+        heard = np.flatnonzero(np.isfinite(code[:, k]))
+        read = code[heard, k]
+        ends = np.concatenate([[-1], np.flatnonzero(read[1:] != read[:-1]), [heard.size - 1]])
+        stuck = np.flatnonzero((np.diff(ends) - 1) * surprise[k] >= _CALLED)
+        if stuck.size:
+            out[k] = heard[ends[stuck[-1] + 1]] + 1
+    return out
+
+
+def _again(shapes: Shapes, meter: int, lie: Floats, age: int) -> Kind | None:
+    """What the lie of a meter that was stuck looks like since it moves, if that is for long enough."""
+    heard = int(np.isfinite(lie).sum())
+    if heard < max(shapes.every, _SHORTEST):
         return Kind.STUCK
-    return shape(free, float(np.sqrt(shapes.noise[meter])), min(age, free.size))
+    return shape(lie, float(np.sqrt(shapes.noise[meter])), min(age, lie.size))
 
 
 def _looks(shapes: Shapes, tick: int, meters: Ints) -> tuple[Ints, Bools]:

@@ -227,6 +227,25 @@ def test_readings_that_waited_are_no_clock_set_back(waited_s: float, told: bool)
         assert a.counts == {Outcome.ACCEPTED: len(arrivals)}
 
 
+def test_many_readings_between_two_ticks_are_no_overflow() -> None:
+    """A reading each second where ticks are a quarter of an hour apart: each tick has the newest."""
+    a, start = aligner(tick_s=900.0), 900.0 * math.ceil(T0 / 900.0)
+    ticks = list(a.due(start - 0.5))
+    for k in range(3601):
+        for meter in ALL:
+            ticks += a.take(reading(meter, start + k, 230.0, k), start + k + 0.01)[1]
+    assert [t.t for t in ticks] == [start + 900.0 * k for k in range(5)]
+    ages = [tick.t - one.t for tick in ticks[1:] for one in (*tick.readings, tick.busbar) if one]
+    assert ages == [1.0] * (4 * len(ALL))
+    assert not a.counts[Outcome.OVERFLOW]
+
+
+def test_a_reading_that_was_overtaken_is_not_lost_twice() -> None:
+    w = Wall(aligner(), T0 - 0.5)
+    w.at(T0 + 0.4, *(reading("a", T0 + 0.1 * k, 230.0, k) for k in (1, 3, 2, 4)))
+    assert w.a.lost == 1
+
+
 def test_a_small_step_back_is_waited_for() -> None:
     w = Wall(aligner(), T0 - 0.5)
     for k in (*range(20), *range(17, 30)):
@@ -261,9 +280,9 @@ def test_gaps_in_the_running_numbers() -> None:
 
 
 def test_a_source_far_ahead_of_the_ticks_is_bounded() -> None:
-    a = aligner()
+    a = aligner(tick_s=0.1)
     w = Wall(a, T0 - 0.5)
-    outcomes = w.at(T0 - 0.4, *(reading("a", T0 + 0.01 * k) for k in range(HELD_PER_SOURCE + 5)))
+    outcomes = w.at(T0 - 0.4, *(reading("a", T0 + 0.1 * k) for k in range(HELD_PER_SOURCE + 5)))
     assert outcomes.count(Outcome.OVERFLOW) == 5
 
 

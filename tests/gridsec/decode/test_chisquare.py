@@ -37,6 +37,11 @@ def test_a_larger_value_is_always_less_likely() -> None:
         assert np.all(np.diff(log_tail(g[g > k], k)) < 0)
 
 
+def test_nothing_is_less_likely_than_infinity() -> None:
+    for of in (log_density, log_tail):
+        assert np.all(of(np.full(FREEDOM.size, np.inf), FREEDOM) < -1e299)
+
+
 def test_density_is_scipys() -> None:
     g = np.array([0.0, 0.1, 3.0, 30.0, 100.0, 3e3])[:, None]
     np.testing.assert_allclose(log_density(g, FREEDOM), chi2.logpdf(g, FREEDOM), rtol=1e-12)

@@ -359,9 +359,9 @@ class TestFeeders:
         end = START + 500.0
         stuck = replace(stuck, t_off=end)
         size = np.full(stuck.meters.size, 0.03)
-        both = (stuck, Bias(stuck.meters, end, START + 600.0, size))
+        both = (stuck, Bias(stuck.meters, end, START + 700.0, size))
         state, looks = watcher.init(START), []
-        for snapshot in snapshots(simulate(site, Scenario(seed=1, duration_s=530.0, attacks=both))):
+        for snapshot in snapshots(simulate(site, Scenario(seed=1, duration_s=640.0, attacks=both))):
             state, _, verdict = watcher.step(state, to_frame(site, snapshot))
             if snapshot.t >= end:
                 looks.append({verdict.kinds[j] for j in stuck.meters})
