@@ -16,14 +16,16 @@ export class Alarms {
   constructor({ onPick, onLink }) {
     this.alarms = new Map();
     this.items = new Map();
+    this.heard = new Map(); // Newest event of each alarm that the list loaded last may not know yet.
+    this.turn = 0;
     this.onPick = onPick;
     this.onLink = onLink;
     this.feeder = null;
     this.source = null;
     this.retry = null;
-    for (const id of ["alarm-state", "alarm-kind"]) byId(id).addEventListener("change", () => this.load());
-    byId("alarm-scope").addEventListener("change", () => this.load());
-    byId("alarm-more").addEventListener("click", () => this.load({ more: true }));
+    for (const id of ["alarm-state", "alarm-kind"]) byId(id).addEventListener("change", () => this.reload());
+    byId("alarm-scope").addEventListener("change", () => this.reload());
+    byId("alarm-more").addEventListener("click", () => this.reload({ more: true }));
     byId("ack-cancel").addEventListener("click", () => byId("ack").close());
     byId("ack-form").addEventListener("submit", (event) => this.answer(event));
   }
@@ -37,11 +39,12 @@ export class Alarms {
   watch(feeder) {
     this.feeder = feeder;
     if (!this.source && this.retry === null) this.connect();
-    else if (byId("alarm-scope").value === "this") this.load();
+    else if (byId("alarm-scope").value === "this") this.reload();
   }
 
   async connect() {
     this.retry = null;
+    this.heard.clear(); // The new stream begins where the list ends.
     try {
       const after = await this.load();
       this.source?.close();
@@ -52,10 +55,24 @@ export class Alarms {
         this.onLink(false);
         if (this.source.readyState === EventSource.CLOSED) this.again();
       });
-    } catch {
-      this.onLink(false);
-      this.again();
+    } catch (error) {
+      this.fail(error);
     }
+  }
+
+  async reload(options) {
+    try {
+      await this.load(options);
+    } catch (error) {
+      this.fail(error);
+    }
+  }
+
+  fail(error) {
+    byId("alarm-error").textContent = `Alarms not loaded: ${error.message}`;
+    byId("alarm-error").hidden = false;
+    this.onLink(false);
+    this.again();
   }
 
   again() {
@@ -71,18 +88,26 @@ export class Alarms {
     if (kind) query.set("kind", kind);
     if (feeder) query.set("feeder", feeder);
     if (more && this.next) query.set("cursor", this.next);
-    const asked = query.toString();
-    this.asked = asked;
-    const page = await getJson(`${API}?${asked}`);
-    if (this.asked !== asked) return page.last_event; // A newer choice has overtaken this answer.
+    this.turn += 1;
+    const { turn } = this;
+    const page = await getJson(`${API}?${query}`);
+    if (turn !== this.turn) return page.last_event; // A newer choice has overtaken this answer.
+    byId("alarm-error").hidden = true;
     if (!more) this.alarms.clear();
     for (const alarm of page.alarms) this.alarms.set(alarm.id, alarm);
+    // The stream may have been faster than this answer, and tells nothing twice.
+    for (const [id, { seq, alarm }] of this.heard) {
+      if (seq > page.last_event) this.alarms.set(id, alarm);
+      else this.heard.delete(id);
+    }
     this.next = page.next;
     this.render();
     return page.last_event;
   }
 
-  take({ alarm }) {
+  take(event) {
+    const { alarm } = event;
+    this.heard.set(alarm.id, event);
     this.alarms.set(alarm.id, alarm);
     this.render();
   }

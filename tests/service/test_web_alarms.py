@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import pytest
-from playwright.sync_api import expect
+from playwright.sync_api import APIResponse, Route, expect
 
 from gridsec.online import Cause
 from service.report import BusbarReport, CustomerReport, InverterReport
@@ -13,6 +14,8 @@ from tests.service.asking import T0
 from tests.service.looking import DESKTOP, PHONE, Site, customer
 
 pytestmark = pytest.mark.browser
+
+LIST = re.compile(r"/api/v1/alarms\?")
 
 
 def test_a_manipulated_inverter_and_its_alarm(site: Site) -> None:
@@ -160,6 +163,42 @@ def test_what_has_not_changed_stays_where_it_is(site: Site) -> None:
     kept = page.locator('[data-mine="yes"]')
     expect(kept).to_have_count(1)
     expect(kept).to_be_focused()
+
+
+def test_an_alarm_that_overtakes_the_list_stays(site: Site) -> None:
+    site.tick(T0)
+    page = site.open()
+    expect(page.locator("#alarm-none")).to_be_visible()
+    held: list[tuple[Route, APIResponse]] = []
+    page.route(LIST, lambda route: held.append((route, route.fetch())))
+    page.select_option("#alarm-kind", "meter-manipulated")
+    while not held:
+        page.wait_for_timeout(20)
+    site.tick(T0 + 1, 4, lies={"H3": 9.0})  # after the server read the list, and before the page has it
+    expect(page.locator(".alarm")).to_have_count(1)
+    ((route, answer),) = held
+    with page.expect_response(LIST):
+        route.fulfill(response=answer)
+    page.wait_for_timeout(300)
+    expect(page.locator(".alarm")).to_have_count(1)
+
+
+def test_a_list_that_cannot_be_loaded_is_said_and_asked_for_again(site: Site) -> None:
+    site.tick(T0, 4, lies={"H3": 9.0}, silent=("H5",))
+    page = site.open()
+    expect(page.locator(".alarm")).to_have_count(2)
+    site.expected = "net::ERR_"
+    page.route(LIST, lambda route: route.abort())
+    error = page.locator("#alarm-error")
+    for control, choice in (("#alarm-kind", "data-loss"), ("#alarm-scope", "this"), ("#alarm-state", "all")):
+        page.select_option(control, choice)
+        expect(error).to_contain_text("Alarms not loaded: ")
+    page.unroute(LIST)
+    expect(error).to_be_hidden()
+    expect(page.locator(".alarm")).to_have_count(1)
+    # The stream goes on as well.
+    site.tick(T0 + 4, 4, silent=("H5", "H6"))
+    expect(page.locator(".alarm")).to_have_count(2)
 
 
 def test_filters(site: Site, village: type) -> None:
