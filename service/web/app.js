@@ -15,11 +15,12 @@ const SIGNS = {
   none: "M16 5a11 11 0 1 0 .01 0M16 9v7l5 3",
 };
 
-const page = { feeder: null, report: null, selected: null, source: null, retry: null, heard: 0, linked: true, past: new Map() };
+const page = { feeder: null, report: null, selected: null, source: null, retry: null, heard: 0, linked: true, past: new Map(), turn: 0 };
 const diagram = new Diagram({ onSelect: (id) => select(id === page.selected ? null : id) });
 const alarms = new Alarms({
   onPick: async (feeder, meter, owner) => {
     if (feeder !== page.feeder?.name) await show(feeder);
+    if (feeder !== page.feeder?.name) return;
     const customer = page.feeder?.layout.customers.find((c) => (owner ? c.customer === owner : c.meter === meter));
     if (customer) select(customer.customer);
   },
@@ -53,13 +54,16 @@ async function start() {
 async function show(name) {
   clearTimeout(page.retry);
   page.source?.close();
-  try {
-    page.feeder = await getJson(`${API}/${encodeURIComponent(name)}`);
-  } catch {
+  page.turn += 1;
+  const { turn } = page;
+  const found = await getJson(`${API}/${encodeURIComponent(name)}`).catch(() => null);
+  if (turn !== page.turn) return; // Another choice has overtaken this answer.
+  if (found === null) {
     page.linked = false;
     page.retry = setTimeout(() => show(name), 3000);
     return;
   }
+  page.feeder = found;
   page.report = null;
   page.heard = 0;
   page.past = new Map();
@@ -196,13 +200,16 @@ function select(id) {
 }
 
 async function recall(feeder, meter) {
-  const until = page.past.get(meter)?.[0]?.t ?? page.report.t;
-  const query = new URLSearchParams({ meter, since: until - 3600, until, limit: 400 });
+  const { past } = page;
+  const [until, since] = [past.get(meter)?.[0]?.t ?? page.report.t, page.report.t - 3600];
+  const room = KEPT - (past.get(meter)?.length ?? 0);
+  if (room <= 0 || until <= since) return;
+  const query = new URLSearchParams({ meter, since, until, limit: room });
   const found = await getJson(`${API}/${encodeURIComponent(feeder)}/history?${query}`).catch(() => ({ points: [] }));
-  if (page.feeder.name !== feeder) return;
+  if (page.past !== past) return; // Another feeder by now.
   const old = found.points.filter((p) => p.meter).map((p) => point(p.t, p.meter));
-  const past = (page.past.get(meter) ?? []).filter((p) => p.t >= until);
-  page.past.set(meter, [...old, ...past]);
+  const later = (past.get(meter) ?? []).filter((p) => p.t >= until);
+  past.set(meter, [...old, ...later].slice(-KEPT));
   detail();
 }
 
@@ -228,7 +235,8 @@ function table() {
   const customer = new Map(page.feeder.layout.customers.map((c) => [c.meter, c.customer]));
   const ratio = (m) => m.score / m.threshold;
   const rank = (m) => (m.suspect ? 1e9 : 0) + (m.seen ? ratio(m) || 0 : 1e6);
-  const busbar = page.report.busbar?.judged ? [page.report.busbar] : [];
+  // It has no score: without a verdict nothing tells about it.
+  const busbar = page.report.busbar?.judged ? [{ ...page.report.busbar, judged: page.report.verdict !== "undecided" }] : [];
   const rows = [...page.report.meters, ...busbar].sort((a, b) => rank(b) - rank(a)).map((m) => {
     const now = status(m, limits);
     return el("tr", { "data-status": now.key },

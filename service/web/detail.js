@@ -5,7 +5,11 @@ import { bare, byId, clock, duration, el, isKnown, nominals, signed, status, svg
 const [W, H, LEFT, RIGHT, TOP, BOTTOM] = [420, 150, 46, 8, 10, 20];
 
 function trend(points, limits, nominal) {
-  const values = points.flatMap((p) => [p.reported, p.estimated, p.estimated - p.half, p.estimated + p.half]).filter(isKnown);
+  const whole = points.filter((p) => isKnown(p.estimated) && isKnown(p.half));
+  const values = [
+    ...points.flatMap((p) => [p.reported, p.estimated]),
+    ...whole.flatMap((p) => [p.estimated - p.half, p.estimated + p.half]),
+  ].filter(isKnown);
   if (values.length < 2) return el("p", { class: "quiet", text: "The trend begins with the next ticks." });
   const [t0, t1] = [points[0].t, points.at(-1).t];
   let [low, high] = [Math.min(...values), Math.max(...values)];
@@ -23,7 +27,6 @@ function trend(points, limits, nominal) {
       return part;
     }).join("");
   };
-  const whole = points.filter((p) => isKnown(p.estimated) && isKnown(p.half));
   const band = whole.length < 2 ? "" : `M${[
     ...whole.map((p) => `${x(p.t).toFixed(1)} ${y(p.estimated + p.half).toFixed(1)}`),
     ...whole.toReversed().map((p) => `${x(p.t).toFixed(1)} ${y(p.estimated - p.half).toFixed(1)}`),

@@ -9,14 +9,20 @@ const SHAPE = {
   ok: "M-7 0a7 7 0 1 0 14 0a7 7 0 1 0-14 0z",
   none: "M-4 0a4 4 0 1 0 8 0a4 4 0 1 0-8 0z",
   silent: "M-8 0a8 8 0 1 0 16 0a8 8 0 1 0-16 0z",
+  unjudged: "M-7 0a7 7 0 1 0 14 0a7 7 0 1 0-14 0zM-3 0H3",
+  doubtful: "M-8-8H8V8H-8z",
   suspect: "M0-12L12 0L0 12L-12 0z",
   high: "M0-10L10 7H-10z",
   low: "M0 10L10-7H-10z",
 };
-const SIGN = { suspect: "!", silent: "?" };
+const SIGN = { suspect: "!", doubtful: "?", silent: "?" };
+// Of these the colour of a voltage would promise too much.
+const PLAIN = new Set(["silent", "unjudged", "doubtful"]);
 const LEGEND = [
   ["ok", "honest meter"],
   ["suspect", "suspect: says something else than the feeder"],
+  ["doubtful", "doubtful: off by too much, but not named"],
+  ["unjudged", "not judged"],
   ["silent", "silent"],
   ["high", "above limit"],
   ["low", "below limit"],
@@ -282,7 +288,7 @@ export class Diagram {
       const v = this.voltAt(part.customer);
       part.group.setAttribute("data-status", now.key);
       part.shape.setAttribute("d", SHAPE[now.key]);
-      part.shape.style.fill = now.key === "silent" ? "" : (this.scale.color(this.part(part.customer.bus, v)) ?? "");
+      part.shape.style.fill = PLAIN.has(now.key) ? "" : (this.scale.color(this.part(part.customer.bus, v)) ?? "");
       part.sign.textContent = SIGN[now.key] ?? "";
       const loud = now.key === "suspect";
       // Neighbours that both have something to say must not say it in the same place.

@@ -41,14 +41,18 @@ export function clock(t, { day = false } = {}) {
   return day || Math.abs(Date.now() - date) > 43200000 ? `${date.toLocaleDateString()} ${time}` : time;
 }
 
-// What a meter is, in one word for people and one for style sheets.
+// What a meter is, in one word for people and one for style sheets. Only who was judged can be honest.
 export function status(meter, limits) {
   if (!meter) return { key: "none", text: "no meter" };
   if (meter.suspect) return { key: "suspect", text: "suspect" };
   if (!meter.seen) return { key: "silent", text: "silent" };
-  const v = meter.v_volt_estimated;
+  const { score, threshold, v_volt_estimated: v } = meter;
+  // The busbar's meter has no score, and says itself whether it was judged.
+  const judged = meter.judged ?? (known(score) && known(threshold));
+  if (known(score) && known(threshold) && score > threshold) return { key: "doubtful", text: "doubtful" };
   if (known(v) && v > (meter.v_max_volt ?? limits.high)) return { key: "high", text: "above limit" };
   if (known(v) && v < (meter.v_min_volt ?? limits.low)) return { key: "low", text: "below limit" };
+  if (!judged || !known(v)) return { key: "unjudged", text: "not judged" };
   return { key: "ok", text: "honest" };
 }
 

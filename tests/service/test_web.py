@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Page, Route, expect
 
 from benchmarks.mesh import baran_wu
 from feeders.load import Site as FeederSite
@@ -19,7 +19,7 @@ from feeders.load import from_tables, load, names
 from gridsec.online import Cause, Decision
 from service.align import Tick
 from service.describe import detail
-from service.report import blind
+from service.report import BusbarReport, blind
 from tests.feeders import stations
 from tests.service.asking import T0
 from tests.service.looking import DESKTOP, PHONE, Site, customer
@@ -96,6 +96,46 @@ def test_undecided_and_silent(site: Site) -> None:
     expect(page.locator(".alarm")).to_contain_text("Data loss")
 
 
+@pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
+def test_who_is_in_doubt_or_not_judged_is_not_honest(site: Site, size: dict[str, int]) -> None:
+    report = site.village.report(T0, cause=Cause.AMBIGUOUS)
+    changes: dict[str, dict[str, Any]] = {
+        "H3": {"score": 9.0, "threshold": 1.0},
+        "H4": {"score": None, "threshold": None},
+        "H5": {"v_volt_estimated": None, "v_volt_std": None, "v2_pu_estimated": None},
+        "H6": {"threshold": None},
+    }
+    meters = tuple(replace(meter, **changes.get(meter.meter, {})) for meter in report.meters)
+    site.service.tick(replace(report, meters=meters))
+    page = site.open(size)
+    expect(page.locator("#decision")).to_have_text("UNDECIDED")
+    page.locator("#meters-box summary").click()
+    wanted = {"H3": "doubtful", "H4": "unjudged", "H5": "unjudged", "H6": "unjudged", "H7": "ok"}
+    words = {"doubtful": "doubtful", "unjudged": "not judged", "ok": "honest"}
+    shapes = {}
+    for name, key in wanted.items():
+        spot = customer(page, name)
+        expect(spot).to_have_attribute("data-status", key)
+        expect(spot).to_have_attribute("aria-label", re.compile(f": {words[key]}, "))
+        shapes[key] = spot.locator(".shape").get_attribute("d"), spot.locator(".sign").text_content()
+        row = page.locator("#meters tr").filter(has=page.get_by_role("button", name=name, exact=True))
+        expect(row).to_have_attribute("data-status", key)
+        expect(row.locator(".state")).to_have_text(words[key])
+        spot.hover()
+        expect(page.locator("#tip .state")).to_have_text(words[key])
+        spot.click()
+        expect(page.locator("#detail-title")).to_have_text(name)
+        expect(page.locator("#detail .state")).to_have_text(words[key])
+    assert len(set(shapes.values())) == len(shapes)
+    expect(page.locator("#legend")).to_contain_text("not judged")
+    # Nothing tells who the busbar's meter is without a verdict either.
+    busbar = BusbarReport(True, True, False, (), None, 231.0, 231.0, 0.0)
+    state = page.locator('#meters tr:has-text("substation") .state')
+    for k, (cause, word) in enumerate([(Cause.AMBIGUOUS, "not judged"), (Cause.AGREEMENT, "honest")], 1):
+        site.service.tick(replace(site.village.report(T0 + k, cause=cause), busbar=busbar))
+        expect(state).to_have_text(word)
+
+
 def test_limits_have_shapes(site: Site) -> None:
     site.tick(T0, 1, volts={"H1": 255.0, "H2": 206.0})
     page = site.open()
@@ -151,6 +191,39 @@ def test_a_customer_shows_what_its_meter_says_and_what_is_true(site: Site) -> No
     expect(panel).to_contain_text("of what an honest meter can reach")
     page.locator("#unselect").click()
     expect(panel).to_be_hidden()
+
+
+def test_a_tick_without_a_reconstruction_does_not_flatten_the_trend(site: Site) -> None:
+    page = site.open()
+    unknown = {"v_volt_estimated": None, "v_volt_std": None, "v2_pu_estimated": None}
+    for k in range(4):
+        report = site.village.report(T0 + k)
+        blinded = tuple(replace(meter, **unknown) for meter in report.meters)
+        site.service.tick(replace(report, meters=blinded) if k == 1 else report)
+        expect(page.locator("#facts dd").nth(3)).to_have_text("–" if k == 1 else re.compile(r"\d"))
+    customer(page, "H3").click()
+    expect(page.locator(".trend")).to_contain_text("3 s ago")
+    axis = page.locator(".trend .grid + .axis").all_text_contents()
+    assert len(axis) == 3
+    assert all(220 < float(text) < 240 for text in axis)
+
+
+def test_looking_again_makes_no_trend_longer_than_an_hour(site: Site) -> None:
+    for k in range(900):
+        site.tick(T0 + 10 * k)
+    page = site.open()
+    asked: list[str] = []
+    page.on("request", lambda r: asked.append(r.url) if "/history?" in r.url else None)
+    expect(page.locator("#decision")).to_have_text("CLEAN")
+    for _ in range(3):
+        customer(page, "H3").click()
+        page.wait_for_timeout(300)
+        expect(page.locator(".trend")).to_contain_text("60 min ago")
+        page.locator("#unselect").click()
+    customer(page, "H3").click()
+    drawn = page.locator(".trend path.reported").get_attribute("d")
+    assert len(re.findall("[ML]", drawn or "")) == 361
+    assert len(asked) == 1
 
 
 def test_what_is_told_at_the_pointer_follows_the_readings(site: Site) -> None:
@@ -344,6 +417,8 @@ def test_two_nominal_voltages_have_one_scale(site_of: Callable[..., Site], villa
         replace(
             meter,
             seen=True,
+            score=0.0,
+            threshold=0.01,
             v_volt_reported=float(volt * parts.get(meter.meter, 1.0)),
             v_volt_estimated=float(volt * parts.get(meter.meter, 1.0)),
             v_volt_std=0.1,
@@ -378,6 +453,35 @@ def test_a_link_leads_to_its_feeder(site_of: Callable[..., Site], village: type)
     page.select_option("#feeder", "village")
     expect(page.locator("#decision")).to_have_text("NO DATA")
     assert page.url.endswith("#village")
+
+
+def test_the_feeder_chosen_last_is_shown_however_slow_the_first(
+    site_of: Callable[..., Site], village: type
+) -> None:
+    site = site_of(village("village"), village("town", 4))
+    site.tick(T0)
+    page = site.open()
+    expect(page.locator("#decision")).to_have_text("CLEAN")
+    asked: list[str] = []
+    held: list[Route] = []
+    page.on("request", lambda r: asked.append(r.url))
+
+    def hold(route: Route) -> None:
+        held.append(route)
+
+    page.route(re.compile("/feeders/town$"), hold)
+    with page.expect_request(re.compile("/feeders/town$")):
+        page.select_option("#feeder", "town")
+    with page.expect_request(re.compile("/feeders/village/stream$")):
+        page.select_option("#feeder", "village")
+    with page.expect_response(re.compile("/feeders/town$")):
+        held[0].continue_()
+    page.wait_for_timeout(300)
+    expect(page.locator("#feeder")).to_have_value("village")
+    expect(page.locator("#diagram .customer")).to_have_count(13)
+    assert not any(url.endswith("/town/stream") for url in asked)
+    site.tick(T0 + 1, lies={"H3": 9.0})
+    expect(page.locator("#decision")).to_have_text("ATTACKED")
 
 
 def test_nothing_comes_from_elsewhere() -> None:
