@@ -71,6 +71,7 @@ export class Alarms {
   fail(error) {
     byId("alarm-error").textContent = `Alarms not loaded: ${error.message}`;
     byId("alarm-error").hidden = false;
+    this.render();
     this.onLink(false);
     this.again();
   }
@@ -124,7 +125,7 @@ export class Alarms {
     const open = [...this.alarms.values()].filter((a) => a.state === "raised").length;
     byId("alarm-count").hidden = open === 0;
     byId("alarm-count").textContent = `${open} new`;
-    byId("alarm-none").hidden = list.length > 0;
+    byId("alarm-none").hidden = list.length > 0 || !byId("alarm-error").hidden;
     byId("alarm-more").hidden = !this.next;
     const focused = document.activeElement?.closest?.("[data-alarm]")?.dataset.alarm;
     // What has not changed stays where it is: nobody's click may fall between two copies of a button.

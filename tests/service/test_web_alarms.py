@@ -190,6 +190,10 @@ def test_a_list_that_cannot_be_loaded_is_said_and_asked_for_again(site: Site) ->
     site.expected = "net::ERR_"
     page.route(LIST, lambda route: route.abort())
     error = page.locator("#alarm-error")
+    page.select_option("#alarm-kind", "voltage-limit")
+    expect(error).to_contain_text("Alarms not loaded: ")
+    expect(page.locator(".alarm")).to_have_count(0)
+    expect(page.locator("#alarm-none")).to_be_hidden()  # nobody knows
     for control, choice in (("#alarm-kind", "data-loss"), ("#alarm-scope", "this"), ("#alarm-state", "all")):
         page.select_option(control, choice)
         expect(error).to_contain_text("Alarms not loaded: ")
