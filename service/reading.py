@@ -86,7 +86,7 @@ class BadReading:
     problems
         Everything that is wrong, one sentence each.
     key
-        The zenoh key it came on.
+        The zenoh key it came on, printable; of a long one the beginning.
     feeder, meter
         Known ids only; None where the key names nothing that is known here.
     head

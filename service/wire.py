@@ -100,7 +100,7 @@ class Wire:
         head = head_of(payload[:HEAD_BYTES])
         if isinstance(source, BadReading):
             return Decoded(bad=(replace(source, head=head),))
-        base = BadReading(BadReason.SYNTAX, (), key, source.feeder, source.meter, head)
+        base = BadReading(BadReason.SYNTAX, (), _shown(key), source.feeder, source.meter, head)
         length = len(payload) if size is None else size
         if length > self.max_bytes:
             problem = f"payload of {length} bytes; at most {self.max_bytes} are read"
@@ -157,8 +157,12 @@ def source_of(key: str, prefix: str, known: Mapping[str, Known]) -> Source | Bad
     return source
 
 
+def _shown(key: str) -> str:
+    return printable(key[:HEAD_BYTES])
+
+
 def _nowhere(key: str, reason: BadReason, why: str) -> BadReading:
-    shown = printable(key[:HEAD_BYTES])
+    shown = _shown(key)
     return BadReading(reason, (f"`{shown}` {why}",), shown)
 
 

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import sqlalchemy as sa
+import structlog
 
 from service.alarms import AlarmUnknown, Transition, acknowledged, to_json
 from service.commissioning import Happened
@@ -36,6 +37,7 @@ from service.store.schema import (
 BAD_READINGS_KEPT = 1000
 _PAYLOAD_KEPT = 256
 _PRUNE_EVERY = 500
+_log = structlog.get_logger("gridsec.store")
 _KEPT = {Matter.COMMISSION: COMMISSION, Matter.DISTRUST: DISTRUST}
 
 
@@ -113,7 +115,8 @@ class Store(Reader):
         reports
             Reports of the feeders; those worth keeping go into the history.
         rejected
-            Readings that could not be used; the newest `BAD_READINGS_KEPT` are kept.
+            Readings that could not be used; the newest `BAD_READINGS_KEPT` are kept. Those that the database
+            cannot represent are dropped, with a line in the log.
         kept, happened
             What goes on of the feeders' commissioning and of who is not believed, and what happened to the
             former.
@@ -316,10 +319,17 @@ def _happened(item: Happened) -> dict[str, Any]:
 
 
 def _put_rejected(connection: sa.Connection, rejected: Iterable[Rejected]) -> None:
+    """Keep bad readings; what their senders put into them must not cost the alarms of this transaction."""
     rows = [
         {"t": item.t, "key": item.key, "reason": item.reason, "payload": item.payload[:_PAYLOAD_KEPT]}
         for item in tuple(rejected)[-BAD_READINGS_KEPT:]
     ]
-    connection.execute(BAD.insert(), rows)
+    try:
+        with connection.begin_nested():
+            connection.execute(BAD.insert(), rows)
+    except (sa.exc.DataError, UnicodeError) as error:
+        problem = " ".join(str(getattr(error, "orig", error)).split())
+        _log.error("bad readings could not be kept", count=len(rows), problem=problem)
+        return
     newest = sa.select(sa.func.max(BAD.c.seq)).scalar_subquery()
     connection.execute(BAD.delete().where(BAD.c.seq <= newest - BAD_READINGS_KEPT))

@@ -21,6 +21,7 @@ from feeders.meters import Channel, Silence
 from feeders.scenario import Sample, Scenario, random_attacks, simulate
 from feeders.schema import to_json, write
 from service.simulate import Pace, key_of, payload_of, play
+from tests.service.databases import both
 from tests.service.running import FEEDER, InProcess, service, until
 
 START = 1_795_212_000.0
@@ -281,6 +282,20 @@ def test_feeders_over_rest_have_an_end_and_stay_deleted(tmp_path: Path) -> None:
     with service(tmp_path, clock="events") as live:
         names = {f["name"] for f in live.get("/api/v1/feeders")["feeders"]}
         assert names == {FEEDER, "village-0", "village-2"}
+
+
+@both
+def test_garbage_on_an_odd_key_holds_up_no_alarm(site: Site, url: str, tmp_path: Path) -> None:
+    attacks = random_attacks(site, 6, "bias", 1, 0.03, t_on=START + 10, t_off=START + 1000)
+    with service(tmp_path, clock="events", database=url) as live:
+        live.put(f"{FEEDER}/concentrator/a\0b/readings", b"{\0")
+        until(lambda: live.metric("gridsec_bad_readings_total", reason="syntax") == 1.0, "the bad reading")
+        run(live, site, Scenario(seed=4, start=START, duration_s=25.0, attacks=attacks))
+        (alarm,) = until(live.alarms, "the alarm")
+        until(lambda: live.meters.query(f"{FEEDER}/alarm/{alarm['id']}", 2.0), "its publication")
+        (kept,) = live.rejected()
+        assert kept["key"] == f"gridsec/{FEEDER}/concentrator/a\\x00b/readings"
+        assert live.metric("gridsec_store_failures_total") == 0.0
 
 
 @pytest.fixture

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from structlog.testing import capture_logs
 
 from service.alarms import (
     Alarm,
@@ -237,6 +238,22 @@ def test_bad_readings_are_kept_but_not_for_ever(store: Store) -> None:
     found = store.rejected(5000)
     assert len(found) == BAD_READINGS_KEPT
     assert (found[0].key, found[-1].key) == ("k3-399", "k1-200")
+
+
+@both
+def test_bad_readings_that_cannot_be_kept_hold_up_no_alarm(store: Store) -> None:
+    """No database keeps half a surrogate, and PostgreSQL no NUL."""
+    store.commit(rejected=[Rejected(T0, "gridsec/x", "no JSON")])
+    alarm = an_alarm()
+    bad = [Rejected(T0, "gridsec/y", "no JSON"), Rejected(T0, "gridsec/\0/\ud800", "no JSON")]
+    with capture_logs() as logs:
+        assert store.commit([raised(alarm)], reports=[a_report(T0)], rejected=bad) == (1,)
+    assert [(line["event"], line["count"]) for line in logs] == [("bad readings could not be kept", 2)]
+    assert store.alarm(alarm.id) == alarm
+    assert len(store.history("village")) == 1
+    assert [one.key for one in store.rejected()] == ["gridsec/x"]
+    store.commit(rejected=[Rejected(T0, "gridsec/z", "no JSON")])
+    assert [one.key for one in store.rejected()] == ["gridsec/z", "gridsec/x"]
 
 
 @both

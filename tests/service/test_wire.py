@@ -327,6 +327,17 @@ def test_any_bytes(payload: bytes, encoding: str, single: bool) -> None:
     sound(decode(payload, METER if single else BATCH, encoding))
 
 
+@given(st.text(max_size=300), st.sampled_from([b"", b"{", b'[{"t": "x"}]', b"x" * 300_000]), st.booleans())
+def test_any_key_is_kept_printable(name: str, payload: bytes, odd: bool) -> None:
+    """zenoh's keys may hold any character, NUL too, which not every database can keep."""
+    chunk = name.replace("/", "") + "\0" * odd
+    key = f"gridsec/village/concentrator/{chunk}/readings"
+    decoded = WIRE.decode(key, payload, "application/json")
+    sound(decoded)
+    assert all(len(bad.key) <= 10 * 200 for bad in decoded.bad)
+    sound(WIRE.decode(key.replace("village", chunk), payload, chunk))
+
+
 @given(st.dictionaries(FIELDS, VALUES, max_size=7), st.booleans())
 def test_any_fields(fields: dict[str, Any], base: bool) -> None:
     value = good(meter="b") | fields if base else fields
