@@ -233,7 +233,8 @@ def _voltage_limit(report: FeederReport, meter: MeterReport) -> Iterable[Conditi
 def _data_loss(report: FeederReport) -> Iterable[Condition]:
     silent = dict(report.silent)
     unsure = [meter.meter for meter in report.meters if not meter.seen and meter.meter not in silent]
-    if report.cause is Cause.NO_BUSBAR and BUSBAR not in silent:
+    busbar_seen = report.busbar.seen and report.cause is not Cause.NO_BUSBAR
+    if not busbar_seen and BUSBAR not in silent:
         unsure.append(BUSBAR)
     for meter, seconds in silent.items():
         # Without the busbar's voltage nothing on the feeder can be judged.

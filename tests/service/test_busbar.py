@@ -19,7 +19,8 @@ from feeders.scenario import Scenario, by_arrival, simulate
 from gridsec.attack import Bias
 from gridsec.online import Cause, Decision, Estimate, Explanation, Verdict
 from gridsec.sequential import nobody
-from service.align import Tick
+from service.alarms import AlarmBook, Change
+from service.align import Clock, Tick
 from service.busbar import BUSBAR, BusbarReport, busbar_report
 from service.conditions import AlarmKind, Condition, Severity, conditions
 from service.history import pack, rows, unpack
@@ -28,6 +29,7 @@ from service.models import State
 from service.reading import Reading
 from service.report import FeederReport, blind, build, to_json
 from service.simulate import key_of, payload_of
+from service.watch import Watch, align_rules, design
 from tests.service.commands import command, plain
 from tests.service.reports import meter, report
 from tests.service.running import FEEDER, InProcess, service, until
@@ -278,6 +280,21 @@ def test_the_command_line_takes_it_where_it_takes_a_number_of_meters(
     code, _, problem = run(monkeypatch, capsys, file, "--attack", "stuck:substation:0:20:55")
     assert code > 0
     assert "by bias, scaling or drift, not by stuck" in plain(problem)
+
+
+def test_one_reading_in_between_does_not_end_its_data_loss(site: Site) -> None:
+    readings = [
+        r
+        for r in by_arrival(simulate(site, Scenario(start=START, duration_s=120.0)))
+        if r.meter or r.t - START in (0.0, 80.0)
+    ]
+    watch = Watch(site, align_rules(site, Clock.EVENTS), AlarmBook(FEEDER))
+    watch.install(design(site))
+    seen = []
+    for r in readings:
+        for result in watch.take(Reading(FEEDER, r.meter or None, r.t, r.v_volt), r.arrival)[1]:
+            seen += [t.change for t in result.transitions if t.alarm.kind is AlarmKind.DATA_LOSS]
+    assert seen == [Change.RAISED]
 
 
 # ------------------------------------------------------------------------------------------ the whole service

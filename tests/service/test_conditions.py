@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from dataclasses import replace
 
 import pytest
 
@@ -141,8 +142,15 @@ def test_a_silent_busbar_is_worse() -> None:
     found = conditions(report(meter("m1"), cause=Cause.NO_BUSBAR, silent=((BUSBAR, 30.0),)))
     loss = next(c for c in found if c.kind is AlarmKind.DATA_LOSS)
     assert (loss.meter, loss.known, loss.severity) == (BUSBAR, True, Severity.MAJOR)
-    young = said(conditions(report(meter("m1"), cause=Cause.NO_BUSBAR)))
-    assert young["data-loss", BUSBAR] is False
+
+
+@pytest.mark.parametrize("cause", list(Cause))
+def test_a_busbar_unseen_but_not_for_long_is_unknown(cause: Cause) -> None:
+    """Whatever the estimator makes of it: one that replaces the busbar's voltage decides all the same."""
+    seen = report(meter("m1"), cause=cause)
+    unseen = replace(seen, busbar=replace(seen.busbar, seen=False))
+    assert said(conditions(unseen))["data-loss", BUSBAR] is False
+    assert (("data-loss", BUSBAR) in said(conditions(seen))) is (cause is Cause.NO_BUSBAR)
 
 
 @pytest.mark.parametrize("cause", UNDECIDED_CAUSES)
