@@ -159,7 +159,14 @@ class Rounds:
         self._wire = Wire(known, self.config.prefix, self.config.max_payload)
 
     def begin(self) -> None:
-        """Answer queries for what stands; publish what an earlier process stored and did not publish."""
+        """Answer queries for what stands; publish what an earlier process stored and did not publish.
+
+        Alarms of feeders that are neither watched nor stored any more are cleared: nobody else would.
+        """
+        ours, t = self.watches.keys() | self.store.feeders().keys(), self._wall()
+        for name in sorted({alarm.feeder for alarm in self.store.active()} - ours):
+            gone = restore(name, self.store.active(name))
+            self.keeper.waiting.add(transitions=close(gone, t, NOT_WATCHED))
         if self.keeper.publisher is not None:
             for watch in self.watches.values():
                 for alarm in watch.book.active:

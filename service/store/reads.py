@@ -111,13 +111,13 @@ class Reader:
         page = [from_json(json.loads(row.data)) for row in rows[:limit]]
         return page, (page[-1].id if len(rows) > limit else None)
 
-    def active(self, feeder: str, *, cleared_since: float | None = None) -> list[Alarm]:
+    def active(self, feeder: str | None = None, *, cleared_since: float | None = None) -> list[Alarm]:
         """Return what `alarms.restore` needs.
 
         Parameters
         ----------
         feeder
-            Whose alarms.
+            Whose alarms; None: of all feeders.
         cleared_since
             Also those that cleared at or after this time, Unix s.
         """
@@ -125,7 +125,9 @@ class Reader:
         stands: sa.ColumnElement[bool] = a.state != str(AlarmState.CLEARED)
         if cleared_since is not None:
             stands = stands | (a.t_cleared >= cleared_since)
-        query = sa.select(a.data).where(a.feeder == feeder, stands).order_by(a.id)
+        query = sa.select(a.data).where(stands).order_by(a.id)
+        if feeder is not None:
+            query = query.where(a.feeder == feeder)
         with self._read() as connection:
             return [from_json(json.loads(data)) for data in connection.scalars(query)]
 

@@ -356,6 +356,33 @@ def test_a_deleted_feeder_leaves_cleared_alarms_and_its_history(
             live.remove(FEEDER)
 
 
+def test_alarms_of_a_feeder_that_was_left_out_are_cleared_at_the_start(
+    site: Site, attacked: list[Sample], path: Path
+) -> None:
+    with Store(f"sqlite:///{path}") as store:
+        rounds(store, site, Outlet(confirms=False)).round(until(attacked, 15.0)[0])
+        first, second = store.active(FEEDER)
+        elsewhere = replace(first, id="0" * 26, feeder="elsewhere")
+        store.outbox_done(store.commit([Transition(elsewhere, Change.RAISED, START)]))
+        store.put_feeder("elsewhere", {"tables": "of another version, which cannot be loaded"})
+    outlet = Outlet()
+    with Store(f"sqlite:///{path}") as store:
+        live = Rounds(RuntimeConfig(), store, [], wall=lambda: START + 60, stored=lambda: None)
+        live.keeper.publisher = outlet
+        live.begin()
+        alarms = {alarm.id: alarm for alarm in store.alarms()[0]}
+        assert alarms.pop(elsewhere.id) == elsewhere
+        assert alarms.keys() == {first.id, second.id}
+        assert {(one.state, one.t_cleared) for one in alarms.values()} == {(AlarmState.CLEARED, START + 60)}
+        assert store.events(first.id)[-1].comment == NOT_WATCHED
+        live.round([])
+        assert [one["state"] for one, _ in outlet.events] == ["raised"] * 2 + ["cleared"] * 2
+    with Store(f"sqlite:///{path}") as store:
+        number = store.last_event
+        rounds(store, site)
+        assert store.last_event == number
+
+
 def test_an_idle_service_notices_that_the_database_is_back(
     site: Site,
     attacked: list[Sample],
