@@ -11,15 +11,14 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
 from typing import Any
 
 import zenoh
 
 from service.bus import BusConfig, BusCounts, BusUnavailable, Sample
+from service.outgoing import Event, Outgoing
 
 RING = 8192
 """Samples that zenoh keeps for us."""
@@ -28,8 +27,6 @@ BATCH = 1024
 _HEAD = 1024
 QUERIES_WAITING = 256
 _ESTIMATES = 1024
-EVENTS_WAITING = 10_000
-TELEMETRY_WAITING = 2_000
 _MAX_SESSIONS = 100_000
 _ACCEPT_PENDING = 1_000
 _OPEN_TIMEOUT_MS = 5_000
@@ -101,15 +98,6 @@ def session(config: BusConfig) -> Iterator[zenoh.Session]:
         yield opened
 
 
-@dataclass(slots=True)
-class _Outgoing:
-    """What is waiting to be published; of telemetry the oldest goes when there is too much."""
-
-    telemetry: deque[tuple[str, bytes]] = field(default_factory=lambda: deque(maxlen=TELEMETRY_WAITING))
-    events: deque[tuple[str, bytes | None, Callable[[], None] | None]] = field(default_factory=deque)
-    closing: bool = False
-
-
 class Bus:
     """The service's side of zenoh, as a context manager.
 
@@ -144,8 +132,7 @@ class Bus:
         self._lossless = lossless
         self._stack = ExitStack()
         self._threads: list[threading.Thread] = []
-        self._wakeup = threading.Condition()
-        self._outgoing = _Outgoing()
+        self._outgoing = Outgoing()
         self._answers: dict[str, bytes] = {}
         self._answers_lock = threading.Lock()
         self.counts = BusCounts()
@@ -226,9 +213,7 @@ class Bus:
         """
         with self._answers_lock:
             self._answers[f"{self._prefix}/{key}"] = payload
-        with self._wakeup:
-            self._outgoing.telemetry.append((f"{self._prefix}/{key}", payload))
-            self._wakeup.notify()
+        self._outgoing.add_telemetry(f"{self._prefix}/{key}", payload)
 
     def event(self, key: str, payload: bytes, *, last: bool, done: Callable[[], None] | None = None) -> bool:
         """Publish something that must not be lost; in order, with high priority.
@@ -255,14 +240,8 @@ class Bus:
                 self._answers.pop(full, None)
             else:
                 self._answers[full] = payload
-        with self._wakeup:
-            if len(self._outgoing.events) >= EVENTS_WAITING:
-                return False
-            self._outgoing.events.append((full, payload, None if last else done))
-            if last:
-                self._outgoing.events.append((full, None, done))
-            self._wakeup.notify()
-        return True
+        put = Event(full, payload, None if last else done)
+        return self._outgoing.add_events(put, *([Event(full, None, done)] if last else []))
 
     def answer(self, key: str, payload: bytes) -> None:
         """Let queries for a key find this, without publishing it.
@@ -290,39 +269,35 @@ class Bus:
 
     def _publish(self, live: zenoh.Session) -> None:
         publishers: dict[str, zenoh.Publisher] = {}
-        while True:
-            with self._wakeup:
-                out = self._outgoing
-                while not (out.telemetry or out.events or out.closing):
-                    self._wakeup.wait()
-                if not (out.telemetry or out.events):
-                    return
-                event = out.events.popleft() if out.events else None
-                value = None if event else out.telemetry.popleft()
+        while (item := self._outgoing.next()) is not None:
             try:
-                if event is not None:
-                    _put_event(live, event[0], event[1])
-                elif value is not None:
-                    if value[0] not in publishers:
-                        publishers[value[0]] = live.declare_publisher(
-                            value[0],
+                if isinstance(item, Event):
+                    _put_event(live, item.key, item.payload)
+                else:
+                    key, value = item
+                    if key not in publishers:
+                        publishers[key] = live.declare_publisher(
+                            key,
                             encoding=JSON,
                             congestion_control=zenoh.CongestionControl.DROP,
                         )
-                    publishers[value[0]].put(value[1])
+                    publishers[key].put(value)
             except zenoh.ZError as error:
                 self.counts.publish_failed += 1
                 self.failure = _first_line(error)
+                if isinstance(item, Event) and _well_formed(item.key):
+                    self._outgoing.put_back(item)
                 continue
             self.counts.published += 1
-            self.failure = None
-            if event is not None and event[2] is not None:
-                event[2]()
+            if isinstance(item, Event):
+                self._outgoing.retry_at = None
+            if self._outgoing.retry_at is None:
+                self.failure = None
+            if isinstance(item, Event) and item.done is not None:
+                item.done()
 
     def _stop_publishing(self, thread: threading.Thread) -> None:
-        with self._wakeup:
-            self._outgoing.closing = True
-            self._wakeup.notify()
+        self._outgoing.close()
         thread.join(timeout=2.0)
 
     # ---------------------------------------------------------------- queries
@@ -340,6 +315,14 @@ class Bus:
                 for key, payload in known:
                     if query.key_expr.intersects(key) and not _reply(query, key, payload):
                         break
+
+
+def _well_formed(key: str) -> bool:
+    try:
+        zenoh.KeyExpr(key)
+    except zenoh.ZError:
+        return False
+    return True
 
 
 def _put_event(live: zenoh.Session, key: str, payload: bytes | None) -> None:

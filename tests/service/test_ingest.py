@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from service import ingest, outgoing
 from service.bus import BusConfig, BusUnavailable, Sample
 from service.ingest import BATCH, RING, Bus, Meters
 from tests.service.running import free_port, until
@@ -212,3 +214,68 @@ def test_what_cannot_be_published_is_said_until_something_is_again() -> None:
         bus.telemetry("f/state", b"a key")
         until(lambda: bus.failure is None)
         assert bus.counts.published == 1
+
+
+class Refusing:
+    """Lets zenoh refuse puts and deletes on keys that hold a word, until told otherwise."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, word: str) -> None:
+        self.word: str | None = word
+        self.tries = 0
+        put_event = ingest._put_event
+
+        def put(live: zenoh.Session, key: str, payload: bytes | None) -> None:
+            if self.word is not None and self.word in key:
+                self.tries += 1
+                raise zenoh.ZError("no way out")
+            put_event(live, key, payload)
+
+        monkeypatch.setattr(ingest, "_put_event", put)
+
+
+def test_an_event_that_zenoh_refused_is_tried_again_in_its_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(outgoing, "RETRY_S", 0.1)
+    refusing, done = Refusing(monkeypatch, "alarm/A"), list[str]()
+    with pair(Sink()) as (bus, _, end), client(end) as watcher:
+        events = watcher.declare_subscriber("gridsec/f/alarm/*", zenoh.handlers.FifoChannel(100))
+        for name in ("A", "B"):
+            bus.event(f"f/alarm/{name}", b"x", last=name == "A", done=lambda name=name: done.append(name))
+        until(lambda: refusing.tries >= 3)
+        bus.telemetry("f/estimate", b"goes out meanwhile")
+        until(lambda: bus.counts.published == 1)
+        assert bus.failure == "no way out"
+        assert done == []
+        refusing.word = None
+        until(lambda: len(done) == 2)
+        assert done == ["A", "B"]
+        assert bus.failure is None
+        heard = [events.handler.recv() for _ in range(3)]
+        assert [(str(h.key_expr)[-1], h.kind) for h in heard] == [
+            ("A", zenoh.SampleKind.PUT),
+            ("A", zenoh.SampleKind.DELETE),
+            ("B", zenoh.SampleKind.PUT),
+        ]
+        assert bus.counts.publish_failed == refusing.tries
+        events.undeclare()
+
+
+def test_closing_waits_for_no_event_that_zenoh_refuses(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(outgoing, "RETRY_S", 60.0)
+    refusing, done = Refusing(monkeypatch, "alarm/A"), list[str]()
+    with pair(Sink()) as (bus, _, _end):
+        for name in ("A", "B"):
+            bus.event(f"f/alarm/{name}", b"x", last=False, done=lambda name=name: done.append(name))
+        until(lambda: refusing.tries)
+        begin = time.monotonic()
+    assert time.monotonic() - begin < 1.5
+    assert refusing.tries == 2
+    assert done == []
+
+
+def test_an_event_without_a_possible_key_holds_up_no_other() -> None:
+    done: list[str] = []
+    with pair(Sink()) as (bus, _, _end):
+        bus.event("f//alarm", b"no key of zenoh", last=True, done=lambda: done.append("none"))
+        bus.event("f/alarm/A", b"a key", last=False, done=lambda: done.append("A"))
+        until(lambda: done)
+        assert (done, bus.failure, bus.counts.publish_failed) == (["A"], None, 2)
