@@ -68,17 +68,17 @@ def replay(
             # The arrival times of the recording do not matter: its readings tell the time.
             outcome, results = watch.take(reading, 0.0)
             tally.readings[outcome] += 1
-            if watch.defect is not None:
-                raise watch.defect
-            yield from _counted(results, tally)
+            yield from _counted(watch, results, tally)
             refused = len(watch.aligner.refused())
             tally.readings[Outcome.ACCEPTED] -= refused
             tally.readings[Outcome.CLOCK_OFF] += refused
-    yield from _counted(watch.flush(), tally)
+    yield from _counted(watch, watch.flush(), tally)
     tally.lost = watch.aligner.lost
 
 
-def _counted(results: list[TickResult], tally: Tally) -> list[TickResult]:
+def _counted(watch: Watch, results: list[TickResult], tally: Tally) -> list[TickResult]:
+    if watch.defect is not None:
+        raise watch.defect
     tally.ticks.update(str(result.report.verdict) for result in results)
     return results
 

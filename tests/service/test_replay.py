@@ -5,13 +5,16 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from feeders.estimators import Watcher
 from feeders.load import Site, from_tables, load
 from feeders.meters import Channel
 from feeders.recording import read_recording, record
 from feeders.scenario import Reading, Scenario, by_arrival, random_attacks, simulate
+from gridsec.online import Frame
 from service.align import Clock
 from service.bus import Sample
 from service.replay import Tally, replay
@@ -102,3 +105,22 @@ def test_bad_readings_of_a_recording_are_counted(site: Site, scenario: Scenario)
     )
     assert tally.readings["accepted"] == len(good)
     assert [r.report.t for r in results] == [START + k for k in range(10)]
+
+
+@pytest.mark.parametrize("back", [60, 1])
+def test_a_defect_ends_a_replay_also_at_its_last_tick(
+    site: Site, scenario: Scenario, monkeypatch: pytest.MonkeyPatch, back: int
+) -> None:
+    # The last readings are missing but for a few: only the end lets their tick go.
+    readings = list(by_arrival(simulate(site, scenario)))[:-10]
+    at = list(replay(site, readings, Tally()))[-back].report.t
+    step = Watcher.step
+
+    def breaks(self: Watcher, state: Any, frame: Frame) -> Any:
+        if frame.t >= at:
+            raise ZeroDivisionError("a defect")
+        return step(self, state, frame)
+
+    monkeypatch.setattr(Watcher, "step", breaks)
+    with pytest.raises(ZeroDivisionError, match="a defect"):
+        list(replay(site, readings, Tally()))
