@@ -309,7 +309,8 @@ def loss_correction(
     """
     if steps < 1:
         raise ValueError(f"steps is {steps}; it must be at least 1")
-    return _correction(feeder, _linear_flows(feeder, p, q, v0_squared), steps)
+    flows = _linear_flows(feeder, p, q, v0_squared)
+    return np.asarray(_lossy(feeder, flows, flows, steps).v2 - flows.v2)
 
 
 def bus_voltages(
@@ -328,7 +329,7 @@ def bus_voltages(
         Squared voltages, pu.
     """
     flows = _linear_flows(feeder, p, q, v0_squared)
-    return flows.v2 + _correction(feeder, flows, steps) if steps else flows.v2
+    return _lossy(feeder, flows, flows, steps).v2
 
 
 def corrected(
@@ -349,25 +350,19 @@ def corrected(
     if steps < 1:
         raise ValueError(f"steps is {steps}; it must be at least 1")
     flows = _linear_flows(feeder, p, q, v0_squared)
-    once = _lossy(feeder, flows, flows)
-    v2 = once.v2 if steps == 1 else flows.v2 + _correction(feeder, flows, steps)
-    return np.asarray(v2 - flows.v2), _remainder(feeder, flows, once)
+    once = _lossy(feeder, flows, flows, 1)
+    return np.asarray(_lossy(feeder, flows, once, steps - 1).v2 - flows.v2), _remainder(feeder, flows, once)
 
 
-def _correction(feeder: Feeder, flows: _Flows, steps: int) -> Floats:
-    now = flows
+def _lossy(feeder: Feeder, flows: _Flows, now: _Flows, steps: int) -> _Flows:
+    """The linear power flow with the losses of another, and so on."""
     for _ in range(steps):
-        now = _lossy(feeder, flows, now)
-    return np.asarray(now.v2 - flows.v2)
-
-
-def _lossy(feeder: Feeder, flows: _Flows, now: _Flows) -> _Flows:
-    """The linear power flow with the losses of another."""
-    current = (now.P**2 + now.charged**2) / now.v2[..., 1:]
-    loss_p, loss_q, drop = _losses(feeder, current, feeder.half * now.v2, sign=-1.0)
-    # Charging is one of the losses here.
-    Q = flows.Q + loss_q
-    return _Flows(flows.P + loss_p, Q, Q, flows.v2 - from_root(feeder, drop))
+        current = (now.P**2 + now.charged**2) / now.v2[..., 1:]
+        loss_p, loss_q, drop = _losses(feeder, current, feeder.half * now.v2, sign=-1.0)
+        # Charging is one of the losses here.
+        Q = flows.Q + loss_q
+        now = _Flows(flows.P + loss_p, Q, Q, flows.v2 - from_root(feeder, drop))
+    return now
 
 
 def model_error_bound(feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:
@@ -391,7 +386,7 @@ def model_error_bound(feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats |
     """
     flows = _linear_flows(feeder, p, q, v0_squared)
     with np.errstate(all="ignore"):
-        return _remainder(feeder, flows, _lossy(feeder, flows, flows))
+        return _remainder(feeder, flows, _lossy(feeder, flows, flows, 1))
 
 
 def reach(feeder: Feeder, p: Floats, q: Floats) -> Floats:

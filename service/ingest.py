@@ -291,10 +291,10 @@ class Bus:
             self.counts.published += 1
             if isinstance(item, Event):
                 self._outgoing.retry_at = None
+                if item.done is not None:
+                    item.done()
             if self._outgoing.retry_at is None:
                 self.failure = None
-            if isinstance(item, Event) and item.done is not None:
-                item.done()
 
     def _stop_publishing(self, thread: threading.Thread) -> None:
         self._outgoing.close()

@@ -304,6 +304,11 @@ def printable(text: str) -> str:
     return text if text.isprintable() else repr(text)[1:-1]
 
 
+def beginning(text: str) -> str:
+    """Return a text, printable, and of a long one the beginning."""
+    return printable(text[:HEAD_BYTES])
+
+
 # CBOR can refer to one value many times, so that three hundred bytes stand for more than memory holds.
 _BRIEF = reprlib.Repr()
 _BRIEF.maxlevel, _BRIEF.maxdict, _BRIEF.maxstring, _BRIEF.maxother = 3, 12, HEAD_BYTES, HEAD_BYTES
@@ -314,6 +319,6 @@ def head_of(value: object) -> str:
     if isinstance(value, bytes):
         return printable(value[:HEAD_BYTES].decode("utf-8", "backslashreplace"))
     try:
-        return printable(_BRIEF.repr(value)[:HEAD_BYTES])
+        return beginning(_BRIEF.repr(value))
     except (ValueError, RecursionError):  # an integer of thousands of digits, a value inside itself
         return name_of(value)

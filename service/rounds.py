@@ -28,7 +28,7 @@ from service.commissioning import to_json as commissioning_json
 from service.errors import FeederUnknown
 from service.keeper import Apart, Keeper, alarm_key, at_once
 from service.metrics import Metrics
-from service.reading import HEAD_BYTES, BadReading, BadReason, Reading, head_of, printable
+from service.reading import HEAD_BYTES, BadReading, BadReason, Reading, beginning, head_of
 from service.report import FeederReport
 from service.report import to_json as report_json
 from service.store import Rejected, Store, StoreUnavailable
@@ -164,8 +164,9 @@ class Rounds:
         Alarms of feeders that are neither watched nor stored any more are cleared: nobody else would.
         """
         ours, t = self.watches.keys() | self.store.feeders().keys(), self._wall()
-        for name in sorted({alarm.feeder for alarm in self.store.active()} - ours):
-            gone = restore(name, self.store.active(name))
+        standing = self.store.active()
+        for name in sorted({alarm.feeder for alarm in standing} - ours):
+            gone = restore(name, [alarm for alarm in standing if alarm.feeder == name])
             self.keeper.waiting.add(transitions=close(gone, t, NOT_WATCHED))
         if self.keeper.publisher is not None:
             for watch in self.watches.values():
@@ -242,9 +243,9 @@ class Rounds:
         try:
             return self._wire.decode(sample.key, sample.payload, sample.encoding, size=sample.size)
         except Exception as error:  # noqa: BLE001 - whatever it is, one payload must not end the service
-            problem = printable(f"{type(error).__name__}: {error}"[:HEAD_BYTES])
+            problem = beginning(f"{type(error).__name__}: {error}")
             _log.error("a payload could not be decoded", key=sample.key[:HEAD_BYTES], problem=problem)
-            head, key = head_of(sample.payload[:HEAD_BYTES]), printable(sample.key[:HEAD_BYTES])
+            head, key = head_of(sample.payload[:HEAD_BYTES]), beginning(sample.key)
             return Decoded(bad=(BadReading(BadReason.INTERNAL, (problem,), key, head=head),))
 
     def _take(self, reading: Reading, sample: Sample, bad: list[Rejected]) -> list[TickResult]:
@@ -270,8 +271,7 @@ class Rounds:
         try:
             results = run()
         except Exception as error:  # noqa: BLE001 - whatever it is, it must not blind the other feeders
-            watch.fail(f"{type(error).__name__}: {error}")
-            watch.defect = error
+            watch.break_down(error)
         if watch.defect is not None:
             _log.error("a feeder's monitor failed", feeder=watch.name, exc_info=watch.defect)
             watch.defect = None

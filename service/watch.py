@@ -179,6 +179,17 @@ class Watch:
         self._watcher = self._state = None
         self.phase, self.problem = Phase.FAILED, problem
 
+    def break_down(self, defect: Exception) -> None:
+        """Give up watching because of a defect, and keep that for whoever sees to it.
+
+        Parameters
+        ----------
+        defect
+            What was raised.
+        """
+        self.fail(f"{type(defect).__name__}: {defect}")
+        self.defect = defect
+
     def take(self, reading: Reading, now: float) -> tuple[Outcome, list[TickResult]]:
         """Take one reading in.
 
@@ -243,8 +254,7 @@ class Watch:
             try:
                 self.report = self._judge(tick)
             except Exception as error:  # noqa: BLE001 - whatever it is, ticks before and after have their answers
-                self.fail(f"{type(error).__name__}: {error}")
-                self.defect = error
+                self.break_down(error)
                 self.report = self._judge(tick)
             self.book, transitions = advance(
                 self.book, self._alarm_rules, conditions(self.report), self.report.t

@@ -29,6 +29,7 @@ from service.reading import (
     Known,
     Raw,
     Reading,
+    beginning,
     head_of,
     judge,
     name_of,
@@ -100,7 +101,7 @@ class Wire:
         head = head_of(payload[:HEAD_BYTES])
         if isinstance(source, BadReading):
             return Decoded(bad=(replace(source, head=head),))
-        base = BadReading(BadReason.SYNTAX, (), _shown(key), source.feeder, source.meter, head)
+        base = BadReading(BadReason.SYNTAX, (), beginning(key), source.feeder, source.meter, head)
         length = len(payload) if size is None else size
         if length > self.max_bytes:
             problem = f"payload of {length} bytes; at most {self.max_bytes} are read"
@@ -157,12 +158,8 @@ def source_of(key: str, prefix: str, known: Mapping[str, Known]) -> Source | Bad
     return source
 
 
-def _shown(key: str) -> str:
-    return printable(key[:HEAD_BYTES])
-
-
 def _nowhere(key: str, reason: BadReason, why: str) -> BadReading:
-    shown = _shown(key)
+    shown = beginning(key)
     return BadReading(reason, (f"`{shown}` {why}",), shown)
 
 
