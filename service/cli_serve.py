@@ -77,9 +77,11 @@ def serve(
 
     `--feeder` is GRIDSEC_FEEDERS, `--max-skew` GRIDSEC_MAX_SKEW_S and `--grace` GRIDSEC_GRACE_S.
     """
+    import structlog
+
     from service import logs
     from service.app import serve as run
-    from service.settings import settings
+    from service.settings import settings, strangers
 
     chosen = settings(
         {
@@ -103,6 +105,8 @@ def serve(
         }
     )
     logs.set_up(chosen.log_level, chosen.log_format)
+    for variable, closest in strangers(os.environ).items():
+        structlog.get_logger().warning("variable_ignored", variable=variable, closest=closest or None)
 
     def announce(running: Running) -> None:
         print(running.url, flush=True)

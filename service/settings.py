@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -150,6 +151,28 @@ def settings(given: Mapping[str, Any]) -> Settings:
         return Settings(**{name: value for name, value in given.items() if value is not None})
     except ValidationError as error:
         raise SettingsInvalid(_problem(one) for one in error.errors()) from error
+
+
+def strangers(environment: Mapping[str, str]) -> dict[str, str]:
+    """Variables that look like settings and are none, each with the setting whose name is closest, or "".
+
+    They are no reason not to start: where containers are linked, others put variables of such names.
+
+    Parameters
+    ----------
+    environment
+        All variables.
+    """
+    ours = [ENV_PREFIX + name.upper() for name in Settings.model_fields]
+    strange = (
+        name for name in environment if name.upper().startswith(ENV_PREFIX) and name.upper() not in ours
+    )
+    closest = {name: get_close_matches(name.upper(), ours, 1) for name in strange if name not in _OTHERS}
+    return {name: found[0] if found else "" for name, found in sorted(closest.items())}
+
+
+# Read elsewhere: where designs are kept, and that tests skip nothing.
+_OTHERS = ("GRIDSEC_CACHE_DIR", "GRIDSEC_TESTS_REQUIRE_ALL")
 
 
 def _problem(error: Any) -> str:

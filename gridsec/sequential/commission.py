@@ -23,7 +23,7 @@ docs/theory-sequential.md, section 6.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -187,11 +187,8 @@ def gather(before: Learning, residual: Floats, use: Bools, h: float) -> Learning
     h
         Time since the last tick, s.
     """
-    return replace(
-        before,
-        total=before.total + np.where(use, residual, 0.0),
-        count=before.count + use,
-        time_s=before.time_s + np.where(use, h, 0.0),
+    return Learning(
+        before.total + np.where(use, residual, 0.0), before.count + use, before.time_s + h * use, before.since
     )
 
 

@@ -21,7 +21,7 @@ chong2020 (16) to (18) for the curves; docs/theory-sequential.md, section 4.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import product
 
 import numpy as np
@@ -51,6 +51,8 @@ class Curves:
         Where it is the inverter, by the voltages, and nothing has spoken against it since.
     heard : (m,)
         Inverters whose injection is metered well enough to notice if they were where they can be.
+    idle
+        Derived. Whether nobody's reports are compared with anything.
     """
 
     count: Ints
@@ -59,11 +61,10 @@ class Curves:
     share: Floats
     sure: Bools
     heard: Bools
+    idle: bool = field(init=False)
 
-    @property
-    def idle(self) -> bool:
-        """Whether nobody's reports are compared with anything."""
-        return not (any_of(self.heard) or any_of(self.count))
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "idle", not (any_of(self.heard) or any_of(self.count)))
 
     def named(self, design: SequentialDesign) -> Bools:
         """Inverters that do not follow their curves, (m,)."""
@@ -190,17 +191,11 @@ def compare(design: SequentialDesign, before: Curves, now: Evidence) -> Curves:
     now
         One tick.
     """
-    if before.idle and not any_of(now.reported):
-        return before
     droop, at, size = design.plant.droop, design.plant.meters, design.customers
     own = np.bincount(droop.customer, minlength=size) > 0
     asked = now.reported[at] & now.trusted & own[at]
     if now.fit is None or now.judged is None or not (any_of(asked) or any_of(before.count)):
-        return (
-            before
-            if not any_of(before.count) and not any_of(before.heard)
-            else empty(at.size, droop.tau.size)
-        )
+        return before if before.idle else empty(at.size, droop.tau.size)
     x, error, slope, span = (
         droop.per_customer(of, size)[at] for of in (now.x, now.lag.error, droop.slope, now.lag.span)
     )

@@ -70,6 +70,8 @@ def none(design: SequentialDesign) -> Doubts:
 _MUCH_LESS = 4.0
 # Powers are known no better than this, pu.
 _EXACT = 1e-6
+# Half-width of a uniform error per standard deviation.
+_ROOT_3 = 3.0**0.5
 
 
 def doubted(
@@ -100,27 +102,27 @@ def doubted(
 
 def _doubts(design: SequentialDesign, before: Doubts, frame: Frame, busbar: Bools | bool) -> Doubts:
     """What this frame does not know; new priors only where that changed."""
-    lengths = np.array(design.lengths)[:, None]
+    lengths = design.lengths
     p, p_calm = _factors(frame.p_error, design.doubt.p, before.p, before.p_calm, lengths)
     q, q_calm = _factors(frame.q_error, design.doubt.q, before.q, before.q_calm, lengths)
     sizes = _claims(np.abs(frame.p), design.options.hidden_power, before.sizes)
-    same = np.ones(lengths.size, dtype=np.bool_)
+    alike = busbar is before.busbar or np.array_equal(busbar, before.busbar)
+    if alike and p is before.p and q is before.q:
+        return before if sizes is before.sizes else replace(before, sizes=sizes)
+    same = np.full(len(lengths), alike)
     for new, old in ((p, before.p), (q, before.q)):
         if new is not old:
             same &= (new == old).all(axis=1)
-    if np.array_equal(busbar, before.busbar) and all_of(same):
-        if sizes is before.sizes and p_calm is before.p_calm and q_calm is before.q_calm:
-            return before
+    if all_of(same):
         return replace(before, sizes=sizes, p_calm=p_calm, q_calm=q_calm)
-    kept = same & np.array_equal(busbar, before.busbar)
     priors: list[Prior] = []
     for s, known in enumerate(before.priors):
-        if kept[s]:
+        if same[s]:
             priors.append(known)
             continue
         # Scales that are in doubt about the same share what follows.
-        alike = (k for k in range(s) if np.array_equal(p[k], p[s]) and np.array_equal(q[k], q[s]))
-        k = next(alike, None)
+        shared = (k for k in range(s) if np.array_equal(p[k], p[s]) and np.array_equal(q[k], q[s]))
+        k = next(shared, None)
         priors.append(_prior(design, p[s], q[s], busbar) if k is None else priors[k])
     return Doubts(p, q, p_calm, q_calm, busbar, tuple(priors), sizes)
 
@@ -152,18 +154,20 @@ def _claims(power: Floats, least: float, before: Floats) -> Floats:
     return np.concatenate([new, before[power.size :]])
 
 
-def _factors(error: Floats, std: Floats, old: Floats, calm: Ints, lengths: Ints) -> tuple[Floats, Ints]:
+def _factors(
+    error: Floats, std: Floats, old: Floats, calm: Ints, lengths: tuple[int, ...]
+) -> tuple[Floats, Ints]:
     """`_factor`, but as long as residuals are remembered that were made with a larger one, that one."""
     new = _factor(error, std, old)
     if new is old:
         return old, calm
-    held = (new < old) & (calm + 1 < lengths)
+    held = (new < old) & (calm + 1 < np.array(lengths)[:, None])
     return np.where(held, old, new), np.where(held, calm + 1, 0)
 
 
 def _factor(error: Floats, std: Floats, old: Floats) -> Floats:
     """Power of two by which a frame knows a power less well than the design assumes, with hysteresis."""
-    known = np.sqrt(3.0) * np.maximum(std, _EXACT)
+    known = _ROOT_3 * np.maximum(std, _EXACT)
     if all_of(error <= _MUCH_LESS * known) and all_of(old <= 1.0):
         return old
     ratio = error / known

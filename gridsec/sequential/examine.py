@@ -17,7 +17,7 @@ from gridsec.sequential.conditional import Fit, drop, judge
 from gridsec.sequential.decoder import Accused, Evidence
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.explain import Search
-from gridsec.sequential.scales import Scale, Scales, View, adapt, believe, directions, view_of
+from gridsec.sequential.scales import Scale, Scales, View, adapt, believe, view_of
 from gridsec.sequential.search import Explanation, Found, Solution
 from gridsec.sequential.state import SequentialState, Trust
 from gridsec.sequential.windows import Window
@@ -68,7 +68,7 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats, hon
         What all other errors are bounded by.
     """
     fits, tick, trust, metered = state.fits, state.ticks, state.trust, state.doubts.busbar
-    calm = all_of(trust.trusted) and not (any_of(trust.bad) or any_of(trust.still))
+    calm = trust.calm
     trust = trust if calm else _own(trust)
     views: list[View | None] = []
     after: list[Fit | None] = []
@@ -76,13 +76,13 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats, hon
     scales = Scales(design, state.doubts, state.window, state.learned, model)
     for s, length in enumerate(design.lengths):
         before = fits[s]
-        stale = before is None or any_of(before.trusted & ~trust.trusted)
+        stale = before is None or (not trust.calm and any_of(before.trusted & ~trust.trusted))
         if tick % _every(length) and not stale:
             views.append(None)
             after.append(before)
             continue
         here = scales[s]
-        now = adapt(before, here, trust.trusted & here.enough, directions(scales.book, trust.accused))
+        now = adapt(before, here, trust.trusted & here.enough, scales.loosened(trust.accused))
         view = view_of(design, here, now)
         if design.decoder is not None:
             found[s], trust = _decoded(design, here, now, trust, s)
@@ -214,6 +214,8 @@ def _due(design: SequentialDesign, trust: Trust, view: View, s: int, tick: int, 
     Before a meter is named, and now and then while that is in doubt; while more is suspected than meters;
     and from time to time, at ticks at which no shorter scale has just searched.
     """
+    if trust.calm:
+        return False
     if any(scale <= s for _, scale in trust.accused):
         return True
     if all_of(trust.trusted):

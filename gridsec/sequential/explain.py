@@ -18,7 +18,7 @@ from gridsec.sequential.conditional import Fit, fit, judge, misfit
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.dictionary import Dictionary
 from gridsec.sequential.loads import UNMETERED
-from gridsec.sequential.scales import Scales, View, adapt, believe, directions, view_of
+from gridsec.sequential.scales import Scales, View, adapt, believe, view_of
 from gridsec.sequential.search import Explanation, Found, Limits, Solution, likelier
 from gridsec.sequential.state import Trust
 
@@ -141,7 +141,7 @@ class Search:
         design, trust = self.design, self.trust
         here = np.arange(design.hangs_on.shape[1]) == phase
         scales = self.scales.wider(UNMETERED * by_place(design.plant.feeder, here))
-        there = adapt(None, scales[self.s], now.trusted, directions(self.book, trust.accused))
+        there = adapt(None, scales[self.s], now.trusted, self.scales.loosened(trust.accused))
         lying = Search(design, scales, self.fits, trust, self.s)
         best = lying.likeliest(there, view_of(design, scales[self.s], there)).best
         charge = search.price(int(np.count_nonzero(self.here.enough)), 1)
@@ -377,7 +377,7 @@ class Search:
         )
 
     def _fit(self, trusted: Bools) -> Fit:
-        loose = directions(self.book, self.accused)
+        loose = self.scales.loosened(self.accused)
         return fit(self.here.prior, self.here.noise, trusted & self.here.enough, loose)
 
     def _total(self, found: Explanation) -> float:
@@ -397,7 +397,7 @@ class Search:
         """What an explanation leaves unexplained on each scale; of `more` meters, which may be off alike."""
         trusted, out = self._trusted(found), []
         trusted = trusted if more is None else trusted | more
-        loose = directions(self.book, (*self.accused, *((k, self.s) for k in found.loosened)))
+        loose = self.scales.loosened((*self.accused, *((k, self.s) for k in found.loosened)))
         for s in range(len(self.fits)):
             there = self.scales[s]
             if s == self.s and more is None and isinstance(found, Solution):

@@ -97,7 +97,7 @@ def clean(design: SequentialDesign, state: SequentialState, frame: Frame) -> Hea
         told = trusted & reported & (least - room <= rest) & (rest <= most + room)
     return Heard(
         live,
-        np.clip(np.where(live, frame.y, 0.0), 0.0, NO_VOLTAGE),
+        np.minimum(np.maximum(np.where(live, frame.y, 0.0), 0.0), NO_VOLTAGE),
         np.where(told, frame.q_net, frame.q),
         told,
         reported,

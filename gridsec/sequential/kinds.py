@@ -291,7 +291,7 @@ def _alone(  # noqa: PLR0917  # some meters, and what is known of them
 def _moves(shapes: Shapes, meters: Ints, code: Floats) -> Ints:
     """Since which of the readings (n, k) meters move that have been stuck before; 0 for others, (k,)."""
     out, surprise = np.zeros(meters.size, dtype=np.intp), shapes.rules.surprise[meters]
-    for k in np.flatnonzero((code[1:] == code[:-1]).sum(axis=0) * surprise >= _CALLED).tolist():
+    for k in np.flatnonzero(_longest(code) * surprise >= _CALLED).tolist():
         heard = np.flatnonzero(np.isfinite(code[:, k]))
         read = code[heard, k]
         ends = np.concatenate([[-1], np.flatnonzero(read[1:] != read[:-1]), [heard.size - 1]])
@@ -299,6 +299,14 @@ def _moves(shapes: Shapes, meters: Ints, code: Floats) -> Ints:
         if stuck.size:
             out[k] = heard[ends[stuck[-1] + 1]] + 1
     return out
+
+
+def _longest(code: Floats) -> Ints:
+    """How often each of several meters' readings, (n, k), repeats itself in a row at most; silence does."""
+    same = (code[1:] == code[:-1]) | np.isnan(code[1:]) | np.isnan(code[:-1])
+    count = np.cumsum(same, axis=0)
+    run = count - np.maximum.accumulate(np.where(same, 0, count), axis=0)
+    return np.asarray(run.max(axis=0, initial=0))
 
 
 def _again(shapes: Shapes, meter: int, lie: Floats, age: int) -> Kind | None:

@@ -142,6 +142,19 @@ class Scales:
             ),
         )
 
+    def loosened(self, accused: tuple[tuple[int, int], ...]) -> Floats | None:
+        """Loosened directions with their standard deviations, (n, k); None for none.
+
+        Parameters
+        ----------
+        accused
+            Indices of the book, each with a scale.
+        """
+        if not accused:
+            return None
+        which = np.array([k for k, _ in accused])
+        return np.asarray(self.book.columns(which) * self.book.std[which])
+
     def wider(self, direction: Floats) -> Scales:
         """The same with priors that leave one more direction open.
 
@@ -167,22 +180,6 @@ def view_of(design: SequentialDesign, here: Scale, now: Fit) -> View:
     limit = here.limits.of(judged.std)
     over = here.enough & (np.abs(judged.offset) > limit)
     return View(judged, here.enough, limit, over, here.limits, design.options.lower)
-
-
-def directions(book: Dictionary, accused: tuple[tuple[int, int], ...]) -> Floats | None:
-    """Loosened directions with their standard deviations, (n, k); None for none.
-
-    Parameters
-    ----------
-    book
-        What else but meters can be wrong.
-    accused
-        Its indices, each with a scale.
-    """
-    if not accused:
-        return None
-    which = np.array([k for k, _ in accused])
-    return np.asarray(book.columns(which) * book.std[which])
 
 
 def adapt(before: Fit | None, here: Scale, wanted: Bools, loose: Floats | None) -> Fit:

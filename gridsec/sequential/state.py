@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, Ints
+from gridsec.arrays import Bools, Floats, Ints, all_of, any_of
 from gridsec.online import Estimate, Verdict
 from gridsec.sequential.bounds import Lag
 from gridsec.sequential.bounds import start as no_lag
@@ -56,6 +56,8 @@ class Trust:
         Ticks that accused each inverter, less those that did not.
     inverters : (m,)
         Inverters named as manipulated.
+    calm
+        Derived. Nobody is suspected, nor was lately.
     """
 
     trusted: Bools
@@ -69,6 +71,14 @@ class Trust:
     accused: tuple[tuple[int, int], ...]
     counted: Ints
     inverters: Bools
+    calm: bool = field(init=False)
+
+    def __post_init__(self) -> None:
+        # Evidence is written in place afterwards, but only against those who are not trusted.
+        against = any_of(self.bad) or any_of(self.still) or any_of(self.named) or any_of(self.inverters)
+        lately = bool(self.accused) or any_of(self.age) or any_of(self.counted)
+        calm = all_of(self.trusted) and not against and not lately
+        object.__setattr__(self, "calm", calm)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,10 +13,10 @@ from gridsec.online import Estimate, Explanation, Frame, Verdict
 from gridsec.sequential.bounds import Lag, Powers, follow
 from gridsec.sequential.bounds import start as begin
 from gridsec.sequential.busbar import Honest
+from gridsec.sequential.commission import Learning, gather, ripe
 from gridsec.sequential.commission import conclude as learn
-from gridsec.sequential.commission import gather, ripe
 from gridsec.sequential.conclude import Tick, conclude
-from gridsec.sequential.curves import CONFIRM, Evidence, compare
+from gridsec.sequential.curves import CONFIRM, Curves, Evidence, compare
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.doubts import Doubts, doubted
 from gridsec.sequential.drive import Free, drive
@@ -111,7 +111,6 @@ def _answer(design: SequentialDesign, look: _Look, frame: Frame) -> tuple[Sequen
     """Name who lies, remember, and put the answer together."""
     state, heard = look.state, look.heard
     seen, window, rivals = _judge(design, look, state.trust)
-    reports = _reports(design, heard, frame, seen, look.x, look.lag)
     v2 = look.v2_bus[design.prior.meters]
     own = _own(design, frame.p, heard.q)
     after = replace(
@@ -121,17 +120,19 @@ def _answer(design: SequentialDesign, look: _Look, frame: Frame) -> tuple[Sequen
         ticks=state.ticks + 1,
         x=look.x,
         free=look.free,
-        lag=look.lag.lied_to(_lied_to(design, state.trust, seen.trust)),
+        lag=look.lag if seen.trust.calm else look.lag.lied_to(_lied_to(design, state.trust, seen.trust)),
         v0_squared=heard.v0_squared,
         unmetered=np.where(heard.busbar, 0, state.unmetered + 1),
         window=window,
         trust=seen.trust,
         fits=seen.fits,
         doubts=look.doubts,
-        curves=compare(design, state.curves, reports),
+        curves=_curves(design, look, frame, seen),
         kinds=_kinds(design, state, look.kinds, seen, window, v2, own),
+        learning=_gathered(design, look, seen.trust, frame.t - state.t),
     )
-    after = _learn(design, after, look.residual, heard.live, frame.t - state.t)
+    if after.learning is not state.learning:
+        after = _learned(design, after)
     return conclude(design, after, Tick(frame, heard, look.q, look.v2_bus, look.transient, seen, rivals))
 
 
@@ -157,6 +158,8 @@ def _judge(
 ) -> tuple[Examined, Window, tuple[Explanation, ...]]:
     """Who is believed and named now, what is remembered then, and rivals of what was found."""
     seen, now = look.seen, look.now
+    if seen.trust.calm and now.trust.calm:
+        return seen, now.window, ()
     over = ended(design, now.trust, seen, now.window)
     trust, rivals = name(design, now.trust, _acquit(seen, over), look.heard.live)
     trust = _distrust(trust, look.copies)
@@ -210,7 +213,7 @@ def _voltages(design: SequentialDesign, frame: Frame, heard: Heard, x: Floats) -
     q = _net(design, heard, x)
     with np.errstate(all="ignore"):
         v2_bus = bus_voltages(plant.feeder, frame.p, q, heard.v0_squared, steps=plant.loss_correction)
-        v2_bus = np.clip(v2_bus, 0.0, NO_VOLTAGE)
+        v2_bus = np.minimum(np.maximum(v2_bus, 0.0), NO_VOLTAGE)
     return q, np.where(np.isnan(v2_bus), by_place(plant.feeder, heard.v0_squared), v2_bus)
 
 
@@ -237,15 +240,17 @@ def _distrust(trust: Trust, copies: Bools) -> Trust:
     )
 
 
-def _reports(  # noqa: PLR0917  # everything known of the injections
-    design: SequentialDesign, heard: Heard, frame: Frame, seen: Examined, x: Floats, lag: Lag
-) -> Evidence:
-    """What the metered reactive powers are compared with the curves by."""
+def _curves(design: SequentialDesign, look: _Look, frame: Frame, seen: Examined) -> Curves:
+    """What the metered reactive powers say beside the curves."""
+    before, heard = look.state.curves, look.heard
+    if before.idle and not any_of(heard.reported):
+        return before
     believed = heard.live & seen.trust.trusted & (seen.trust.age == 0)
     s = sum(length <= CONFIRM for length in design.lengths) - 1
     view = seen.views[s]
     judged = None if view is None else view.judged
-    return Evidence(frame, heard.reported, heard.told, believed, x, lag, seen.fits[s], judged)
+    now = Evidence(frame, heard.reported, heard.told, believed, look.x, look.lag, seen.fits[s], judged)
+    return compare(design, before, now)
 
 
 def _kinds(  # noqa: PLR0917  # everything that lies are compared with
@@ -274,22 +279,26 @@ def _own(design: SequentialDesign, p: Floats, q: Floats) -> Floats:
     return np.asarray(shapes.active * p[meters] + shapes.reactive * q[meters])
 
 
-def _learn(
-    design: SequentialDesign, state: SequentialState, residual: Floats, live: Bools, h: float
-) -> SequentialState:
-    """Gather what the meters' fixed errors are, and from some time on rely on it."""
-    trust = state.trust
+def _gathered(design: SequentialDesign, look: _Look, trust: Trust, h: float) -> Learning | None:
+    """What is known so far of the meters' fixed errors."""
+    before = look.state.learning
     # While more than meters is suspected, what the others read is not their own error.
-    if state.learning is None or state.ticks == 1 or trust.accused:
-        return state
+    if before is None or not look.state.ticks or trust.accused:
+        return before
+    use = look.heard.live & trust.trusted & _known(design, look.doubts)
     # A pause of the frames is no time in which anything was heard.
-    step_s, use = design.step_s, live & trust.trusted & _known(design, state.doubts)
-    learning = gather(state.learning, residual, use, h if h <= _PAUSE * step_s else step_s)
-    # Whoever is named has no say; suspects that report may yet turn out to be right.
-    settled = trust.trusted | trust.named | (state.window.counts[-1] == 0)
+    return gather(before, look.residual, use, h if h <= _PAUSE * design.step_s else design.step_s)
+
+
+def _learned(design: SequentialDesign, state: SequentialState) -> SequentialState:
+    """Rely on what was gathered of the meters' fixed errors, once that was for long enough."""
+    trust, learning = state.trust, state.learning
+    if learning is None:
+        return state
     ready = ripe(design, learning) & trust.trusted
-    if not any_of(ready) or not all_of(settled):
-        return replace(state, learning=learning)
+    # Whoever is named has no say; suspects that report may yet turn out to be right.
+    if not any_of(ready) or not all_of(trust.trusted | trust.named | (state.window.counts[-1] == 0)):
+        return state
     known = learn(design, state.learned, learning, ready, state.t)
     window = shift(state.window, state.learned.bias - known.learned.bias)
     fits = (None,) * len(state.fits)

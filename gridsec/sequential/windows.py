@@ -20,21 +20,21 @@ class Window:
 
     Attributes
     ----------
-    residual : (longest, p)
-        Ring buffer of residuals; 0 where there was none.
-    heard : (longest, p)
+    residuals : (longest,) of (p,)
+        Residuals of each tick, the newest last; 0 where there was none.
+    heard : (longest,) of (p,)
         Where there was one.
-    head
-        Row of the next tick.
+    turn
+        Ticks since the sums were last added up from the beginning.
     sums : (s, p)
         Sum of the residuals within each scale.
     counts : (s, p)
         How many they are.
     """
 
-    residual: Floats
-    heard: Bools
-    head: int
+    residuals: tuple[Floats, ...]
+    heard: tuple[Bools, ...]
+    turn: int
     sums: Floats
     counts: Ints
 
@@ -51,9 +51,9 @@ def empty(lengths: tuple[int, ...], meters: int) -> Window:
     """
     longest = max(lengths)
     return Window(
-        residual=np.zeros((longest, meters)),
-        heard=np.zeros((longest, meters), dtype=np.bool_),
-        head=0,
+        residuals=(np.zeros(meters),) * longest,
+        heard=(np.zeros(meters, dtype=np.bool_),) * longest,
+        turn=0,
         sums=np.zeros((len(lengths), meters)),
         counts=np.zeros((len(lengths), meters), dtype=np.intp),
     )
@@ -73,18 +73,16 @@ def push(window: Window, lengths: tuple[int, ...], residual: Floats, heard: Bool
     heard : (p,)
         Where there is a reading.
     """
+    before, marks, turn = window.residuals, window.heard, window.turn + 1
     values = np.where(heard, residual, 0.0)
-    ring, marks, head = window.residual.copy(), window.heard.copy(), window.head
-    longest = len(ring)
-    leaving = [(head - length) % longest for length in lengths]
-    sums = window.sums + values - ring[leaving]
-    counts = window.counts + heard - marks[leaving]
-    ring[head], marks[head] = values, heard
-    head = (head + 1) % longest
-    if head == 0:
+    after = (*before[1:], values)
+    if turn == len(after):
         # Differences of running sums gather rounding errors; one round's worth is all there ever is.
-        sums = np.stack([ring[longest - length :].sum(axis=0) for length in lengths])
-    return Window(ring, marks, head, sums, counts)
+        sums, turn = np.stack([np.sum(after[-length:], axis=0) for length in lengths]), 0
+    else:
+        sums = window.sums + values - np.array([before[-length] for length in lengths])
+    counts = window.counts + heard - np.array([marks[-length] for length in lengths])
+    return Window(after, (*marks[1:], heard), turn, sums, counts)
 
 
 def forget(window: Window, meters: Bools) -> Window:
@@ -99,11 +97,11 @@ def forget(window: Window, meters: Bools) -> Window:
     """
     if not any_of(meters):
         return window
-    ring, marks = window.residual.copy(), window.heard.copy()
-    ring[:, meters], marks[:, meters] = 0.0, False
+    residuals = tuple(np.where(meters, 0.0, each) for each in window.residuals)
+    marks = tuple(each & ~meters for each in window.heard)
     sums = np.where(meters, 0.0, window.sums)
     counts = np.where(meters, 0, window.counts)
-    return Window(ring, marks, window.head, sums, counts)
+    return Window(residuals, marks, window.turn, sums, counts)
 
 
 def forget_last(window: Window, lengths: tuple[int, ...], ticks: Ints) -> Window:
@@ -120,12 +118,12 @@ def forget_last(window: Window, lengths: tuple[int, ...], ticks: Ints) -> Window
     """
     if not any_of(ticks):
         return window
-    age = (window.head - 1 - np.arange(len(window.residual))) % len(window.residual)
-    kept = window.heard & (age[:, None] >= ticks)
-    ring = np.where(kept, window.residual, 0.0)
-    sums = np.stack([ring[age < length].sum(axis=0) for length in lengths])
-    counts = np.stack([kept[age < length].sum(axis=0, dtype=np.intp) for length in lengths])
-    return Window(ring, kept, window.head, sums, counts)
+    age = np.arange(len(window.heard))[::-1, None]
+    kept = np.stack(window.heard) & (age >= ticks)
+    residuals = np.where(kept, np.stack(window.residuals), 0.0)
+    sums = np.stack([residuals[-length:].sum(axis=0) for length in lengths])
+    counts = np.stack([kept[-length:].sum(axis=0, dtype=np.intp) for length in lengths])
+    return Window(tuple(residuals), tuple(kept), window.turn, sums, counts)
 
 
 def shift(window: Window, change: Floats) -> Window:
@@ -138,5 +136,6 @@ def shift(window: Window, change: Floats) -> Window:
     change : (p,)
         What every residual gains, squared pu.
     """
-    ring = np.where(window.heard, window.residual + change, 0.0)
-    return Window(ring, window.heard, window.head, window.sums + window.counts * change, window.counts)
+    pairs = zip(window.residuals, window.heard, strict=True)
+    residuals = tuple(np.where(heard, each + change, 0.0) for each, heard in pairs)
+    return Window(residuals, window.heard, window.turn, window.sums + window.counts * change, window.counts)

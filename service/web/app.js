@@ -224,7 +224,7 @@ function detail() {
   const now = { meter, inverter, v: diagram.voltAt(customer), std: known?.v_volt_std ?? meter?.v_volt_std };
   const own = commissioning.of(customer.meter);
   byId("replaced").hidden = own === null;
-  showDetail(page.feeder, customer, { ...now, own }, page.past.get(customer.meter) ?? []);
+  showDetail(page.feeder, customer, { ...now, own, report: page.report }, page.past.get(customer.meter) ?? []);
 }
 
 // ------------------------------------------------------------- all of them
@@ -235,10 +235,9 @@ function table() {
   const customer = new Map(page.feeder.layout.customers.map((c) => [c.meter, c.customer]));
   const ratio = (m) => m.score / m.threshold;
   const rank = (m) => (m.suspect ? 1e9 : 0) + (m.seen ? ratio(m) || 0 : 1e6);
-  // It has no score: without a verdict nothing tells about it.
-  const busbar = page.report.busbar?.judged ? [{ ...page.report.busbar, judged: page.report.verdict !== "undecided" }] : [];
+  const busbar = page.report.busbar?.judged ? [page.report.busbar] : [];
   const rows = [...page.report.meters, ...busbar].sort((a, b) => rank(b) - rank(a)).map((m) => {
-    const now = status(m, limits);
+    const now = status(m, limits, page.report);
     return el("tr", { "data-status": now.key },
       el("th", { scope: "row" }, customer.has(m.meter)
         ? el("button", { type: "button", class: "plain", text: m.meter, on: { click: () => select(customer.get(m.meter)) } })

@@ -65,12 +65,12 @@ function row(label, value, extra) {
   return [el("dt", { text: label }), el("dd", {}, el("b", { text: value }), extra ? el("span", { class: "quiet", text: ` ${extra}` }) : null)];
 }
 
-export function showDetail(feeder, customer, { meter, inverter, v, std, own }, points) {
+export function showDetail(feeder, customer, { meter, inverter, v, std, own, report }, points) {
   const nominal = nominals(feeder).get(customer.bus);
   const share = nominal / feeder.v_nominal_volt;
   const limits = { low: share * feeder.v_min_volt, high: share * feeder.v_max_volt };
   const pu = (value) => (isKnown(value) ? `${(value / nominal).toFixed(4)} pu` : "");
-  const now = status(meter, limits);
+  const now = status(meter, limits, report);
   byId("detail-title").textContent = customer.customer;
   const head = el("p", { class: "where" },
     el("span", { class: "state", "data-status": now.key, text: now.text }),

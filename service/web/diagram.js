@@ -284,7 +284,7 @@ export class Diagram {
     let before = null;
     for (const [id, part] of this.customers) {
       const meter = this.meters.get(part.customer.meter);
-      const now = status(meter, this.limits);
+      const now = status(meter, this.limits, this.report);
       const v = this.voltAt(part.customer);
       part.group.setAttribute("data-status", now.key);
       part.shape.setAttribute("d", SHAPE[now.key]);
@@ -343,7 +343,7 @@ export class Diagram {
     this.tip.hidden = !part || !this.report;
     if (this.tip.hidden) return;
     const meter = this.meters.get(part.customer.meter);
-    const now = status(meter, this.limits);
+    const now = status(meter, this.limits, this.report);
     this.tip.replaceChildren(
       el("b", { text: id }),
       ...(part.customer.phase ? [el("span", { text: `phase ${part.customer.phase}` })] : []),

@@ -41,8 +41,11 @@ export function clock(t, { day = false } = {}) {
   return day || Math.abs(Date.now() - date) > 43200000 ? `${date.toLocaleDateString()} ${time}` : time;
 }
 
+// Without a verdict nothing tells who is honest; but that one meter is silent says nothing against the others.
+export const vouches = ({ verdict, cause }) => verdict !== "undecided" || cause === "silent-meters";
+
 // What a meter is, in one word for people and one for style sheets. Only who was judged can be honest.
-export function status(meter, limits) {
+export function status(meter, limits, report) {
   if (!meter) return { key: "none", text: "no meter" };
   if (meter.suspect) return { key: "suspect", text: "suspect" };
   if (!meter.seen) return { key: "silent", text: "silent" };
@@ -52,7 +55,7 @@ export function status(meter, limits) {
   if (known(score) && known(threshold) && score > threshold) return { key: "doubtful", text: "doubtful" };
   if (known(v) && v > (meter.v_max_volt ?? limits.high)) return { key: "high", text: "above limit" };
   if (known(v) && v < (meter.v_min_volt ?? limits.low)) return { key: "low", text: "below limit" };
-  if (!judged || !known(v)) return { key: "unjudged", text: "not judged" };
+  if (!judged || !known(v) || !vouches(report)) return { key: "unjudged", text: "not judged" };
   return { key: "ok", text: "honest" };
 }
 

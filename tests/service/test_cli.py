@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import socket
@@ -122,9 +123,12 @@ def test_an_http_port_in_use(tmp_path: Path) -> None:
         address = f"127.0.0.1:{taken.getsockname()[1]}"
         message = refused(
             5, process("serve", "--feeder", FEEDER, "--http", address,
-            "--zenoh-listen", f"tcp/127.0.0.1:{free_port()}", "--database", f"sqlite:///{tmp_path / 'a.db'}"),
+            "--zenoh-listen", f"tcp/127.0.0.1:{free_port()}", "--database", f"sqlite:///{tmp_path / 'a.db'}",
+            env={"GRIDSEC_MAX_SKEW": "3"}),
         )  # fmt: skip
     assert f"HTTP cannot listen on {address}: Address already in use" in message
+    # Said once the log is set up, before anything else can go wrong.
+    assert re.search("variable_ignored.*GRIDSEC_MAX_SKEW_S.*GRIDSEC_MAX_SKEW", message)
 
 
 def test_a_zenoh_port_in_use(tmp_path: Path) -> None:

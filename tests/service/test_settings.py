@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from service.align import Clock
-from service.settings import Settings, SettingsInvalid, settings, split_address
+from service.settings import Settings, SettingsInvalid, settings, split_address, strangers
 
 
 @pytest.fixture(autouse=True)
@@ -75,3 +75,14 @@ def test_addresses() -> None:
     for wrong in ("", ":80", "host:", "host:65536", "host:-1", "host:8o", "host:²"):
         with pytest.raises(ValueError, match="looks like"):
             split_address(wrong)
+
+
+def test_a_variable_that_is_nearly_a_setting_is_named() -> None:
+    mine = {"GRIDSEC_MAX_SKEW": "3", "GRIDSEC_PORT_8000_TCP_ADDR": "10.0.0.7", "gridsec_htpp": "[::1]:80"}
+    none = {"GRIDSEC_HTTP": "[::1]:80", "gridsec_queue": "200", "GRIDSEC_CACHE_DIR": "/tmp", "HOME": "/"}
+    assert strangers(mine | none) == {
+        "GRIDSEC_MAX_SKEW": "GRIDSEC_MAX_SKEW_S",
+        "GRIDSEC_PORT_8000_TCP_ADDR": "",
+        "gridsec_htpp": "GRIDSEC_HTTP",
+    }
+    assert strangers(none) == {}

@@ -98,7 +98,7 @@ def test_undecided_and_silent(site: Site) -> None:
 
 @pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
 def test_who_is_in_doubt_or_not_judged_is_not_honest(site: Site, size: dict[str, int]) -> None:
-    report = site.village.report(T0, cause=Cause.AMBIGUOUS)
+    report = site.village.report(T0, cause=Cause.SILENT_METERS)
     changes: dict[str, dict[str, Any]] = {
         "H3": {"score": 9.0, "threshold": 1.0},
         "H4": {"score": None, "threshold": None},
@@ -128,12 +128,13 @@ def test_who_is_in_doubt_or_not_judged_is_not_honest(site: Site, size: dict[str,
         expect(page.locator("#detail .state")).to_have_text(words[key])
     assert len(set(shapes.values())) == len(shapes)
     expect(page.locator("#legend")).to_contain_text("not judged")
-    # Nothing tells who the busbar's meter is without a verdict either.
+    # Without a verdict nothing tells who is honest, not even of those whose scores are small, or the busbar.
     busbar = BusbarReport(True, True, False, (), None, 231.0, 231.0, 0.0)
-    state = page.locator('#meters tr:has-text("substation") .state')
+    states = [page.locator(f'#meters tr:has-text("{name}") .state') for name in ("H7", "substation")]
     for k, (cause, word) in enumerate([(Cause.AMBIGUOUS, "not judged"), (Cause.AGREEMENT, "honest")], 1):
         site.service.tick(replace(site.village.report(T0 + k, cause=cause), busbar=busbar))
-        expect(state).to_have_text(word)
+        for state in states:
+            expect(state).to_have_text(word)
 
 
 def test_limits_have_shapes(site: Site) -> None:
