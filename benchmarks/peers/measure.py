@@ -85,7 +85,7 @@ def measure(
     With `seconds`, everybody gets the mean of the readings, with its smaller standard deviation.
     """
     scores = {name: Score() for name in everybody}
-    if PANDA in scores and seconds == 1:
+    if PANDA in scores:
         scores[PANDA].seen = 0
     times: dict[str, list[float]] = {name: [] for name in everybody}
     for trial in range(trials):
@@ -98,7 +98,7 @@ def measure(
             answer = method(given)
             times[name].append(time.perf_counter() - start)
             _count(scores[name], answer, told)
-            if isinstance(method, Panda) and seconds == 1:
+            if isinstance(method, Panda):
                 scores[name].seen += method.chi2(given) is True
     for name, score in scores.items():
         score.ms = float(np.median(times[name])) * 1e3 if times[name] else float("nan")
@@ -137,6 +137,22 @@ def limits(count: int, trials: int) -> tuple[float, float]:
     low = betaincinv(count, trials - count + 1, 1.0 - _CONFIDENCE) if count else 0.0
     high = betaincinv(count + 1, trials - count, _CONFIDENCE) if count < trials else 1.0
     return float(low), float(high)
+
+
+def rival(here: dict[str, Score]) -> tuple[int, int, int] | None:
+    """Beside the best peer: snapshots in which only ours was exact, only the peer, and all that both saw."""
+    pairs = [
+        (sum(ours and not its for ours, its in both), sum(its and not ours for ours, its in both), len(both))
+        for name, peer in here.items()
+        if name not in {OURS, SERVED} and (both := list(zip(here[OURS].hits, peer.hits, strict=False)))
+    ]
+    return min(pairs, key=lambda each: ((each[0] - each[1]) / each[2], -each[2])) if pairs else None
+
+
+def beaten(scores: dict[Cell, dict[str, Score]]) -> list[Cell]:
+    """Attacked cells in which a peer is exact more often than ours, by more than two standard deviations."""
+    attacked = [(cell, rival(here)) for cell, here in scores.items() if cell.attack != "clean"]
+    return [cell for cell, best in attacked if best and best[1] - best[0] > 2.0 * np.sqrt(best[0] + best[1])]
 
 
 def too_many(scores: dict[Cell, dict[str, Score]]) -> list[Cell]:

@@ -8,12 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.peers.measure import OURS, SERVED, Score, limits
+from benchmarks.peers.measure import OURS, PANDA, SERVED, Score, limits, rival
 from benchmarks.peers.scene import Cell
 
 Scores = dict[Cell, dict[str, Score]]
 
 _OWN = (OURS, SERVED)
+_FIGURES = (("single snapshots", "peers.png"), ("60 s of data", "peers-minute.png"))
 _NAMES = {"rural1-behind": "rural1, 13 customers", "rural3-behind": "rural3, 118 customers"}
 
 
@@ -29,11 +30,19 @@ def _percent(count: int, score: Score) -> str:
     return f"{100.0 * count / score.trials:.0f}" if score.trials else "-"
 
 
-def tables(single: Scores, minute: Scores) -> str:
-    """Everything as Markdown."""
-    parts = ["## Single snapshots", _exact(single), _clean(single), _details(single)]
+def _seen(score: Score) -> str:
+    return _percent(score.seen, score) if score.seen >= 0 else ""
+
+
+def tables(single: Scores, minute: Scores, *, drawn: bool = False) -> str:
+    """Everything as Markdown; the figures, too, where they are drawn."""
+    figures = (
+        [f"![Exactly identified liars, {what}]({name})" for what, name in _FIGURES] if drawn else ["", ""]
+    )
+    parts = ["## Single snapshots", _exact(single), figures[0], _clean(single), _details(single)]
     if minute:
-        parts += ["## With 60 s of data", _exact(minute), _clean(minute)]
+        parts += ["## With 60 s of data", _exact(minute), figures[1], _clean(minute)]
+    parts = [part for part in parts if part]
     return "\n\n".join(parts) + "\n"
 
 
@@ -66,7 +75,11 @@ def _exact(scores: Scores) -> str:
                 own,
                 _percent(ours.among, ours),
                 _paired(here),
-                *([_percent(here[SERVED].exact, here[SERVED])] if SERVED in names else []),
+                *(
+                    [_percent(here[SERVED].exact, here[SERVED]), _seen(here[PANDA])]
+                    if SERVED in names
+                    else []
+                ),
             ]
         )
     head = [
@@ -77,21 +90,17 @@ def _exact(scores: Scores) -> str:
         "ours",
         "ours, among explanations",
         "ours - best peer (only ours : only the peer)",
-        *([SERVED] if SERVED in names else []),
+        *([SERVED, "chi-square test sees it"] if SERVED in names else []),
     ]
     return "Named exactly the liars, % of snapshots:\n\n" + _rows(head, rows)
 
 
 def _paired(here: dict[str, Score]) -> str:
     """The least difference to a peer in snapshots that both saw, in per cent and in numbers of snapshots."""
-    pairs = [
-        (sum(ours and not its for ours, its in both), sum(its and not ours for ours, its in both), len(both))
-        for name, peer in here.items()
-        if name not in _OWN and (both := list(zip(here[OURS].hits, peer.hits, strict=False)))
-    ]
-    if not pairs:
+    best = rival(here)
+    if best is None:
         return ""
-    only, other, shared = min(pairs, key=lambda each: ((each[0] - each[1]) / each[2], -each[2]))
+    only, other, shared = best
     return f"{100.0 * (only - other) / shared:+.1f} ({only} : {other})"
 
 
@@ -123,9 +132,8 @@ def _details(scores: Scores) -> str:
             s = here[name]
             if not s.trials:
                 continue
-            seen = _percent(s.seen, s) if s.seen >= 0 else ""
             numbers = [_percent(count, s) for count in (s.exact, s.missed, s.false, s.failed)]
-            rows.append([*_place(cell), name, str(s.trials), *numbers, seen])
+            rows.append([*_place(cell), name, str(s.trials), *numbers, _seen(s)])
     head = [
         "feeder",
         "noise",
@@ -162,11 +170,13 @@ def load(paths: list[Path]) -> tuple[Scores, Scores]:
 
 
 def write(folder: Path, single: Scores, minute: Scores, speed: str) -> None:
-    """Write peers.md and its figure."""
+    """Write peers.md and its figures."""
     text = (Path(__file__).parent / "text.md").read_text(encoding="utf-8")
-    text = text.replace("{tables}", tables(single, minute)).replace("{speed}", speed.strip())
+    text = text.replace("{tables}", tables(single, minute, drawn=True)).replace("{speed}", speed.strip())
     (folder / "peers.md").write_text(text, encoding="utf-8")
-    _draw(folder / "peers.png", single)
+    for (_, name), scores in zip(_FIGURES, (single, minute), strict=True):
+        if scores:
+            _draw(folder / name, scores)
 
 
 def _draw(path: Path, scores: Scores) -> None:

@@ -18,6 +18,7 @@ from benchmarks.peers.measure import (
     PANDA,
     PEERS,
     Score,
+    beaten,
     limits,
     measure,
     prepared,
@@ -134,6 +135,10 @@ def test_peers_are_compared_in_the_snapshots_that_both_have_seen(tmp_path: Path)
     assert not minute
     # Ours is exact in one of the two that pandapower has seen, though better than it in per cent of all.
     assert "| 100 | 50 | **75** | 0 | -50.0 (0 : 1) |" in report.tables(again, minute)
+    # One snapshot may be chance, nine are not.
+    assert beaten(single) == []
+    often = {"pgm 3.0": Score(trials=9, exact=9, hits=[True] * 9), OURS: Score(trials=9, hits=[False] * 9)}
+    assert beaten({cell: often}) == [cell]
 
 
 @pytest.mark.parametrize("trial", [0, 3, 6])
