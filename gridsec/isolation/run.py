@@ -13,7 +13,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats
 from gridsec.isolation.design import IsolationDesign
-from gridsec.isolation.selection import disagreement, estimate, select
+from gridsec.isolation.selection import contradiction, disagreement, estimate, select
 from gridsec.observers.unknown_input import Pair, UnknownInputState
 from gridsec.observers.unknown_input import init as init_family
 from gridsec.observers.unknown_input import step as step_family
@@ -180,8 +180,14 @@ def step(
     inputs_now = support(input_attack_, input_threshold)
     sensors_now = support(sensor_attack, sensor_threshold)
     inputs, sensors = state.inputs | inputs_now, state.sensors | sensors_now
-    settled = bool(np.all(bound < plant.span))
-    decision, cause, reason = _decide(design, torn, settled, inputs, sensors)
+    excess = pi if design.measure == "bounds" else contradiction(design, family)
+    evidence = _Evidence(
+        torn=torn,
+        contradicted=bool(np.any(np.isfinite(excess) & (excess > 1.0))),
+        settled=bool(np.all(bound < plant.span)),
+        silent=~heard,
+    )
+    decision, cause, reason = _decide(design, evidence, inputs, sensors)
     answer = Isolation(
         t=family.t,
         decision=decision,
@@ -221,26 +227,57 @@ def _times(matrix: Floats, bound: Floats) -> Floats:
     return np.where(reached, np.inf, matrix @ np.where(endless, 0.0, bound))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Evidence:
+    """What an answer rests on beside who is named.
+
+    Attributes
+    ----------
+    torn
+        Whether the large observers' intervals do not intersect.
+    contradicted
+        Whether some observer differs from its company by more than both bounds allow.
+    settled
+        Whether the estimate's bound says more than what is known anyway.
+    silent : (p,)
+        Sensors without a reading.
+    """
+
+    torn: bool
+    contradicted: bool
+    settled: bool
+    silent: Bools
+
+
 def _decide(
-    design: IsolationDesign, torn: bool, settled: bool, inputs: Bools, sensors: Bools
+    design: IsolationDesign, evidence: _Evidence, inputs: Bools, sensors: Bools
 ) -> tuple[Decision, Cause, str]:
     names = f"inputs {np.flatnonzero(inputs).tolist()}, sensors {np.flatnonzero(sensors).tolist()}"
-    limit = len(inputs) if design.max_inputs == len(inputs) else design.max_inputs
     if not design.guaranteed:
         count = len(design.missing)
         reason = f"{count} members of the bank do not exist, nothing is proven; suspected: {names}"
         return Decision.UNDECIDED, Cause.DESIGN_INVALID, reason
-    if torn:
+    if evidence.torn:
         reason = "no set of trusted inputs and sensors agrees with itself: more are attacked than assumed"
         return Decision.UNDECIDED, Cause.TOO_MANY_SUSPECTS, reason
-    if np.count_nonzero(inputs) > limit or np.count_nonzero(sensors) > design.max_sensors:
+    if np.count_nonzero(inputs) > design.max_inputs or np.count_nonzero(sensors) > design.max_sensors:
         return Decision.UNDECIDED, Cause.TOO_MANY_SUSPECTS, f"more are named than assumed: {names}"
     if np.any(inputs) or np.any(sensors):
         return Decision.ATTACKED, Cause.RESIDUALS, f"attacked: {names}"
-    if not settled:
-        return (
-            Decision.UNDECIDED,
-            Cause.SETTLING,
-            "the estimate's error bound is not below what is known anyway",
-        )
-    return Decision.CLEAN, Cause.AGREEMENT, "every input and sensor is within its bounds"
+    return _quiet(evidence)
+
+
+def _quiet(evidence: _Evidence) -> tuple[Decision, Cause, str]:
+    """The answer where nobody is named."""
+    silent = np.flatnonzero(evidence.silent).tolist()
+    if evidence.contradicted:
+        reason = "observers contradict each other, and nobody can be named"
+        reason += f"; sensors {silent} are silent" if silent else ""
+        return Decision.UNDECIDED, Cause.AMBIGUOUS, reason
+    if not evidence.settled:
+        reason = "the estimate's error bound is not below what is known anyway"
+        return Decision.UNDECIDED, Cause.SETTLING, reason
+    reason = "every input and sensor is within its bounds"
+    if silent:
+        reason = f"all that is heard is within its bounds; sensors {silent} are silent"
+    return Decision.CLEAN, Cause.AGREEMENT, reason

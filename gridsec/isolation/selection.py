@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gridsec.arrays import Floats
+from gridsec.arrays import Bools, Floats
 from gridsec.isolation.design import IsolationDesign
 from gridsec.observers.unknown_input import UnknownInputState
 
@@ -29,15 +29,44 @@ def disagreement(design: IsolationDesign, state: UnknownInputState) -> Floats:
     Floats
         (a,).
     """
-    gap = np.abs(state.x[design.large][:, None, :] - state.x[design.company])
-    if design.measure == "distance":
-        pi = np.linalg.norm(gap, axis=2).max(axis=1)
-    else:
-        allowed = state.box[design.large][:, None, :] + state.box[design.company]
-        # Equal estimates agree even where both are known exactly.
-        pi = np.where(gap > 0.0, gap / np.maximum(allowed, np.finfo(np.float64).tiny), 0.0).max(axis=(1, 2))
+    if design.measure == "bounds":
+        return contradiction(design, state)
+    pi = np.linalg.norm(_gap(design, state), axis=2).max(axis=1)
+    return np.where(_dead(design, state), np.inf, pi)
+
+
+def contradiction(design: IsolationDesign, state: UnknownInputState) -> Floats:
+    """The largest difference of an entry from that of its company, in parts of the sum of both bounds.
+
+    Parameters
+    ----------
+    design
+        The bank.
+    state
+        Where its observers stand.
+
+    Returns
+    -------
+    Floats
+        (a,); infinite where no member is left to confirm it. A finite value above 1 proves that the
+        observer or one of its company is deceived.
+    """
+    gap = _gap(design, state)
+    allowed = state.box[design.large][:, None, :] + state.box[design.company]
+    # Equal estimates agree even where both are known exactly.
+    pi = np.where(gap > 0.0, gap / np.maximum(allowed, np.finfo(np.float64).tiny), 0.0).max(axis=(1, 2))
+    return np.where(_dead(design, state), np.inf, pi)
+
+
+def _gap(design: IsolationDesign, state: UnknownInputState) -> Floats:
+    """Differences of every large observer's estimate from those of its company, (a, b, n)."""
+    return np.asarray(np.abs(state.x[design.large][:, None, :] - state.x[design.company]))
+
+
+def _dead(design: IsolationDesign, state: UnknownInputState) -> Bools:
+    """Large observers that nothing can confirm, (a,)."""
     dead = design.alone | ~state.live[design.large] | ~state.live[design.company].all(axis=1)
-    return np.where(dead, np.inf, pi)
+    return np.asarray(dead)
 
 
 def bounds(design: IsolationDesign, state: UnknownInputState) -> Floats:

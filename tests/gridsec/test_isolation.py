@@ -20,7 +20,16 @@ from gridsec.arrays import Floats
 from gridsec.droop import Droop, curve_gap, voltage_curve
 from gridsec.errors import DesignInfeasible, NotObservable
 from gridsec.feeder import lindistflow, loss_correction
-from gridsec.isolation import Isolation, IsolationDesign, disagreement, init, members, step, support
+from gridsec.isolation import (
+    Isolation,
+    IsolationDesign,
+    Measure,
+    disagreement,
+    init,
+    members,
+    step,
+    support,
+)
 from gridsec.lmi.sampled import advance
 from gridsec.lure import close_loop, known_input
 from gridsec.observers.unknown_input import UnknownInputPlant, inverters, obstruction
@@ -277,6 +286,27 @@ def test_one_silent_meter_is_borne_and_two_are_not() -> None:
     assert {answer.cause for answer in answers[30:40]} == {Cause.SETTLING}
     assert all(decided[45:])
     assert np.isnan(answers[25].sensor_attack[4])
+
+
+@pytest.mark.parametrize("measure", ["bounds", "distance"])
+def test_a_lie_that_nobody_can_be_blamed_for_is_undecided(measure: Measure) -> None:
+    """One meter is silent: the only large observer left is contradicted by its company, and names nobody."""
+    made = replace(complete(), measure=measure)
+    rng, plant = np.random.default_rng(0), made.family.plant
+    for lie, decision, cause in (
+        (50.0, Decision.UNDECIDED, Cause.AMBIGUOUS),
+        (0.0, Decision.CLEAN, Cause.AGREEMENT),
+    ):
+        x, state = rng.standard_normal(2), init(made, 0.0, radius=np.full(2, 6.0))
+        for k in range(60):
+            u = rng.uniform(-5, 5, 2)
+            y = plant.system.C @ x + np.array([lie * (k > 40), 0.0, 0.0, 0.0])
+            state, answer = step(made, state, y, u, ALL4 & ((np.arange(4) != 1) | (k < 20)))
+            x = advance(plant.system, x, u)
+        assert (answer.decision, answer.cause) == (decision, cause)
+        assert not answer.sensors.any()
+        assert "sensors [1] are silent" in answer.reason
+        assert "every input and sensor" not in answer.reason
 
 
 def test_the_continuous_loop_is_inside_the_sampled_plants_bounds() -> None:
