@@ -27,7 +27,7 @@ from scipy.linalg import block_diag, solve_discrete_lyapunov
 
 from gridsec.arrays import Bools, Floats, frozen, spectral_radius, symmetry_defect
 from gridsec.errors import DesignInfeasible
-from gridsec.observers.parts import Stack, decompose, riccati, stack
+from gridsec.observers.parts import Stack, decompose, heard, riccati, stack
 
 RESIDUAL = 1e-8
 """Largest relative residual of a Riccati equation whose solution counts."""
@@ -133,12 +133,18 @@ def design(
     lee2018, Assumption 4.3.3, (4.3.8), (4.3.9).
     """
     Q, R = np.asarray(Q, dtype=np.float64), np.asarray(R, dtype=np.float64)
+    problems: list[str] = []
     for name, M, size in (("Q", Q, len(A)), ("R", R, len(C))):
         if M.shape != (size, size):
-            raise ValueError(f"{name} has shape {M.shape}; ({size}, {size}) is needed")
+            problems.append(f"{name} has shape {M.shape}; ({size}, {size}) is needed")
+            continue
         scale = float(np.max(np.abs(M), initial=0.0))
-        if symmetry_defect(M) > 1e-12 or float(np.linalg.eigvalsh(M)[0]) < -1e-12 * scale:
-            raise ValueError(f"{name} is no covariance: not symmetric, or not positive semidefinite")
+        if not np.all(np.isfinite(M)):
+            problems.append(f"{name} is not finite")
+        elif not symmetry_defect(M) <= 1e-12 or float(np.linalg.eigvalsh(M)[0]) < -1e-12 * scale:
+            problems.append(f"{name} is no covariance: not symmetric, or not positive semidefinite")
+    if problems:
+        raise ValueError("; ".join(problems))
     whole = stack(decompose(A, C, slowest=slowest, tol=tol), B)
     own = block_diag(*(np.ones((part.t.size, 1)) for part in whole.parts))
     process = whole.phi @ Q @ whole.phi.T
@@ -195,7 +201,8 @@ def correct(design: KalmanDesign, state: KalmanState, y: Floats, seen: Bools | N
     design, state
         Filters, and where they stand.
     y : (…, p)
-        Readings; anything where not seen.
+        Readings; ignored where not seen or not finite. Runs share their covariance: a sensor that lacks
+        the reading of one of them is not used in any.
     seen : (p,)
         Which readings there are; all by default.
 
@@ -206,7 +213,7 @@ def correct(design: KalmanDesign, state: KalmanState, y: Floats, seen: Bools | N
     T, R = design.stack.T, design.noise
     M = (state.P @ T.T) * design.own
     s = np.einsum("im,mi->i", T, M) + np.diagonal(R)
-    use = s > 0.0 if seen is None else (s > 0.0) & seen
+    use = (s > 0.0) & heard(y, seen)
     K = M * np.where(use, 1.0 / np.where(use, s, 1.0), 0.0)
     J = np.eye(len(K)) - K @ T
     P = J @ state.P @ J.T + K @ R @ K.T
@@ -224,7 +231,7 @@ def step(
     design, state
         Filters, and where they stand.
     y : (…, p)
-        Readings at the end of the step; anything where not seen.
+        Readings at the end of the step; ignored where not seen or not finite.
     u : (…, m)
         Input during the step.
     seen : (p,)

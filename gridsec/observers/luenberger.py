@@ -22,7 +22,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, frozen, spectral_radius
 from gridsec.errors import DesignInfeasible
-from gridsec.observers.parts import Part, Stack, decompose, riccati, stack
+from gridsec.observers.parts import Part, Stack, decompose, heard, riccati, stack
 
 LONGEST = 1 << 17
 """Largest number of steps after which an observer's error must have halved for good."""
@@ -220,8 +220,8 @@ def design(
     E, noise = np.asarray(bounds.E, dtype=np.float64), np.asarray(bounds.noise, dtype=np.float64)
     if E.ndim != 2 or E.shape[0] != len(A) or noise.shape != (len(parts),):
         raise ValueError(f"E has shape {E.shape} and noise {noise.shape} for n = {len(A)}, p = {len(parts)}")
-    if bounds.process < 0.0 or np.any(noise < 0.0):
-        raise ValueError("bounds of disturbance and noise cannot be negative")
+    if not (bounds.process >= 0.0 and np.all(noise >= 0.0)):
+        raise ValueError("bounds of disturbance and noise must be numbers and cannot be negative")
     if isinstance(gains, str):
         weight = bounds.process**2 * E @ E.T
         if np.any(noise == 0.0):
@@ -357,7 +357,8 @@ def step(
     design, state
         Observers, and where they stand.
     y : (…, p)
-        Readings; anything where not seen.
+        Readings; ignored where not seen or not finite. Runs share their bounds: a sensor that lacks the
+        reading of one of them is not used in any.
     u : (…, m)
         Inputs.
     seen : (p,)
@@ -369,15 +370,16 @@ def step(
     lee2018 (4.3.1).
     """
     stack = design.stack
-    if seen is None or bool(np.all(seen)):
+    live = heard(y, seen)
+    if np.all(live):
         z = state.z @ design.F.T + y @ design.L.T + u @ stack.G.T
         return LuenbergerState(state.t + design.period, z, state.origin, state.age + 1)
-    surprise = np.where(seen, y - state.z @ stack.T.T, 0.0)
+    surprise = np.where(live, y - state.z @ stack.T.T, 0.0)
     z = state.z @ stack.S.T + surprise @ design.L.T + u @ stack.G.T
     pushed = design.bounds.process * float(np.linalg.norm(design.bounds.E, 2))
     grown = np.where(design.step_norm > 0.0, design.step_norm * bound(design, state) + pushed, 0.0)
-    origin = np.where(seen, state.origin, grown)
-    return LuenbergerState(state.t + design.period, z, origin, np.where(seen, state.age + 1, 0))
+    origin = np.where(live, state.origin, grown)
+    return LuenbergerState(state.t + design.period, z, origin, np.where(live, state.age + 1, 0))
 
 
 def bound(design: LuenbergerDesign, state: LuenbergerState) -> Floats:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import LinAlgError, block_diag, schur, solve_discrete_are
 
-from gridsec.arrays import Floats, Ints, frozen, frozen_ints, unit_rows
+from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints, unit_rows
 from gridsec.errors import DesignInfeasible
 
 
@@ -220,3 +220,18 @@ def riccati(S: Floats, t: Floats, Q: Floats, r: float, *, tol: float) -> Floats:
     if not worst <= tol:
         raise DesignInfeasible("Riccati equation of one sensor", said, -worst)
     return np.asarray(0.5 * (best + best.T))
+
+
+def heard(y: Floats, seen: Bools | None) -> Bools:
+    """Sensors whose readings can be used, (p,): seen, and finite in all runs.
+
+    Parameters
+    ----------
+    y : (…, p)
+        Readings; leading axes are independent runs.
+    seen : (p,)
+        Which readings there are; None: all.
+    """
+    finite = np.isfinite(y)
+    live = finite.all(axis=tuple(range(finite.ndim - 1)))
+    return np.asarray(live if seen is None else live & np.asarray(seen, dtype=np.bool_))

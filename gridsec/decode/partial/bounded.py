@@ -138,7 +138,7 @@ def design(
     """
     blocks = observers.stack.blocks
     size = np.ones(len(blocks)) if scale is None else np.asarray(scale, dtype=np.float64)
-    if size.shape != (len(blocks),) or not np.all(size > 0.0):
+    if size.shape != (len(blocks),) or not np.all(np.isfinite(size) & (size > 0.0)):
         raise ValueError("scale must have one positive number for each sensor")
     stacked = Stack.of([block / s for block, s in zip(blocks, size, strict=True)])
     decoder = search.design(stacked, max_attacked, tol=tol, left_out=left_out)
@@ -202,7 +202,8 @@ def decode(design: BoundedDesign, state: BoundedState) -> tuple[BoundedState, Bo
     limit = design.constants.theta * v_max
     x = _fit(stacked, z, state.trusted)
     sizes = stacked.norms(z - stacked.matrix @ x)
-    disagree = sizes > limit
+    # Written so that a residual that is no number disagrees.
+    disagree = ~(sizes <= limit)
     searched = np.count_nonzero(disagree) > design.decoder.max_attacked
     credible = True
     if searched:

@@ -25,6 +25,7 @@ from gridsec.decode.partial.fusion import Fused, Parity, fuse, parity
 from gridsec.decode.stacks import MOST_SUBSETS, Stack, require, subsets
 from gridsec.observers import kalman
 from gridsec.observers.kalman import KalmanDesign, KalmanState, Steady
+from gridsec.observers.parts import heard
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -214,13 +215,13 @@ def init(
     Raises
     ------
     ValueError
-        If a stationary filter lacks a reading.
+        If a stationary filter lacks a reading, or one is not finite.
     """
     first = kalman.init(design.filters, t, mean, covariance)
     if design.steady is None:
         first = kalman.correct(design.filters, first, y, seen)
     else:
-        _require_all(seen)
+        _require_all(y, seen)
         z = first.z + (y - first.z @ design.filters.stack.T.T) @ design.steady.K.T
         first = KalmanState(t, z, design.steady.P, design.steady.K)
     return decode(design, GaussianState(first, 0, 0, _none(design, first.P)))
@@ -241,10 +242,10 @@ def step(
     Raises
     ------
     ValueError
-        If a stationary filter lacks a reading.
+        If a stationary filter lacks a reading, or one is not finite.
     """
     if design.steady is not None:
-        _require_all(seen)
+        _require_all(y, seen)
         filters = kalman.step_steady(design.filters, design.steady, state.filters, y, u)
     else:
         filters = kalman.step(design.filters, state.filters, y, u, seen)
@@ -269,7 +270,8 @@ def decode(design: GaussianDesign, state: GaussianState) -> tuple[GaussianState,
     z, now = state.filters.z, state.current
     tables, tested = _fused(design, state.tables, now)
     g, threshold = _score(tested, z), float(design.thresholds[tested.freedom])
-    alarm = g > threshold
+    # Written so that a statistic that is no number alarms.
+    alarm = not g <= threshold
     chosen, passed, used = now, state.passed, tested
     if alarm:
         for i in range(1, len(design.sets)):
@@ -290,7 +292,7 @@ def decode(design: GaussianDesign, state: GaussianState) -> tuple[GaussianState,
         used.estimator @ z,
         used.covariance,
         trusted,
-        bool(alarm),
+        alarm,
         g,
         threshold,
         tested.freedom,
@@ -299,8 +301,8 @@ def decode(design: GaussianDesign, state: GaussianState) -> tuple[GaussianState,
     return GaussianState(state.filters, chosen, passed, tables), outcome
 
 
-def _require_all(seen: Bools | None) -> None:
-    if seen is not None and not np.all(seen):
+def _require_all(y: Floats, seen: Bools | None) -> None:
+    if not np.all(heard(y, seen)):
         raise ValueError("filters with stationary gains need every reading; design without `steady`")
 
 

@@ -340,6 +340,8 @@ def test_tables_are_refreshed_as_asked_and_steady_filters_keep_them() -> None:
         gaussian.step(fixed, at_rest, C @ np.zeros(3), np.zeros(1), np.arange(6) > 0)
     with pytest.raises(ValueError, match="every reading"):
         gaussian.init(fixed, 0.0, np.zeros(3), np.eye(3), y[0], seen=np.arange(6) > 0)
+    with pytest.raises(ValueError, match="every reading"):
+        gaussian.step(fixed, at_rest, np.where(np.arange(6) > 0, 0.0, np.nan), np.zeros(1))
 
 
 def test_silent_sensor_does_not_alarm_and_its_reading_does_not_matter() -> None:
@@ -357,3 +359,35 @@ def test_silent_sensor_does_not_alarm_and_its_reading_does_not_matter() -> None:
             assert not out.alarm
         outs.append(out)
     assert np.array_equal(outs[0].x, outs[1].x)
+
+
+def test_one_reading_that_is_no_number_silences_nobody() -> None:
+    """The next gross lie is found as if the reading had only been missing."""
+    gauss, *_ = gaussian_case(2, false_alarm=1e-6)
+    bound, *_ = bounded_design(3)
+    first, _ = gaussian.init(gauss, 0.0, np.zeros(3), 0.01 * np.eye(3), np.zeros(6))
+    second, _ = bounded.init(bound, 0.0, np.zeros(3), 0.1)
+    at = np.arange(6)
+    for y in (np.where(at == 0, np.nan, 0.0), np.zeros(6), np.where(at == 1, 500.0, 0.0)):
+        first, out = gaussian.step(gauss, first, y, np.zeros(1))
+        second, other = bounded.step(bound, second, y, np.zeros(1))
+        lie = bool(y[1])
+        assert out.alarm == lie
+        assert out.trusted[1] != lie
+        assert other.disagree[1] == lie
+        for one in (out, other):
+            assert np.all(np.isfinite(one.x))
+            assert one.credible
+
+
+def test_an_estimate_that_is_no_number_is_not_credible() -> None:
+    gauss, *_ = gaussian_case(2)
+    bound, *_ = bounded_design(3)
+    first, _ = gaussian.init(gauss, 0.0, np.zeros(3), 0.01 * np.eye(3), np.zeros(6))
+    second, _ = bounded.init(bound, 0.0, np.zeros(3), 0.1)
+    _, out = gaussian.step(gauss, first, np.zeros(6), np.array([np.nan]))
+    _, other = bounded.step(bound, second, np.zeros(6), np.array([np.nan]))
+    assert out.alarm
+    assert not out.credible
+    assert other.disagree.all()
+    assert not other.credible

@@ -173,9 +173,24 @@ def test_covariances_that_are_none_are_refused() -> None:
         (np.eye(3), np.eye(2)),
         (np.array([[1.0, 0.5], [0.0, 1.0]]), np.eye(2)),
         (np.eye(2), np.diag([1.0, -1.0])),
+        (np.array([[np.nan, 0.0], [0.0, 1.0]]), np.eye(2)),
+        (np.eye(2), np.diag([np.inf, 1.0])),
     ):
-        with pytest.raises(ValueError, match=r"shape|covariance"):
+        with pytest.raises(ValueError, match=r"shape|covariance|finite"):
             kalman.design(A, B, C, Q, R, slowest=0.0, tol=TOL)
+    with pytest.raises(ValueError, match=r"Q is not finite; R has shape"):
+        kalman.design(A, B, C, np.full((2, 2), np.nan), np.eye(3), slowest=0.0, tol=TOL)
+
+
+def test_a_reading_that_is_not_finite_counts_as_unseen() -> None:
+    made, *_ = case(5)
+    start = kalman.init(made, 0.0, np.arange(5.0), np.eye(5))
+    y, seen = np.arange(5.0), np.array([True, True, False, True, True])
+    expected = kalman.correct(made, start, y, seen)
+    for junk in (np.nan, np.inf):
+        found = kalman.correct(made, start, np.where(seen, y, junk))
+        assert np.array_equal(found.z, expected.z)
+        assert np.array_equal(found.P, expected.P)
 
 
 def test_steady_filter_that_does_not_exist_is_refused() -> None:

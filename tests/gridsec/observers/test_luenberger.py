@@ -263,6 +263,17 @@ def test_masked_sensor_has_no_influence_and_batch_equals_single() -> None:
     assert np.allclose(full.z, luenberger.step(made, luenberger.init(made, 0.0, guesses, 1.0), y, u).z)
 
 
+def test_a_reading_that_is_not_finite_counts_as_unseen() -> None:
+    made = designed(11)
+    start = luenberger.init(made, 0.0, np.arange(5.0), 1.0)
+    y, seen = np.arange(5.0), np.array([True, False, True, True, True])
+    expected = luenberger.step(made, start, y, np.zeros(1), seen)
+    for junk in (np.nan, -np.inf):
+        found = luenberger.step(made, start, np.where(seen, y, junk), np.zeros(1))
+        assert np.array_equal(found.z, expected.z)
+        assert np.array_equal(found.origin, expected.origin)
+
+
 def test_unknown_start_has_no_bound_ever() -> None:
     made = designed(11)
     state = luenberger.init(made, 0.0, np.zeros(5))
@@ -281,6 +292,8 @@ def test_designs_that_do_not_work_are_refused() -> None:
         luenberger.design(A, B, C, bounds, slowest=0.0, tol=TOL, gains=[np.zeros(1)])
     with pytest.raises(ValueError, match="negative"):
         luenberger.design(A, B, C, Bounds(-1.0, np.array([0.1]), np.eye(2)), slowest=0.0, tol=TOL)
+    with pytest.raises(ValueError, match="numbers"):
+        luenberger.design(A, B, C, Bounds(0.1, np.array([np.nan]), np.eye(2)), slowest=0.0, tol=TOL)
     with pytest.raises(ValueError, match="positive bounds"):
         luenberger.design(A, B, C, Bounds(0.1, np.zeros(1), np.eye(2)), slowest=0.0, tol=TOL)
     with pytest.raises(ValueError, match="shape"):
