@@ -60,8 +60,15 @@ class Test:
         Parameters
         ----------
         false_alarm
-            delta, between 0 and 1.
+            delta, strictly between 0 and 1.
+
+        Raises
+        ------
+        ValueError
+            If it is not.
         """
+        if not 0.0 < false_alarm < 1.0:
+            raise ValueError(f"false_alarm is {false_alarm}; it must lie in (0, 1)")
         return float(chdtri(self.freedom, false_alarm))
 
 
@@ -76,7 +83,7 @@ class Verdicts:
     g : (…)
         Square sums of the standardised residuals.
     alarm : (…)
-        Whether g exceeds the threshold.
+        Whether g exceeds the threshold, or is no number.
     """
 
     x: Floats
@@ -143,7 +150,8 @@ def design_test(stack: Stack, P: Floats, kept: Ints | None = None) -> Test:
     Raises
     ------
     NotObservable
-        If these sensors do not determine x.
+        If these sensors do not determine x, or do so without any redundancy, so that no reading could
+        speak against it.
     DesignInfeasible
         If P is not positive definite.
 
@@ -151,6 +159,19 @@ def design_test(stack: Stack, P: Floats, kept: Ints | None = None) -> Test:
     ----------
     lee2018 (2.2.16) to (2.2.20), Algorithm 2.2 with N - n degrees of freedom.
     """
+    test = _least_squares(stack, P, kept)
+    if test.freedom == 0:
+        alone = list(range(stack.count)) if kept is None else np.asarray(kept).tolist()
+        raise NotObservable(
+            alone,
+            stack.unknowns,
+            f"sensors {alone} determine the state without redundancy: nothing could contradict them",
+        )
+    return test
+
+
+def _least_squares(stack: Stack, P: Floats, kept: Ints | None = None) -> Test:
+    """`design_test` for any sensors that determine x, with or without redundancy."""
     use = np.arange(stack.count) if kept is None else np.asarray(kept)
     rows = stack.rows(use)
     n, N = stack.unknowns, stack.matrix.shape[0]
@@ -185,7 +206,7 @@ def residual_covariance(stack: Stack, P: Floats) -> Floats:
     ----------
     lee2018 (2.2.20).
     """
-    return np.asarray(P - stack.matrix @ design_test(stack, P).covariance @ stack.matrix.T)
+    return np.asarray(P - stack.matrix @ _least_squares(stack, P).covariance @ stack.matrix.T)
 
 
 def detect(test: Test, z: Floats, *, false_alarm: float) -> Verdicts:
@@ -198,14 +219,19 @@ def detect(test: Test, z: Floats, *, false_alarm: float) -> Verdicts:
     z : (…, N)
         Measurements.
     false_alarm
-        delta, probability of an alarm without an error.
+        delta, probability of an alarm without an error, strictly between 0 and 1.
+
+    Returns
+    -------
+    Verdicts
+        Measurements that are not finite alarm.
 
     References
     ----------
     lee2018, Algorithm 2.2, with the degrees of freedom corrected.
     """
     g = np.square(z @ test.standardise.T).sum(axis=-1)
-    return Verdicts(np.asarray(z @ test.estimator.T), g, np.asarray(g > test.threshold(false_alarm)))
+    return Verdicts(np.asarray(z @ test.estimator.T), g, np.asarray(~(g <= test.threshold(false_alarm))))
 
 
 def design_hypotheses(stack: Stack, P: Floats, q: int, *, most: int = MOST_SUBSETS) -> Hypotheses:
@@ -231,13 +257,6 @@ def design_hypotheses(stack: Stack, P: Floats, q: int, *, most: int = MOST_SUBSE
     kept = subsets(stack.count, stack.count - q, most)
     tests = [design_test(stack, P, k) for k in kept]
     freedom = np.array([t.freedom for t in tests], dtype=np.intp)
-    if np.any(freedom == 0):
-        alone = kept[int(np.argmin(freedom))]
-        raise NotObservable(
-            alone.tolist(),
-            stack.unknowns,
-            f"sensors {alone.tolist()} determine the state without redundancy: nothing could contradict them",
-        )
     wide = np.zeros((len(tests), int(freedom.max()), stack.matrix.shape[0]))
     for i, t in enumerate(tests):
         wide[i, : t.freedom] = t.standardise

@@ -258,3 +258,17 @@ def test_refusals() -> None:
         design_test(stack, np.eye(4), np.array([0, 1]))
     with pytest.raises(DesignInfeasible, match="not positive definite"):
         design_test(stack, np.zeros((4, 4)))
+    with pytest.raises(NotObservable, match=r"\[0, 1, 2\] determine the state without redundancy"):
+        design_test(stack, np.eye(4), np.arange(3))
+    square = Stack.of_rows(rng.standard_normal((3, 3)))
+    assert np.allclose(residual_covariance(square, np.eye(3)), 0.0, atol=1e-9)
+    for rate in (0.0, 1.0, 2.0, -1.0, np.nan):
+        with pytest.raises(ValueError, match="false_alarm"):
+            detect(design_test(stack, np.eye(4)), np.zeros(4), false_alarm=rate)
+
+
+def test_measurements_that_are_not_finite_alarm() -> None:
+    test = design_test(Stack.of_rows(np.ones((3, 1))), np.eye(3))
+    z = np.array([[np.nan, 1.0, 1.0], [1.0, np.inf, 1.0], [1.0, 1.0, 1.0]])
+    with np.errstate(invalid="ignore"):
+        assert detect(test, z, false_alarm=0.01).alarm.tolist() == [True, True, False]
