@@ -96,7 +96,7 @@ def matching_pursuit(F: Floats, y: Floats, q: int, *, heights: Ints | None = Non
     e : (N,)
         Least squares on the chosen blocks, zero elsewhere.
     chosen : (q,)
-        The blocks, in the order of their choice. Fewer if the residual vanishes before.
+        The blocks, in the order of their choice. Fewer if the residual vanishes or all are chosen before.
 
     References
     ----------
@@ -107,7 +107,7 @@ def matching_pursuit(F: Floats, y: Floats, q: int, *, heights: Ints | None = Non
     bases = [np.linalg.qr(F[:, part])[0] for part in parts]
     chosen: list[int] = []
     e, rest = np.zeros(F.shape[1]), y
-    while len(chosen) < q and np.any(rest):
+    while len(chosen) < min(q, len(parts)) and np.any(rest):
         match = np.array([np.linalg.norm(b.T @ rest) for b in bases])
         # Rounding must not make it choose a block twice.
         match[chosen] = -1.0

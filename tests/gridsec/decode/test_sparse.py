@@ -142,3 +142,10 @@ def test_nothing_to_find_and_nothing_possible() -> None:
         basis_pursuit(F, np.array([1.0, 2.0]))
     with pytest.raises(DesignInfeasible, match="stacked basis pursuit"):
         group_pursuit(F, np.array([1.0, 2.0]), np.array([1, 2]))
+
+
+def test_no_block_is_chosen_twice_where_more_are_asked_for_than_there_are() -> None:
+    F, y = np.array([[1.0, 0.3], [0.2, 1.0], [0.5, 0.5]]), np.array([1.0, 0.5, 2.0])
+    e, chosen = matching_pursuit(F, y, 3)
+    assert sorted(chosen.tolist()) == [0, 1]
+    assert np.allclose(e, np.linalg.solve(F.T @ F, F.T @ y), atol=1e-12)
