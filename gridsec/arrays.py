@@ -58,6 +58,28 @@ def frozen_ints(values: Ints) -> Ints:
     return out
 
 
+def not_negative(name: str, values: Floats | float) -> Floats:
+    """`values` as doubles, if none of them is negative or no number; infinity passes.
+
+    Parameters
+    ----------
+    name
+        What they are called where one of them is refused.
+    values : (…)
+        The numbers.
+
+    Raises
+    ------
+    ValueError
+        If one is negative or NaN.
+    """
+    out = np.asarray(values, dtype=np.float64)
+    wrong = out[~(out >= 0.0)]
+    if wrong.size:
+        raise ValueError(f"{name} is {wrong[0]}; it must be a number that is not negative")
+    return out
+
+
 def any_of(mask: Bools | Ints | Floats) -> bool:
     """``mask.any()``, in a fifth of the time where the array is small.
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, Ints
+from gridsec.arrays import Bools, Floats, Ints, not_negative
 from gridsec.decode.search import Decoded, Decoder, bounded, cheapest
 from gridsec.decode.stacks import MOST_SUBSETS, Stack, masked, require, residual, subsets
 
@@ -187,7 +187,12 @@ def detect(stack: Stack, z: Floats, *, v_max: Floats | float) -> Detected:
     z : (…, N)
         Measurements.
     v_max : scalar or (…)
-        Largest norm of a block of the noise.
+        Largest norm of a block of the noise, not negative.
+
+    Raises
+    ------
+    ValueError
+        If a `v_max` is negative or no number.
 
     References
     ----------
@@ -195,8 +200,9 @@ def detect(stack: Stack, z: Floats, *, v_max: Floats | float) -> Detected:
     """
     sizes = stack.norms(residual(stack, z))
     x = z @ np.linalg.pinv(stack.matrix).T
-    limit = np.sqrt(stack.count) * np.asarray(v_max, dtype=np.float64)[..., None]
-    return Detected(np.asarray(x), sizes, np.any(sizes > limit, axis=-1))
+    limit = np.sqrt(stack.count) * not_negative("v_max", v_max)[..., None]
+    # Written so that a residual that is no number alarms.
+    return Detected(np.asarray(x), sizes, np.any(~(sizes <= limit), axis=-1))
 
 
 def correct(decoder: Decoder, constants: CorrectionConstants, z: Floats, *, v_max: Floats | float) -> Decoded:
@@ -211,13 +217,18 @@ def correct(decoder: Decoder, constants: CorrectionConstants, z: Floats, *, v_ma
     z : (…, N)
         Measurements.
     v_max : scalar or (…)
-        Largest norm of a block of the noise.
+        Largest norm of a block of the noise, not negative.
+
+    Raises
+    ------
+    ValueError
+        If a `v_max` is negative or no number.
 
     References
     ----------
     lee2018 (2.2.8'), Theorem 2.2.11.
     """
-    return bounded(decoder, z, limit=constants.theta * np.asarray(v_max, dtype=np.float64)[..., None])
+    return bounded(decoder, z, limit=constants.theta * not_negative("v_max", v_max)[..., None])
 
 
 def _subset_norms(stack: Stack, kept: Ints) -> tuple[Floats, Floats]:

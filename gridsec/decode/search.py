@@ -17,7 +17,7 @@ from math import comb
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, Ints, frozen
+from gridsec.arrays import Bools, Floats, Ints, frozen, not_negative
 from gridsec.decode.stacks import MOST_SUBSETS, Stack, masked, require, subsets
 
 
@@ -146,18 +146,23 @@ def bounded(decoder: Decoder, z: Floats, *, limit: Floats | float) -> Decoded:
     z : (…, N)
         Measurements, finite.
     limit : scalar or (…, 1) or (…, p)
-        `v'_max = theta v_max`, for which `gridsec.decode.noise` gives the error bound.
+        `v'_max = theta v_max`, for which `gridsec.decode.noise` gives the error bound; not negative.
 
     Returns
     -------
     Decoded
         Of several minimisers the one whose explained blocks fit best; the bound holds for all.
 
+    Raises
+    ------
+    ValueError
+        If a limit is negative or no number.
+
     References
     ----------
     lee2018 (2.2.8'), Proposition 2.2.10, Theorem 2.2.11.
     """
-    wide = np.asarray(limit, dtype=np.float64)
+    wide = not_negative("limit", limit)
     return _vote(decoder, z, _candidates(decoder, z), wide if wide.ndim == 0 else wide[..., None, :])
 
 
@@ -171,7 +176,8 @@ def _candidates(decoder: Decoder, z: Floats) -> Floats:
 def _vote(decoder: Decoder, z: Floats, x: Floats, limit: Floats) -> Decoded:
     stack = decoder.stack
     sizes = stack.norms(np.asarray(z)[..., None, :] - x @ stack.matrix.T)
-    unexplained = sizes > limit
+    # Written so that a residual that is no number counts as unexplained.
+    unexplained = ~(sizes <= limit)
     count = np.count_nonzero(unexplained, axis=-1)
     misfit = np.where(unexplained, 0.0, sizes).sum(axis=-1)
     best = np.argmin(np.where(count == count.min(axis=-1, keepdims=True), misfit, np.inf), axis=-1)

@@ -320,4 +320,5 @@ def sensors_in_error(stack: Stack, z: Floats, x: Floats, limit: Floats | float) 
     ----------
     lee2018, Lemma 2.2.8 and Theorem 2.2.12.
     """
-    return np.asarray(np.count_nonzero(stack.norms(z - x @ stack.matrix.T) > limit, axis=-1))
+    # Written so that a residual that is no number counts.
+    return np.asarray(np.count_nonzero(~(stack.norms(z - x @ stack.matrix.T) <= limit), axis=-1))

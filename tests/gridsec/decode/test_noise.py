@@ -231,3 +231,19 @@ def test_refusals() -> None:
         correction_constants(stack, 2, tol=TOL)
     with pytest.raises(ValueError, match="q <= r <= 2 q"):
         correction_constants(stack, 1, tol=TOL, left_out=0)
+    decoder, constants = design(stack, 1, tol=TOL), correction_constants(stack, 1, tol=TOL)
+    for bad in (np.nan, -1.0, np.array([0.1, np.nan])):
+        with pytest.raises(ValueError, match="v_max is"):
+            detect(stack, np.zeros((2, 5)), v_max=bad)
+        with pytest.raises(ValueError, match="v_max is"):
+            correct(decoder, constants, np.zeros((2, 5)), v_max=bad)
+
+
+def test_a_reading_that_is_no_number_alarms_and_decodes_to_nothing_credible() -> None:
+    stack = Stack.of_rows(np.ones((3, 1)))
+    z = np.array([[np.nan, 1.0, 1.0], [1.0, 1.0, 1.0]])
+    assert detect(stack, z, v_max=0.1).alarm.tolist() == [True, False]
+    found = correct(design(stack, 1, tol=TOL), correction_constants(stack, 1, tol=TOL), z, v_max=0.1)
+    assert found.credible.tolist() == [False, True]
+    assert found.in_error.tolist() == [[True] * 3, [False] * 3]
+    assert sensors_in_error(stack, z, np.ones((2, 1)), 0.1).tolist() == [3, 0]

@@ -124,3 +124,6 @@ def test_refusals() -> None:
         design(stack, 1, tol=TOL, left_out=3)
     with pytest.raises(DesignInfeasible, match="at most 5 allowed"):
         design(stack, 1, tol=TOL, most=5)
+    for limit in (np.nan, -1e-9):
+        with pytest.raises(ValueError, match="limit is"):
+            bounded(design(stack, 1, tol=TOL), np.zeros(6), limit=limit)
