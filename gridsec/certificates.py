@@ -180,7 +180,7 @@ def quadratic(
     multiplier : (m,)
         Lambda, positive.
     rate
-        Claimed decay rate, 1/s.
+        Claimed decay rate, 1/s, positive.
     kind, status
         As in `Certificate`.
 
@@ -242,7 +242,8 @@ def verify(certificate: Certificate, lure: Lure, trusted: Bools | None = None) -
     -------
     float
         Slack of the condition at the claimed rate, relative to the rate of the slowest inverter and
-        less the rounding error of the computation. Positive: the certificate holds.
+        less the rounding error of the computation. Positive: the certificate holds. Minus infinity where
+        the claimed rate is not positive and finite.
 
     Raises
     ------
@@ -447,16 +448,22 @@ def _quadratic_rate(P: Floats, multiplier: Floats, form: _Form) -> float:
     return float(eigenvalues[0] - rounding * np.max(np.abs(eigenvalues))) / 2.0
 
 
+def _decays(rate: float) -> bool:
+    """Whether a claimed rate claims anything: errors that may grow are no convergence."""
+    return bool(np.isfinite(rate) and rate > 0.0)
+
+
 def _quadratic_margin(P: Floats, multiplier: Floats, rate: float, form: _Form) -> float:
     """Slack of `_quadratic_rate` over the claimed rate, relative to the slowest inverter."""
-    sound = np.all(multiplier > 0) and np.array_equal(P, P.T)
-    best = _quadratic_rate(P, multiplier, form) if sound else -np.inf
-    return (best - rate) * float(np.max(form.tau))
+    sound = _decays(rate) and np.all(multiplier > 0) and np.array_equal(P, P.T)
+    if not sound:
+        return -np.inf
+    return (_quadratic_rate(P, multiplier, form) - rate) * float(np.max(form.tau))
 
 
 def _small_gain_margin(weights: Floats, rate: float, form: _Form) -> float:
     """Slack of `T^-1 (I - D |S|) c >= rate c`, relative to the slowest inverter."""
-    if not np.all(weights > 0):
+    if not (_decays(rate) and np.all(weights > 0)):
         return -np.inf
     loop = form.slope * (np.abs(form.S) @ weights) / weights
     rounding = 2.0 * weights.size * np.finfo(np.float64).eps * (1.0 + loop)

@@ -240,12 +240,16 @@ def test_forgeries_are_caught(seed: int) -> None:
         assert verify(certificate, lure) > 0
         assert verify(replace(certificate, rate=1.2 * certificate.rate), lure) < 0
         assert verify(replace(certificate, P=-certificate.P), lure) == -np.inf
+        for claimed in (0.0, -1e6, -np.inf, np.inf, np.nan):
+            assert verify(replace(certificate, rate=claimed), lure) == -np.inf
         if lure.slope.size > 1:
             with pytest.raises(DesignInfeasible, match="do not fit"):
                 verify(replace(certificate, P=certificate.P[:1]), lure)
         with pytest.raises(DesignInfeasible, match="do not fit"):
             verify(replace(certificate, kind="hearsay"), lure)
     forged = reactance(lure)
+    with pytest.raises(DesignInfeasible, match="fails its verification"):
+        quadratic(lure, forged.P, forged.multiplier, -1.0, kind="reactance", status="")
     assert verify(replace(forged, multiplier=0.0 * forged.multiplier), lure) == -np.inf
     if lure.slope.size > 1:
         P = forged.P.copy()
