@@ -13,10 +13,17 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.special import chdtr
 
-from gridsec.arrays import Floats
+from gridsec.arrays import Floats, not_negative
 from gridsec.decode.stacks import Stack
+from gridsec.errors import DesignInfeasible
 
+# Of Ruben's series: its longest, and the index in parts of the spread by which nothing is left of it.
 _TERMS = 2000
+_SPREAD = 30.0
+# Numbers of nodes on the contour; more of them for more weights.
+_NODES = (24, 32, 40, 48, 64, 96, 128, 192, 256)
+_ROUNDING = 1e-15
+_DOUBLINGS = 64
 
 
 def bound_probability(stack: Stack, P: Floats, v_max: float, *, tol: float) -> float:
@@ -34,13 +41,21 @@ def bound_probability(stack: Stack, P: Floats, v_max: float, *, tol: float) -> f
     v_max
         Bound, not negative.
     tol
-        Largest error per block, downwards, of the series of `quadratic_probability`.
+        Largest error per block, downwards, of `quadratic_probability`.
+
+    Raises
+    ------
+    ValueError
+        If `v_max` is negative or no number, or P is no covariance.
+    DesignInfeasible
+        If the probability of a block cannot be had as closely as `tol`.
 
     References
     ----------
     lee2018 (2.2.15); T. Royen, "A simple proof of the Gaussian correlation conjecture extended to some
     multivariate gamma distributions", Far East Journal of Theoretical Statistics 48(2), 2014.
     """
+    not_negative("v_max", v_max)
     at = np.split(np.arange(P.shape[0]), np.cumsum(stack.heights)[:-1])
     total = 1.0
     for rows in at:
@@ -57,11 +72,26 @@ def bound_for(stack: Stack, P: Floats, probability: float, *, tol: float) -> flo
     stack, P, tol
         As in `bound_probability`; `tol` should be well below `1 - probability`.
     probability
-        Wanted p_v, between 0 and 1.
+        Wanted p_v, strictly between 0 and 1.
+
+    Raises
+    ------
+    ValueError
+        If `probability` is not.
+    DesignInfeasible
+        If it is not reached, because `tol` is too coarse for it.
     """
-    high = float(np.sqrt(np.max(np.linalg.eigvalsh(P))))
-    while bound_probability(stack, P, high, tol=tol) < probability:
-        high *= 2.0
+    if not 0.0 < probability < 1.0:
+        raise ValueError(f"probability is {probability}; it must lie in (0, 1)")
+    size = float(np.sqrt(max(float(np.max(np.linalg.eigvalsh(P))), 0.0)))
+    if size == 0.0:
+        return 0.0
+    for doublings in range(_DOUBLINGS):
+        high = 2.0**doublings * size
+        if bound_probability(stack, P, high, tol=tol) >= probability:
+            break
+    else:
+        raise DesignInfeasible("bound of the noise", f"{probability} is not reached up to {high:g}")
     found, result = brentq(
         lambda v: bound_probability(stack, P, v, tol=tol) - probability, 0.0, high, full_output=True
     )
@@ -72,27 +102,50 @@ def bound_for(stack: Stack, P: Floats, probability: float, *, tol: float) -> flo
 def quadratic_probability(values: Floats, limit: float, *, tol: float) -> float:
     """`Pr(sum_j values_j u_j^2 <= limit)` for independent standard normal u, from below.
 
-    Ruben's mixture of chi-square distributions, whose weights are positive and sum to one: a partial
-    sum errs downwards, by at most the weight left out times the next distribution's value.
+    By Ruben's series where it ends soon, else by the inverse of the Laplace transform.
 
     Parameters
     ----------
     values : (k,)
-        Positive weights: the eigenvalues of a covariance.
+        Weights: the eigenvalues of a covariance. Those that are zero, up to rounding, add nothing.
     limit
         Not negative.
     tol
-        Stop when the error is below this.
+        Largest error, downwards.
+
+    Raises
+    ------
+    ValueError
+        If a weight is negative or not finite, or the limit is negative or no number.
+    DesignInfeasible
+        If neither method comes as close as `tol`.
+    """
+    top = float(np.max(values, initial=0.0))
+    if not np.all(np.isfinite(values) & (values >= -_ROUNDING * top)):
+        raise ValueError("weights must be finite and not negative")
+    if not limit >= 0.0:
+        raise ValueError(f"limit is {limit}; it must be a number that is not negative")
+    used = values[values > 0.0]
+    if limit == 0.0 or used.size == 0:
+        return float(used.size == 0)
+    # The series ends when its index passes the spread of the weights or half the limit over the smallest.
+    soon = min(limit, _SPREAD * top) <= 2.0 * _TERMS * float(used.min())
+    found = _series(used, limit, tol) if soon else None
+    return _integral(used, limit, tol) if found is None else found
+
+
+def _series(values: Floats, limit: float, tol: float) -> float | None:
+    """Ruben's mixture of chi-square distributions; None if it does not end within `_TERMS`.
+
+    Weights are positive and sum to one: a partial sum errs downwards, by at most the weight left out times
+    the next distribution's value.
 
     References
     ----------
     H. Ruben, "Probability content of regions under spherical normal distributions, IV", Annals of
     Mathematical Statistics 33(2), 1962.
     """
-    k = values.size
-    if limit <= 0.0 or k == 0:
-        return float(k == 0)
-    scale = float(values.min())
+    k, scale = values.size, float(values.min())
     ratio = 1.0 - scale / values
     weights = [float(np.sqrt(np.prod(scale / values)))]
     powers = ratio.copy()
@@ -105,5 +158,31 @@ def quadratic_probability(values: Floats, limit: float, *, tol: float) -> float:
         tail = float(chdtr(k + 2 * j, limit / scale))
         total, used = total + weights[j] * tail, used + weights[j]
         if (1.0 - used) * tail <= tol:
-            break
-    return min(total, 1.0)
+            return min(total, 1.0)
+    return None
+
+
+def _integral(values: Floats, limit: float, tol: float) -> float:
+    """The Laplace transform `prod (1 + 2 values p)^(-1/2) / p` inverted, less the error.
+
+    All its singularities lie on the negative half axis. On a parabola around that the midpoint rule
+    converges geometrically, whatever the spread of the weights; two rules in a row tell the error.
+
+    References
+    ----------
+    L. N. Trefethen, J. A. C. Weideman, T. Schmelzer, "Talbot quadratures and rational approximations",
+    BIT Numerical Mathematics 46, 2006.
+    """
+    before, error = np.inf, np.inf
+    for nodes in _NODES:
+        angle = (2.0 * np.arange(nodes) + 1.0) * np.pi / nodes - np.pi
+        z = nodes * (0.1309 - 0.1194 * angle**2 + 0.25j * angle)
+        slope = 0.25j - 0.2388 * angle
+        logarithm = np.log1p(2.0 * np.multiply.outer(z / limit, values)).sum(axis=1)
+        terms = np.exp(z - 0.5 * logarithm) * slope / z
+        now = float(np.sum(terms).imag)
+        error = abs(now - before) + _ROUNDING * float(np.sum(np.abs(terms)))
+        if error <= tol:
+            return min(max(now - error, 0.0), 1.0)
+        before = now
+    raise DesignInfeasible("probability of a quadratic form", f"known up to {error:.1e} only, not {tol:.1e}")

@@ -9,6 +9,7 @@ from scipy.stats import chi2, norm
 from gridsec.decode import Stack, design, sensors_in_error
 from gridsec.decode.noise import correct, correction_constants, detect, detection_constants
 from gridsec.decode.probability import bound_for, bound_probability, quadratic_probability
+from gridsec.errors import DesignInfeasible
 
 
 def test_closed_forms() -> None:
@@ -36,6 +37,66 @@ def test_the_series_errs_downwards_and_little(spread: float) -> None:
     error = 4.0 * np.sqrt(sample.mean() * (1 - sample.mean()) / 200_000)
     assert abs(got - sample.mean()) < error
     assert quadratic_probability(values, 2.0 * spread, tol=1e-2) <= got + 1e-12
+
+
+@pytest.mark.parametrize("small", [1e-2, 1e-3, 1e-4, 1e-8, 1e-30])
+@pytest.mark.parametrize("limit", [1e-3, 0.5, 3.0, 40.0, 1e9])
+def test_weights_of_very_different_size(small: float, limit: float) -> None:
+    """Oracle: the distribution of the large part, averaged over the small one by Gauss-Hermite."""
+    node, weight = np.polynomial.hermite_e.hermegauss(180)
+    share = weight / weight.sum()
+    rest = np.maximum(limit - small * node**2, 0.0)
+    want = float(share @ chi2.cdf(rest, 3))
+    got = quadratic_probability(np.array([1.0, 1.0, 1.0, small]), limit, tol=1e-9)
+    assert -2e-9 <= got - want <= 1e-9 or limit < 30.0 * small
+    alone = chi2.cdf(limit, 3)
+    assert got <= alone + 1e-12
+    assert got == pytest.approx(alone, abs=1e-9 + small)
+
+
+def test_many_weights_over_sixteen_decades() -> None:
+    """Pairs make exponentials: `1 - sum of a_i^(n-1) exp(-t / 2 a_i) / prod(a_i - a_j)`."""
+    a = np.geomspace(1e-16, 1.0, 9)
+    for t in (0.1, 1.0, 5.0):
+        apart = a[:, None] - a[None, :]
+        np.fill_diagonal(apart, 1.0)
+        share = np.prod(np.where(np.eye(9) > 0, 1.0, a[:, None] / apart), axis=1)
+        want = 1.0 - share @ np.exp(-t / (2.0 * a))
+        got = quadratic_probability(np.repeat(a, 2), t, tol=1e-10)
+        assert got == pytest.approx(want, abs=2e-10)
+    # Where neither method is near its end: hundreds of weights, a few of them small.
+    values, rng = np.concatenate([np.ones(200), np.full(4, 1e-5)]), np.random.default_rng(4)
+    assert quadratic_probability(values, 210.0, tol=1e-9) == pytest.approx(chi2.cdf(210.0, 200), abs=1e-5)
+    mixed = rng.uniform(1e-6, 1.0, 12)
+    sample = float((rng.standard_normal((100_000, 12)) ** 2 @ mixed <= 5.0).mean())
+    assert quadratic_probability(mixed, 5.0, tol=1e-9) == pytest.approx(sample, abs=0.007)
+
+
+def test_weights_of_zero_add_nothing() -> None:
+    got = quadratic_probability(np.array([0.0, 2.0, 0.0]), 3.0, tol=1e-12)
+    assert got == pytest.approx(chi2.cdf(1.5, 1), abs=1e-12)
+    assert quadratic_probability(np.zeros(3), 0.0, tol=1e-12) == 1.0
+    stack = Stack.of([np.eye(2)])
+    want = norm.ppf(0.995)
+    for small in (0.0, 1e-12):
+        assert bound_for(stack, np.diag([1.0, small]), 0.99, tol=1e-9) == pytest.approx(want, abs=1e-6)
+    assert bound_for(stack, np.zeros((2, 2)), 0.99, tol=1e-9) == 0.0
+
+
+def test_what_is_no_probability_or_covariance_is_refused() -> None:
+    stack = Stack.of([np.eye(2)])
+    for wrong in (0.0, 1.0, 1.5, -1.0, np.nan):
+        with pytest.raises(ValueError, match="probability is"):
+            bound_for(stack, np.eye(2), wrong, tol=1e-9)
+    with pytest.raises(DesignInfeasible, match="not reached"):
+        bound_for(stack, np.diag([1.0, 1e-6]), 1.0 - 1e-15, tol=1e-6)
+    for values, limit in (([1.0, -0.1], 1.0), ([np.nan], 1.0), ([1.0], np.nan), ([1.0], -1.0)):
+        with pytest.raises(ValueError, match=r"weights must|limit is"):
+            quadratic_probability(np.array(values), limit, tol=1e-9)
+    with pytest.raises(ValueError, match="v_max is"):
+        bound_probability(stack, np.eye(2), -1.0, tol=1e-9)
+    with pytest.raises(DesignInfeasible, match="known up to"):
+        quadratic_probability(np.array([1.0, 1e-6]), 1.0, tol=0.0)
 
 
 def test_lower_bound_under_correlation_and_exact_without() -> None:
