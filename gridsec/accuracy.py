@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gridsec.arrays import Floats, Ints
+from gridsec.arrays import Floats, Ints, frozen
+from gridsec.errors import refuse
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,6 +36,11 @@ class MeterAccuracy:
         Its resolution, pu.
     busbar_jitter
         Its jitter, pu.
+
+    Raises
+    ------
+    ValueError
+        With every problem found.
     """
 
     class_fraction: Floats
@@ -46,18 +52,19 @@ class MeterAccuracy:
 
     def __post_init__(self) -> None:
         """Check shapes and signs; a wrong description is a programming error, not an online outcome."""
-        p = np.shape(self.class_fraction)
+        p, problems = np.shape(self.class_fraction), []
         for name in ("class_fraction", "resolution", "jitter"):
-            value = np.asarray(getattr(self, name), dtype=np.float64)
+            value = frozen(getattr(self, name))
             object.__setattr__(self, name, value)
             if value.ndim != 1 or value.shape != p:
-                raise ValueError(f"{name} must have one entry per meter, got shape {value.shape}")
+                problems.append(f"{name} must have one entry per meter, got shape {value.shape}")
             if not (np.isfinite(value).all() and (value >= 0).all()):
-                raise ValueError(f"{name} must be finite and not negative")
+                problems.append(f"{name} must be finite and not negative")
         for name in ("busbar_class", "busbar_resolution", "busbar_jitter"):
             number = float(getattr(self, name))
             if not (np.isfinite(number) and number >= 0):
-                raise ValueError(f"{name} must be finite and not negative, got {number}")
+                problems.append(f"{name} must be finite and not negative, got {number}")
+        refuse(problems)
 
 
 def reading_error(accuracy: MeterAccuracy, v2: Floats, sigmas: float) -> Floats:

@@ -63,3 +63,21 @@ class DesignInfeasible(GridsecError):
         self.margin = margin
         tail = "" if margin is None else f", margin {margin:.3g}"
         super().__init__(f"{what}: {status}{tail}")
+
+
+def refuse(problems: Iterable[str]) -> None:
+    """Raise one ValueError that names all problems of an input; nothing if there are none.
+
+    Parameters
+    ----------
+    problems
+        One clause each: what is wrong, and what would be right.
+
+    Raises
+    ------
+    ValueError
+        If there is any.
+    """
+    found = tuple(problems)
+    if found:
+        raise ValueError("; ".join(found))

@@ -26,7 +26,7 @@ import numpy as np
 from scipy.linalg import block_diag, solve_discrete_lyapunov
 
 from gridsec.arrays import Bools, Floats, frozen, spectral_radius, symmetry_defect
-from gridsec.errors import DesignInfeasible
+from gridsec.errors import DesignInfeasible, refuse
 from gridsec.observers.parts import Stack, decompose, heard, riccati, stack
 
 RESIDUAL = 1e-8
@@ -143,8 +143,7 @@ def design(
             problems.append(f"{name} is not finite")
         elif not symmetry_defect(M) <= 1e-12 or float(np.linalg.eigvalsh(M)[0]) < -1e-12 * scale:
             problems.append(f"{name} is no covariance: not symmetric, or not positive semidefinite")
-    if problems:
-        raise ValueError("; ".join(problems))
+    refuse(problems)
     whole = stack(decompose(A, C, slowest=slowest, tol=tol), B)
     own = block_diag(*(np.ones((part.t.size, 1)) for part in whole.parts))
     process = whole.phi @ Q @ whole.phi.T
