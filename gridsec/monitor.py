@@ -35,7 +35,7 @@ from gridsec.lmi import contraction
 from gridsec.lure import Lure, close_loop, rest
 from gridsec.network import linear
 from gridsec.online import Estimate, Frame, Verdict
-from gridsec.plant import MonitorDesign, MonitorState, Options, Plant
+from gridsec.plant import MonitorDesign, MonitorState, Options, Plant, check_plant
 from gridsec.stacked import StackedState
 
 __all__ = ["MonitorDesign", "MonitorState", "Options", "Plant", "design", "init", "step"]
@@ -78,21 +78,14 @@ def design(
     DesignInfeasible
         If no certificate holds, the bank would be too large, or the gains detect nothing.
     ValueError
-        If two meters sit at one customer, or the accuracy is that of other meters.
+        As `plant.check_plant`.
 
     References
     ----------
     chong2020, Corollary 1, for any feeder and with what its errata ask for.
     """
     meters = plant.meters
-    if np.unique(meters).size != meters.size:
-        raise ValueError("two meters at one customer; combine them before")
-    if plant.accuracy.class_fraction.shape != meters.shape:
-        raise ValueError(
-            f"accuracy is given for {plant.accuracy.class_fraction.size} meters of {meters.size}"
-        )
-    if not (np.isfinite(step_s) and step_s > 0):
-        raise ValueError(f"step_s is {step_s}; it must be a positive number of seconds")
+    check_plant(plant, max_attacked=max_attacked, step_s=step_s)
     if options is None:
         options = Options() if step_s <= 30.0 else Options(release=4)
     lure = close_loop(plant.feeder, plant.droop, meters)

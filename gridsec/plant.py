@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+
+import numpy as np
 
 from gridsec import bank as banks
 from gridsec.accuracy import MeterAccuracy
@@ -10,6 +13,7 @@ from gridsec.arrays import Floats, Ints
 from gridsec.certificates import Certificate
 from gridsec.detect import ErrorBound, ErrorModel, error_model
 from gridsec.droop import Droop
+from gridsec.errors import refuse
 from gridsec.feeder import LinDistFlow
 from gridsec.judge import Tally
 from gridsec.lure import Lure
@@ -33,6 +37,11 @@ class Plant:
         What the meters promise.
     loss_correction
         DistFlow fixed-point steps that correct LinDistFlow for branch losses; 0 leaves it linear.
+
+    Raises
+    ------
+    ValueError
+        With every problem found; whether meters, feeder and accuracy fit is for `check_plant`.
     """
 
     feeder: Network
@@ -40,6 +49,14 @@ class Plant:
     meters: Ints
     accuracy: MeterAccuracy
     loss_correction: int = 1
+
+    def __post_init__(self) -> None:
+        meters, problems = np.asarray(self.meters), []
+        if meters.ndim != 1 or (meters.size and meters.dtype.kind not in "iu"):
+            problems.append("meters must be whole numbers, one for each meter")
+        if not _whole(self.loss_correction, 0):
+            problems.append(f"loss_correction is {self.loss_correction}; it must be a whole number from 0 on")
+        refuse(problems)
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +83,11 @@ class Options:
         A meter whose threshold is above this cannot be judged, squared pu: 0.1 is 5 % of the voltage.
     v2_limits
         Squared voltages outside these are no supply: a busbar reading there is not used, pu.
+
+    Raises
+    ------
+    ValueError
+        With every problem found.
     """
 
     sigmas: float = 4.0
@@ -75,6 +97,81 @@ class Options:
     tie: float = 1e-6
     widest: float = 0.1
     v2_limits: tuple[float, float] = (0.25, 2.25)
+
+    def __post_init__(self) -> None:
+        refuse(
+            [
+                *(
+                    f"{name} is {getattr(self, name)}; it must be a finite number that is not negative"
+                    for name in ("sigmas", "tie")
+                    if not 0.0 <= getattr(self, name) < np.inf
+                ),
+                *(
+                    f"{name} is {getattr(self, name)}; it must be a whole number from 1 on"
+                    for name in ("confirm", "release")
+                    if not _whole(getattr(self, name), 1)
+                ),
+                *judging_problems(self.settled, self.widest, self.v2_limits),
+            ]
+        )
+
+
+def judging_problems(settled: float, widest: float, v2_limits: tuple[float, float]) -> list[str]:
+    """What is wrong with the numbers that say when a verdict can be given at all.
+
+    Parameters
+    ----------
+    settled, widest, v2_limits
+        As in `Options`.
+    """
+    problems = []
+    if not 0.0 < settled <= 1.0:
+        problems.append(f"settled is {settled}; it must be a part of a threshold, above 0 and up to 1")
+    if not widest > 0.0:
+        problems.append(f"widest is {widest}; it must be a positive number")
+    if not 0.0 <= v2_limits[0] < v2_limits[1]:
+        problems.append(f"v2_limits is {v2_limits}; it must be two ascending numbers that are not negative")
+    return problems
+
+
+def _whole(value: object, least: int) -> bool:
+    """Whether a value is a whole number, and not below the least."""
+    return isinstance(value, int | np.integer) and int(value) >= least
+
+
+def check_plant(plant: Plant, *, max_attacked: int, step_s: float, more: Iterable[str] = ()) -> None:
+    """Refuse what no estimator can watch, before anything is computed.
+
+    Parameters
+    ----------
+    plant
+        What is to be watched.
+    max_attacked
+        M, how many meters may be manipulated at the same time.
+    step_s
+        Expected interval between frames, s.
+    more
+        Further problems that the caller has found.
+
+    Raises
+    ------
+    ValueError
+        With every problem: meters at no customer, two at one, accuracy of other meters, numbers out of range.
+    """
+    meters, customers, problems = np.asarray(plant.meters), plant.feeder.bus.size, []
+    nowhere = meters[(meters < 0) | (meters >= customers)]
+    if nowhere.size:
+        problems.append(f"meters {nowhere.tolist()} are at no customer: there are {customers}")
+    if np.unique(meters).size != meters.size:
+        problems.append("two meters at one customer: combine them before")
+    if plant.accuracy.class_fraction.shape != meters.shape:
+        given = plant.accuracy.class_fraction.size
+        problems.append(f"accuracy is given for {given} meters of {meters.size}")
+    if not _whole(max_attacked, 0):
+        problems.append(f"max_attacked is {max_attacked}; it must be a whole number that is not negative")
+    if not (np.isfinite(step_s) and step_s > 0):
+        problems.append(f"step_s is {step_s}; it must be a positive number of seconds")
+    refuse([*problems, *more])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -56,7 +56,7 @@ from gridsec.network import busbar_places, by_place
 from gridsec.observers import circle
 from gridsec.observers.circle import CircleDesign
 from gridsec.online import Cause, Decision, Estimate, Explanation, Frame, Verdict
-from gridsec.plant import Options, Plant, Setting, setting
+from gridsec.plant import Options, Plant, Setting, check_plant, setting
 
 __all__ = ["PartialDesign", "PartialState", "constants", "design", "init", "step"]
 
@@ -147,15 +147,10 @@ def design(
     DesignInfeasible
         If the feeder does not forget its initial state, or there are too many sets of M meters.
     ValueError
-        If two meters sit at one customer, or the accuracy is that of other meters.
+        As `plant.check_plant`.
     """
     meters, p = plant.meters, plant.meters.size
-    if np.unique(meters).size != p:
-        raise ValueError("two meters at one customer; combine them before")
-    if plant.accuracy.class_fraction.shape != meters.shape:
-        raise ValueError(f"accuracy is given for {plant.accuracy.class_fraction.size} meters of {p}")
-    if not (np.isfinite(step_s) and step_s > 0):
-        raise ValueError(f"step_s is {step_s}; it must be a positive number of seconds")
+    check_plant(plant, max_attacked=max_attacked, step_s=step_s)
     if p <= 2 * max_attacked:
         why = f"{p} meters, of which {max_attacked} may lie; more than {2 * max_attacked} are needed"
         raise NotObservable(range(p), p, why)

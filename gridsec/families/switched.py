@@ -22,13 +22,12 @@ from gridsec.arrays import Bools, Floats, Ints
 from gridsec.certificates import Certificate, certify
 from gridsec.detect import ErrorBound, ErrorModel, Motion, Uncertainty
 from gridsec.errors import DesignInfeasible, NotObservable
+from gridsec.families.sets import MOST_SETS
 from gridsec.frames import Inputs, injections, reconstruct
 from gridsec.judge import Tally
 from gridsec.lure import close_loop, rest
 from gridsec.online import Estimate, Frame, Verdict
-from gridsec.plant import Options, Plant, Setting, setting
-
-MOST_SETS = 20_000
+from gridsec.plant import Options, Plant, Setting, check_plant, setting
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,11 +147,12 @@ def design(
     DesignInfeasible
         If no closed-form certificate holds, or there are too many sets to search.
     ValueError
-        If a number is out of range.
+        As `plant.check_plant`, or if `dwell_s` is negative or not finite.
     """
     p = plant.meters.size
-    if not (np.isfinite(step_s) and step_s > 0 and max_attacked >= 0):
-        raise ValueError("step_s must be a positive number of seconds, and max_attacked not negative")
+    wrong = dwell_s is not None and not 0.0 <= dwell_s < np.inf
+    more = [f"dwell_s is {dwell_s}; it must be a number of seconds that is not negative"] if wrong else []
+    check_plant(plant, max_attacked=max_attacked, step_s=step_s, more=more)
     if p <= 2 * max_attacked:
         what = f"{p} meters cannot be told apart when {max_attacked} of them may lie"
         raise NotObservable(range(p), p, what)

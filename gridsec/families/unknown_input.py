@@ -37,7 +37,7 @@ from gridsec.families.tubes import Doubt, spread
 from gridsec.frames import NO_VOLTAGE, known, nothing_new, reconstruct
 from gridsec.judge import Tally, count
 from gridsec.online import Estimate, Frame, Verdict
-from gridsec.plant import Options, Plant, setting
+from gridsec.plant import Options, Plant, check_plant, setting
 
 __all__ = ["UnknownInputDesign", "UnknownInputState", "design", "init", "step"]
 
@@ -73,15 +73,11 @@ def design(
     DesignInfeasible
         If there are too many pairs.
     ValueError
-        If two meters sit at one customer, or a number is not positive.
+        As `plant.check_plant`, or if `max_inverters` is negative.
     """
     p, m = plant.meters.size, plant.droop.tau.size
-    if np.unique(plant.meters).size != p:
-        raise ValueError("two meters at one customer; combine them before")
-    if max_attacked < 0 or max_inverters < 0 or not (np.isfinite(step_s) and step_s > 0):
-        raise ValueError(
-            f"cannot watch for {max_attacked} meters, {max_inverters} inverters every {step_s} s"
-        )
+    more = [f"max_inverters is {max_inverters}; it cannot be negative"] if not max_inverters >= 0 else []
+    check_plant(plant, max_attacked=max_attacked, step_s=step_s, more=more)
     if p <= 2 * max_attacked:
         why = f"{p} meters of which {max_attacked} may lie: more than {2 * max_attacked} are needed"
         raise NotObservable(range(p), p, why + " (yang2021, Assumption 3)")

@@ -17,11 +17,11 @@ from gridsec.accuracy import ToldError, busbar_error
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.certificates import Certificate, certify, verify
 from gridsec.detect import curve_mismatch
-from gridsec.errors import DesignInfeasible, NotObservable
+from gridsec.errors import DesignInfeasible, NotObservable, refuse
 from gridsec.lmi import contraction
 from gridsec.lure import Lure, close_loop
 from gridsec.network import Network, Power, hangs_on, own, sizes
-from gridsec.plant import Plant
+from gridsec.plant import Plant, check_plant, judging_problems
 from gridsec.sequential.conditional import Prior
 from gridsec.sequential.decoder import Decoder
 from gridsec.sequential.dictionary import Dictionary
@@ -31,6 +31,9 @@ from gridsec.sequential.loads import LoadDoubt, injection_doubt, prior
 from gridsec.sequential.repeats import rules
 
 YEAR_S = 365.25 * 86400.0
+
+
+_SCALES = "must be at least one number of seconds, none of them negative"
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +73,11 @@ class SequentialOptions:
         Part of its accuracy class by which an honest meter may change after that.
     widest, v2_limits, settled
         As in `gridsec.plant.Options`.
+
+    Raises
+    ------
+    ValueError
+        With every problem found.
     """
 
     alarms_per_year: float = 1.0
@@ -88,6 +96,30 @@ class SequentialOptions:
     widest: float = 0.1
     v2_limits: tuple[float, float] = (0.25, 2.25)
     settled: float = 0.1
+
+    def __post_init__(self) -> None:
+        positive, zero = "must be a positive number", "must be a finite number that is not negative"
+        wanted = [
+            ("alarms_per_year", 0.0 < self.alarms_per_year < np.inf, positive),
+            ("scales_s", bool(self.scales_s) and all(0.0 <= s < np.inf for s in self.scales_s), _SCALES),
+            ("enough", 0.0 < self.enough <= 1.0, "must be above 0 and up to 1"),
+            ("focus", 0.0 < self.focus < np.inf, positive),
+            ("several", self.several >= 0, zero),
+            ("release", self.release >= 1, "must be at least 1"),
+            ("suspect", 0.0 < self.suspect < 1.0, "must be between 0 and 1"),
+            ("lower", 0.0 < self.lower <= 1.0, "must be above 0 and up to 1"),
+            ("like", 1.0 <= self.like < np.inf, "must be at least 1 and finite"),
+            *(
+                (name, 0.0 <= getattr(self, name) < np.inf, zero)
+                for name in ("hidden_power", "hidden_charge", "commission_s", "stability")
+            ),
+        ]
+        refuse(
+            [
+                *(f"{name} is {getattr(self, name)}; it {what}" for name, sound, what in wanted if not sound),
+                *judging_problems(self.settled, self.widest, self.v2_limits),
+            ]
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -232,11 +264,11 @@ def design(
     DesignInfeasible
         If no certificate holds for the droop loop.
     ValueError
-        If two meters sit at one customer, `doubt` is that of other customers, or `step_s` is no time.
+        As `plant.check_plant`, or if `doubt` is that of other customers.
     """
     options = SequentialOptions() if options is None else options
     meters = plant.meters
-    _check(plant, doubt, step_s)
+    _check(plant, doubt, step_s, max_attacked)
     lure = close_loop(plant.feeder, plant.droop, meters)
     effects = Effects(plant.feeder)
     injections = injection_doubt(plant.droop, plant.accuracy, meters, plant.feeder.bus.size)
@@ -309,21 +341,15 @@ def _most_power(feeder: Network, power: Power) -> Floats:
 _HIGH = 1.03
 
 
-def _check(plant: Plant, doubt: LoadDoubt, step_s: float) -> None:
+def _check(plant: Plant, doubt: LoadDoubt, step_s: float, most: int | None) -> None:
     meters, customers = plant.meters, plant.feeder.bus.size
     if meters.size < _FEWEST:
         why = f"{meters.size} meters; at least {_FEWEST} are needed to outvote one"
         raise NotObservable(meters.tolist(), meters.size, why)
-    if np.unique(meters).size != meters.size:
-        raise ValueError("two meters at one customer; combine them before")
+    more = []
     if doubt.p.shape != (customers,) or doubt.q.shape != (customers,):
-        raise ValueError(f"doubt is given for {doubt.p.size} and {doubt.q.size} customers of {customers}")
-    if plant.accuracy.class_fraction.shape != meters.shape:
-        raise ValueError(
-            f"accuracy is given for {plant.accuracy.class_fraction.size} meters of {meters.size}"
-        )
-    if not (np.isfinite(step_s) and step_s > 0):
-        raise ValueError(f"step_s is {step_s}; it must be a positive number of seconds")
+        more.append(f"doubt is given for {doubt.p.size} and {doubt.q.size} customers of {customers}")
+    check_plant(plant, max_attacked=0 if most is None else most, step_s=step_s, more=more)
 
 
 _FEWEST = 3

@@ -1,0 +1,109 @@
+"""What is refused before anything is designed, with all problems at once."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from gridsec import monitor, sequential
+from gridsec.families import partial, set_search, unknown_input
+from gridsec.plant import Options, Plant
+from gridsec.sequential import LoadDoubt, SequentialOptions
+from tests.gridsec.street import accuracy, make_plant
+
+FAMILIES = (monitor, partial, set_search, unknown_input)
+
+
+def street() -> Plant:
+    return make_plant(np.random.default_rng(0), customers=5)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"meters": np.array([-1, 0, 1, 2, 3])}, r"meters \[-1\] are at no customer: there are 5"),
+        ({"meters": np.array([9, 0, 1, 2, 5])}, r"meters \[9, 5\] are at no customer"),
+        ({"meters": np.array([0, 0, 1, 2, 3])}, "two meters at one customer"),
+        ({"accuracy": accuracy(3)}, "accuracy is given for 3 meters of 5"),
+        ({"accuracy": accuracy(1)}, "accuracy is given for 1 meters of 5"),
+    ],
+)
+def test_a_plant_that_does_not_fit_together_is_refused(
+    family: ModuleType, wrong: dict[str, object], said: str
+) -> None:
+    with pytest.raises(ValueError, match=said):
+        family.design(replace(street(), **wrong), max_attacked=1, step_s=1.0)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("step_s", [0.0, -1.0, np.nan, np.inf])
+def test_all_problems_are_named_at_once(family: ModuleType, step_s: float) -> None:
+    wrong = replace(street(), meters=np.array([-1, 3, 3]))
+    with pytest.raises(ValueError, match="customer") as caught:
+        family.design(wrong, max_attacked=-1, step_s=step_s)
+    for said in (r"[-1]", "two meters", "5 meters of 3", "max_attacked is -1", f"step_s is {step_s}"):
+        assert said in str(caught.value)
+
+
+def test_the_sequential_monitor_asks_the_same_of_a_plant() -> None:
+    wrong = replace(street(), meters=np.array([-1, 3, 3]))
+    with pytest.raises(ValueError, match="no customer") as caught:
+        sequential.design(wrong, doubt=LoadDoubt(np.ones(3), np.ones(3), 1.0), step_s=np.nan, max_attacked=-1)
+    for said in ("two meters", "5 meters of 3", "max_attacked", "step_s", "3 and 3 customers of 5"):
+        assert said in str(caught.value)
+
+
+def test_numbers_of_one_family_are_named_with_the_others() -> None:
+    for dwell_s in (np.nan, -1.0, np.inf):
+        with pytest.raises(ValueError, match=r"max_attacked is -1.*dwell_s is"):
+            set_search.design(street(), max_attacked=-1, step_s=1.0, dwell_s=dwell_s)
+    with pytest.raises(ValueError, match=r"step_s is.*max_inverters is -1"):
+        unknown_input.design(street(), max_attacked=1, step_s=0.0, max_inverters=-1)
+
+
+def test_options_that_would_name_everybody_or_nobody_are_refused() -> None:
+    with pytest.raises(ValueError, match="sigmas") as caught:
+        Options(np.nan, confirm=0, release=0, settled=0.0, tie=-1.0, widest=np.nan, v2_limits=(2.0, 1.0))
+    for name in ("sigmas", "confirm", "release", "settled", "tie", "widest", "v2_limits"):
+        assert f"{name} is" in str(caught.value)
+    Options(sigmas=0.0, confirm=1, release=1, settled=1.0, tie=0.0, widest=np.inf)
+
+
+def test_options_of_the_sequential_monitor_are_checked_alike() -> None:
+    wrong = {
+        "alarms_per_year": 0.0, "scales_s": (np.nan,), "enough": 0.0, "focus": np.nan, "several": -1,
+        "release": 0, "suspect": 1.0, "lower": np.nan, "like": 0.5, "hidden_power": -1.0,
+        "hidden_charge": np.nan, "commission_s": np.nan, "stability": -0.1, "widest": np.nan,
+        "v2_limits": (np.nan, 1.0), "settled": np.nan,
+    }  # fmt: skip
+    with pytest.raises(ValueError, match="alarms_per_year") as caught:
+        SequentialOptions(**wrong)  # type: ignore[arg-type]
+    for name in wrong:
+        assert f"{name} is" in str(caught.value)
+
+
+def test_a_plant_of_broken_numbers_is_refused() -> None:
+    for steps in (-1, 0.5, np.nan):
+        with pytest.raises(ValueError, match="loss_correction"):
+            replace(street(), loss_correction=steps)
+    with pytest.raises(ValueError, match=r"meters must be whole numbers.*loss_correction"):
+        replace(street(), meters=np.array([0.0, 1.5]), loss_correction=-1)
+
+
+def test_an_accuracy_names_all_its_problems_and_is_read_only() -> None:
+    mine = np.full(2, 0.005)
+    with pytest.raises(ValueError, match="class_fraction must be finite") as caught:
+        replace(
+            accuracy(2), class_fraction=np.array([np.nan, 0.0]), resolution=-np.ones(3), busbar_class=-1.0
+        )
+    for said in ("resolution must have one entry", "resolution must be finite", "busbar_class must be"):
+        assert said in str(caught.value)
+    made = replace(accuracy(2), class_fraction=mine)
+    mine[0] = 1.0
+    assert made.class_fraction.tolist() == [0.005, 0.005]
+    with pytest.raises(ValueError, match="read-only"):
+        made.jitter[0] = 1.0
