@@ -22,7 +22,7 @@ from typing import Literal
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, frozen
-from gridsec.errors import DesignInfeasible
+from gridsec.errors import DesignInfeasible, refuse
 from gridsec.lmi.discrete import DiscreteOptions, discrete_circle
 from gridsec.lmi.discrete_bounds import (
     DirectProof,
@@ -399,12 +399,23 @@ def monte_carlo(
         Of the random numbers.
     confidence
         Of the statement `exceedance`.
+
+    Raises
+    ------
+    ValueError
+        With every number out of range; an observer that hears no noise has no gain.
     """
     system, rng = stack.system, np.random.default_rng(seed)
     runs, p = len(start), len(system.C)
-    if not (runs and 0.0 < confidence < 1.0):
-        raise ValueError("at least one run, and a confidence between 0 and 1")
     width = np.broadcast_to(np.asarray(half_width, dtype=np.float64), (p,))
+    problems = []
+    if not (runs and 0.0 < confidence < 1.0):
+        problems.append("at least one run, and a confidence between 0 and 1")
+    if not np.all(np.isfinite(width) & (width >= 0.0)):
+        problems.append(f"half_width must be finite and not negative, got {width.tolist()}")
+    elif not np.all(stack.masks @ width > 0.0):
+        problems.append("every observer needs a meter with noise: half_width is 0 for all that some trust")
+    refuse(problems)
     everyone, truth = np.ones(p, dtype=np.bool_), np.asarray(start, dtype=np.float64)
     x = np.repeat(truth[:, None, :], len(stack.masks), axis=1)
     loudest, worst = np.zeros((runs, len(stack.masks))), np.zeros(len(stack.masks))

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, frozen
+from gridsec.errors import refuse
 from gridsec.lmi.discrete import DiscreteOptions, discrete_circles
 from gridsec.lmi.discrete_bounds import DirectProof
 from gridsec.lmi.sampled import DiscreteLure
@@ -166,6 +167,11 @@ def design(
     rule
         How a window isolates.
 
+    Raises
+    ------
+    ValueError
+        With every number that is not finite or negative, or if the observers are not those of a bank.
+
     References
     ----------
     yang2019 (10), (19).
@@ -175,10 +181,14 @@ def design(
     wanted = bank_masks(p, max_attacked)
     if not np.array_equal(np.stack([one.trusted for one in observers]), wanted):
         raise ValueError(f"no bank for {p} meters and {max_attacked} liars, in the order of `bank_masks`")
-    if length < 1:
-        raise ValueError("a window has at least one step")
     gamma = np.array([one.noise_gain for one in observers]) if gains is None else np.asarray(gains)
-    level = epsilon + gamma * noise + np.array([one.unknown_gain for one in observers]) * unknown
+    sizes = {"noise": noise, "start": start, "epsilon": epsilon, "unknown": unknown}
+    refuse(_problems(sizes, gamma, len(observers), length))
+    level = epsilon + gamma * noise
+    if unknown > 0.0:
+        level = level + np.array([one.unknown_gain for one in observers]) * unknown
+    if not np.all(np.isfinite(level)):
+        raise ValueError("an observer has no finite bound of its error: nothing would ever exceed it")
     large, small = level[1 : 1 + sets.count_large], level[1 + sets.count_large :]
     spread = np.broadcast_to(small, sets.parent.shape).ravel()[sets.pairs].max(axis=1)
     return WindowDesign(
@@ -193,6 +203,21 @@ def design(
         length=int(length),
         rule=rule,
     )
+
+
+def _problems(sizes: dict[str, float], gains: Floats, observers: int, length: int) -> list[str]:
+    """What is wrong with the numbers that thresholds are made of."""
+    numbers = {**{name: np.array(size) for name, size in sizes.items()}, "gains": gains}
+    problems = [
+        f"{name} must be finite and not negative, got {value.tolist()}"
+        for name, value in numbers.items()
+        if not np.all(np.isfinite(value) & (value >= 0.0))
+    ]
+    if gains.shape != (observers,):
+        problems.append(f"gains have the shape {gains.shape}; one for each of {observers} observers")
+    if length < 1:
+        problems.append("a window has at least one step")
+    return problems
 
 
 def consistency(design: WindowDesign, x: Floats) -> tuple[Floats, Floats]:

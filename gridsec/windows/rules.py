@@ -17,6 +17,19 @@ from gridsec.arrays import Bools, Floats
 Rule = Literal["majority", "survivors"]
 
 
+def exceeds(measure: Floats, threshold: Floats | float) -> Bools:
+    """Whether measures are above their thresholds.
+
+    Parameters
+    ----------
+    measure : (…)
+        pi or pi_J; NaN, which could not be judged, exceeds nothing.
+    threshold : (…) or scalar
+        A threshold that is no number is exceeded by whatever could be judged.
+    """
+    return np.asarray(~np.isnan(measure) & ~(measure <= threshold))
+
+
 def detection(pi: Floats, threshold: float, length: int) -> Bools:
     """Algorithm 1: whether pi exceeds its threshold anywhere in each window.
 
@@ -35,9 +48,8 @@ def detection(pi: Floats, threshold: float, length: int) -> Bools:
         detection(i) as booleans.
     """
     count = pi.shape[-1] // length
-    return np.asarray(
-        (pi[..., : count * length] > threshold).reshape(*pi.shape[:-1], count, length).any(axis=-1)
-    )
+    above = exceeds(pi[..., : count * length], threshold)
+    return np.asarray(above.reshape(*pi.shape[:-1], count, length).any(axis=-1))
 
 
 def believed(passing: Bools, masks: Bools) -> Bools:
@@ -111,7 +123,7 @@ def isolation(pi_sets: Floats, thresholds: Floats, masks: Bools, length: int, ru
     shape = (*pi_sets.shape[:-2], count, length, pi_sets.shape[-1])
     windowed = np.asarray(pi_sets[..., : count * length, :].reshape(shape))
     if rule == "survivors":
-        failed = np.asarray((windowed > thresholds).any(axis=-2))
+        failed = np.asarray(exceeds(windowed, thresholds).any(axis=-2))
         judged = np.asarray(np.isfinite(windowed).any(axis=-2))
         alive = np.asarray(~failed & judged)
         decided = np.asarray(alive.any(axis=-1) & judged.all(axis=-1))

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gridsec.arrays import Floats, frozen
+from gridsec.errors import refuse
 from gridsec.lmi.sampled import advance as advance_plant
 from gridsec.lmi.sampled import measure
 from gridsec.observers.circle_discrete import advance
@@ -83,7 +84,18 @@ def calibrate(design: WindowDesign, honest: Trace) -> WindowDesign:
         The bank.
     honest
         From `simulate` without attack.
+
+    Raises
+    ------
+    ValueError
+        If the measures are not finite, or all of the runs end before windows begin.
     """
     first = design.settling
-    top = honest.pi_sets[..., first:, :].reshape(-1, design.sets.count_large).max(axis=0)
-    return replace(design, detect_above=float(honest.pi[..., first:].max()), isolate_above=frozen(top))
+    measures = {"pi": honest.pi[..., first:], "pi_sets": honest.pi_sets[..., first:, :]}
+    refuse(
+        f"{name} has no finite numbers alone from step {first} on"
+        for name, found in measures.items()
+        if not (found.size and np.isfinite(found).all())
+    )
+    top = measures["pi_sets"].reshape(-1, design.sets.count_large).max(axis=0)
+    return replace(design, detect_above=float(measures["pi"].max()), isolate_above=frozen(top))

@@ -77,6 +77,11 @@ class TestMonteCarlo:
         stack = observers.stack(yang2019.bank())
         with pytest.raises(ValueError, match="at least one run"):
             observers.monte_carlo(stack, half_width=0.5, start=np.zeros((0, 2)), u=np.zeros((1, 1)), seed=0)
+        for width in (0.0, np.nan, -1.0, np.array([1.0, 0.0, 0.0, 0.0])):
+            with pytest.raises(ValueError, match=r"at least one run.*half_width"):
+                observers.monte_carlo(
+                    stack, half_width=width, start=np.zeros((0, 2)), u=np.zeros((1, 1)), seed=0
+                )
 
 
 @pytest.fixture(scope="module")
