@@ -15,7 +15,7 @@ from gridsec.arrays import Bools, Floats, Ints
 from gridsec.observers.circle_discrete import advance
 from gridsec.online import Decision
 from gridsec.windows.design import WindowDesign, consistency
-from gridsec.windows.rules import isolation
+from gridsec.windows.rules import exceeds, isolation
 
 # An observer whose error after a silence is not bounded by anything is never judged again.
 _NEVER = np.iinfo(np.intp).max
@@ -60,7 +60,8 @@ class WindowVerdict:
     detection
         Algorithm 1: CLEAN, ATTACKED, or UNDECIDED if some step could not be judged and none exceeded.
     isolation
-        Algorithm 2: CLEAN if no meter is suspect, ATTACKED, or UNDECIDED.
+        Algorithm 2: ATTACKED, CLEAN if no meter is suspect and every set could be judged at every step,
+        or UNDECIDED.
     suspects : (p,)
         The meters.
     score, threshold : (1 + s,)
@@ -155,15 +156,17 @@ def _verdict(design: WindowDesign, t: float, pi: Floats, pi_sets: Floats) -> Win
     masks = design.observers.masks[1 : 1 + design.sets.count_large]
     found = isolation(pi_sets, design.isolate_above, masks, design.length, design.rule)
     seen = bool(np.isfinite(pi).all())
-    exceeded = bool((pi > design.detect_above).any())
+    exceeded = bool(exceeds(pi, design.detect_above).any())
     quiet = Decision.CLEAN if seen else Decision.UNDECIDED
     suspects = np.asarray(found.suspects[0])
-    named = Decision.ATTACKED if suspects.any() else Decision.CLEAN
+    # Nobody is cleared by the steps that could not be judged.
+    whole = bool(found.decided[0] and np.isfinite(pi_sets).all())
+    cleared = Decision.CLEAN if whole else Decision.UNDECIDED
     largest = np.concatenate([[_top(pi)], [_top(column) for column in pi_sets.T]])
     return WindowVerdict(
         t=t,
         detection=Decision.ATTACKED if exceeded else quiet,
-        isolation=named if found.decided[0] else Decision.UNDECIDED,
+        isolation=Decision.ATTACKED if suspects.any() else cleared,
         suspects=suspects,
         score=largest,
         threshold=np.concatenate([[design.detect_above], design.isolate_above]),

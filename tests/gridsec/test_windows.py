@@ -83,6 +83,17 @@ class TestThresholds:
             windows.design((*bank[:1], *bank[:0:-1]), 1, noise=1.0, length=50)
         with pytest.raises(ValueError, match="at least one step"):
             windows.design(bank, 1, noise=1.0, length=0)
+        for wrong in (np.nan, -1.0, np.inf):
+            gains = np.full(len(bank), wrong)
+            with pytest.raises(ValueError, match=r"noise.*start.*epsilon.*unknown.*gains.*one step"):
+                windows.design(
+                    bank, 1, noise=wrong, start=wrong, epsilon=wrong, unknown=wrong, gains=gains, length=0
+                )
+        with pytest.raises(ValueError, match="shape"):
+            windows.design(bank, 1, noise=1.0, length=5, gains=np.ones(2))
+        endless = [replace(bank[0], unknown_gain=np.inf), *bank[1:]]
+        with pytest.raises(ValueError, match="no finite bound"):
+            windows.design(endless, 1, noise=1.0, length=5, unknown=0.1)
         with pytest.raises(NotObservable):
             windows.bank(plant, 2, options=want)
         with pytest.raises(ValueError, match="at least 1"):
@@ -398,6 +409,30 @@ class TestOnline:
         assert np.array_equal(np.isfinite(last), ~masks(d)[:, 0])
         assert measure(plant, np.zeros(2), u).shape == (4,)
 
+    @pytest.mark.parametrize("rule", ["majority", "survivors"])
+    def test_a_window_of_which_one_step_is_judged_clears_nobody(self, rule: str) -> None:
+        """All meters are heard at the first step of a window alone."""
+        d = replace(example(), rule=rule)
+        state, verdicts = windows.init(d, 0.0, np.zeros(2)), []
+        for k in range(d.length):
+            seen = np.full(4, k != 0)
+            state, verdict = windows.step(d, state, np.zeros(4), np.zeros(1), seen)
+            verdicts += [verdict] if verdict is not None else []
+        assert np.all(np.isfinite(verdicts[0].score))
+        assert verdicts[0].detection is verdicts[0].isolation is Decision.UNDECIDED
+
+    @pytest.mark.parametrize("rule", ["majority", "survivors"])
+    def test_a_threshold_that_is_no_number_is_never_clean(self, rule: str) -> None:
+        nothing = np.full(4, np.nan)
+        d = replace(example(), rule=rule, detect_above=np.nan, isolate_above=nothing, length=3)
+        state = windows.init(d, 0.0, np.zeros(2))
+        for _ in range(3):
+            state, verdict = windows.step(d, state, np.zeros(4), np.zeros(1), np.ones(4, dtype=bool))
+        assert verdict is not None
+        assert verdict.detection is Decision.ATTACKED
+        assert verdict.isolation is Decision.UNDECIDED
+        assert windows.detection(np.array([0.1, np.nan]), np.nan, 1).tolist() == [True, False]
+
     def test_an_attack_during_silence_is_still_evidence(self) -> None:
         d = example()
         state, verdicts = windows.init(d, 0.0, np.zeros(2)), []
@@ -420,6 +455,19 @@ class TestCalibration:
         assert again.detect_above < at.simulated.detect_above < at.proven.detect_above
         # Of 40 fresh runs each exceeds the 500 calibrating ones with at most 0.0092 (99 %).
         assert np.count_nonzero(honest.pi.max(axis=1) > at.calibrated.detect_above) <= 3
+
+    def test_a_trace_that_is_not_finite_or_too_short_calibrates_nothing(self) -> None:
+        d = example()
+        trace = windows.simulate(d, np.zeros(2), np.zeros((5, 1)), np.full((5, 4), 0.1))
+        broken = replace(
+            trace,
+            pi=np.where(np.arange(5) == 2, np.nan, trace.pi),
+            pi_sets=np.full_like(trace.pi_sets, np.inf),
+        )
+        with pytest.raises(ValueError, match=r"pi has no.*pi_sets has no"):
+            windows.calibrate(d, broken)
+        with pytest.raises(ValueError, match="from step 9"):
+            windows.calibrate(replace(d, settling=9), trace)
 
     def test_calibrated_thresholds_are_no_bounds(self) -> None:
         """Constant noise of the same size raises a false alarm at once, not so above the proven threshold."""
