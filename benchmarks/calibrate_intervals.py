@@ -1,8 +1,8 @@
 """Whether the 95 % intervals of a calibration hold: recordings of feeders whose files are right.
 
-    python -m benchmarks.calibrate_intervals [recordings] [feeder ...]
+    python -m benchmarks.calibrate_intervals [recordings] [feeder ...] [--days 4] [--step 900]
 
-Four days at 15 min by full AC power flow, 2 % of the readings lost, hidden loads of 0.2 kW (0.1 kvar) and
+Days of readings by full AC power flow, 2 % of them lost, hidden loads (`--hidden-kw`, half as many kvar) and
 meters with errors within their class; every other recording has reactive powers. Counted are the intervals of
 the meters' biases and of the lines' lengths that hold the truth, the root mean square of their errors in
 standard errors, the largest, and the recordings in which anything is proposed at all.
@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import os
 import tempfile
+from dataclasses import dataclass
 from pathlib import Path
 
 # Before NumPy loads its libraries.
@@ -30,19 +31,27 @@ from feeders.variation import Variation
 from gridsec.arrays import Floats
 
 FEEDERS = ("cigre-lv", "simbench-lv-rural1")
-TICKS, STEP_S, HIDDEN_KW = 384, 900.0, 0.2
 # Quantile of the normal distribution that 95 % are within.
 SURE = 1.959964
 
 
-def errors(site: Site, seed: int, folder: Path) -> tuple[Floats, bool]:
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """Length of a recording, days, interval of the readings, s, and hidden loads, kW."""
+
+    days: float
+    step_s: float
+    hidden_kw: float
+
+
+def errors(site: Site, what: Recorded, seed: int, folder: Path) -> tuple[Floats, bool]:
     """Errors of one calibration's estimates in their standard errors, and whether anything was proposed."""
     given = Scenario(
         seed=seed,
-        duration_s=TICKS * STEP_S,
-        dt_s=STEP_S,
+        duration_s=what.days * 86_400.0,
+        dt_s=what.step_s,
         profile_s=0.0,
-        variation=Variation(hidden_kw=HIDDEN_KW, hidden_kvar=0.5 * HIDDEN_KW),
+        variation=Variation(hidden_kw=what.hidden_kw, hidden_kvar=0.5 * what.hidden_kw),
         errors=MeterErrors(report_q=seed % 2 == 1),
         channel=Channel(loss=0.02),
     )
@@ -55,7 +64,7 @@ def errors(site: Site, seed: int, folder: Path) -> tuple[Floats, bool]:
     return np.concatenate([of_meters, (lines["factor"] - 1.0) / lines["std"]]), not found.proposals.empty
 
 
-def main(recordings: int, feeders: list[str]) -> None:
+def main(recordings: int, feeders: list[str], what: Recorded) -> None:
     """Count and print."""
     print("| feeder | q metered | recordings | intervals that hold, % | rms | largest | with a proposal |")
     print("|---|---|---|---|---|---|---|")
@@ -65,7 +74,7 @@ def main(recordings: int, feeders: list[str]) -> None:
             z, proposed = [], 0
             for k in range(recordings // 2):
                 with tempfile.TemporaryDirectory() as folder:
-                    each, any_ = errors(site, 2 * k + told, Path(folder))
+                    each, any_ = errors(site, what, 2 * k + told, Path(folder))
                 z.append(each)
                 proposed += any_
             all_ = np.concatenate(z)
@@ -79,5 +88,8 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(prog="python -m benchmarks.calibrate_intervals", description=__doc__)
     parser.add_argument("recordings", type=int, nargs="?", default=16)
     parser.add_argument("feeders", nargs="*", default=list(FEEDERS))
+    parser.add_argument("--days", type=float, default=4.0)
+    parser.add_argument("--step", type=float, default=900.0, help="interval of the readings, s")
+    parser.add_argument("--hidden-kw", type=float, default=0.2)
     wanted = parser.parse_args()
-    main(wanted.recordings, wanted.feeders)
+    main(wanted.recordings, wanted.feeders, Recorded(wanted.days, wanted.step, wanted.hidden_kw))
