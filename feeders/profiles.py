@@ -15,6 +15,7 @@ from typing import Final
 
 import numpy as np
 
+from feeders.choices import choice
 from gridsec.online import Floats
 
 ENVELOPES = "envelopes.csv"
@@ -96,8 +97,13 @@ def library(season: Season = Season.SUMMER) -> Profiles:
     ----------
     season
         Which; summer has two weeks, the others have one.
+
+    Raises
+    ------
+    ValueError
+        If there is no such season.
     """
-    return _read(season)
+    return _read(choice("season", Season, season))
 
 
 @cache

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from feeders.campaign import random_attacks
+from feeders.choices import choice
 from feeders.load import Snapshot
 from feeders.meters import BUSBAR, Channel, Delivery, MeterErrors, Meters, Registers
 from feeders.profiles import Season
@@ -98,6 +99,7 @@ class Scenario:
     busbar_attacks: tuple[Attack, ...] = ()
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "season", choice("season", Season, self.season))
         if self.seed < 0:
             raise ValueError(f"seed must not be negative, got {self.seed}")
         if not np.isfinite(self.profile_s):

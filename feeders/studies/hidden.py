@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from feeders.choices import choice
 from gridsec.arrays import Bools, Floats, Ints, unit_rows
 from gridsec.lure import close_loop
 from gridsec.studies.patterns import Patterns, patterns, unknown_pair, unknown_voltages
@@ -95,8 +96,9 @@ def knowledge(
     Raises
     ------
     ValueError
-        If there is no such customer or meter.
+        If there is no such customer, meter or part of the curves.
     """
+    curves = choice("curves", Curves, curves)
     gone = meter_mask(site, silent)
     metered = np.zeros(site.feeder.bus.size, dtype=np.bool_)
     metered[site.meters] = True

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from feeders.choices import choice
 from feeders.doubts import unread
 from feeders.forecast import always
 from feeders.load import Snapshot, to_frame
@@ -46,6 +47,11 @@ def box(site: Site, *, share: float = SHARE, curves: Curves = Curves.DEADBAND) -
         Of the peak load.
     curves
         Where the inverters work; at nominal voltage that is the deadband.
+
+    Raises
+    ------
+    ValueError
+        If they have no such part.
     """
     frame = _frame(site, share)
     return _box(site, curves, frame.p_error, frame.q_error)
@@ -70,7 +76,7 @@ def false_powers(
     Raises
     ------
     ValueError
-        If there is no such customer.
+        If there is no such customer or part of the curves.
     """
     frame, silent = _frame(site, share), unread(site)
     p, q = np.maximum(frame.p_error, silent.p_error), np.maximum(frame.q_error, silent.q_error)
@@ -105,7 +111,8 @@ def _box(site: Site, curves: Curves, p_error: Floats, q_error: Floats) -> Box:
     """What powers, off by so much, the busbar and the meters do."""
     R, X = (between(site.feeder, power) for power in Power)
     own = site.droop.customer
-    slope = site.droop.slope if curves is Curves.STEEPEST else np.zeros(own.size)
+    steepest = choice("curves", Curves, curves) is Curves.STEEPEST
+    slope = site.droop.slope if steepest else np.zeros(own.size)
     loop = np.eye(len(X))
     loop[:, own] += 2.0 * X[:, own] * slope
     open_loop = np.hstack(

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import pandas as pd
 
+from feeders.choices import choice
 from feeders.studies.hidden import Attack, Curves, Knowledge, knowledge
 from feeders.studies.journal import Progress, Where, worked
 from gridsec.errors import DesignInfeasible
@@ -115,12 +116,13 @@ def redundancy(
     Raises
     ------
     ValueError
-        If there is no such customer or meter.
+        If there is no such customer, meter or part of the curves.
     OtherStudy
         If the journal is another study's.
     InUse
         If another process is writing it.
     """
+    curves = choice("curves", Curves, curves)
     subject = {
         "study": "redundancy",
         "digest": site.digest,

@@ -12,7 +12,7 @@ from feeders.inverters import ClosedLoop, Loads
 from feeders.load import Site, load, names, to_frame
 from feeders.meters import BUSBAR, Channel, MeterErrors, Silence
 from feeders.powerflow import PowerFlow
-from feeders.scenario import START, SUNNY_NOON_S, Sample, Scenario, by_arrival, simulate, snapshots
+from feeders.scenario import START, SUNNY_NOON_S, Sample, Scenario, Season, by_arrival, simulate, snapshots
 from feeders.truth import substeps
 from feeders.variation import Customers, Variation
 from gridsec.attack import Bias, Replay, Stuck
@@ -290,7 +290,7 @@ def test_readings_come_out_as_soon_as_they_can() -> None:
             taken += 1
             yield sample
 
-    first = next(by_arrival(counted()))  # type: ignore[arg-type]  # a generator of samples
+    first = next(by_arrival(counted()))  # a generator of samples
     assert first.arrival == START + 2.5
     assert taken == 4
 
@@ -307,7 +307,7 @@ def test_readings_come_out_as_soon_as_they_can() -> None:
 )
 def test_nonsense_is_refused(change: dict[str, float], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        Scenario(**change)  # type: ignore[arg-type]  # that is the point
+        Scenario(**change)  # that is the point
 
 
 def test_attacks_on_meters_that_are_not_there_are_refused() -> None:
@@ -318,3 +318,11 @@ def test_attacks_on_meters_that_are_not_there_are_refused() -> None:
     ancient = Replay(np.array([0]), START, START + 1.0, delay_s=1e7)
     with pytest.raises(ValueError, match="looks back"):
         next(simulate(site, Scenario(attacks=(ancient,))))
+
+
+def test_the_text_of_a_season_is_the_season() -> None:
+    text, member = (Scenario(duration_s=2.0, season=season) for season in ("winter", Season.WINTER))
+    assert text == member
+    assert all(same(a, b) for a, b in zip(play(village(), text), play(village(), member), strict=True))
+    with pytest.raises(ValueError, match="season is 'dry'; expected one of winter, spring, summer, autumn"):
+        Scenario(season="dry")

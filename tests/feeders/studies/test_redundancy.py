@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from feeders.load import load
-from feeders.studies.hidden import Attack
+from feeders.studies.hidden import Attack, Curves
 from feeders.studies.journal import Journal, OtherStudy
 from feeders.studies.redundancy import ALL, SILENT, redundancy
 
@@ -92,3 +92,14 @@ def test_unknown_names_are_refused() -> None:
         redundancy(RURAL, silent=["m99"])
     with pytest.raises(ValueError, match="no customer 'nobody'"):
         redundancy(RURAL, unknown=["nobody"])
+
+
+def test_the_text_of_a_choice_is_the_choice_and_another_text_is_refused(tmp_path: Path) -> None:
+    site, journal = load("cigre-lv"), tmp_path / "journal"
+    both = ("steepest", Curves.STEEPEST)
+    said = [redundancy(site, curves=curves, journal=journal) for curves in both]
+    assert said[0].summary.equals(said[1].summary)
+    assert said[0].summary.equals(redundancy(site).summary)
+    assert not said[0].summary.equals(redundancy(site, curves=Curves.DEADBAND).summary)
+    with pytest.raises(ValueError, match="curves is 'flat'; expected one of steepest, deadband"):
+        redundancy(site, curves="flat")
