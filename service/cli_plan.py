@@ -119,13 +119,19 @@ def protect(
     """The fewest meters to protect so that liars are named, are noticed, or can only lie a little."""
     from feeders.load import load
     from feeders.studies.hidden import Attack
-    from feeders.studies.protect import Goal
+    from feeders.studies.protect import Goal, check
     from feeders.studies.protect import protect as study
 
-    kinds = {"--goal": (goal or Goal.CONTAIN, tuple(Goal)), "--attack": (attack, tuple(Attack))}
-    for option, (name, known) in kinds.items():
-        if name not in known:
-            raise typer.BadParameter(f"{name!r}: expected one of {', '.join(known)}", param_hint=option)
+    bound = math.nan if lie_volt is None else lie_volt
+    with said():
+        check(
+            max_attacked=max_attacked,
+            goal=goal,
+            lie_volt=bound,
+            attack=attack,
+            unknown=unknown,
+            busbar_known=not busbar_unknown,
+        )
     see(folders={"--out": out}, files={"--journal": journal})
     with keeping("protect", feeder, journal, without=no_journal) as kept:
         site = load(converted(feeder, out))
@@ -134,7 +140,7 @@ def protect(
                 site,
                 max_attacked=max_attacked,
                 goal=Goal(goal) if goal else None,
-                lie_volt=math.nan if lie_volt is None else lie_volt,
+                lie_volt=bound,
                 attack=Attack(attack),
                 unknown=unknown,
                 busbar_known=not busbar_unknown,

@@ -16,7 +16,7 @@ from rich.markup import escape
 from service import console
 from service.cli_campaign import Estimator, KnownKvar, KnownKw, Seed, Step
 from service.cli_droop import Allowed, Preset, see_choice
-from service.cli_plan import BusbarUnknown, GoalOf, LieVolt, Silent, Unknown, bar
+from service.cli_plan import BusbarUnknown, GoalOf, LieVolt, Silent, Unknown, bar, said
 from service.console import FAILED, Studied, complain
 from service.foreign import converted
 from service.keeping import keeping
@@ -81,11 +81,19 @@ def report(
     Interrupted, the same command goes on where it was. What a study cannot answer, the report says.
     """
     from feeders.columns import ESTIMATORS
+    from feeders.studies.protect import check as see_question
     from gridsec.droop import PRESETS
     from service.study_report import STUDIES, Asked
 
     chosen = _studies(studies, tuple(STUDIES), recorded=readings is not None)
-    _see_goal(goal, lie_volt)
+    with said():
+        see_question(
+            max_attacked=max_attacked,
+            goal=goal,
+            lie_volt=math.nan if lie_volt is None else lie_volt,
+            unknown=unknown,
+            busbar_known=not busbar_unknown,
+        )
     see_choice([preset] if preset else [], PRESETS, "--preset")
     see_choice([estimator] if estimator else [], ESTIMATORS, "--estimator")
     _see_limits(busbar, "--busbar")
@@ -113,19 +121,6 @@ def report(
         readings=readings,
     )
     _make(asked, chosen, out, made=made, command=_command(asked, out, studies))
-
-
-def _see_goal(goal: str | None, lie_volt: float | None) -> None:
-    from feeders.studies.protect import Goal
-
-    if goal is None:
-        return
-    if goal not in tuple(Goal):
-        raise typer.BadParameter(f"{goal!r}: expected one of {', '.join(Goal)}", param_hint="--goal")
-    if goal == Goal.BOUND and lie_volt is None:
-        raise typer.BadParameter("--goal bound asks for it", param_hint="--lie-volt")
-    if not Goal(goal).in_volts and lie_volt is not None:
-        raise typer.BadParameter("goes with --goal bound and contain", param_hint="--lie-volt")
 
 
 def _see_limits(limits: tuple[float, float] | None, option: str, *, apart: bool = False) -> None:

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
+from feeders.choices import choice, no_choice
 from feeders.studies.hidden import Attack, Curves, knowledge, meter_mask
 from feeders.studies.journal import Journal, Where
 from feeders.studies.operating import SHARE, box, false_powers, squared, volts_of_lie
@@ -30,7 +31,7 @@ from gridsec.studies.protect import Attacker, Unprotectable, fewest_protected, h
 if TYPE_CHECKING:
     from feeders.load import Site
 
-__all__ = ["Goal", "Protect", "protect"]
+__all__ = ["Goal", "Protect", "check", "protect"]
 
 
 class Goal(StrEnum):
@@ -161,7 +162,7 @@ def protect(
         that half of what company and false powers add to the lie of a meter is gone.
     attack, unknown, busbar_known
         For `IDENTIFY` and `NOTICE`: which attacks count, and what nobody knows. `CONTAIN` takes the unknown
-        powers too, and needs the busbar's voltage.
+        powers too; `BOUND` has none. Both, and every `lie_volt`, need the busbar's voltage.
     curves
         Where inverters work. By default on the steepest part for the first two, in the deadband in volts.
     share
@@ -180,20 +181,31 @@ def protect(
     DesignInfeasible
         If no protection of the other meters is enough.
     ValueError
-        If there is no such customer or meter, or no bound of the lie.
+        If there is no such customer or meter, or as `check`.
     OtherStudy
         If the journal is another study's.
     InUse
         If another process is writing it.
     """
-    _check(max_attacked, goal, lie_volt, busbar_known=busbar_known)
+    check(
+        max_attacked=max_attacked,
+        goal=goal,
+        lie_volt=lie_volt,
+        attack=attack,
+        unknown=unknown,
+        busbar_known=busbar_known,
+        curves=curves,
+        share=share,
+    )
+    attack, goal = Attack(attack), None if goal is None else Goal(goal)
     know = partial(knowledge, site, unknown=unknown, silent=(), busbar_known=busbar_known)
     if goal is None:
         bounded = busbar_known and (
             lie_volt > 0.0 or _nobody_hides(know(curves=curves or Curves.STEEPEST).found[attack])
         )
         goal = Goal.CONTAIN if bounded else Goal.IDENTIFY
-    where = curves or (Curves.DEADBAND if goal.in_volts else Curves.STEEPEST)
+    usual = Curves.DEADBAND if goal.in_volts else Curves.STEEPEST
+    where = usual if curves is None else choice("curves", Curves, curves)
     if goal.in_volts:
         asked = _in_volts(site, goal, max_attacked, lie_volt, unknown=unknown, share=share, curves=where)
     else:
@@ -237,14 +249,60 @@ def protect(
     )
 
 
-def _check(max_attacked: int, goal: Goal | None, lie_volt: float, *, busbar_known: bool) -> None:
-    """Say what is wrong with a question that has no answer."""
-    if max_attacked < 1:
-        raise ValueError(f"max_attacked is {max_attacked}; it must be at least 1")
-    if (goal is Goal.BOUND and math.isnan(lie_volt)) or lie_volt <= 0.0:
-        raise ValueError(f"lie_volt is {lie_volt}; to bound lies it must be a positive number of volts")
-    if goal is Goal.CONTAIN and not busbar_known:
-        raise ValueError("to bound lies the busbar's voltage must be known")
+def check(
+    *,
+    max_attacked: int,
+    goal: Goal | str | None = None,
+    lie_volt: float = math.nan,
+    attack: Attack | str = Attack.PERSISTENT,
+    unknown: Sequence[str] | None = None,
+    busbar_known: bool = True,
+    curves: Curves | str | None = None,
+    share: float = SHARE,
+) -> None:
+    """Refuse a question that has no answer, or says things that the goal would leave out of account.
+
+    Parameters
+    ----------
+    max_attacked, goal, lie_volt, attack, unknown, busbar_known, curves, share
+        As in `protect`.
+
+    Raises
+    ------
+    ValueError
+        With everything that is wrong.
+    """
+    problems = [
+        *no_choice("goal", Goal, *([] if goal is None else [goal])),
+        *no_choice("attack", Attack, attack),
+        *no_choice("curves", Curves, *([] if curves is None else [curves])),
+    ]
+    bounded = not math.isnan(lie_volt)
+    hiding = goal in (Goal.IDENTIFY, Goal.NOTICE)
+    in_volts = goal in (Goal.BOUND, Goal.CONTAIN) or (goal is None and bounded)
+    for problem, wrong in (
+        (f"max_attacked is {max_attacked}; it must be at least 1", max_attacked < 1),
+        (
+            f"lie_volt is {lie_volt}; to bound lies it must be a positive number of volts",
+            not 0.0 < lie_volt < math.inf and (bounded or goal == Goal.BOUND),
+        ),
+        (f"share is {share}; it must be finite and not negative", not 0.0 <= share < math.inf),
+        ("to bound lies the busbar's voltage must be known", in_volts and not busbar_known),
+        (f"lie_volt goes with goals in volts, not with {goal}", bounded and hiding),
+        (f"share goes with goals in volts, not with {goal}", share != SHARE and hiding),
+        (
+            "attack goes with goals identify and notice, not with bounds of lies",
+            in_volts and attack == Attack.ANY,
+        ),
+        (
+            "unknown powers do not go with bound, for which all are reported truly",
+            goal == Goal.BOUND and unknown,
+        ),
+    ):
+        if wrong:
+            problems.append(problem)
+    if problems:
+        raise ValueError("; ".join(problems))
 
 
 def _unmet(liars: Sequence[str]) -> str:

@@ -107,8 +107,8 @@ def test_what_a_study_cannot_answer_is_in_the_report(
         (("--studies", "protect,palmistry"), "'palmistry': expected some of"),
         (("--studies", "calibrate"), "calibrate needs --readings"),
         (("--goal", "all"), "expected one of identify, notice, bound, contain"),
-        (("--goal", "bound"), "--goal bound asks for it"),
-        (("--goal", "notice", "--lie-volt", "3"), "goes with --goal bound and contain"),
+        (("--goal", "bound"), "lie_volt is nan; to bound lies it must be a positive number"),
+        (("--goal", "notice", "--lie-volt", "3"), "lie_volt goes with goals in volts, not with notice"),
         (("--at", "tomorrow"), "expected a date and time of ISO 8601"),
     ],
 )

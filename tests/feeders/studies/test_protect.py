@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from feeders.doubts import unread
 from feeders.load import from_tables, load
 from feeders.powerflow import PowerFlow
-from feeders.studies.hidden import Attack
+from feeders.studies.hidden import Attack, Curves
 from feeders.studies.operating import box, false_powers, squared, volts_of_lie
 from feeders.studies.protect import Goal, protect
 from gridsec.errors import DesignInfeasible
@@ -103,6 +104,36 @@ def test_attacks_are_kept_in_the_journal(tmp_path: Path) -> None:
     whole = protect(RURAL, **arguments)
     assert again.meters.equals(whole.meters)
     assert again.attacks.equals(whole.attacks)
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        ({"goal": "all"}, "goal is 'all'; expected one of identify, notice, bound, contain"),
+        ({"goal": Goal.BOUND, "lie_volt": 6.0, "busbar_known": False}, "the busbar's voltage must be known"),
+        ({"goal": Goal.BOUND, "lie_volt": 6.0, "unknown": UNKNOWN}, "unknown powers do not go with bound"),
+        ({"goal": Goal.IDENTIFY, "lie_volt": 8.0}, "lie_volt goes with goals in volts, not with identify"),
+        ({"lie_volt": 8.0, "busbar_known": False}, "the busbar's voltage must be known"),
+        ({"lie_volt": 8.0, "attack": Attack.ANY}, "attack goes with goals identify and notice"),
+        ({"goal": Goal.NOTICE, "share": 0.2}, "share goes with goals in volts, not with notice"),
+        (
+            {"goal": "bound", "max_attacked": 0, "curves": "x"},
+            "curves is 'x'.*max_attacked is 0.*lie_volt is",
+        ),
+    ],
+)
+def test_nothing_that_was_asked_is_left_out_of_account(asked: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        protect(RURAL, **({"max_attacked": 1} | asked))
+
+
+def test_the_text_of_a_goal_is_the_goal() -> None:
+    site = load("cigre-lv")
+    given: dict[str, Any] = {"max_attacked": 1, "lie_volt": 8.0}
+    text = protect(site, goal="bound", curves="steepest", attack="persistent", **given)
+    assert text.goal is Goal.BOUND
+    assert text.before == protect(site, goal=Goal.BOUND, curves=Curves.STEEPEST, **given).before
+    assert text.before != protect(site, goal=Goal.BOUND, curves=Curves.DEADBAND, **given).before
 
 
 # ------------------------------------------------------------------------------------ false powers
