@@ -210,7 +210,7 @@ def read_recording(path: Path | str) -> Recording:
     Raises
     ------
     RecordingInvalid
-        When the file is not Parquet, lacks a column, or has a newer format.
+        When the file is not Parquet, lacks a column or has one of another type, or has a newer format.
     """
     path = Path(path)
     try:
@@ -218,9 +218,9 @@ def read_recording(path: Path | str) -> Recording:
             schema, count = file.schema_arrow, file.metadata.num_rows
     except (OSError, pa.ArrowException) as error:
         raise RecordingInvalid(f"{path}: no recording: {error}") from error
-    missing = [name for name in REQUIRED if name not in schema.names]
-    if missing:
-        raise RecordingInvalid(f"{path}: columns {', '.join(missing)} are missing")
+    problems = _wrong_columns(schema)
+    if problems:
+        raise RecordingInvalid(f"{path}: {'; '.join(problems)}")
     if KEY not in (schema.metadata or {}):
         return Recording(path, count, None, None, None, {})
     try:
@@ -231,6 +231,43 @@ def read_recording(path: Path | str) -> Recording:
         return Recording(path, count, about["feeder"], about["digest"], scenario, about["versions"])
     except (ValueError, KeyError, TypeError) as error:
         raise RecordingInvalid(f"{path}: its metadata cannot be read: {error!r}") from error
+
+
+def _wrong_columns(schema: Any) -> list[str]:
+    """What is wrong with the columns of a file, all at once."""
+    missing = [name for name in REQUIRED if name not in schema.names]
+    problems = [f"columns {', '.join(missing)} are missing"] if missing else []
+    for name in (*READINGS.names, PHASES.name):
+        if name not in schema.names:
+            continue
+        given = schema.field(name).type
+        kind = given.value_type if pa.types.is_dictionary(given) else given
+        if name == "meter":
+            fits, expected = _is_text(kind), "names of meters"
+        elif name == PHASES.name:
+            fits, expected = _is_list(kind) and _is_number(kind.value_type), "lists of numbers"
+        else:
+            fits, expected = _is_number(kind), "Unix time in seconds" if name in _TIMES else "numbers"
+        # A column in which nothing is has no type.
+        if not fits and not (pa.types.is_null(kind) and name not in REQUIRED):
+            problems.append(f"column {name} is of type {given}; expected {expected}")
+    return problems
+
+
+_TIMES: Final = ("t", "arrival")
+
+
+def _is_number(kind: Any) -> bool:
+    return bool(pa.types.is_integer(kind) or pa.types.is_floating(kind))
+
+
+def _is_text(kind: Any) -> bool:
+    return bool(pa.types.is_string(kind) or pa.types.is_large_string(kind) or pa.types.is_string_view(kind))
+
+
+def _is_list(kind: Any) -> bool:
+    is_any = (pa.types.is_list, pa.types.is_large_list, pa.types.is_fixed_size_list)
+    return any(is_this(kind) for is_this in is_any)
 
 
 _LISTS = ("attacks", "busbar_attacks")

@@ -9,6 +9,13 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import pandas as pd
+from pandas.api.types import (
+    is_bool_dtype,
+    is_complex_dtype,
+    is_numeric_dtype,
+    is_object_dtype,
+    is_string_dtype,
+)
 
 from feeders.meters import BUSBAR
 from feeders.recording import REQUIRED, RecordingInvalid, read_recording
@@ -26,6 +33,17 @@ MOST_FRAMES: Final = 720
 
 FEWEST_FRAMES: Final = 48
 """Fewer frames than these say nothing about what varies."""
+
+LATEST_S: Final = 1e10
+"""Times from here on, in the year 2286, are in another unit than seconds."""
+
+FARTHEST_S: Final = 10.0 * 365.25 * 86400.0
+"""Times farther than this from the median of all, s, are of a clock that was not set."""
+
+NUMBERS: Final = ("t", "v_volt", "p_kw", "q_kvar")
+"""Columns of numbers."""
+
+_EXPECTED: Final = {"t": "expected Unix time in seconds"}
 
 FEWEST_SPANS: Final = 6.0
 """The recording is at least so many correlation times of the loads' errors long."""
@@ -76,7 +94,8 @@ def open_readings(path: Path | str) -> pd.DataFrame | Recording:
     if path.suffix.lower() != ".csv":
         return read_recording(path)
     try:
-        return pd.read_csv(path, dtype={"meter": "string"}, keep_default_na=True)
+        # A converter keeps ids as they are: "NA" and "null" are names like others.
+        return pd.read_csv(path, converters={"meter": str})
     except (OSError, ValueError) as error:
         raise RecordingInvalid(f"{path}: no table of readings: {error}") from error
 
@@ -94,8 +113,8 @@ def frames(site: Site | ThreePhaseSite, readings: pd.DataFrame | Recording | Pat
     Raises
     ------
     RecordingInvalid
-        If columns are missing, meters are unknown, the recording is another feeder's, the busbar has no
-        reading, or there are too few.
+        If columns are missing or hold no numbers, times are not Unix seconds, meters are unknown, the
+        recording is another feeder's, the busbar has no reading, or there are too few.
     """
     given = open_readings(readings) if isinstance(readings, (Path, str)) else readings
     if not isinstance(given, pd.DataFrame):
@@ -103,36 +122,84 @@ def frames(site: Site | ThreePhaseSite, readings: pd.DataFrame | Recording | Pat
             raise RecordingInvalid(f"{given.path}: recorded on {given.feeder}, not on {site.feeder.name}")
         given = given.frame()
     missing = [name for name in REQUIRED if name not in given.columns]
-    if missing:
-        raise RecordingInvalid(f"readings: columns {', '.join(missing)} are missing")
-    meter = given["meter"].astype("string").fillna(BUSBAR)
+    problems = [f"columns {', '.join(missing)} are missing"] if missing else []
+    told = {name: _numbers(given[name], problems) for name in NUMBERS if name in given}
+    numbers = {name: values for name, values in told.items() if values is not None}
+    if "t" in numbers:
+        problems += _wrong_times(numbers["t"])
+    meter = given["meter"].astype("string").fillna(BUSBAR) if "meter" in given else pd.Series(dtype="string")
     known = {name: k for k, name in enumerate((*site.meter_ids, BUSBAR))}
     column = meter.map(known)
     unknown = sorted(set(meter[column.isna()]))
     if unknown:
         shown = ", ".join(unknown[:10]) + (f" and {len(unknown) - 10} more" if len(unknown) > 10 else "")
-        raise RecordingInvalid(f"readings of meters that {site.feeder.name} does not have: {shown}")
-    if not (column == len(site.meter_ids)).any():
-        raise RecordingInvalid("readings: none of the busbar (an empty meter); nothing to compare with")
-    return _binned(site, given, np.asarray(column, dtype=np.intp))
+        problems.append(f"there are meters that {site.feeder.name} does not have: {shown}")
+    if "meter" in given and not (column == len(site.meter_ids)).any():
+        problems.append("none of the busbar (an empty meter); nothing to compare with")
+    if problems:
+        raise RecordingInvalid(f"readings: {'; '.join(problems)}")
+    return _binned(site, given, numbers, np.asarray(column, dtype=np.intp))
 
 
-def _binned(site: Site | ThreePhaseSite, given: pd.DataFrame, column: Ints) -> Frames:
-    t = given["t"].to_numpy(dtype=np.float64)
+def _numbers(column: pd.Series, problems: list[str]) -> Floats | None:
+    """A column as numbers, NaN where there is none; None, and told, where it holds something else."""
+    expected = _EXPECTED.get(str(column.name), "expected numbers")
+    if is_numeric_dtype(column) and not is_bool_dtype(column) and not is_complex_dtype(column):
+        return column.to_numpy(dtype=np.float64, na_value=np.nan)
+    if not (is_object_dtype(column) or is_string_dtype(column)):
+        problems.append(f"{column.name} is of type {column.dtype}; {expected}")
+        return None
+    text = column.astype("string")
+    values = pd.to_numeric(text, errors="coerce").to_numpy(dtype=np.float64, na_value=np.nan)
+    # Where there is nothing, there is no wrong number.
+    nothing = text.fillna("").str.strip().str.lower().isin(["", "nan"]).to_numpy()
+    wrong = np.flatnonzero(np.isnan(values) & ~nothing)
+    if wrong.size:
+        problems.append(f"{column.name} of {_rows(wrong)} is {text.iloc[wrong[0]]!r}; {expected}")
+        return None
+    return values
+
+
+def _wrong_times(t: Floats) -> list[str]:
+    """What is wrong with times: those that are none, of another unit, or far from all others."""
+    finite = np.isfinite(t)
+    plain = finite & (t >= 0.0) & (t < LATEST_S)
+    middle = float(np.median(t[plain])) if plain.any() else 0.0
+    problems = []
+    for wrong, what in (
+        (~finite, "expected a time"),
+        (finite & ~plain, "expected Unix time in seconds"),
+        (plain & (np.abs(t - middle) > FARTHEST_S), f"more than ten years from the usual {middle:.15g}"),
+    ):
+        rows = np.flatnonzero(wrong)
+        if rows.size:
+            problems.append(f"t of {_rows(rows)} is {t[rows[0]]:.15g}; {what}")
+    return problems
+
+
+def _rows(which: Ints) -> str:
+    """The first of some rows, counted from 1, and how many there are."""
+    return f"row {which[0] + 1}" + (f" and {which.size - 1} more" if which.size > 1 else "")
+
+
+def _binned(
+    site: Site | ThreePhaseSite, given: pd.DataFrame, numbers: dict[str, Floats], column: Ints
+) -> Frames:
+    t = numbers["t"]
     width, step = len(site.meter_ids) + 1, _step(t, column)
     first = float(t.min())
     # Clocks are off by a little: frames are centred on the first tick.
     number = np.floor((t - first) / step + 0.5).astype(np.intp)
-    together = max(1, int(np.ceil((number.max() + 1) / MOST_FRAMES)))
+    together = max(1, int(np.ceil(np.unique(number).size / MOST_FRAMES)))
     tau = site.tables.meta.load.correlation_s
     together = max(1, min(together, int(tau / 3.0 / step))) if together > 1 else 1
-    number //= together
-    size = (int(number.max()) + 1, width)
+    # Only frames with readings: between the first and the last there may be years without any.
+    used, number = np.unique(number // together, return_inverse=True)
+    size = (used.size, width)
     cell = number * width + column
     values = {}
     for name in ("v_volt", "p_kw", "q_kvar"):
-        x = pd.to_numeric(given[name]).to_numpy(dtype=np.float64, na_value=np.nan) if name in given else None
-        values[name] = _means(cell, np.full(t.size, np.nan) if x is None else x, size)
+        values[name] = _means(cell, numbers.get(name, np.full(t.size, np.nan)), size)
     v, count = values["v_volt"]
     there = (np.isfinite(v[:, :-1]).mean(axis=1) >= 0.3) & np.isfinite(v[:, -1])
     T = int(there.sum())
@@ -143,7 +210,7 @@ def _binned(site: Site | ThreePhaseSite, given: pd.DataFrame, column: Ints) -> F
             f"{wanted / 3600:.3g} h are needed, and days tell more than hours"
         )
     phases = _phases(given, number, size[0])
-    middle = first + (np.arange(size[0]) * together + 0.5 * (together - 1)) * step
+    middle = first + (used * together + 0.5 * (together - 1)) * step
     return Frames(
         meter_ids=site.meter_ids,
         t=middle[there],
@@ -178,7 +245,7 @@ def _step(t: Floats, column: Ints) -> float:
     order = np.lexsort((t, column))
     gap = np.diff(t[order])[np.diff(column[order]) == 0]
     gap = gap[gap > 0.0]
-    if not gap.size or not np.isfinite(t).all():
+    if not gap.size:
         raise RecordingInvalid("too little data: no meter has two readings at different times")
     return float(np.median(gap))
 

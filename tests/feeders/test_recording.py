@@ -146,6 +146,13 @@ def test_what_is_no_recording_is_said_to_be_none(tmp_path: Path) -> None:
     pd.DataFrame({"meter": ["m1"]}).to_parquet(short)
     with pytest.raises(RecordingInvalid, match="columns t, v_volt are missing"):
         read_recording(short)
+    day = pd.to_datetime(["2026-06-01"])
+    frame = pd.DataFrame({"meter": [1], "t": day, "p_kw": [True], "v_phases": [[1.0]], "seq": [None]})
+    frame.to_parquet(short)
+    with pytest.raises(
+        RecordingInvalid, match="v_volt are missing; column meter is of .*; column t is of.*p_kw"
+    ):
+        read_recording(short)
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from feeders.scenario import START
 from feeders.schema import read, write
 from feeders.studies.calibrate import OtherFeeder, calibrate
 from feeders.studies.calibrate_corrections import Kind
+from feeders.studies.calibrate_readings import frames
 from feeders.studies.journal import OtherStudy
 from gridsec.attack import Attack, Bias, Drift, Replay, Stuck
 from tests.feeders.studies.calibrate_cases import (
@@ -228,3 +229,46 @@ def test_clear_errors(tmp_path: Path) -> None:
     for name, value in (("risk", 0.0), ("tolerance", 0.5)):
         with pytest.raises(ValueError, match=f"{name} is"):
             calibrate(CIGRE, table, **{name: value})
+
+
+def test_times_that_are_none_are_named_before_memory_is_taken_for_them(tmp_path: Path) -> None:
+    table = recorded(tmp_path, scenario(1, ticks=20)).frame()
+    t, fourth = table["t"], table.index == 3
+    moments = pd.to_datetime(t, unit="s")
+    for change, said in (
+        ({"t": moments}, r"t is of type datetime64.*; expected Unix time in seconds"),
+        ({"t": moments.astype(str)}, r"t of row 1 and \d+ more is '2026-06-01.*; expected Unix time"),
+        ({"t": 1000.0 * t}, r"t of row 1 and \d+ more is 178\d+; expected Unix time in seconds"),
+        ({"t": t.mask(fourth)}, r"t of row 4 is nan; expected a time$"),
+        ({"t": t.mask(fourth, 0.0)}, "t of row 4 is 0; more than ten years from the usual 178"),
+        ({"t": t.mask(fourth, 1e300)}, r"t of row 4 is 1e\+300; expected Unix time in seconds"),
+        ({"v_volt": "x", "p_kw": True}, "v_volt of row 1 and .* is 'x'; .*; p_kw is of type bool; expected"),
+        ({"t": -1.0, "meter": "m99"}, "t of row 1 .* is -1; .*does not have: m99; none of the busbar"),
+    ):
+        with pytest.raises(RecordingInvalid, match=said):
+            frames(CIGRE, table.assign(**change))
+
+
+def test_a_reading_years_later_changes_no_frame(tmp_path: Path) -> None:
+    table = recorded(tmp_path, scenario(1)).frame()
+    late = pd.concat([table, table[:1].assign(t=table["t"].max() + 3e7)])
+    one, other = frames(CIGRE, table), frames(CIGRE, late)
+    for name in ("t", "v_volt", "p_kw", "v0_volt", "count"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+
+
+def test_a_meter_with_a_name_like_nothing_is_not_the_busbars(tmp_path: Path) -> None:
+    table = recorded(tmp_path, scenario(1)).frame()
+    for name in ("NA", "null", "nan", "None", "0012"):
+        renamed = site(
+            replace(
+                TABLES,
+                customers=tuple(
+                    replace(row, meter=name) if row.meter == "m01" else row for row in TABLES.customers
+                ),
+            )
+        )
+        table.assign(meter=table["meter"].astype(str).replace("m01", name)).to_csv(tmp_path / "a.csv")
+        found, expected = frames(renamed, tmp_path / "a.csv"), frames(CIGRE, table)
+        np.testing.assert_array_equal(found.v_volt, expected.v_volt)
+        np.testing.assert_array_equal(found.v0_volt, expected.v0_volt)
