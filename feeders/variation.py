@@ -30,6 +30,9 @@ GRID_S: Final = 1.0
 CHUNK_CORRELATIONS: Final = 16
 """Length of a chunk of a random process, in correlation times: its ends are independent (e^-16)."""
 
+FARTHEST_INDEX: Final = 2**63
+"""Indices of random streams stay below this number, and above its negative."""
+
 STAGGER_S: Final = 1800.0
 """Customers with the same profile follow it up to this much earlier or later, s."""
 
@@ -53,8 +56,9 @@ class Stream(IntEnum):
 
 
 def generator(seed: int, stream: Stream, index: int = 0) -> np.random.Generator:
-    """Random numbers of one stream, at one index >= 0 of it."""
-    sequence = np.random.SeedSequence(entropy=seed, spawn_key=(int(stream), index))
+    """Random numbers of one stream, at one index of it; negative ones have numbers of their own."""
+    place = index if index >= 0 else FARTHEST_INDEX - index
+    sequence = np.random.SeedSequence(entropy=seed, spawn_key=(int(stream), place))
     return np.random.Generator(np.random.Philox(sequence))
 
 
@@ -131,7 +135,7 @@ class Fluctuation:
         self._chunks: dict[int, Floats] = {}
 
     def at(self, t: Floats) -> Floats:
-        """The process at times t (T,), Unix s >= 0, not necessarily sorted: (T, count)."""
+        """The process at times t (T,), Unix s, not necessarily sorted: (T, count)."""
         place = t / GRID_S
         below = np.floor(place)
         share = (place - below)[:, None]

@@ -326,3 +326,10 @@ def test_the_text_of_a_season_is_the_season() -> None:
     assert all(same(a, b) for a, b in zip(play(village(), text), play(village(), member), strict=True))
     with pytest.raises(ValueError, match="season is 'dry'; expected one of winter, spring, summer, autumn"):
         Scenario(season="dry")
+
+
+def test_a_scenario_may_begin_in_1970() -> None:
+    site = village()
+    early, later = (play(site, Scenario(start=start, duration_s=3.0)) for start in (0.0, 2.0))
+    assert len(early) == len(later) == 3
+    assert early[2].v_bus_volt[0] == pytest.approx(later[0].v_bus_volt[0], rel=1e-12)

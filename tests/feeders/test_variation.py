@@ -164,3 +164,18 @@ def test_busbar_keeps_its_mean_and_steps_with_the_taps() -> None:
     v0 = np.concatenate([Customers(site, slow, seed, START, 0.0).at(t).v0_volt for seed in range(10)])
     assert v0.std() / 230.0 == pytest.approx(0.003, rel=0.15)
     assert v0.mean() / 230.0 == pytest.approx(1.02, abs=0.0006)
+
+
+def test_times_about_1970_are_like_others() -> None:
+    t = np.arange(-20_000.0, 20_000.0)
+    process = Fluctuation(0, Stream.LOAD, 200, 20.0).at(t)
+    assert process.std() == pytest.approx(1.0, rel=0.02)
+    lag = np.mean(process[20:] * process[:-20])
+    assert lag == pytest.approx(np.exp(-1.0), abs=0.02)
+    site, stepped = village(), replace(CALM, tap_step_pu=0.0125)
+    whole = Customers(site, stepped, 1, 0.0, 0.0).at(np.arange(-200_000.0, 200_000.0, 50.0)).v0_volt
+    steps = np.flatnonzero(np.diff(whole))
+    assert min(np.count_nonzero(steps < 4000), np.count_nonzero(steps > 4000)) >= 10
+    never = replace(stepped, tap_interval_s=np.inf)
+    both = Customers(site, never, 1, 0.0, 0.0).at(np.array([-1e6, -1.0, 0.0, 1e9])).v0_volt
+    assert np.unique(both).size == 1
