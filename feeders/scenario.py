@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from feeders.load import Site
 
 __all__ = [
+    "LATEST_S",
     "START",
     "SUNNY_NOON_S",
     "Reading",
@@ -37,6 +38,7 @@ __all__ = [
     "Scenario",
     "Season",
     "by_arrival",
+    "check",
     "random_attacks",
     "simulate",
     "snapshots",
@@ -44,6 +46,9 @@ __all__ = [
 
 START: Final = 1_780_272_000.0
 """Monday, 1 June 2026, 00:00 UTC."""
+
+LATEST_S: Final = 1e10
+"""Times from here on, in the year 2286, are in another unit than seconds."""
 
 SUNNY_NOON_S: Final = 216_000.0
 """Noon of the first Wednesday of a season's profiles; in summer a sunny day in June."""
@@ -104,8 +109,8 @@ class Scenario:
             raise ValueError(f"seed must not be negative, got {self.seed}")
         if not np.isfinite(self.profile_s):
             raise ValueError(f"profile_s must be finite, got {self.profile_s}")
-        if not (np.isfinite(self.start) and self.start >= 0.0):
-            raise ValueError(f"start must be a Unix time, got {self.start}")
+        if not 0.0 <= self.start < LATEST_S:
+            raise ValueError(f"start must be a Unix time in seconds, got {self.start}")
         if not self.duration_s > 0.0:
             raise ValueError(f"duration_s must be positive, got {self.duration_s}")
         if not 0.0 < self.dt_s < np.inf:
@@ -244,7 +249,7 @@ def simulate(site: Site, scenario: Scenario) -> Iterator[Sample]:
     ValueError
         When an attack or a silence names a meter that the feeder does not have, or looks too far back.
     """
-    _check(site, scenario)
+    check(site, scenario)
     meters = Meters(site, scenario.errors, scenario.channel, scenario.seed)
     nominal = site.customer_nominal[site.meters]
     past = _Past(site.meters.size, scenario)
@@ -404,24 +409,36 @@ def _busbar_attacked(site: Site, scenario: Scenario, t: Floats, reported: Regist
     return replace(reported, v0_volt=v0_volt)
 
 
-def _check(site: Site, scenario: Scenario) -> None:
-    for wrong in scenario.inverter_attacks:
-        if wrong.inverters.max() >= site.droop.tau.size:
-            raise ValueError(
-                f"an attack names inverter {wrong.inverters.max()}, but {site.feeder.name} has "
-                f"{site.droop.tau.size}"
-            )
-    phases = busbar_places(site.feeder).stop
-    for attack in scenario.busbar_attacks:
-        if attack.meters.max() >= phases or reach(attack, attack.t_off) > 0.0:
-            raise ValueError(
-                f"an attack on the busbar's meter looks back, or names phases that {site.feeder.name} has not"
-            )
+def check(site: Site, scenario: Scenario) -> None:
+    """Refuse attacks that cannot be played on a feeder.
+
+    Parameters
+    ----------
+    site, scenario
+        The feeder, and what happens to it.
+
+    Raises
+    ------
+    ValueError
+        With everything that is wrong.
+    """
+    name, phases = site.feeder.name, busbar_places(site.feeder).stop
+    problems = [
+        f"an attack names inverter {wrong.inverters.max()}, but {name} has {site.droop.tau.size}"
+        for wrong in scenario.inverter_attacks
+        if wrong.inverters.max() >= site.droop.tau.size
+    ]
+    if any(
+        attack.meters.max() >= phases or reach(attack, attack.t_off) > 0.0
+        for attack in scenario.busbar_attacks
+    ):
+        problems.append(f"an attack on the busbar's meter looks back, or names phases that {name} has not")
     for attack in scenario.attacks:
         if attack.meters.max() >= site.meters.size:
-            raise ValueError(
-                f"an attack names meter {attack.meters.max()}, but {site.feeder.name} has {site.meters.size}"
-            )
+            problems.append(f"an attack names meter {attack.meters.max()}, but {name} has {site.meters.size}")
         then = max(attack.t_on, scenario.start)
         if attack.t_off > then and reach(attack, then) > LONGEST_LOOK_BACK_S:
-            raise ValueError(f"an attack looks back {reach(attack, then):.0f} s, further than can be played")
+            back = reach(attack, then)
+            problems.append(f"an attack looks back {back:.0f} s, further than can be played")
+    if problems:
+        raise ValueError("; ".join(problems))

@@ -12,22 +12,27 @@ import math
 import os
 import sys
 import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 from rich.markup import escape
 
 from gridsec.errors import DesignInfeasible, FeederInvalid, GridsecError, NotObservable
 from service import cli_feeders, cli_reproduce, cli_serve, cli_study, console
+from service.cli_plan import said
 from service.cli_serve import Endpoints
 from service.console import ADDRESS, DATABASE, FAILED, FEEDER, FILE, USAGE, Feeder, complain
 from service.places import Unusable, see
 
 if TYPE_CHECKING:
+    from feeders.campaign import Kind
     from feeders.load import Site
-    from feeders.scenario import Scenario, Season
-    from gridsec.attack import Attack
+    from feeders.scenario import Scenario
+    from gridsec.attack import Attack, InverterAttack
 
 app = typer.Typer(
     name="gridsec",
@@ -208,27 +213,42 @@ def simulate(
 
     Faster than real time needs a service with `--clock events`.
     """
+    from feeders.choices import no_choice
     from feeders.load import load
     from feeders.meters import Channel, MeterErrors
-    from feeders.recording import record
-    from feeders.scenario import Scenario
+    from feeders.recording import record, truth_path
+    from feeders.scenario import Scenario, Season
+    from feeders.scenario import check as see_attacks
 
-    if out is not None:
-        _see_recording(out, duration)
     site = load(feeder)
-    tick = dt or site.tables.meta.monitor.tick_s
+    length = duration or math.inf
+    problems = _wrong_times(dt, start)
+    if out is not None:
+        if math.isinf(length):
+            problems.append("--duration: a recording has an end")
+        live = {"--connect": connect, "--lockstep": lockstep, "--speed": speed != 1.0}
+        problems += [f"{name} goes with publishing, not with --out" for name, given in live.items() if given]
+    problems += no_choice("--season", Season, season)
+    lies = _read_all("--attack", attack, _lie, problems)
+    wrong = _read_all("--inverter-attack", inverter_attack, partial(_injection, site), problems)
+    if problems:
+        raise typer.BadParameter("; ".join(problems))
+    if out is not None:
+        see(replaced={"--out": out, "--out, its truth": truth_path(out)})
+    tick = site.tables.meta.monitor.tick_s if dt is None else dt
     first = math.ceil(time.time() / tick) * tick if start is None else start
-    scenario = Scenario(
-        seed=seed,
-        start=first,
-        duration_s=duration or math.inf,
-        dt_s=tick,
-        errors=MeterErrors(report_q=report_q),
-        channel=Channel(loss=loss),
-        season=_season(season),
-    )
-    scenario = _with_attacks(site, scenario, attack or [])
-    scenario = _with_inverter_attacks(site, scenario, inverter_attack or [])
+    with said():
+        scenario = Scenario(
+            seed=seed,
+            start=first,
+            duration_s=length,
+            dt_s=tick,
+            errors=MeterErrors(report_q=report_q),
+            channel=Channel(loss=loss),
+            season=Season(season),
+        )
+        scenario = _attacked(site, scenario, lies, wrong)
+        see_attacks(site, scenario)
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         recording = record(site, scenario, out)
@@ -237,75 +257,114 @@ def simulate(
     _publish(site, scenario, tuple(connect or ("tcp/127.0.0.1:7447",)), prefix, (speed or math.inf, lockstep))
 
 
-def _see_recording(out: Path, duration: float) -> None:
-    from feeders.recording import truth_path
+def _wrong_times(dt: float | None, start: float | None) -> list[str]:
+    """What is wrong with the times of a scenario."""
+    from feeders.scenario import LATEST_S
 
-    if not duration:
-        raise typer.BadParameter("a recording has an end", param_hint="--duration")
-    see(replaced={"--out": out, "--out, its truth": truth_path(out)})
-
-
-def _season(text: str) -> Season:
-    from feeders.scenario import Season
-
-    try:
-        return Season(text)
-    except ValueError:
-        raise typer.BadParameter(
-            f"{text!r} is not known; expected one of {', '.join(Season)}", param_hint="--season"
-        ) from None
+    problems = []
+    if dt is not None and not 0.0 < dt < math.inf:
+        problems.append(f"--dt is {dt:g}; expected a positive number of seconds")
+    if start is not None and not 0.0 <= start < LATEST_S:
+        problems.append(f"--start is {start:g}; expected a Unix time in seconds")
+    return problems
 
 
-def _with_attacks(site: Site, scenario: Scenario, texts: list[str]) -> Scenario:
-    from dataclasses import replace
+Told = TypeVar("Told")
 
-    from feeders.campaign import Kind, busbar_attack, random_attacks
+
+def _read_all(
+    option: str, texts: list[str] | None, read: Callable[[str], Told], problems: list[str]
+) -> list[Told]:
+    """Read all texts of an option, and tell what is wrong with them."""
+    out = []
+    for text in texts or []:
+        try:
+            out.append(read(text))
+        except ValueError as error:
+            problems.append(f"{option} {text!r}: {error}")
+    return out
+
+
+def _span(begin: float, end: float) -> tuple[float, float]:
+    """Two times, s after the start, one before the other."""
+    if not (math.isfinite(begin) and begin < end):
+        raise ValueError(f"it must begin before it ends, not at {begin:g} and {end:g}")
+    return begin, end
+
+
+@dataclass(frozen=True, slots=True)
+class _Lie:
+    """What --attack says; no count: the busbar's meter lies."""
+
+    kind: Kind
+    count: int | None
+    size: float
+    begin: float
+    end: float
+
+
+def _lie(text: str) -> _Lie:
+    """Read `kind:count:size:from:to`."""
+    from feeders.campaign import Kind
     from service.busbar import BUSBAR
 
-    attacks: list[Attack] = []
-    on_busbar: list[Attack] = []
-    for number, text in enumerate(texts):
-        try:
-            kind, count, size, begin, end = text.split(":")
-            how_many = 0 if count == BUSBAR else int(count)
-            part, on, off = float(size), scenario.start + float(begin), scenario.start + float(end)
-            known = Kind(kind)
-        except ValueError:
-            kinds = ", ".join(Kind)
-            raise typer.BadParameter(
-                f"{text!r}: expected kind:count:size:from:to with a kind of {kinds}", param_hint="--attack"
-            ) from None
-        if count == BUSBAR:
-            on_busbar.append(busbar_attack(site, known, part, t_on=on, t_off=off))
-            continue
-        seed = scenario.seed + number
-        attacks += random_attacks(site, seed, known, how_many, part, t_on=on, t_off=off, scenario=scenario)
-    return replace(scenario, attacks=tuple(attacks), busbar_attacks=tuple(on_busbar))
+    try:
+        name, count, size, begin, end = text.split(":")
+        many, part, kind = None if count == BUSBAR else int(count), float(size), Kind(name)
+        times = float(begin), float(end)
+    except ValueError:
+        raise ValueError(f"expected kind:count:size:from:to with a kind of {', '.join(Kind)}") from None
+    on, off = _span(*times)
+    if many is not None and many < 1:
+        raise ValueError(f"{many} meters cannot lie")
+    # Who repeats what was lies by what has changed since, whatever size is said.
+    sized = many is not None and kind not in (Kind.STUCK, Kind.REPLAY)
+    if not math.isfinite(part) or (sized and part <= 0.0):
+        what = "positive" if sized else "finite"
+        raise ValueError(f"its size is {size}; expected a {what} part of nominal")
+    if kind is Kind.DRIFT and math.isinf(off):
+        raise ValueError("a drift must end, as its speed follows from that")
+    return _Lie(kind, many, part, on, off)
 
 
-def _with_inverter_attacks(site: Site, scenario: Scenario, texts: list[str]) -> Scenario:
-    from dataclasses import replace
-
+def _injection(site: Site, text: str) -> InverterAttack:
+    """Read `customer:kvar:from:to`; times are still after the start."""
     import numpy as np
 
     from gridsec.attack import InverterAttack
 
     owners = [site.feeder.customers[int(c)] for c in site.droop.customer]
-    attacks = []
-    for text in texts:
-        try:
-            customer, *numbers = text.rsplit(":", 3)
-            kvar, begin, end = map(float, numbers)
-            which = np.array([owners.index(customer)], dtype=np.intp)
-            q = np.array([kvar / site.feeder.base_kva])
-            attacks.append(InverterAttack(which, q, scenario.start + begin, scenario.start + end))
-        except ValueError:
-            raise typer.BadParameter(
-                f"{text!r}: expected customer:kvar:from:to with a customer who has an inverter: "
-                f"{', '.join(owners)}",
-                param_hint="--inverter-attack",
-            ) from None
-    return replace(scenario, inverter_attacks=tuple(attacks))
+    try:
+        customer, kvar, begin, end = text.rsplit(":", 3)
+        which, q = owners.index(customer), float(kvar) / site.feeder.base_kva
+        times = float(begin), float(end)
+    except ValueError:
+        raise ValueError(
+            f"expected customer:kvar:from:to with a customer who has an inverter: {', '.join(owners)}"
+        ) from None
+    return InverterAttack(np.array([which], dtype=np.intp), np.array([q]), *_span(*times))
+
+
+def _attacked(site: Site, scenario: Scenario, lies: list[_Lie], wrong: list[InverterAttack]) -> Scenario:
+    """The scenario with those who lie, and inverters that inject something else."""
+    from feeders.campaign import busbar_attack, random_attacks
+
+    attacks: list[Attack] = []
+    on_busbar: list[Attack] = []
+    for number, lie in enumerate(lies):
+        on, off = scenario.start + lie.begin, scenario.start + lie.end
+        if lie.count is None:
+            on_busbar.append(busbar_attack(site, lie.kind, lie.size, t_on=on, t_off=off))
+            continue
+        seed = scenario.seed + number
+        attacks += random_attacks(
+            site, seed, lie.kind, lie.count, lie.size, t_on=on, t_off=off, scenario=scenario
+        )
+    begin = scenario.start
+    moved = (replace(each, t_on=begin + each.t_on, t_off=begin + each.t_off) for each in wrong)
+    return replace(
+        scenario, attacks=tuple(attacks), busbar_attacks=tuple(on_busbar), inverter_attacks=tuple(moved)
+    )
 
 
 def _publish(

@@ -11,7 +11,7 @@ from rich.markup import escape
 
 from service import console
 from service.cli_plan import Out, bar, said, show
-from service.console import Studied
+from service.console import Studied, finite
 from service.foreign import converted
 from service.keeping import JournalAt, Keeping, NoJournal, keeping
 from service.places import see
@@ -56,11 +56,14 @@ Places = Annotated[
 ]
 Seasons = Annotated[list[str] | None, typer.Option(help="May be repeated. [default: all four]")]
 Duration = Annotated[
-    float | None, typer.Option(help="Length of a scenario, s. [default: 600 readings]", min=30.0)
+    float | None,
+    typer.Option(help="Length of a scenario, s. [default: 600 readings]", min=30.0, callback=finite),
 ]
 Step = Annotated[
     float | None,
-    typer.Option(help="Interval of the readings, s. [default: as the feeder's files say]", min=0.1),
+    typer.Option(
+        help="Interval of the readings, s. [default: as the feeder's files say]", min=0.1, callback=finite
+    ),
 ]
 DesignOf = Annotated[str, typer.Option(help="factorial or random combinations.")]
 Estimator = Annotated[
@@ -80,19 +83,28 @@ AlarmsPerYear = Annotated[
     ),
 ]
 Learned = Annotated[
-    float, typer.Option(help="Hours over which it has learned its meters' fixed errors before.", min=0.0)
+    float,
+    typer.Option(
+        help="Hours over which it has learned its meters' fixed errors before.", min=0.0, callback=finite
+    ),
 ]
 MetersAs = Annotated[str, typer.Option(help="Errors of the meters: site, real or white.")]
 LoadErrorKw = Annotated[
-    float, typer.Option(help="What nobody knows of each customer's active power, 1 sigma.", min=0.0)
+    float,
+    typer.Option(
+        help="What nobody knows of each customer's active power, 1 sigma.", min=0.0, callback=finite
+    ),
 ]
-LoadErrorKvar = Annotated[float, typer.Option(help="The same of its reactive power, 1 sigma.", min=0.0)]
+LoadErrorKvar = Annotated[
+    float, typer.Option(help="The same of its reactive power, 1 sigma.", min=0.0, callback=finite)
+]
 KnownKw = Annotated[
     float | None,
     typer.Option(
         help="What nobody knows of each metered customer's active power, 1 sigma; comes and goes within ten "
         "minutes. [default: what the files say of registers; with --load-error-kvar, none]",
         min=0.0,
+        callback=finite,
     ),
 ]
 KnownKvar = Annotated[
@@ -101,6 +113,7 @@ KnownKvar = Annotated[
         help="The same of its reactive power. [default: what the files say of power factors; with "
         "--load-error-kw, none]",
         min=0.0,
+        callback=finite,
     ),
 ]
 Workers = Annotated[int | None, typer.Option(help="Processes. [default: all cores]", min=1)]

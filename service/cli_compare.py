@@ -14,7 +14,7 @@ from rich.table import Table
 
 from service import console
 from service.cli_campaign import LoadErrorKvar, LoadErrorKw, MetersAs
-from service.console import Studied
+from service.console import Studied, finite
 from service.foreign import converted
 from service.keeping import JournalAt, Keeping, NoJournal, keeping
 from service.places import see
@@ -29,7 +29,7 @@ MaxAttacked = Annotated[
     int, typer.Option(help="How many meters lie, and estimators are to withstand.", min=1)
 ]
 Seeds = Annotated[int, typer.Option(help="Runs of each case.", min=1)]
-Duration = Annotated[float, typer.Option(help="Length of a run, s.", min=70.0)]
+Duration = Annotated[float, typer.Option(help="Length of a run, s.", min=70.0, callback=finite)]
 ReportQ = Annotated[bool, typer.Option(help="Meters report the net reactive power.")]
 Csv = Annotated[Path | None, typer.Option(help="Write all numbers into this file.")]
 Write = Annotated[

@@ -14,7 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from service import console
-from service.console import Studied
+from service.console import Studied, finite
 from service.foreign import converted
 from service.keeping import JournalAt, NoJournal, keeping
 from service.places import see
@@ -177,10 +177,12 @@ def detectable(
     feeder: Studied = "simbench-lv-rural1",
     *,
     max_attacked: Annotated[int, typer.Option(help="How many meters lie together at most.", min=1)] = 2,
-    share: Annotated[float, typer.Option(help="Share of its peak that every load draws.", min=0.0)] = 0.5,
+    share: Annotated[
+        float, typer.Option(help="Share of its peak that every load draws.", min=0.0, callback=finite)
+    ] = 0.5,
     risk: Annotated[float, typer.Option(help="Probability left out of account, at one moment.")] = 1e-3,
     trials: Annotated[int, typer.Option(help="Simulate so many lies of each size.", min=0)] = 0,
-    seed: Annotated[int, typer.Option(help="Chooses what is random in simulated lies.")] = 0,
+    seed: Annotated[int, typer.Option(help="Chooses what is random in simulated lies.", min=0)] = 0,
     workers: Annotated[
         int | None, typer.Option(help="Processes. [default: all cores, from 50 meters on]", min=1)
     ] = None,

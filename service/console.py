@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from typing import Annotated, Final
 
@@ -29,6 +30,24 @@ Studied = Annotated[
 
 out = Console(highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() else 160)
 err = Console(stderr=True, highlight=False, soft_wrap=True)
+
+
+def finite(value: float | None) -> float | None:
+    """Refuse infinite numbers where they are options of a command.
+
+    Parameters
+    ----------
+    value
+        What was given, if anything.
+
+    Raises
+    ------
+    typer.BadParameter
+        If it is infinite, or none.
+    """
+    if value is not None and not math.isfinite(value):
+        raise typer.BadParameter(f"{value} is no finite number")
+    return value
 
 
 def complain(message: str) -> None:

@@ -19,6 +19,7 @@ from pandas.api.types import (
 
 from feeders.meters import BUSBAR
 from feeders.recording import REQUIRED, RecordingInvalid, read_recording
+from feeders.scenario import LATEST_S
 from gridsec.arrays import Floats, Ints
 
 if TYPE_CHECKING:
@@ -33,9 +34,6 @@ MOST_FRAMES: Final = 720
 
 FEWEST_FRAMES: Final = 48
 """Fewer frames than these say nothing about what varies."""
-
-LATEST_S: Final = 1e10
-"""Times from here on, in the year 2286, are in another unit than seconds."""
 
 FARTHEST_S: Final = 10.0 * 365.25 * 86400.0
 """Times farther than this from the median of all, s, are of a clock that was not set."""

@@ -7,6 +7,7 @@ docs/theory-studies.md, sections 3 and 5.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import dataclass
@@ -121,7 +122,7 @@ def detectable(
     NotObservable, DesignInfeasible
         If the feeder cannot be watched.
     ValueError
-        If `max_attacked` or `risk` is out of range.
+        If `max_attacked`, `share` or `risk` is out of range.
     OtherStudy
         If the journal is another study's.
     InUse
@@ -131,6 +132,8 @@ def detectable(
         raise ValueError(f"max_attacked is {max_attacked}; it must be from 1 to {site.meters.size}")
     if not 0.0 < risk < 1.0:
         raise ValueError(f"risk is {risk}; it must be between 0 and 1")
+    if not 0.0 <= share < math.inf:
+        raise ValueError(f"share is {share}; it must be finite and not negative")
     subject = {
         "study": "detectable",
         "digest": site.digest,

@@ -206,11 +206,33 @@ def test_wrong_usage(gridsec: Run) -> None:
     done = gridsec("simulate", FEEDER, "--attack", "bias:2", "--out", "x")
     assert done.returncode == 2
     assert "kind:count:size:from:to" in done.stderr
-    for text in ("load-6:-4:20", "nobody:-4:20:55", "LV1.101 Load 2:-4:55:20"):
+    for text in ("load-6:-4:20", "nobody:-4:20:55", "LV1.101 Load 2:-4:a:20"):
         done = gridsec("simulate", FEEDER, "--inverter-attack", text, "--out", "x")
         assert done.returncode == 2
         assert "customer:kvar:from:to" in done.stderr
     assert gridsec("demo", "--duration", "1").returncode == 2
+
+
+def test_all_that_is_wrong_with_a_scenario_is_told_at_once(gridsec: Run, tmp_path: Path) -> None:
+    out = tmp_path / "x.parquet"
+    lies = ["bias:2:0.03:4:2", "bias:2:0.03:nan:55", "bias:-1:0.03:4:5", "bias:2:-1:4:5", "drift:1:0.1:4:inf"]
+    lies += ["bias:substation:nan:4:5"]
+    wrong = ["LV1.101 Load 2:nan:4:5", "LV1.101 Load 2:4:5:5"]
+    given = {"--season": "dry", "--dt": "0", "--start": "-5", "--lockstep": "3", "--speed": "2"}
+    words = [f"{name}={value}" for name, value in given.items()]
+    words += [f"--attack={lie}" for lie in lies] + [f"--inverter-attack={each}" for each in wrong]
+    done = gridsec("simulate", FEEDER, "--duration", "inf", *words, "--out", str(out))
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr
+    said = plain(done.stderr)
+    for text in (*lies, *wrong, "--dt is 0", "--start is -5", "--season is 'dry'", "a recording has an end"):
+        assert text in said
+    for text in ("--speed", "--lockstep"):
+        assert f"{text} goes with publishing, not with --out" in said
+    assert not out.exists()
+    done = gridsec("simulate", FEEDER, "--attack=stuck:1:0:-1e9:5", "--out", str(out))
+    assert done.returncode == 2
+    assert "further than can be played" in plain(done.stderr)
 
 
 def test_conversion_of_nothing(gridsec: Run, tmp_path: Path) -> None:

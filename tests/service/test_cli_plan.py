@@ -7,7 +7,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from tests.service.commands import command
+from tests.service.commands import command, plain
 
 run = command("study")
 
@@ -104,3 +104,28 @@ def test_feeders_in_three_phases_are_studied(
     assert code == 0
     assert "identify asks for nothing here, which is no safety" in told
     assert "--goal contain" in told
+
+
+@pytest.mark.parametrize(
+    ("words", "option"),
+    [
+        (("campaign", "cigre-lv", "--duration", "inf"), "--duration"),
+        (("campaign", "cigre-lv", "--step", "inf"), "--step"),
+        (("compare", "cigre-lv", "--duration", "inf"), "--duration"),
+        (("report", "cigre-lv", "--load-error-kw", "inf"), "--load-error-kw"),
+        (("detectable", "cigre-lv", "--trials", "2", "--seed", "-1"), "--seed"),
+        (("detectable", "cigre-lv", "--share", "inf"), "--share"),
+    ],
+)
+def test_numbers_that_cannot_be_are_refused_before_the_work(
+    words: tuple[str, ...],
+    option: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, _, told = run(monkeypatch, capsys, *words)
+    assert code == 2
+    assert f"Invalid value for '{option}'" in plain(told)
+    assert not list(tmp_path.iterdir())
