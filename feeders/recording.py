@@ -13,7 +13,7 @@ import json
 import math
 import os
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from importlib import metadata
 from itertools import islice
 from pathlib import Path
@@ -23,10 +23,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from feeders.meters import BUSBAR, Channel, MeterErrors, Silence
-from feeders.scenario import Reading, Sample, Scenario, Season, simulate
-from feeders.variation import Variation
-from gridsec import attack as attacks
+from feeders.meters import BUSBAR
+from feeders.scenario import Reading, Sample, Scenario, simulate
+from feeders.scenario_json import scenario_from_json, scenario_to_json
 from gridsec.arrays import Bools, Floats
 from gridsec.errors import GridsecError
 from gridsec.network import InPhases
@@ -134,13 +133,15 @@ class Recording:
         Raises
         ------
         RecordingInvalid
-            When there is none.
+            When there is none, or it is that of another recording.
         """
         path = truth_path(self.path)
         try:
-            table = pq.read_table(path)
+            table, own = pq.read_table(path), pq.read_schema(self.path)
         except (OSError, pa.ArrowException) as error:
             raise RecordingInvalid(f"{path}: no truth of this recording: {error}") from error
+        if (table.schema.metadata or {}).get(KEY) != (own.metadata or {}).get(KEY):
+            raise RecordingInvalid(f"{path}: no truth of this recording, but of another one")
         there = {name: _matrix(table.column(name)) for name in table.column_names}
         # Parquet has no lists without entries: of no inverter, or no meter, there is no column.
         none = np.empty((table.num_rows, 0))
@@ -155,7 +156,8 @@ def truth_path(path: Path) -> Path:
 def record(site: Site, scenario: Scenario, path: Path | str) -> Recording:
     """Play a scenario into a file, and its truth into a second one beside it.
 
-    Both are written under temporary names first, so that a file with the right name is complete.
+    Both are written under temporary names first, so that a file with the right name is complete. Where they
+    replace others, the old truth goes first: it never stands beside new readings.
 
     Parameters
     ----------
@@ -192,6 +194,7 @@ def record(site: Site, scenario: Scenario, path: Path | str) -> Recording:
             pq.ParquetWriter(partial[1], _truth_schema(site).with_metadata(extra)) as truth,
         ):
             _write(simulate(site, scenario), scenario.dt_s, readings, truth)
+        targets[1].unlink(missing_ok=True)
         for source, target in zip(partial, targets, strict=True):
             os.replace(source, target)
     finally:
@@ -268,100 +271,6 @@ def _is_text(kind: Any) -> bool:
 def _is_list(kind: Any) -> bool:
     is_any = (pa.types.is_list, pa.types.is_large_list, pa.types.is_fixed_size_list)
     return any(is_this(kind) for is_this in is_any)
-
-
-_LISTS = ("attacks", "busbar_attacks")
-
-
-def scenario_to_json(scenario: Scenario) -> dict[str, Any]:
-    """Turn a scenario into what JSON can hold; infinite times become the text "inf"."""
-    plain = {field.name: getattr(scenario, field.name) for field in fields(scenario)}
-    plain["variation"] = asdict(scenario.variation)
-    plain["errors"] = asdict(scenario.errors)
-    plain["channel"] = asdict(scenario.channel)
-    for name in _LISTS:
-        plain[name] = [
-            {"kind": type(attack).__name__}
-            | {field.name: getattr(attack, field.name) for field in fields(attack)}
-            for attack in getattr(scenario, name)
-        ]
-    plain["inverter_attacks"] = [
-        {field.name: getattr(attack, field.name) for field in fields(attack)}
-        for attack in scenario.inverter_attacks
-    ]
-    out: dict[str, Any] = _plain(plain)
-    return out
-
-
-def scenario_from_json(obj: dict[str, Any]) -> Scenario:
-    """Turn it back; `scenario_to_json` has made it.
-
-    Raises
-    ------
-    KeyError, TypeError, ValueError
-        When it is something else.
-    """
-    given = {"busbar_attacks": ()} | obj
-    channel = dict(given["channel"])
-    channel["silences"] = tuple(
-        Silence(s["meter"], float(s["t_on"]), float(s["t_off"])) for s in channel["silences"]
-    )
-    given["channel"] = Channel(**channel)
-    given["variation"] = Variation(**given["variation"])
-    given["errors"] = MeterErrors(**given["errors"])
-    for name in _LISTS:
-        given[name] = tuple(_attack(entry) for entry in given[name])
-    given["inverter_attacks"] = tuple(
-        attacks.InverterAttack(
-            np.array(entry["inverters"], dtype=np.intp),
-            np.array(entry["q"], dtype=np.float64),
-            float(entry["t_on"]),
-            float(entry["t_off"]),
-        )
-        for entry in given.get("inverter_attacks", ())
-    )
-    given["duration_s"] = float(given["duration_s"])
-    given["season"] = Season(given.get("season", Season.SUMMER))
-    return Scenario(**given)
-
-
-_ATTACKS: Final = {
-    kind.__name__: kind
-    for kind in (
-        attacks.Bias,
-        attacks.Scaling,
-        attacks.Drift,
-        attacks.Stuck,
-        attacks.Replay,
-        attacks.Random,
-        attacks.Coordinated,
-    )
-}
-
-
-def _attack(entry: dict[str, Any]) -> attacks.Attack:
-    values = dict(entry)
-    kind: Any = _ATTACKS[values.pop("kind")]
-    for name, value in values.items():
-        if isinstance(value, list):
-            values[name] = np.array(value, dtype=np.intp if name == "meters" else np.float64)
-        elif isinstance(value, str):
-            values[name] = float(value)
-    made: attacks.Attack = kind(**values)
-    return made
-
-
-def _plain(value: Any) -> Any:
-    """Arrays to lists, infinities to text, tuples to lists, all the way down."""
-    if isinstance(value, dict):
-        return {name: _plain(item) for name, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, float) and math.isinf(value):
-        return str(value)
-    return value
 
 
 def _write(samples: Iterator[Sample], dt_s: float, readings: Any, truth: Any) -> None:

@@ -19,6 +19,7 @@ from feeders.campaign import random_attacks
 from feeders.choices import choice
 from feeders.load import Snapshot
 from feeders.meters import BUSBAR, Channel, Delivery, MeterErrors, Meters, Registers
+from feeders.plain import own_numbers
 from feeders.profiles import Season
 from feeders.truth import Block, net_reactive, truth
 from feeders.variation import Variation
@@ -104,6 +105,7 @@ class Scenario:
     busbar_attacks: tuple[Attack, ...] = ()
 
     def __post_init__(self) -> None:
+        own_numbers(self)
         object.__setattr__(self, "season", choice("season", Season, self.season))
         if self.seed < 0:
             raise ValueError(f"seed must not be negative, got {self.seed}")

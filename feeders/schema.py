@@ -15,8 +15,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from feeders import check, raw
 from feeders.columns import (
     CUSTOMER_COLUMNS,
@@ -28,6 +26,7 @@ from feeders.columns import (
     parse,
     shown,
 )
+from feeders.plain import plain
 from feeders.raw import CUSTOMERS_FILE, LINES_FILE, META_FILE, Rows
 from feeders.records import Parsed, Record
 from gridsec.errors import FeederInvalid
@@ -275,7 +274,7 @@ def to_json(tables: FeederTables) -> dict[str, Any]:
     meta["load"] = {key: load[key] for key in load if key not in SELDOM or load[key] != usual[key]}
     meta["busbar_xy"] = None if tables.meta.busbar_xy is None else list(tables.meta.busbar_xy)
     return {
-        "feeder": _plain(meta),
+        "feeder": plain(meta),
         "lines": [_ordered(asdict(row), LINE_COLUMNS) for row in tables.lines],
         "customers": [_ordered(asdict(row), CUSTOMER_COLUMNS) for row in tables.customers],
     }
@@ -304,16 +303,7 @@ def _tables(examination: Examination) -> FeederTables:
 def _ordered(row: dict[str, Any], columns: tuple[Column, ...]) -> dict[str, Any]:
     given = (column.name for column in columns)
     seldom = {*PHASE_NAMES, "to_volt"}
-    return {name: _plain(row[name]) for name in given if row[name] is not None or name not in seldom}
-
-
-def _plain(value: Any) -> Any:
-    """The same with numbers of NumPy as those of Python: the former print their type."""
-    if isinstance(value, dict):
-        return {name: _plain(each) for name, each in value.items()}
-    if isinstance(value, list):
-        return [_plain(each) for each in value]
-    return value.item() if isinstance(value, np.generic) else value
+    return {name: plain(row[name]) for name in given if row[name] is not None or name not in seldom}
 
 
 # --- from cells to typed rows -------------------------------------------------------------------

@@ -21,6 +21,7 @@ from types import TracebackType
 from typing import Any, Final, Protocol, Self
 
 from feeders.outside import GROUP
+from feeders.plain import plain
 from gridsec.errors import GridsecError
 
 if sys.platform == "win32":
@@ -55,7 +56,7 @@ class Keeper(Protocol):
         """It cannot be used, or no more. True: try again; False: go on without it; or raise."""
 
 
-Where = Path | Keeper | None
+Where = Path | str | Keeper | None
 """A journal's file, or who has one; None: nothing is kept."""
 
 
@@ -122,8 +123,10 @@ class Journal:
         self.path: Path | None = None
         self.of = of
         self._done: dict[str, Any] = {}
+        where = Path(where) if isinstance(where, str) else where
         self._keeper = None if isinstance(where, Path) else where
-        head = json.dumps({**subject, "versions": versions(), "edition": edition()}, sort_keys=True)
+        told = {**subject, "versions": versions(), "edition": edition()}
+        head = json.dumps(plain(told), sort_keys=True)
         digest = hashlib.sha256(head.encode()).hexdigest()[:16]
         path = where if isinstance(where, Path) or where is None else where.file(subject["study"], digest)
         trying = path is not None

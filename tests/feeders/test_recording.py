@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -109,6 +111,47 @@ def test_scenarios_survive_json() -> None:
     older = {name: value for name, value in winter.items() if name not in {"season", "busbar_attacks"}}
     assert scenario_from_json(older).season is Season.SUMMER  # all there was
     assert scenario_from_json(older).busbar_attacks == ()
+
+
+def test_numbers_of_numpy_and_infinite_ones_are_written_and_read(tmp_path: Path) -> None:
+    given = Scenario(
+        seed=np.int64(3),
+        start=np.float64(START),
+        duration_s=np.int32(3),
+        dt_s=np.float32(1.0),
+        substep_s=np.inf,
+        variation=Variation(busbar_pu=np.float32(1.0), tap_interval_s=np.inf),
+        channel=Channel(silences=(Silence("inf", np.float32(0.0), np.inf),)),
+    )
+    expected = replace(given, seed=3, duration_s=3.0, dt_s=1.0)
+    assert scenario_from_json(json.loads(json.dumps(scenario_to_json(given)))) == expected
+    made = record(village(), replace(given, channel=Channel()), tmp_path / "a.parquet")
+    assert made.truth().t.tolist() == [START, START + 1.0, START + 2.0]
+
+
+def test_new_readings_never_stand_beside_an_old_truth(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    site, path = village(), tmp_path / "a.parquet"
+    record(site, Scenario(seed=1, duration_s=3.0), path)
+    kept = truth_path(path).read_bytes()
+    whole, calls = os.replace, []
+
+    def interrupted(source: Path, target: Path) -> None:
+        calls.append(target)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        whole(source, target)
+
+    monkeypatch.setattr(os, "replace", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        record(site, Scenario(seed=2, duration_s=3.0), path)
+    assert read_recording(path).scenario == Scenario(seed=2, duration_s=3.0)
+    with pytest.raises(RecordingInvalid, match="no truth of this recording"):
+        read_recording(path).truth()
+    truth_path(path).write_bytes(kept)
+    with pytest.raises(RecordingInvalid, match="of another one"):
+        read_recording(path).truth()
 
 
 def test_pandas_reads_it(tmp_path: Path) -> None:

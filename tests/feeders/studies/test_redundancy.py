@@ -95,7 +95,7 @@ def test_unknown_names_are_refused() -> None:
 
 
 def test_the_text_of_a_choice_is_the_choice_and_another_text_is_refused(tmp_path: Path) -> None:
-    site, journal = load("cigre-lv"), tmp_path / "journal"
+    site, journal = load("cigre-lv"), str(tmp_path / "journal")
     both = ("steepest", Curves.STEEPEST)
     said = [redundancy(site, curves=curves, journal=journal) for curves in both]
     assert said[0].summary.equals(said[1].summary)
