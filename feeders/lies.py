@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from feeders.campaign import NoSuchAttack, coordinated, fake_load, present_loads
+from feeders.choices import choice
 from feeders.variation import Stream, generator
 from gridsec.arrays import Floats, Ints
 from gridsec.attack import Attack, Bias, Coordinated, Drift, InverterAttack, Replay, Scaling, Stuck
@@ -60,6 +61,9 @@ class Lie:
     size: float = 3.0
     onset_s: float = 30.0
     end_s: float = np.inf
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "trick", choice("trick", Trick, self.trick))
 
 
 def manipulations(

@@ -16,9 +16,11 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from feeders.choices import choice
 from feeders.lies import Lie, Trick, manipulations
 from feeders.load import Site, from_tables, to_frame
 from feeders.meters import MeterErrors
+from feeders.plain import own_numbers
 from feeders.scenario import START, SUNNY_NOON_S, Sample, Scenario, simulate, snapshots
 from feeders.variation import Customers, Variation
 from gridsec.arrays import Bools, Floats, Ints
@@ -118,6 +120,10 @@ class Trial:
     profile_s: float = SUNNY_NOON_S
     variation: Variation = STEADY
     report_q: bool = False
+
+    def __post_init__(self) -> None:
+        own_numbers(self)
+        object.__setattr__(self, "meters", choice("meters", Meters, self.meters))
 
     @property
     def stated(self) -> Site:

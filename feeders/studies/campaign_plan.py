@@ -7,17 +7,21 @@ differ from their onsets on. Everything random follows from the plan's seed and 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
+from functools import partial
 from itertools import product
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from feeders.choices import choice, each_choice
 from feeders.columns import ESTIMATORS
 from feeders.lies import Trick
 from feeders.load import from_tables
+from feeders.plain import own_numbers, plain
 from feeders.profiles import Season, library
 from feeders.trials import LoadError, Meters, Trial
 from feeders.variation import Variation
@@ -98,6 +102,7 @@ class Kind:
     promise: Promise | None = None
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "trick", choice("trick", Trick, self.trick))
         if not self.sizes or self.name == CLEAN:
             raise ValueError(f"kind {self.name!r} needs a size, and a name other than {CLEAN!r}")
         if (self.volts or self.together) and self.trick is not Trick.BIAS:
@@ -226,7 +231,14 @@ class Plan:
     report_q: bool = False
 
     def __post_init__(self) -> None:
-        for problem, wrong in (
+        own_numbers(self)
+        set_ = partial(object.__setattr__, self)
+        set_("places", each_choice("place", Place, self.places))
+        set_("seasons", each_choice("season", Season, self.seasons))
+        set_("design", choice("design", Design, self.design))
+        set_("meters", choice("meters", Meters, self.meters))
+        times = (self.duration_s, self.step_s, *self.onset_s, self.lying_s, self.settling_s, self.learn_s)
+        checks = (
             ("a campaign needs scenes, and a scene scenarios", min(self.scenes, self.together) < 1),
             ("the seed must not be negative", self.seed < 0),
             (
@@ -236,7 +248,11 @@ class Plan:
             ("numbers of liars must be positive", min((*self.liars, 1)) < 1),
             ("there are no seasons", not self.seasons),
             ("kinds of lies need different names", len({k.name for k in self.kinds}) < len(self.kinds)),
-            ("a false-alarm rate is missing or not positive", min(self.alarms_per_year, default=0.0) <= 0.0),
+            (
+                "a false-alarm rate is missing, or not positive and finite",
+                not self.alarms_per_year or not all(0.0 < rate < math.inf for rate in self.alarms_per_year),
+            ),
+            ("times must be finite numbers", not all(map(math.isfinite, times))),
             ("step_s and lying_s must be positive", min(self.step_s, self.lying_s) <= 0.0),
             (
                 f"learn_s must be 0 or from {self.learn_step_s:g} s on",
@@ -250,9 +266,10 @@ class Plan:
                 f"estimator {self.estimator!r} does not exist; there are {', '.join(ESTIMATORS)}",
                 self.estimator not in ESTIMATORS,
             ),
-        ):
-            if wrong:
-                raise ValueError(problem)
+        )
+        problems = [problem for problem, wrong in checks if wrong]
+        if problems:
+            raise ValueError("; ".join(problems))
 
     @classmethod
     def of(cls, site: Site, **chosen: Any) -> Plan:
@@ -385,15 +402,20 @@ class Plan:
         Raises
         ------
         ValueError
-            If there is no such setting.
+            If there is no such setting, or it is a whole number and not given one.
         FeederInvalid
             If a setting has a value that it cannot have.
         """
         meta = stated.tables.meta
         known = asdict(meta.monitor)
-        for name, _ in self.settings:
+        problems = []
+        for name, value in self.settings:
             if name not in known or name in ("estimator", "tick_s", "alarms_per_year"):
-                raise ValueError(f"{name!r} is no setting of an estimator")
+                problems.append(f"{name!r} is no setting of an estimator")
+            elif isinstance(known[name], int) and not float(value).is_integer():
+                problems.append(f"{name} is {value}; expected a whole number")
+        if problems:
+            raise ValueError("; ".join(problems))
         # A whole number stays one, whatever the setting was written as.
         chosen = {name: type(known[name])(value) for name, value in self.settings}
         if self.learn_s:
@@ -404,7 +426,7 @@ class Plan:
     @property
     def subject(self) -> dict[str, Any]:
         """The plan as JSON has it."""
-        told: dict[str, Any] = json.loads(json.dumps(asdict(self)))
+        told: dict[str, Any] = json.loads(json.dumps(plain(asdict(self))))
         return told
 
 

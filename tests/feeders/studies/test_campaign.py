@@ -24,7 +24,7 @@ from feeders.load import Site, from_tables, load
 from feeders.profiles import Season
 from feeders.studies.campaign import Campaign, NothingPlayed, campaign
 from feeders.studies.campaign_lies import attacks, liars
-from feeders.studies.campaign_plan import CLEAN, Case, Kind, Place, Plan
+from feeders.studies.campaign_plan import CLEAN, Case, Design, Kind, Place, Plan
 from feeders.studies.campaign_run import (
     ClusterUnusable,
     Dask,
@@ -37,7 +37,7 @@ from feeders.studies.campaign_run import (
 from feeders.studies.campaign_tables import false_names, grouped, scenarios
 from feeders.studies.campaign_watch import risings
 from feeders.studies.journal import OtherStudy, edition
-from feeders.trials import LoadError, frames, judge
+from feeders.trials import LoadError, Meters, Trial, frames, judge
 from feeders.variation import Variation
 from gridsec.feeder import lindistflow
 from tests.feeders import stations
@@ -238,6 +238,9 @@ def test_settings_reach_the_estimator() -> None:
     assert design(plan.watched(plan.trial(SITE, plan.moment(0)).stated, 1.0)).max_attacked == 2
     with pytest.raises(ValueError, match="'colour' is no setting"):
         campaign(SITE, replace(PLAN, settings=(("colour", 1.0),)))
+    for wrong in (1.9, np.nan, np.inf):
+        with pytest.raises(ValueError, match=f"max_attacked is {wrong}; expected a whole number"):
+            campaign(SITE, replace(PLAN, settings=(("max_attacked", wrong),)))
 
 
 def test_lies_inside_the_class_are_named_once_meters_are_learned() -> None:
@@ -460,3 +463,22 @@ def test_a_killed_campaign_goes_on(here: Campaign, tmp_path: Path) -> None:
     child.wait()
     edition.cache_clear()  # that process has read the code later than this one
     same(here, campaign(SITE, PLAN, journal=journal))
+
+
+def test_texts_and_numbers_of_numpy_make_the_same_plan() -> None:
+    asked = replace(
+        PLAN, seed=np.int64(7), duration_s=np.float32(120.0), design="random", seasons=("winter",)
+    )
+    same = replace(PLAN, seed=7, duration_s=120.0, design=Design.RANDOM, seasons=(Season.WINTER,))
+    assert asked == same
+    assert asked.cases(1) == same.cases(1)
+    assert asked.subject == same.subject
+    assert Kind("b", "bias", (1.0,), volts=(2.0,)) == Kind("b", Trick.BIAS, (1.0,), volts=(2.0,))
+    assert Trial(SITE, meters="site").stated.tables == Trial(SITE, meters=Meters.SITE).stated.tables
+    wrong = {"alarms_per_year": (np.inf,), "lying_s": np.nan, "seed": -1}
+    with pytest.raises(ValueError, match=r"seed must not be.*false-alarm rate.*times must be finite"):
+        replace(PLAN, **wrong)
+    with pytest.raises(ValueError, match="times must be finite"):
+        replace(PLAN, duration_s=np.inf)
+    with pytest.raises(ValueError, match="design is 'none'; expected one of factorial, random"):
+        replace(PLAN, design="none")
