@@ -7,6 +7,7 @@ from typing import Final
 
 import numpy as np
 
+from feeders.columns import META_COLUMNS
 from feeders.forecast import always
 from feeders.load import Site, Snapshot, to_frame
 from feeders.schema import FeederTables
@@ -20,6 +21,11 @@ TYPICAL: Final = 0.5
 ALIKE: Final = 0.5
 """Share of a variance that customers have in common, of reactive power where only power factors are known,
 and of all powers that nobody meters: seasons, hours and habits move all of them the same way."""
+
+LONGEST_S: Final = next(
+    column.high for column in META_COLUMNS["load"] if column.name == "correlation_s" and column.high
+)
+"""The longest correlation time that files can say, s."""
 
 
 def load_doubt(site: Site) -> LoadDoubt:
@@ -102,6 +108,8 @@ def forecast_errors(site: Site, t: Floats, p_kw: Floats, q_kvar: Floats) -> tupl
 def tell(tables: FeederTables, doubt: LoadDoubt, base_kva: float) -> FeederTables:
     """Write into customers without a meter how far their powers are off, and into `[load]` for how long.
 
+    Longer than files can say is as long as they can say.
+
     Parameters
     ----------
     tables
@@ -115,7 +123,7 @@ def tell(tables: FeederTables, doubt: LoadDoubt, base_kva: float) -> FeederTable
     rows = tuple(
         row if row.meter else replace(row, p_std_kw=float(p), q_std_kvar=float(q)) for row, p, q in told
     )
-    load = replace(tables.meta.load, correlation_s=doubt.time_s)
+    load = replace(tables.meta.load, correlation_s=min(float(doubt.time_s), LONGEST_S))
     return replace(tables, meta=replace(tables.meta, load=load), customers=rows)
 
 
@@ -123,8 +131,8 @@ def from_history(error_p: Floats, error_q: Floats, step_s: float) -> LoadDoubt:
     """Learn from a history of errors, true powers minus those that were assumed.
 
     The correlation time is that of a first-order process with the same correlation from sample to sample,
-    the median over the customers; the common share is what the customers' mean varies more than
-    independent ones would.
+    the median over the customers, and no longer than the history; the common share is what the customers'
+    mean varies more than independent ones would.
 
     Parameters
     ----------
@@ -145,14 +153,14 @@ def from_history(error_p: Floats, error_q: Floats, step_s: float) -> LoadDoubt:
     return LoadDoubt(
         p=np.sqrt(np.mean(error_p**2, axis=0)),
         q=np.sqrt(np.mean(error_q**2, axis=0)),
-        time_s=step_s / -float(np.log(_from_sample_to_sample(error_p))),
+        time_s=min(step_s / -float(np.log(_from_sample_to_sample(error_p))), step_s * len(error_p)),
         common_p=_common(error_p),
         common_q=_common(error_q),
     )
 
 
 _FEWEST = 3
-# Correlations outside these are no first-order process that this history could show.
+# Correlations outside these are no first-order process that a history could show.
 _RANGE = (1e-3, 1.0 - 1e-6)
 
 

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from feeders.doubts import ALIKE, load_doubt, unread
+from feeders.doubts import ALIKE, from_history, load_doubt, tell, unread
 from feeders.estimators import design
 from feeders.load import Site, from_tables, load, names
 from feeders.scenario import START
+from feeders.schema import write
 from gridsec.feeder import lindistflow
 from gridsec.sequential import LoadDoubt, SequentialDesign, SequentialState
 from gridsec.sequential.loads import prior
@@ -108,3 +110,13 @@ def test_a_step_counts_what_is_not_metered_once_and_errs_by_what_it_says() -> No
         ratios.append(((estimate.v2 - truth) / estimate.std)[some])
     assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 1.2
     assert np.abs(ratios).max() < 3.0
+
+
+def test_what_was_learned_of_a_slow_history_can_be_loaded_again(tmp_path: Path) -> None:
+    """Errors that hardly change: no history shows that they last longer than it does itself."""
+    slow = np.linspace(1.0, 1.0001, 20_000)[:, None] * np.ones(len(CIGRE.feeder.customers))
+    found = from_history(slow, slow, 900.0)
+    assert found.time_s == 900.0 * 20_000
+    assert from_history(slow[:50], slow[:50], 900.0).time_s == 900.0 * 50
+    write(tell(CIGRE.tables, found, CIGRE.feeder.base_kva), tmp_path / "learned")
+    assert load(tmp_path / "learned").tables.meta.load.correlation_s == 1e7
