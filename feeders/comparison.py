@@ -19,6 +19,7 @@ import numpy as np
 
 from feeders.campaign import NoSuchAttack
 from feeders.estimators import FAMILIES, Watcher, choose, design
+from feeders.files import replace_file
 from feeders.lies import Lie, Trick
 from feeders.outside import EstimatorUnusable
 from feeders.studies.journal import Journal, Where
@@ -332,7 +333,7 @@ def _most(values: Floats) -> float:
 
 
 def write_csv(rows: Iterable[Row], path: Path) -> None:
-    """Write all numbers as they are.
+    """Write all numbers as they are; a file that is there is replaced when the new one is complete.
 
     Parameters
     ----------
@@ -341,11 +342,15 @@ def write_csv(rows: Iterable[Row], path: Path) -> None:
     path
         The file.
     """
+
+    def write(new: Path) -> None:
+        with new.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, [each.name for each in fields(Row)])
+            writer.writeheader()
+            writer.writerows(asdict(row) for row in rows)
+
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, [each.name for each in fields(Row)])
-        writer.writeheader()
-        writer.writerows(asdict(row) for row in rows)
+    replace_file(path, write)
 
 
 HEADERS: Final = (

@@ -65,6 +65,7 @@ def compare(
     """
     from feeders.comparison import CASES, Plan, markdown, splice, write_csv
     from feeders.estimators import FAMILIES
+    from feeders.files import replace_file
     from feeders.load import load
     from feeders.trials import LoadError, Meters
 
@@ -79,19 +80,23 @@ def compare(
         cases=_known(case, tuple(each.name for each in CASES), "--case"),
         workers=workers or os.cpu_count() or 1,
     )
-    see(files={"--csv": csv, "--write": write, "--journal": journal}, read={"--write": write})
-    before = None if write is None else write.read_text(encoding="utf-8")
-    if before is not None:
-        splice(before, "")  # a document without markers is refused before the work, not after it
+    see(files={"--journal": journal}, replaced={"--csv": csv, "--write": write}, read={"--write": write})
+    if write is not None:
+        splice(_read(write), "")  # a document without markers is refused before the work, not after it
     with keeping("compare", feeder, journal, without=no_journal) as kept:
         site = load(converted(feeder, None))
         rows = _compared(site, plan, kept)
         _show(rows, plan)
         if csv is not None:
             write_csv(rows, csv)
-        if write is not None and before is not None:
+        if write is not None:
             told = f"{_told(feeder, site, plan)}\n\n{markdown(rows, plan)}"
-            write.write_text(splice(before, told), encoding="utf-8")
+            text = splice(_read(write), told)  # as it is now: somebody may have worked on it meanwhile
+            replace_file(write, lambda new: new.write_text(text, encoding="utf-8"))
+
+
+def _read(page: Path) -> str:
+    return page.read_text(encoding="utf-8")
 
 
 def _compared(site: Site, plan: Plan, kept: Keeping) -> list[Row]:

@@ -110,7 +110,9 @@ def _file(path: Path) -> str | None:
 
 
 def _replaced(path: Path) -> str | None:
-    return "a folder; expected a file" if path.is_dir() else _room(path.parent)
+    if path.exists() and not path.is_file():
+        return _file(path)
+    return _room(Path(os.path.realpath(path)).parent)
 
 
 def _read(path: Path) -> str | None:

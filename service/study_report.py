@@ -13,12 +13,13 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from feeders.files import replace_file
 from feeders.report.book import Report
 from feeders.report.sections import Outcome, Result
 from feeders.studies.droop_fleets import NOTHING, NoInverters
 from gridsec.errors import GridsecError
 from service.planned import planned, sources
-from service.tables import replace_file, write_tables
+from service.tables import write_tables
 
 if TYPE_CHECKING:
     from feeders.load import Site

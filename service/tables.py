@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from feeders.files import replace_file
 from feeders.raw import META_FILE
 
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["A_FEEDER", "is_feeder", "replace_file", "write_tables"]
+__all__ = ["A_FEEDER", "is_feeder", "write_tables"]
 
 A_FEEDER: Final = "a feeder's folder; tables would replace its own files, they go into another folder"
 
@@ -60,30 +60,6 @@ def write_tables(folder: Path | None, tables: Mapping[str, pd.DataFrame]) -> Non
             raise ValueError(f"{name!r} is no name of a table's file")
         replace_file(folder / f"{name}.csv", partial(frame.to_csv, index=False))
         replace_file(folder / f"{name}.parquet", partial(_for_parquet(frame).to_parquet, index=False))
-
-
-def replace_file(path: Path, write: Callable[[Path], object]) -> None:
-    """Replace a file when its new content is complete; what cannot be completed leaves nothing.
-
-    Parameters
-    ----------
-    path
-        The file.
-    write
-        Writes it, into another file beside it.
-
-    Raises
-    ------
-    OSError
-        If it cannot be written.
-    """
-    new = path.with_name(f".{path.name}.new")
-    try:
-        write(new)
-        os.replace(new, path)
-    except BaseException:
-        new.unlink(missing_ok=True)
-        raise
 
 
 def _for_parquet(frame: pd.DataFrame) -> pd.DataFrame:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import math
+import os
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -159,6 +161,34 @@ def test_csv_holds_every_number(tmp_path: Path) -> None:
     assert float(read[2]["error_liars"]) == 0.25
     assert math.isinf(float(read[2]["error_all"]))
     assert set(read[0]) == set(Row.__dataclass_fields__)
+
+
+def test_a_csv_that_cannot_be_completed_leaves_the_old_one(tmp_path: Path) -> None:
+    path = tmp_path / "rows.csv"
+    write_csv(ROWS, path)
+    before = path.read_bytes()
+
+    def breaking() -> Iterator[Row]:
+        yield ROWS[0]
+        raise OSError("the disk is full")
+
+    with pytest.raises(OSError, match="full"):
+        write_csv(breaking(), path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_link_to_a_csv_stays_one_and_a_pipe_is_written(tmp_path: Path) -> None:
+    link = tmp_path / "link.csv"
+    link.symlink_to("rows.csv")
+    write_csv(ROWS, link)
+    assert link.is_symlink()
+    assert (tmp_path / "rows.csv").is_file()
+    reading, writing = os.pipe()
+    write_csv(ROWS[:1], Path(f"/dev/fd/{writing}"))
+    os.close(writing)
+    with os.fdopen(reading, encoding="utf-8") as told:
+        assert len(told.readlines()) == 2
 
 
 def test_the_page_has_a_row_and_a_sentence_for_every_family() -> None:

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from feeders.comparison import BEGIN, END
+from feeders.comparison import BEGIN, END, Row
 from feeders.estimators import FAMILIES
+from service import cli_compare
 from tests.service.commands import command
 
 QUICK = ("--seeds", "1", "--duration", "80", "--max-attacked", "1", "--case", "bias")
@@ -48,6 +49,25 @@ def test_numbers_go_to_the_screen_to_a_file_and_into_a_document(
     assert f"    {command} --family sequential --family exact-bank --case bias\n" in text
     assert text.count("| exact-bank |") == 2
     assert text.count("not run") == len(FAMILIES) - 2
+
+
+def test_what_is_written_in_the_document_during_the_work_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = tmp_path / "page.md"
+    page.write_text(f"{BEGIN}\nold\n{END}\n", encoding="utf-8")
+
+    def working(*_: object) -> list[Row]:
+        with page.open("a", encoding="utf-8") as file:
+            file.write("written meanwhile\n")
+        return []
+
+    monkeypatch.setattr(cli_compare, "_compared", working)
+    code, _, error = run(monkeypatch, capsys, "compare", "cigre-lv", *QUICK, "--write", str(page))
+    assert code == 0, error
+    text = page.read_text(encoding="utf-8")
+    assert "old" not in text
+    assert text.endswith(f"{END}\nwritten meanwhile\n")
 
 
 def test_a_family_that_is_refused_tells_why(
