@@ -104,26 +104,27 @@ def droop(
     see_choice([who], tuple(Who), "--who")
     _see_presets(preset, compare, fleets)
     usual = DroopOptions()
-    options = DroopOptions(
-        preset=preset,
-        who=Who(who),
-        interval_s=interval,
-        dead=dead,
-        v0_low=busbar[0],
-        v0_high=busbar[1],
-        v_min=band[0] if band else None,
-        v_max=band[1] if band else None,
-        load_high=load_high,
-        pv_high=pv_high,
-        presets=tuple(compare) if compare else usual.presets,
-        tau_factors=tuple(tau_factor) if tau_factor else usual.tau_factors,
-        hosting=hosting,
-        hosting_presets=tuple("" if name == "none" else name for name in fleets),
-        hosting_load=hosting_load,
-        hosting_customers=tuple(at) if at else None,
-        unit_kw=unit_kw,
-        draws=draws,
-    )
+    with said():
+        options = DroopOptions(
+            preset=preset,
+            who=Who(who),
+            interval_s=interval,
+            dead=dead,
+            v0_low=busbar[0],
+            v0_high=busbar[1],
+            v_min=band[0] if band else None,
+            v_max=band[1] if band else None,
+            load_high=load_high,
+            pv_high=pv_high,
+            presets=tuple(compare) if compare else usual.presets,
+            tau_factors=tuple(tau_factor) if tau_factor else usual.tau_factors,
+            hosting=hosting,
+            hosting_presets=tuple("" if name == "none" else name for name in fleets),
+            hosting_load=hosting_load,
+            hosting_customers=tuple(at) if at else None,
+            unit_kw=unit_kw,
+            draws=draws,
+        )
     see(folders={"--out": out}, files={"--journal": journal})
     with keeping("droop", feeder, journal, without=no_journal) as kept:
         site, others = load(converted(feeder, out)), [load(converted(name, None)) for name in also or ()]

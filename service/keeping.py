@@ -20,7 +20,7 @@ from rich.control import Control
 from rich.markup import escape
 from rich.segment import ControlType
 
-from gridsec.errors import GridsecError
+from gridsec.errors import DesignInfeasible, NotObservable
 from service import console
 from service.console import complain
 
@@ -204,10 +204,10 @@ def keeping(
         kept.close(done=False)
         console.err.print(escape(kept.left()))
         raise
-    except (GridsecError, typer.BadParameter):
+    except (DesignInfeasible, NotObservable):
         kept.close(done=True)  # that there is no answer is one, and it would be the same again
         raise
-    except BaseException:
+    except BaseException:  # what was finished before something else failed is not to be done again
         kept.close(done=False)
         raise
     kept.close(done=True)

@@ -16,9 +16,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
+from feeders.command_line import word
 from feeders.studies.bases import Bases
-from feeders.studies.droop_fleets import Who, box, chosen_fleet, equip, points
+from feeders.studies.droop_fleets import box, chosen_fleet, equip, points
 from feeders.studies.droop_hosting import Conditions, Plan, capacity, curve, draw, shares_of
+from feeders.studies.droop_options import DroopOptions, band_problem
 from feeders.studies.droop_safety import Kept, Safety, nobody, safety
 from feeders.studies.droop_steps import Run, simulate, step_rows, steps, trajectories
 from feeders.studies.droop_verdict import (
@@ -32,7 +34,7 @@ from feeders.studies.droop_verdict import (
     worst,
 )
 from feeders.studies.journal import Progress, Where, worked
-from gridsec.droop import PRESETS, Droop
+from gridsec.droop import Droop
 from gridsec.studies.droop_network import Box
 from gridsec.studies.droop_rest import rest
 from gridsec.studies.droop_stability import Update, enlarged
@@ -44,62 +46,6 @@ __all__ = ["ANY", "DroopOptions", "DroopStudy", "droop", "presets_of"]
 
 ANY = "any loads"
 """The row about all loads within their limits."""
-
-
-@dataclass(frozen=True, slots=True)
-class DroopOptions:
-    """What is studied.
-
-    Attributes
-    ----------
-    preset
-        Preset of all inverters; None: the feeder's own fleet.
-    who
-        Whom a preset equips: customers with generation (`pv`), or `all`.
-    interval_s, dead
-        Sampling interval of the inverters, s (0: continuous), and dead time in whole intervals.
-    v0_low, v0_high
-        Limits of the busbar's voltage, pu; points of operation have the middle, hosting the upper one.
-    v_min, v_max
-        The band, parts of the nominal voltage; None: the limits of the feeder's files.
-    load_high, pv_high
-        Largest shares of the peaks in the box of all loads.
-    presets
-        Presets to compare, each instead of the feeder's own.
-    tau_factors
-        Factors on all time constants to compare.
-    hosting
-        Whether to look for hosting capacities.
-    hosting_presets
-        Fleets that new generation comes with; empty: without reactive power.
-    hosting_load
-        Share of their peak that loads draw meanwhile.
-    hosting_customers
-        Who gets the generation; None: who has some, in proportion.
-    unit_kw
-        Size of a unit that comes to a random customer, kW.
-    draws
-        How many random orders of customers.
-    """
-
-    preset: str | None = None
-    who: Who = Who.PV
-    interval_s: float = 1.0
-    dead: int = 0
-    v0_low: float = 1.0
-    v0_high: float = 1.0
-    v_min: float | None = None
-    v_max: float | None = None
-    load_high: float = 1.0
-    pv_high: float = 1.0
-    presets: tuple[str, ...] = PRESETS
-    tau_factors: tuple[float, ...] = (0.01, 0.1, 0.3, 1.0, 3.0)
-    hosting: bool = False
-    hosting_presets: tuple[str, ...] = ("", "ieee1547-b")
-    hosting_load: float = 0.1
-    hosting_customers: tuple[str, ...] | None = None
-    unit_kw: float = 5.0
-    draws: int = 30
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -209,7 +155,7 @@ def droop(
     NoInverters
         If the feeder has no inverters and no preset is given.
     ValueError
-        If options are out of range.
+        If the band is none, or new generation is for somebody who is no customer.
     OtherStudy
         If the journal is another study's.
     InUse
@@ -217,11 +163,9 @@ def droop(
     """
     given = options or DroopOptions()
     study = _Study(Subject.of(site), chosen_fleet(site, given.preset, given.who), given, seed)
-    low, high = study.limits
-    if not 0.0 < low < high:
-        raise ValueError(f"the band from {low:g} to {high:g} is none; expected two ascending voltages, pu")
+    if problem := band_problem(*study.limits):  # one limit may be given, and the other the file's
+        raise ValueError(problem)
     subject = {"study": "droop", "digest": site.digest, "seed": seed, "options": asdict(given)}
-    _ = study.update, study.box  # wrong options are told before the work, not in the midst of it
     done = worked(journal, subject, _tasks(study), progress)
     tables = _tables(site, done)
     band = tables["band"].iloc[0]
@@ -252,7 +196,7 @@ def _tasks(study: _Study) -> Iterator[Task]:
     for name in given.presets:
         yield f"presets|{name}", partial(_preset, study, name)
     for times in given.tau_factors:
-        yield f"time_constants|{times:g}", partial(_time_constant, study, times)
+        yield f"time_constants|{word(times)}", partial(_time_constant, study, times)
     if given.hosting:
         yield from _hosting_tasks(study)
 

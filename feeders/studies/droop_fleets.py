@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -221,13 +222,13 @@ def box(
     ValueError
         If limits are the wrong way round.
     """
-    for what, low, high in (
-        ("load", load_low, load_high),
-        ("generation", pv_low, pv_high),
-        ("busbar voltage", v0_low, v0_high),
-    ):
-        if not 0.0 <= low <= high:
-            raise ValueError(f"{what}: from {low:g} to {high:g}; expected two ascending numbers from 0 on")
+    problems = [
+        *range_problem("load", load_low, load_high),
+        *range_problem("generation", pv_low, pv_high),
+        *range_problem("busbar voltage", v0_low, v0_high),
+    ]
+    if problems:
+        raise ValueError("; ".join(problems))
     known = site.loads
     return Box(
         p_low=pv_low * known.pv_peak - load_high * known.load_peak,
@@ -237,6 +238,19 @@ def box(
         v0_low=v0_low,
         v0_high=v0_high,
     )
+
+
+def range_problem(what: str, low: float, high: float) -> list[str]:
+    """What is wrong with two limits; empty if nothing is.
+
+    Parameters
+    ----------
+    what, low, high
+        Of what they are, and the limits.
+    """
+    if 0.0 <= low <= high < math.inf:
+        return []
+    return [f"{what}: from {low:g} to {high:g}; expected two ascending numbers from 0 on"]
 
 
 def inverter_names(site: Site, droop: Droop, rows: Ints) -> list[str]:

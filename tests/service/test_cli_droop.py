@@ -59,6 +59,9 @@ def test_wrong_arguments_are_told(
         (("--interval", "0", "--dead", "2"), "short interval"),
         (("--band", "1.1", "0.9"), "band"),
         (("--hosting", "--at", "me"), "no customer 'me'"),
+        (("--at", "me"), "only with hosting"),
+        (("--hosting", "--unit-kw", "0"), "unit of generation is 0 kW"),
+        (("--tau-factor", "0", "--tau-factor", "-1"), "is 0; it must be a positive number; a factor"),
     ):
         code, _, told = run(monkeypatch, capsys, "cigre-lv", *wrong)
         assert code == 2, told

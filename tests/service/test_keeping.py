@@ -11,10 +11,13 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 
-from feeders.studies.journal import edition
+from feeders.studies.journal import edition, worked
+from gridsec.errors import GridsecError
+from service.keeping import keeping
 from tests.service.commands import command, plain
 
 run = command("study")
@@ -196,6 +199,19 @@ def test_what_has_no_answer_leaves_no_journal(
     words = ("protect", "--unknown", "LV1.101 Load 8", "--never", "m08")
     code, _, _ = run(monkeypatch, capsys, *words)
     assert code == 3
+    assert not list(cache.iterdir())
+
+
+def test_work_that_was_done_before_an_error_is_kept(cache: Path) -> None:
+    def refuse() -> NoReturn:
+        raise GridsecError("this piece cannot be done")
+
+    tasks: dict[str, Callable[[], int]] = {"one": lambda: 1, "two": refuse}
+    with pytest.raises(GridsecError, match="this piece"), keeping("any", "village") as kept:
+        worked(kept, {"study": "any"}, tasks.items(), None)
+    tasks = {"one": refuse, "two": lambda: 2}
+    with keeping("any", "village") as kept:
+        assert worked(kept, {"study": "any"}, tasks.items(), None) == {"one": 1, "two": 2}
     assert not list(cache.iterdir())
 
 

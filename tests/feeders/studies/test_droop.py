@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -373,10 +374,47 @@ def test_what_cannot_be_is_said() -> None:
     with pytest.raises(FeederInvalid, match="equip all"):
         droop(nobody, DroopOptions(preset="vde4105"))
     assert equip(nobody, "vde4105", Who.ALL).tau.size == len(bare)
-    for wrong, why in (
-        (DroopOptions(v_min=1.2), "band"),
-        (DroopOptions(interval_s=-1.0), "interval"),
-        (DroopOptions(v0_low=1.1, v0_high=0.9), "busbar"),
-    ):
-        with pytest.raises(ValueError, match=why):
-            droop(village(), wrong)
+    with pytest.raises(ValueError, match="band"):
+        droop(village(), DroopOptions(v_min=1.2))
+
+
+def test_options_that_make_no_study_are_named_all_at_once() -> None:
+    with pytest.raises(ValueError, match="interval") as caught:
+        DroopOptions(
+            preset="x",
+            presets=("y",),
+            interval_s=-1.0,
+            v0_low=1.1,
+            v0_high=0.9,
+            v_min=1.2,
+            v_max=math.nan,
+            load_high=math.inf,
+            tau_factors=(1.0, 0.0, math.nan),
+            hosting=True,
+            hosting_presets=("", "z"),
+            hosting_customers=(),
+            unit_kw=math.nan,
+            draws=-1,
+        )
+    told = str(caught.value)
+    wanted = (
+        "'x'",
+        "'y'",
+        "'z'",
+        "interval",
+        "constants is 0;",
+        "constants is nan;",
+        "busbar",
+        "band",
+        "load is inf",
+    )
+    wanted += ("unit of generation is nan", "-1 random orders", "nobody")
+    assert [told.count(part) for part in wanted] == [1] * len(wanted)
+    for unit in (0.0, -5.0, math.inf):
+        with pytest.raises(ValueError, match="unit of generation"):
+            DroopOptions(hosting=True, unit_kw=unit)
+
+
+def test_what_only_hosting_asks_is_not_ignored_without_it() -> None:
+    with pytest.raises(ValueError, match=r"hosting_customers \(--at\), unit_kw \(--unit-kw\): only with"):
+        DroopOptions(hosting_customers=("home",), unit_kw=3.0)
