@@ -19,15 +19,18 @@ from pathlib import Path
 from typing import Any
 
 from feeders import convert_simbench
+from feeders.command_line import command_line
 from feeders.convert_changes import CHANGES_FILE, Change, changes_csv, sentences
 from feeders.convert_check import SourceCheck, compare
+from feeders.convert_folder import from_folder, source_again
 from feeders.convert_levels import EVERYTHING, Extent
 from feeders.convert_network import Converted, feeder_of
 from feeders.convert_opendss import read_opendss
 from feeders.convert_pandapower import Fleet, from_pandapower
 from feeders.convert_pgm import read_pgm
-from feeders.convert_source import SOURCE_FILE, feeder_source, profiles_source
+from feeders.convert_source import SOURCE_FILE, feeder_source, profiles_source, versioned
 from feeders.load import from_tables
+from feeders.origin import origin as origin_of
 from feeders.profiles import ENVELOPES, Season
 from feeders.schema import FeederTables, read, write
 from gridsec.errors import FeederInvalid, GridsecError
@@ -170,7 +173,7 @@ def convert(
     root
         Bus that becomes the metered busbar, where the source leaves a choice.
     name
-        Name of the feeder; default: the name of the folder.
+        Name of the feeder; default: the name of the folder, or that of a source that is a feeder's folder.
     droop
         Preset of the source's generators.
     opened
@@ -184,7 +187,7 @@ def convert(
     ------
     FeederInvalid
         If the result is no feeder that can be loaded: a loop, an island, no zero sequence where one is
-        needed, ...
+        needed, ...; or with every option that makes nothing of a feeder's folder.
     GridsecError
         If the source does not exist, its own tool cannot read it, or the extra `convert` is not installed.
     """
@@ -193,9 +196,10 @@ def convert(
         _convert_profiles(folder)
         return Conversion((), None, "profiles have no power flow")
     recipe = RECIPES.get(source)
-    chosen = name or (
-        source if recipe is not None else re.sub(r"[^A-Za-z0-9_-]+", "-", folder.resolve().name)
-    )
+    again = recipe is None and Path(source).is_dir()  # such a feeder has a name, and tells where it is from
+    before = origin_of(source) if again else None
+    usual = "" if again else re.sub(r"[^A-Za-z0-9_-]+", "-", folder.resolve().name)
+    chosen = name or (source if recipe is not None else usual)
     extent = Extent(one_voltage, meshed)
     converted, package = _converted(source, chosen[:64], root=root, droop=droop, opened=opened, extent=extent)
     problems = _problems(converted.tables)
@@ -208,15 +212,19 @@ def convert(
     (folder / CHANGES_FILE).write_text(changes_csv(done.changes), encoding="utf-8", newline="\n")
     target = f"data/feeders/{chosen}" if recipe else str(out)
     options = [*_options(root, name, droop, opened), *_flags(extent)]
-    text = feeder_source(
-        converted.tables,
-        about=recipe.about if recipe else "A converted network.",
-        origin=recipe.source if recipe else source,
-        package=package,
-        command=" ".join(["gridsec feeders convert", source, target, *options]),
-        notes=done.notes,
-        check=done.check.sentence if done.check else f"Not checked: {done.unchecked}",
-    )
+    command = command_line(["gridsec", "feeders", "convert", source, target, *options])
+    if again:
+        text = source_again(before, converted.tables, Path(source), command, done.notes)
+    else:
+        text = feeder_source(
+            converted.tables,
+            about=recipe.about if recipe else "A converted network.",
+            origin=recipe.source if recipe else source,
+            package=versioned(package),
+            command=command,
+            notes=done.notes,
+            check=done.check.sentence if done.check else f"Not checked: {done.unchecked}",
+        )
     (folder / SOURCE_FILE).write_text(text, encoding="utf-8", newline="\n")
     return done
 
@@ -297,8 +305,9 @@ def _read(
     recipe = RECIPES.get(source)
     origin = recipe.source if recipe else source
     path = Path(origin)
-    if path.is_dir():
-        return Converted(read(path), (), None, "it was a feeder's folder already"), "gridsec"
+    if recipe is None and path.is_dir():
+        again = from_folder(path, name, root=root, opened=opened, droop=droop, one_voltage=extent.one_voltage)
+        return again, "gridsec"
     kind = _kind(path) if path.is_file() else ""
     if kind == OPENDSS:
         network, package = read_opendss(path), "opendssdirect.py"
@@ -352,8 +361,8 @@ def _kind(path: Path) -> str:
 
 def _options(root: str | None, name: str | None, droop: str | None, opened: Sequence[str]) -> list[str]:
     """Return the options of the command line that were given."""
-    given = ((f"--root {root!r}", root), (f"--name {name}", name), (f"--droop {droop}", droop))
-    return [text for text, value in given if value] + [f"--open {line!r}" for line in opened]
+    given = (("--root", root), ("--name", name), ("--droop", droop), *(("--open", line) for line in opened))
+    return [word for option, value in given if value for word in (option, value)]
 
 
 def _flags(extent: Extent) -> list[str]:

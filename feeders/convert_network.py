@@ -193,7 +193,7 @@ def below(network: Network, root: str | None, opened: Sequence[str], extent: Ext
         If there is no such bus, or more than one that could be meant.
     """
     changes = list(network.changes)
-    rows = _opened(network.lines, opened, changes)
+    rows = opened_rows(network.lines, opened, changes)
     busbar = _busbar(network, rows, root)
     network, rows = transformed(network, rows, busbar, extent, changes)
     inside = reached(busbar, rows)
@@ -260,8 +260,23 @@ def accepting(tables: FeederTables, changes: list[Change]) -> FeederTables:
     return replace(tables, meta=replace(tables.meta, accept=accept)) if accept else tables
 
 
-def _opened(lines: Iterable[LineRow], opened: Sequence[str], changes: list[Change]) -> list[LineRow]:
-    """Open the lines that were asked for."""
+def opened_rows(lines: Iterable[LineRow], opened: Sequence[str], changes: list[Change]) -> list[LineRow]:
+    """Open the lines that were asked for.
+
+    Parameters
+    ----------
+    lines
+        Rows of lines.csv.
+    opened
+        Names of lines.
+    changes
+        Takes what was opened.
+
+    Raises
+    ------
+    FeederInvalid
+        With every line that does not exist.
+    """
     rows = list(lines)
     unknown = sorted(set(opened) - {row.line for row in rows})
     if unknown:

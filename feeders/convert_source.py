@@ -79,7 +79,14 @@ pandapower draws the types of some of the Kerber networks' service cables at ran
 from the seed 1."""
 
 
-def _version(package: str) -> str:
+def versioned(package: str) -> str:
+    """Return a package's name with its version.
+
+    Parameters
+    ----------
+    package
+        Its name.
+    """
     try:
         return f"{package} {version(package)}"
     except PackageNotFoundError:
@@ -107,7 +114,7 @@ def feeder_source(
     origin
         What was converted, as `convert` takes it.
     package
-        The package that holds the data, or that reads the file.
+        The package that holds the data, or that reads the file, with its version.
     command
         Command line that makes the folder again.
     notes
@@ -120,7 +127,7 @@ def feeder_source(
 
 {about}
 
-- Source: `{origin}`, {_version(package)}
+- Source: `{origin}`, {package}
 - Made by: `{command}`
 - {len(tables.lines)} lines and switches, {len(tables.customers)} customers
 
@@ -166,7 +173,7 @@ seconds from the first sample, which is at 00:00 local time.
 `envelopes.csv` holds, for each load profile, the narrowest limits
 `q_low p - q_floor <= q <= q_high p + q_floor` that hold every point of SimBench's whole year.
 
-- Source: {_version("simbench")}
+- Source: {versioned("simbench")}
 - Made by: `gridsec convert profiles data/profiles`
 
 ## Licence

@@ -28,11 +28,15 @@ class Origin:
         How the feeder's AC power flow compares with the source's, or why it was not compared; the same.
     changes
         What was left out, approximated, added or changed; one row each, as in conversion.csv.
+    about, command
+        What the network is, and the command line that made the folder; empty if that is not told.
     """
 
     source: str
     check: str
     changes: pd.DataFrame
+    about: str = ""
+    command: str = ""
 
 
 def origin(path_or_name: Path | str) -> Origin | None:
@@ -61,6 +65,12 @@ def origin(path_or_name: Path | str) -> Origin | None:
     text = told.read_text(encoding="utf-8", errors="replace") if told.is_file() else ""
     source = re.search(r"^- Source: `(.*)`(.*)$", text, re.MULTILINE)
     check = re.search(r"^## Checked\n\n(.*?)\n\n", text, re.MULTILINE | re.DOTALL)
+    about = re.search(r"^# .*\n\n(.*?)\n\n- Source: ", text, re.DOTALL)
+    command = re.search(r"^- Made by: `(.*)`$", text, re.MULTILINE)
     return Origin(
-        "".join(source.groups()) if source else "", " ".join(check[1].split()) if check else "", changes
+        "".join(source.groups()) if source else "",
+        " ".join(check[1].split()) if check else "",
+        changes,
+        about[1] if about else "",
+        command[1] if command else "",
     )

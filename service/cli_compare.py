@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,6 +11,7 @@ from rich.markup import escape
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from feeders.command_line import command_line
 from service import console
 from service.cli_campaign import LoadErrorKvar, LoadErrorKw, MetersAs
 from service.console import Studied, finite
@@ -151,15 +151,16 @@ def _command(feeder: str, plan: Plan) -> str:
         "--load-error-kw": (plan.load_error.p_kw, usual.load_error.p_kw),
         "--load-error-kvar": (plan.load_error.q_kvar, usual.load_error.q_kvar),
     }
-    words = ["gridsec study compare", shlex.quote(feeder)]
-    words += [f"{name} {value}" for name, (value, default) in options.items() if value != default]
+    words: list[object] = ["gridsec", "study", "compare", feeder]
+    for name, (value, default) in options.items():
+        words += [name, value] if value != default else []
     words += ["--report-q"] * plan.report_q
     for name, chosen, every in (
         ("--family", plan.families, usual.families),
         ("--case", plan.cases, usual.cases),
     ):
-        words += [f"{name} {each}" for each in chosen if chosen != every]
-    return " ".join(words)
+        words += [word for each in chosen if chosen != every for word in (name, each)]
+    return command_line(words)
 
 
 def _show(rows: list[Row], plan: Plan) -> None:

@@ -159,7 +159,10 @@ def convert(
     *,
     root: Annotated[str | None, typer.Option(help="Bus that is the metered busbar.")] = None,
     name: Annotated[
-        str | None, typer.Option(help="Name of the feeder. [default: that of the folder]")
+        str | None,
+        typer.Option(
+            help="Name of the feeder. [default: that of the folder, or as a feeder's folder has it]"
+        ),
     ] = None,
     droop: Annotated[str | None, typer.Option(help="Droop preset of the source's generators.")] = None,
     opened: Annotated[

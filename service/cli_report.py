@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import shlex
 from dataclasses import MISSING, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
+from feeders.command_line import command_line
 from service import console
 from service.cli_campaign import Estimator, KnownKvar, KnownKw, Seed, Step
 from service.cli_droop import Allowed, Preset, see_choice
@@ -196,7 +196,7 @@ def _command(asked: Asked, out: Path, studies: str | None) -> str:
     usual = replace(
         asked, **{each.name: each.default for each in fields(asked) if each.default is not MISSING}
     )
-    words = ["gridsec", "study", "report", asked.feeder, "--out", str(out)]
+    words: list[object] = ["gridsec", "study", "report", asked.feeder, "--out", out]
     words += [] if studies is None else ["--studies", studies]
     for each in fields(asked):
         value = getattr(asked, each.name)
@@ -208,9 +208,9 @@ def _command(asked: Asked, out: Path, studies: str | None) -> str:
         if value is True:
             words.append(option)
         elif each.name in ("busbar", "band"):
-            words += [option, *(f"{limit:g}" for limit in value)]
+            words += [option, *value]
         elif isinstance(value, tuple):
             words += [word for name in value for word in (option, name)]
         else:
-            words += [option, f"{value:g}" if isinstance(value, float) else str(value)]
-    return shlex.join(words)
+            words += [option, value]
+    return command_line(words)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 from rich.markup import escape
 
+from feeders.command_line import command_line
 from gridsec.errors import FeederInvalid
 from service import console
 
@@ -57,8 +58,9 @@ def converted(feeder: str, out: Path | None) -> str:
     folder = (out or temporary or Path()) / FOLDER
     if folder.exists() and not (folder / CHANGES_FILE).is_file():
         raise FileExistsError(f"{folder}: already there, and no converted feeder; {feeder} would become it")
+    command = command_line(("gridsec", "feeders", "convert", feeder, "FOLDER"))
     advice = (
-        f"to choose: gridsec feeders convert {feeder} FOLDER, with --root BUS (the metered busbar) and "
+        f"to choose: {command}, with --root BUS (the metered busbar) and "
         "--open LINE (to cut a loop) or --meshed (to keep loops closed); then study FOLDER"
     )
     done: Conversion | None = None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import platform
-import shlex
 import time
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager
@@ -13,6 +12,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from feeders.command_line import command_line, word
 from feeders.files import replace_file
 from feeders.report.book import Report
 from feeders.report.sections import Outcome, Result
@@ -213,7 +213,7 @@ def _known(asked: Asked) -> list[str]:
 
 
 def _protection(asked: Asked) -> list[str]:
-    bound = [] if math.isnan(asked.lie_volt) else ["--lie-volt", f"{asked.lie_volt:g}"]
+    bound = [] if math.isnan(asked.lie_volt) else ["--lie-volt", word(asked.lie_volt)]
     goal = [] if asked.goal is None else ["--goal", asked.goal]
     return [*_liars(asked), *goal, *bound, *_known(asked)]
 
@@ -237,7 +237,7 @@ def _given(asked: Asked, *names: str) -> list[str]:
         value = getattr(asked, name)
         if value is not None:
             values = value if isinstance(value, tuple) else (value,)
-            words += [option(name), *(f"{one:g}" if isinstance(one, float) else one for one in values)]
+            words += [option(name), *map(word, values)]
     return words
 
 
@@ -307,7 +307,7 @@ def outcome(
             problem = str(error)
     duration = time.perf_counter() - start
     return Outcome(
-        name, found, problem, shlex.join(words), duration, resumed=name in kept.resumed, absent=absent
+        name, found, problem, command_line(words), duration, resumed=name in kept.resumed, absent=absent
     )
 
 

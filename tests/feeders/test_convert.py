@@ -7,6 +7,7 @@ import datetime
 import gzip
 import io
 import random
+import shlex
 import sys
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from feeders.convert_changes import sentences
 from feeders.convert_pandapower import Fleet, from_pandapower
 from feeders.convert_simbench import envelope, envelopes_csv, library_csv
 from feeders.load import from_tables, load, names
+from feeders.origin import origin
 from feeders.profiles import Season, data_root, envelopes
 from feeders.schema import read, validate
 from gridsec.errors import FeederInvalid, GridsecError
@@ -295,6 +297,48 @@ def test_simbench_code_alone_medium_voltage(tmp_path: Path) -> None:
     assert done.check is not None
     assert done.check.buses == 105
     assert done.check.largest_pu < 1e-6
+
+
+def test_a_folder_written_again_keeps_what_it_tells_of_its_source(tmp_path: Path) -> None:
+    convert("pandapower:case33bw", tmp_path / "a", name="first")
+    before = origin(tmp_path / "a")
+    assert before is not None
+    out = tmp_path / "with space"
+    done = convert(str(tmp_path / "a"), out, name="second")
+    after = origin(out)
+    assert after is not None
+    assert len(before.changes)
+    assert after.changes.to_csv() == before.changes.to_csv()
+    assert (after.source, after.about) == (before.source, before.about)
+    assert after.check == f"Before the folder was written again: {before.check}"
+    assert "nothing" not in (out / "SOURCE.md").read_text(encoding="utf-8").partition("## Checked")[0]
+    assert after.command.split("`, then `")[0] == before.command
+    again = ["gridsec", "feeders", "convert", str(tmp_path / "a"), str(out), "--name", "second"]
+    assert shlex.split(after.command.split("`, then `")[1]) == again
+    assert load(out).feeder.name == "second"
+    assert done.check is None
+
+
+def test_a_line_of_a_folder_is_opened_and_what_a_folder_cannot_take_is_refused(tmp_path: Path) -> None:
+    net = networks.case33bw()
+    net.line.loc[36, "in_service"] = True
+    pp.to_json(net, str(tmp_path / "looped.json"))
+    before = convert(str(tmp_path / "looped.json"), tmp_path / "a", meshed=True)
+    done = convert(str(tmp_path / "a"), tmp_path / "b", opened=["line-36"])
+    assert done.changes[:-1] == before.changes
+    assert (done.changes[-1].element, done.changes[-1].prop) == ("line line-36", "closed")
+    opened = {row.line: row.closed for row in read(tmp_path / "b").lines}
+    assert opened == {row.line: row.closed and row.line != "line-36" for row in read(tmp_path / "a").lines}
+    wrong = {"root": "s", "droop": "vde4105", "one_voltage": True, "opened": ["nosuch"]}
+    with pytest.raises(FeederInvalid) as caught:
+        convert(str(tmp_path / "a"), tmp_path / "c", **wrong)  # type: ignore[arg-type]
+    assert [problem.split(" is ")[0] for problem in caught.value.problems] == [
+        "root",
+        "droop",
+        "one_voltage",
+        "there",
+    ]
+    assert not (tmp_path / "c").exists()
 
 
 def test_unknown_sources(tmp_path: Path) -> None:

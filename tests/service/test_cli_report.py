@@ -10,6 +10,8 @@ import pandas as pd
 import pytest
 from playwright.sync_api import Browser
 
+from service.cli_report import _command
+from service.study_report import STUDIES, Asked
 from tests.service.commands import command, plain, text_of
 
 FEW = ("--studies", "redundancy,protect")
@@ -52,6 +54,28 @@ def test_a_report_and_everything_beside_it(
     assert code == 0
     assert "with work kept from before" in page.read_text(encoding="utf-8")
     assert {path.name: path.read_bytes() for path in (folder / "figures").iterdir()} == first
+
+
+def test_commands_in_a_report_say_exactly_what_was_asked() -> None:
+    asked = Asked(
+        feeder="my feeder",
+        goal="bound",
+        lie_volt=2501234.5,
+        unknown=("-5 x",),
+        step=1000000.5,
+        load_error_kw=0.12345678,
+        band=(0.9, 1.1000001),
+    )
+    words = shlex.split(_command(asked, Path("our report.html"), None))
+    assert words[3] == "my feeder"
+    assert words[words.index("--out") + 1] == "our report.html"
+    given = {"--lie-volt": (2501234.5,), "--step": (1000000.5,), "--load-error-kw": (0.12345678,)}
+    single = [word for study in STUDIES.values() for word in study.options(asked)]
+    for each in (words, single):
+        for option, values in (given | {"--band": (0.9, 1.1000001)}).items():
+            at = each.index(option) + 1
+            assert tuple(map(float, each[at : at + len(values)])) == values
+        assert each[each.index("--unknown") + 1] == "-5 x"
 
 
 def test_an_interrupted_report_goes_on(

@@ -45,7 +45,7 @@ def test_numbers_go_to_the_screen_to_a_file_and_into_a_document(
     assert text.endswith(f"{END}\nkept\n")
     assert "old" not in text
     assert "13 meters (errors: site), 9 inverters, M = 1, one run of 80 s at 1 s per case" in text
-    command = "gridsec study compare simbench-lv-rural1 --max-attacked 1 --seeds 1 --duration 80.0"
+    command = "gridsec study compare simbench-lv-rural1 --max-attacked 1 --seeds 1 --duration 80"
     assert f"    {command} --family sequential --family exact-bank --case bias\n" in text
     assert text.count("| exact-bank |") == 2
     assert text.count("not run") == len(FAMILIES) - 2

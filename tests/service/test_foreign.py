@@ -181,7 +181,7 @@ def test_a_report_tells_what_was_not_carried_over(
     [
         (("--max-attacked", "1"), command("study", "protect")),
         (("--scenarios", "2", "--duration", "30", "--workers", "1"), command("study", "campaign")),
-        (("--draws", "0", "--compare", "vde4105", "--preset", "vde4105", "--who", "all"),
+        (("--compare", "vde4105", "--preset", "vde4105", "--who", "all"),
          command("study", "droop")),
         (("--case", "clean", "--family", "sequential", "--seeds", "1", "--duration", "70"),
          command("study", "compare")),
