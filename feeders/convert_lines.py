@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -325,15 +326,13 @@ def _parallel(rows: list[LineRow], changes: list[Change]) -> LineRow:
     changes.append(Change(f"lines {names}", WHOLE, "changed", f"in parallel; one line {first.line}"))
     positive = [complex(row.r_ohm, row.x_ohm) for row in rows]
     total = 1.0 / sum(1.0 / z for z in positive)
-    limits = [
-        row.rating_a * abs(z) / abs(total) for row, z in zip(rows, positive, strict=True) if row.rating_a
-    ]
+    limit = _shared(rows, [abs(total) / abs(z) for z in positive])
     joined = replace(
         first,
         r_ohm=rounded(total.real),
         x_ohm=rounded(total.imag),
         b_us=rounded(sum(row.b_us for row in rows)),
-        rating_a=rounded(min(limits)) if len(limits) == len(rows) else None,
+        rating_a=None if math.isnan(limit) else rounded(limit),
     )
     zeros = [
         complex(row.r0_ohm, row.x0_ohm) for row in rows if row.r0_ohm is not None and row.x0_ohm is not None
@@ -347,29 +346,52 @@ def _parallel(rows: list[LineRow], changes: list[Change]) -> LineRow:
 def _side_by_side(rows: list[LineRow], names: str, changes: list[Change]) -> LineRow:
     """Join lines of any phases and matrices between the same buses: their admittances add up."""
     first = rows[0]
-    admittance: Phasors = np.zeros((3, 3), dtype=np.complex128)
+    each: list[Phasors] = []
     charge = np.zeros((3, 3))
     taps = np.full(3, np.nan)
     for row in rows:
         own = phases_of(row)
         here = np.ix_(own, own)
-        admittance[here] += np.linalg.inv(series_of(row)[here])
+        each.append(np.zeros((3, 3), dtype=np.complex128))
+        each[-1][here] = np.linalg.inv(series_of(row)[here])
         charge[here] += shunt_of(row)[here]
         taps[own] = np.where(np.isnan(taps[own]), np.array(row.taps)[own], taps[own])
         if np.abs(taps[own] - np.array(row.taps)[own]).max() > CYCLIC:
             effect = f"that of {first.line} beside it; the current that their difference drives is left out"
             changes.append(Change(f"line {row.line}", "tap", "approximated", effect))
+    admittance = np.sum(each, axis=0)
     phases = np.flatnonzero(admittance.diagonal())
     there = np.ix_(phases, phases)
+    series = np.asarray(np.linalg.inv(admittance[there]))
     changes.append(Change(f"lines {names}", WHOLE, "changed", f"side by side; one line {first.line}"))
     joined = line_row(
         first.line,
         (first.from_bus, first.to_bus),
         phases,
-        series=np.asarray(np.linalg.inv(admittance[there])),
+        series=series,
         shunt=1e-6 * charge[there],
         changes=changes,
     )
-    limit = min((row.rating_a for row in rows if row.rating_a is not None), default=None)
+    parts = [own[there] @ series for own in each]
+    # Of currents that are alike in all phases, as ratings are meant; single ones share by the diagonal.
+    balanced = np.exp(-2j * np.pi / 3.0 * phases)
+    limits = np.array([_shared(rows, share) for share in np.abs(parts @ balanced).T])
+    limit = None if np.isnan(limits).any() else rounded(float(limits.min()))
+    even = all(np.abs(part - np.diag(part.diagonal())).max() <= CYCLIC for part in parts)
+    if limit is not None and not (even and np.ptp(limits) <= CYCLIC * limit):
+        effect = f"{limit:g} A, the least of its conductors' in balanced currents"
+        changes.append(Change(f"lines {names}", "rating", "approximated", effect))
     joined = replace(joined, rating_a=limit, to_x=first.to_x, to_y=first.to_y, to_volt=first.to_volt)
     return with_taps(joined, taps)
+
+
+def _shared(rows: Sequence[LineRow], shares: Sequence[float] | Floats) -> float:
+    """Rating of lines in parallel, each with its share of the current; NaN if one of them has none."""
+    if any(row.rating_a is None for row in rows):
+        return math.nan
+    limits = (
+        row.rating_a / share
+        for row, share in zip(rows, shares, strict=True)
+        if row.rating_a is not None and share > 0.0
+    )
+    return float(min(limits))
