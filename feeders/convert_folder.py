@@ -7,8 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
+from feeders.convert_busbar import opened_rows
 from feeders.convert_changes import Change
-from feeders.convert_network import Converted, opened_rows
+from feeders.convert_network import Converted
 from feeders.convert_source import feeder_source, versioned
 from feeders.origin import Origin, origin
 from feeders.schema import FeederTables, read

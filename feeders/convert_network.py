@@ -7,14 +7,15 @@ customers that draw what flows into them.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
 
 from feeders.columns import SUSPICIONS
-from feeders.convert_changes import WHOLE, BusbarUnclear, Change
+from feeders.convert_busbar import busbar_of, chosen, named_bus, opened_rows
+from feeders.convert_changes import WHOLE, Change
 from feeders.convert_check import SourceState
 from feeders.convert_customers import USUAL_POWER_FACTOR, base_kva, with_meters
 from feeders.convert_draws import Draw, customers_of, idle_customers, is_even
@@ -23,7 +24,7 @@ from feeders.convert_levels import EVERYTHING, Extent, levels_of, transformed
 from feeders.convert_lines import balanced_charging, merged, turned
 from feeders.schema import FeederMeta, FeederTables, LineRow, LoadDefaults, validate
 from gridsec.arrays import Phasors
-from gridsec.errors import FeederInvalid, GridsecError
+from gridsec.errors import FeederInvalid
 
 UNFED: Final = "not supplied in the source"
 BEYOND: Final = "supplied in the source, but not through what the feeder has: see what is left out or opened"
@@ -155,7 +156,8 @@ def feeder_of(
     FeederInvalid
         With every reason why there is no feeder.
     """
-    part = below(network, root, opened, extent)
+    busbar = chosen(network, lambda: None if root is None else named_bus(network, root), opened, droop)
+    part = below(network, busbar, opened, extent)
     volt = network.nominal[part.busbar]
     rows, power = customers_of(part.draws, network.nominal, droop, part.changes)
     idle, taken = idle_customers(part.draws, power)
@@ -194,7 +196,7 @@ def below(network: Network, root: str | None, opened: Sequence[str], extent: Ext
     """
     changes = list(network.changes)
     rows = opened_rows(network.lines, opened, changes)
-    busbar = _busbar(network, rows, root)
+    busbar = busbar_of(network, rows, root)
     network, rows = transformed(network, rows, busbar, extent, changes)
     inside = reached(busbar, rows)
     problems = _infeeds(network, rows, busbar, inside)
@@ -258,97 +260,6 @@ def accepting(tables: FeederTables, changes: list[Change]) -> FeederTables:
             changes.append(Change("feeder", sentence, "accepted", "as the source has it"))
     accept = tuple(name for name in SUSPICIONS if name in doubts)
     return replace(tables, meta=replace(tables.meta, accept=accept)) if accept else tables
-
-
-def opened_rows(lines: Iterable[LineRow], opened: Sequence[str], changes: list[Change]) -> list[LineRow]:
-    """Open the lines that were asked for.
-
-    Parameters
-    ----------
-    lines
-        Rows of lines.csv.
-    opened
-        Names of lines.
-    changes
-        Takes what was opened.
-
-    Raises
-    ------
-    FeederInvalid
-        With every line that does not exist.
-    """
-    rows = list(lines)
-    unknown = sorted(set(opened) - {row.line for row in rows})
-    if unknown:
-        raise FeederInvalid(f"there is no line {line!r} to open" for line in unknown)
-    changes.extend(
-        Change(f"line {line}", "closed", "changed", "open, as asked for; the check shows what that does")
-        for line in opened
-    )
-    return [replace(row, closed=False) if row.line in opened else row for row in rows]
-
-
-def _busbar(network: Network, rows: list[LineRow], root: str | None) -> str:
-    """Return the bus asked for, or the first from the source on that has lines."""
-    if root is not None:
-        hits = [bus for bus in network.nominal if bus == root] or [
-            bus for bus in network.nominal if bus.lower() == root.lower()
-        ]
-        if len(hits) != 1:
-            raise GridsecError(f"there is no bus {root!r}")
-        return hits[0]
-    if len(network.sources) != 1:
-        names = ", ".join(network.sources) or "none"
-        raise BusbarUnclear(f"the busbar is not clear, voltage sources at: {names}; name it with root")
-    way = _way_down(network, rows)
-    if not _has_lines(way[-1], rows):
-        beyond = ", ".join(sorted(_beyond(network, way))) or "none"
-        raise BusbarUnclear(f"the busbar is not clear, candidates: {beyond}; name it with root")
-    return way[-1]
-
-
-def below_source(network: Network) -> str | None:
-    """Return the bus of the only source's only transformer on its other side; None if there is no such bus.
-
-    Parameters
-    ----------
-    network
-        The network.
-    """
-    way = _way_down(network, network.lines) if len(network.sources) == 1 else []
-    return way[-1] if len(way) > 1 and _has_lines(way[-1], network.lines) else None
-
-
-def one_busbar(buses: Collection[str], rows: Iterable[LineRow]) -> bool:
-    """Return whether buses are one, joined by closed switches.
-
-    Parameters
-    ----------
-    buses
-        Some buses.
-    rows
-        The network's lines.
-    """
-    return bool(buses) and fused_with(min(buses), rows).keys() >= set(buses)
-
-
-def _way_down(network: Network, rows: list[LineRow]) -> list[str]:
-    """Follow transformers from the source, as long as there is only one way and no line."""
-    way = [network.sources[0]]
-    while not _has_lines(way[-1], rows):
-        beyond = _beyond(network, way)
-        if not one_busbar(beyond, rows):
-            break
-        way.append(min(beyond))
-    return way
-
-
-def _has_lines(bus: str, rows: list[LineRow]) -> bool:
-    return any(row.closed and bus in (row.from_bus, row.to_bus) for row in rows)
-
-
-def _beyond(network: Network, way: list[str]) -> set[str]:
-    return {bus for each in network.couplings if way[-1] in each.buses for bus in each.buses} - set(way)
 
 
 def _infeeds(network: Network, rows: list[LineRow], busbar: str, inside: Mapping[str, int]) -> list[str]:

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
+from feeders.convert_busbar import below_source, chosen, one_busbar
 from feeders.convert_changes import WHOLE, BusbarUnclear, Change
 from feeders.convert_customers import (
     HOUSEHOLD_KW,
@@ -27,9 +28,10 @@ from feeders.convert_draws import ONLY_REACTIVE, SWITCHED_OFF, customers_of, idl
 from feeders.convert_graph import as_rows, reached
 from feeders.convert_levels import EVERYTHING, Extent
 from feeders.convert_lines import balanced_charging
-from feeders.convert_network import Converted, Network, below, below_source, finished, one_busbar
+from feeders.convert_network import Converted, Network, below, finished
 from feeders.convert_pandapower_flow import between_phases, phase_powers
-from feeders.convert_pandapower_net import ids, network_of
+from feeders.convert_pandapower_net import network_of
+from feeders.convert_pandapower_tables import ids, with_truths
 from feeders.profiles import envelopes, pv_names
 from feeders.schema import CustomerRow, FeederMeta, FeederTables, LoadDefaults, MonitorDefaults
 from gridsec.arrays import Phasors
@@ -127,9 +129,11 @@ def from_pandapower(
     FeederInvalid
         With every reason why there is no feeder below it.
     """
+    net = with_truths(net)
     network = network_of(net)
     names = ids(net.bus, "bus")
-    part = below(network, _root(net, network, names, root), opened, extent)
+    busbar = chosen(network, lambda: _root(net, network, names, root), opened, droop)
+    part = below(network, busbar, opened, extent)
     inside = {i for i, bus in names.items() if bus in part.inside}
     source = _Source(net, names, inside, part.changes, network.volts)
     customers = _customers(source, droop)
@@ -166,10 +170,10 @@ def _root(net: Any, network: Network, names: dict[int, str], wanted: str | None)
         if len(hits) != 1:
             raise GridsecError(f"{len(hits)} buses are called {wanted!r}; give the index of one")
         return names[hits[0]]
-    trafos = net.trafo[net.trafo.in_service]
+    trafos = net.trafo[net.trafo.in_service.astype(bool)]
     sides = sorted({int(bus) for bus in trafos.lv_bus})
     if not sides:
-        sides = sorted({int(bus) for bus in net.ext_grid.bus[net.ext_grid.in_service]})
+        sides = sorted({int(bus) for bus in net.ext_grid.bus[net.ext_grid.in_service.astype(bool)]})
     if one_busbar([names[bus] for bus in sides], network.lines):
         return names[sides[0]]
     found = below_source(network)

@@ -5,11 +5,9 @@ from __future__ import annotations
 import json
 import math
 import warnings
-from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from importlib.metadata import version
-from numbers import Real
 from typing import Any, Final
 
 import numpy as np
@@ -20,16 +18,12 @@ from feeders.convert_draws import Draw, as_it_stands
 from feeders.convert_lines import ALL, by_sequence, capacitor, charging_cells, open_end
 from feeders.convert_network import Network
 from feeders.convert_pandapower_flow import between_phases, flow_into, phase_powers, solve, unbalanced
+from feeders.convert_pandapower_tables import CARRIED, ids, number, problems_of
 from feeders.convert_two_ports import TwoPort, coupling_of
 from feeders.levels import same_level
 from feeders.schema import LineRow
 from gridsec.errors import FeederInvalid
 
-# Tables that are carried over, or told about one by one; every other row in the feeder earns a note.
-CARRIED: Final = {
-    "bus", "line", "load", "asymmetric_load", "asymmetric_sgen", "sgen", "switch", "trafo", "trafo3w",
-    "ext_grid", "gen", "storage", "motor", "ward", "xward", "shunt", "impedance",
-}  # fmt: skip
 FIXED: Final = {"gen": -1.0, "storage": 1.0, "motor": 1.0, "ward": 1.0, "xward": 1.0}
 """Tables of what becomes a customer as the source's power flow has it, and the sign of its results."""
 
@@ -53,32 +47,6 @@ NOTED: Final = {
 CURVES: Final = ("characteristic", "capability", "_table", "_spline")
 """Parts of the names of tables that other tables look values up in: those in force are carried over."""
 
-COLUMNS: Final = {
-    "bus": "name vn_kv in_service",
-    "line": "name from_bus to_bus length_km r_ohm_per_km x_ohm_per_km c_nf_per_km g_us_per_km max_i_ka df "
-    "parallel in_service",
-    "switch": "name bus element et closed",
-    "load": "name bus p_mw q_mvar scaling in_service",
-    "asymmetric_load": "name bus p_a_mw p_b_mw p_c_mw q_a_mvar q_b_mvar q_c_mvar scaling in_service",
-    "sgen": "name bus p_mw q_mvar sn_mva scaling in_service",
-    "asymmetric_sgen": "name bus p_a_mw p_b_mw p_c_mw q_a_mvar q_b_mvar q_c_mvar scaling in_service",
-    "ext_grid": "bus in_service",
-    "trafo": "name hv_bus lv_bus in_service",
-    "trafo3w": "name hv_bus mv_bus lv_bus in_service",
-    "shunt": "name bus p_mw q_mvar vn_kv step in_service",
-}
-"""What is needed of a net's tables."""
-
-NUMBERS: Final = {
-    "line": {
-        **dict.fromkeys(("length_km", "r_ohm_per_km", "x_ohm_per_km", "c_nf_per_km"), 0.0),
-        "parallel": 1.0,
-    },
-    "load": dict.fromkeys(("p_mw", "q_mvar", "scaling"), -math.inf),
-    "sgen": dict.fromkeys(("p_mw", "q_mvar", "scaling"), -math.inf),
-}
-"""Numbers without which a row says nothing, and the least that they can be."""
-
 UNLIMITED_KA: Final = 1000.0
 SWITCH_RX: Final = 2.0
 """R / X of the impedance of switches between buses, which pandapower's power flow takes by itself."""
@@ -87,88 +55,6 @@ SHUNTS: Final = ("gf_pu", "bf_pu", "gt_pu", "bt_pu")
 """Shunts at the two ends of an impedance."""
 
 SIDES: Final = {"trafo": ("hv", "lv"), "trafo3w": ("hv", "mv", "lv")}
-
-
-def ids(table: Any, noun: str, taken: Iterable[str] = ()) -> dict[int, str]:
-    """Return an id per row: the source's name where there is a unique one, otherwise with its index.
-
-    Parameters
-    ----------
-    table
-        A table of a net.
-    noun
-        What a row is called that has no name.
-    taken
-        Names that others have.
-    """
-    given = {int(i): _clean(name) for i, name in zip(table.index, table["name"], strict=True)}
-    count = Counter([*given.values(), *taken])
-    found: dict[int, str] = {}
-    for i, name in given.items():
-        own = name if name and count[name] == 1 else f"{name or noun}-{i}"
-        while own != name and count[own]:
-            own += "'"
-        found[i] = own
-        count[own] += own != name
-    return found
-
-
-def _clean(name: object) -> str:
-    text = "" if name is None or name != name else str(name)  # noqa: PLR0124  # NaN is the table's None
-    return "".join(c if c.isprintable() else " " for c in text).strip()[:100]
-
-
-def problems_of(net: Any) -> list[str]:
-    """Return everything that keeps a net's tables from being read.
-
-    Parameters
-    ----------
-    net
-        What a file held.
-    """
-    missing = [
-        f"the table {table!r} is missing" for table in COLUMNS if not hasattr(net.get(table), "columns")
-    ]
-    if missing:
-        return missing
-    problems = [
-        f"{table}: the column {column!r} is missing"
-        for table, columns in COLUMNS.items()
-        for column in columns.split()
-        if column not in net[table].columns
-    ]
-    if problems:
-        return problems
-    for table, columns in COLUMNS.items():
-        ends = [name for name in columns.split() if name == "bus" or name.endswith("_bus")]
-        for column in ends:
-            strange = net[table].index[~net[table][column].isin(net.bus.index)]
-            problems += [f"{table} {i}: {column} {net[table].at[i, column]} is no bus" for i in strange]
-    for kind, table in (("b", "bus"), ("l", "line")):
-        given = net.switch[net.switch.et == kind]
-        strange = given.index[~given.element.isin(net[table].index)]
-        problems += [f"switch {i}: element {net.switch.at[i, 'element']} is no {table}" for i in strange]
-    return problems + _numbers(net)
-
-
-def _numbers(net: Any) -> list[str]:
-    """Whatever is not a number, or not one that it can be."""
-    problems = []
-    if not isinstance(net.get("f_hz"), Real) or not 0.0 < net.f_hz < math.inf:
-        problems.append(f"f_hz is {net.get('f_hz')}; expected a frequency")
-    for table, columns in NUMBERS.items():
-        for column, least in columns.items():
-            values = np.asarray([_number(cell) for cell in net[table][column]], dtype=np.float64)
-            bad = net[table].index[~((values >= least) & np.isfinite(values))]
-            wanted = f"at least {least:g}" if math.isfinite(least) else "a number"
-            problems += [
-                f"{table} {i}: {column} is {net[table].at[i, column]}; expected {wanted}" for i in bad
-            ]
-    return problems
-
-
-def _number(cell: object) -> float:
-    return float(cell) if isinstance(cell, Real) else math.nan
 
 
 def network_of(net: Any) -> Network:
@@ -330,7 +216,7 @@ def _impedances(net: Any, buses: dict[int, str], network: Network) -> None:
 
 def _series(row: dict[str, Any], way: str) -> tuple[float, float]:
     """R and X of an impedance, pu of its own base; NaN where they are not known."""
-    r, x = (_number(row.get(f"{part}{way}_pu")) for part in "rx")
+    r, x = (number(row.get(f"{part}{way}_pu")) for part in "rx")
     return r, x
 
 
@@ -459,6 +345,8 @@ def _shunts(net: Any, buses: dict[int, str], network: Network) -> None:
             network.of_bus.append((bus, Change(label, WHOLE, "left out", "switched off in the source")))
             continue
         p, q = _at_its_step(net, row)
+        if p == q == 0.0:
+            network.of_bus.append((bus, Change(label, WHOLE, "left out", "draws nothing at its step")))
         if p != 0:
             network.of_bus.append((bus, Change(label, "conductance", "left out", f"{1e3 * p:.4g} kW")))
         if q > 0:

@@ -112,7 +112,7 @@ def test_loop_is_named_and_opened_when_asked(tmp_path: Path) -> None:
     done = convert(str(path), tmp_path / "x", root="root", opened=["ring"])
     assert done.check is not None
     assert not done.check.exact
-    assert "--open 'ring'" in (tmp_path / "x" / "SOURCE.md").read_text()
+    assert "--open ring" in (tmp_path / "x" / "SOURCE.md").read_text()
     pp.to_json(village(), str(path))
     # What the open cable's end still charges is all that is left between the two.
     assert check_against_source(str(path), tmp_path / "x", root="root").largest_pu < 1e-3
@@ -131,7 +131,7 @@ def test_single_phases_with_generators_and_a_folder_again(tmp_path: Path) -> Non
     roof = {row.customer: row for row in read(tmp_path / "x").customers}["roof"]
     assert (roof.phases, roof.pv_kw, roof.load_kw) == ("b", pytest.approx(4.0), 0.0)
     again = convert(str(tmp_path / "x"), tmp_path / "y")
-    assert (again.check, again.changes) == (None, ())
+    assert (again.check, again.changes) == (None, done.changes)
     assert read(tmp_path / "y") == read(tmp_path / "x")
 
 
@@ -175,6 +175,58 @@ def test_all_problems_of_a_net_at_once(tmp_path: Path) -> None:
     with pytest.raises(FeederInvalid) as caught:
         from_pandapower(fresh, "x")
     assert len(caught.value.problems) == 2
+
+
+def test_unknown_numbers_and_truths_of_any_table_are_told() -> None:
+    net = village()
+    pp.create_asymmetric_load(net, 2, p_a_mw=0.001, p_b_mw=np.nan)
+    pp.create_asymmetric_sgen(net, 2, p_a_mw=0.001, q_c_mvar=np.nan)
+    pp.create_shunt(net, 2, q_mvar=np.nan)
+    net.bus.loc[1, "vn_kv"] = np.nan
+    net.load["in_service"] = net.load["in_service"].astype(object)
+    net.load.loc[0, "in_service"] = np.nan
+    net.switch["closed"] = net.switch["closed"].astype(object)
+    net.switch.loc[0, "closed"] = None
+    with pytest.raises(FeederInvalid) as caught:
+        from_pandapower(net, "x")
+    assert len(caught.value.problems) == 6
+    for part in (
+        "asymmetric_load 0: p_b_mw is nan",
+        "asymmetric_sgen 0: q_c_mvar is nan",
+        "shunt 1: q_mvar is nan",
+        "bus 1: vn_kv is nan; expected above 0",
+        "load 0: in_service is nan; expected true or false",
+        "switch 0: closed is None",
+    ):
+        assert part in str(caught.value), part
+
+
+def test_truths_may_be_numbers_and_a_shunt_of_no_power_is_named() -> None:
+    net = village()
+    expected = from_pandapower(net, "x").tables
+    for table in ("load", "line", "trafo", "ext_grid", "bus"):
+        net[table]["in_service"] = net[table]["in_service"].astype(float)
+    pp.create_shunt(net, 2, q_mvar=0.0, name="none")
+    found = from_pandapower(net, "x")
+    assert found.tables == expected
+    assert "shunt none" in [each.element for each in found.changes]
+
+
+def test_a_wrong_busbar_hides_no_other_wrong_choice(tmp_path: Path) -> None:
+    net = village()
+    for wrong, count in (({"droop": "nosuch"}, 1), ({"opened": ["no", "none"]}, 2)):
+        with pytest.raises(FeederInvalid) as caught:
+            from_pandapower(net, "x", **wrong)  # type: ignore[arg-type]
+        assert len(caught.value.problems) == count
+    choices = {"root": "nowhere", "droop": "nosuch", "opened": ["no"]}
+    source = str(pgm(tmp_path / "town.json", 6, balanced=True))
+    pp.to_json(net, str(tmp_path / "village.json"))
+    for each in (source, str(tmp_path / "village.json")):
+        with pytest.raises(FeederInvalid) as caught:
+            convert(each, tmp_path / "x", **choices)  # type: ignore[arg-type]
+        told = caught.value.problems
+        assert len(told) == 3, told
+        assert all(part in told[k] for k, part in enumerate(("nowhere", "'no'", "'nosuch'")))
 
 
 def test_what_is_no_number_is_told_and_not_a_traceback() -> None:
