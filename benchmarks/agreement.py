@@ -21,6 +21,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 
+from benchmarks._arguments import arguments
 from feeders.campaign import NoSuchAttack
 from feeders.estimators import DIRECT, SEQUENTIAL, Watcher, choose, design
 from feeders.load import Site, load, to_frame
@@ -106,4 +107,4 @@ def main(count: int) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(int(sys.argv[1]) if len(sys.argv) > 1 else 1000))
+    sys.exit(main(arguments(__doc__, scenarios=1000).scenarios))

@@ -16,7 +16,6 @@ the busbar's meter does not lie.
 from __future__ import annotations
 
 import os
-import sys
 from dataclasses import dataclass, replace
 
 # Before NumPy loads its libraries.
@@ -25,6 +24,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 
+from benchmarks._arguments import arguments
 from feeders.estimators import design
 from feeders.lies import Lie, Trick
 from feeders.load import load
@@ -116,4 +116,4 @@ def main(seeds: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 5)
+    main(arguments(__doc__, seeds=5).seeds)

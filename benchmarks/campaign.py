@@ -25,6 +25,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from distributed import LocalCluster
 
+from benchmarks._arguments import arguments
 from feeders.load import load
 from feeders.studies.campaign import Campaign, campaign
 from feeders.studies.campaign_plan import Plan
@@ -126,5 +127,5 @@ def main(scenes: int, *, full: bool) -> int:
 
 
 if __name__ == "__main__":
-    numbers = [int(each) for each in sys.argv[1:] if each.isdigit()]
-    sys.exit(main(numbers[0] if numbers else SCENES, full="--full" in sys.argv))
+    asked = arguments(__doc__, scenes=SCENES, full=False)
+    sys.exit(main(asked.scenes, full=asked.full))

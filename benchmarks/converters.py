@@ -34,6 +34,7 @@ import numpy as np
 from power_grid_model import ComponentType, DatasetType, initialize_array
 from power_grid_model.utils import json_serialize_to_file
 
+from benchmarks._arguments import arguments
 from feeders.convert import Conversion, convert
 from feeders.convert_changes import WHOLE, Change
 from feeders.load import load
@@ -244,4 +245,4 @@ def main(words: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main(list(arguments(__doc__, words=()).words)))

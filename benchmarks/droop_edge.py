@@ -8,8 +8,9 @@ inverters are made larger by a common factor.
 
 from __future__ import annotations
 
-import sys
+from collections.abc import Sequence
 
+from benchmarks._arguments import arguments
 from feeders.load import load
 from feeders.studies.droop_fleets import Who, equip, point
 from feeders.studies.droop_verdict import Subject, edge
@@ -18,10 +19,16 @@ from gridsec.studies.droop_stability import Update, enlarged
 UPDATES = (Update(60.0), Update(60.0, 2), Update(1.0), Update(1.0, 1))
 
 
-def main() -> None:
-    """Print a row for each feeder and kind of update."""
+def main(feeders: Sequence[str]) -> None:
+    """Print a row for each feeder and kind of update.
+
+    Parameters
+    ----------
+    feeders
+        Names or folders.
+    """
     print("feeder, interval s, dead: proven, unstable, ratio")
-    for name in sys.argv[1:] or ["cigre-lv"]:
+    for name in feeders:
         site = load(name)
         subject, fleet, at = Subject.of(site), equip(site, "ieee1547-b", Who.ALL), point(site, 0.3, 0.3, 1.05)
         for update in UPDATES:
@@ -30,4 +37,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(arguments(__doc__, feeders=("cigre-lv",)).feeders)

@@ -15,7 +15,6 @@ CLEAN.
 from __future__ import annotations
 
 import os
-import sys
 from collections import Counter
 from dataclasses import replace
 
@@ -25,6 +24,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 
+from benchmarks._arguments import arguments
 from feeders.campaign import NoSuchAttack
 from feeders.estimators import SEQUENTIAL, Watcher, choose, design
 from feeders.lies import Lie, Trick, manipulations
@@ -95,4 +95,4 @@ def main(seeds: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 30)
+    main(arguments(__doc__, seeds=30).seeds)

@@ -22,6 +22,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 
+from benchmarks._arguments import arguments
 from feeders.estimators import design
 from feeders.lies import Lie, Trick
 from feeders.load import load
@@ -101,5 +102,5 @@ def main(seeds: int, feeders: tuple[str, ...]) -> int:
 
 
 if __name__ == "__main__":
-    given = sys.argv[1:]
-    sys.exit(main(int(given[0]) if given else 10, tuple(given[1:]) or FEEDERS))
+    asked = arguments(__doc__, seeds=10, feeders=FEEDERS)
+    sys.exit(main(asked.seeds, tuple(asked.feeders)))

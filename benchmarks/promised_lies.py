@@ -17,6 +17,7 @@ import time
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+from benchmarks._arguments import arguments
 from feeders.load import load
 from feeders.studies.detectable import detectable
 from feeders.studies.rehearsal import rehearse
@@ -52,6 +53,5 @@ def main(trials: int, feeders: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    arguments = sys.argv[1:]
-    count = int(arguments.pop(0)) if arguments and arguments[0].isdigit() else TRIALS
-    sys.exit(main(count, arguments or list(FEEDERS)))
+    asked = arguments(__doc__, trials=TRIALS, feeders=FEEDERS)
+    sys.exit(main(asked.trials, list(asked.feeders)))

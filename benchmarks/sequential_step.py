@@ -12,6 +12,7 @@ lie; steady state no worse than with the square of the number; 500 MB for 2 000.
 
 from __future__ import annotations
 
+import argparse
 import os
 import resource
 import subprocess
@@ -26,6 +27,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 
+from benchmarks._arguments import count
 from gridsec import sequential
 from gridsec.accuracy import MeterAccuracy
 from gridsec.arrays import Floats
@@ -250,8 +252,18 @@ def _draw(picture: str, sizes: Floats, rows: list[Measured]) -> None:
     figure.savefig(picture, dpi=110)
 
 
+def _asked() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("picture", nargs="?", help="draw the times into this file")
+    parser.add_argument("--one", type=count, metavar="N", help="measure N customers only, and print numbers")
+    return parser.parse_args()
+
+
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["--one"]:
-        print(*astuple(measure(int(sys.argv[2]))))
+    asked = _asked()
+    if asked.one is not None:
+        print(*astuple(measure(asked.one)))
         sys.exit(0)
-    sys.exit(main(sys.argv[1] if len(sys.argv) > 1 else None))
+    sys.exit(main(asked.picture))

@@ -11,13 +11,13 @@ were ever named, with what they were called last.
 
 from __future__ import annotations
 
-import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from benchmarks._arguments import arguments
 from feeders.estimators import SEQUENTIAL, Watcher, choose, design
 from feeders.load import Site, Snapshot, from_tables, load, to_frame
 from feeders.scenario import Scenario, simulate, snapshots
@@ -207,6 +207,5 @@ def main(step_s: float, seeds: int, days: float, feeders: Sequence[str] = FEEDER
 
 
 if __name__ == "__main__":
-    asked = [float(word) for word in sys.argv[1:4]]
-    step_s, seeds, days = (*asked, *(900.0, 3.0, 8.0)[len(asked) :])
-    main(step_s, int(seeds), days, sys.argv[4:] or FEEDERS)
+    asked = arguments(__doc__, step_s=900.0, seeds=3, days=8.0, feeders=FEEDERS)
+    main(asked.step_s, asked.seeds, asked.days, asked.feeders)

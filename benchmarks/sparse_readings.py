@@ -21,7 +21,6 @@ in the last ten ticks before anybody lies.
 from __future__ import annotations
 
 import os
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -32,6 +31,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 
+from benchmarks._arguments import arguments
 from feeders.estimators import design
 from feeders.load import Site, from_tables, load
 from feeders.meters import Channel, Silence
@@ -171,4 +171,5 @@ def main(seeds: int, feeder: str = FEEDER) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 5, *sys.argv[2:3])
+    asked = arguments(__doc__, seeds=5, feeder=FEEDER)
+    main(asked.seeds, asked.feeder)

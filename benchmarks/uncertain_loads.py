@@ -24,6 +24,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 
+from benchmarks._arguments import arguments
 from feeders.estimators import Watcher, design
 from feeders.load import Site, from_tables, load
 from feeders.scenario import START
@@ -216,5 +217,5 @@ def _counts(cell: Cell, outcomes: list[Outcome]) -> tuple[int, int, int]:
 
 
 if __name__ == "__main__":
-    wanted = dict(enumerate(sys.argv))
-    sys.exit(main(int(wanted.get(1, 20)), wanted.get(2, FEEDER), float(wanted.get(3, LOAD_KW))))
+    asked = arguments(__doc__, seeds=20, feeder=FEEDER, kw=LOAD_KW)
+    sys.exit(main(asked.seeds, asked.feeder, asked.kw))

@@ -3,18 +3,58 @@
 from __future__ import annotations
 
 import importlib
+import re
+import runpy
 from pathlib import Path
 
 import pytest
+
+from benchmarks._arguments import arguments
 
 ROOT = Path(__file__).parents[1]
 MODULES = sorted(
     ".".join(file.relative_to(ROOT).with_suffix("").parts)
     for file in (ROOT / "benchmarks").rglob("*.py")
-    if file.stem not in {"__init__", "__main__"}
+    if not file.stem.startswith("__")
 )
+ASKING = [
+    name
+    for name in MODULES
+    if "._" not in name
+    and re.search(
+        r"import arguments$|ArgumentParser\(",
+        (ROOT / f"{name.replace('.', '/')}.py").read_text(encoding="utf-8"),
+        re.MULTILINE,
+    )
+]
 
 
 @pytest.mark.parametrize("name", MODULES)
 def test_every_benchmark_can_be_imported(name: str) -> None:
     assert importlib.import_module(name).__doc__
+
+
+@pytest.mark.parametrize("name", ASKING)
+def test_a_benchmark_that_is_asked_for_help_gives_it_and_does_nothing_else(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for words, code in ((["--help"], 0), (["--nosuch"], 2)):
+        monkeypatch.setattr("sys.argv", [name, *words])
+        with pytest.raises(SystemExit) as ended:
+            runpy.run_path(str(ROOT / f"{name.replace('.', '/')}.py"), run_name="__main__")
+        assert ended.value.code == code
+    assert capsys.readouterr().out.startswith("usage: ")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_arguments_of_benchmarks_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    usual = {"seeds": 5, "kw": 0.6, "full": False, "feeders": ("a", "b")}
+    monkeypatch.setattr("sys.argv", ["x"])
+    assert vars(arguments("", **usual)) == usual
+    monkeypatch.setattr("sys.argv", ["x", "3", "--full", "0.5", "c"])
+    assert vars(arguments("", **usual)) == {"seeds": 3, "kw": 0.5, "full": True, "feeders": ["c"]}
+    for wrong in (["0"], ["x"], ["1.5"], ["1", "nan"], ["1", "-1"]):
+        monkeypatch.setattr("sys.argv", ["x", *wrong])
+        with pytest.raises(SystemExit):
+            arguments("", **usual)
