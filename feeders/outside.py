@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 from gridsec.errors import DesignInfeasible, GridsecError, NotObservable
 
 if TYPE_CHECKING:
-    from feeders.estimators import Job
+    from feeders.family import Job
     from feeders.load import Site
 
 GROUP: Final = "gridsec.estimators"
