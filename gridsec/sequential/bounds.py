@@ -33,7 +33,7 @@ import numpy as np
 from gridsec.accuracy import told_error
 from gridsec.arrays import Bools, Floats, any_of
 from gridsec.frames import NO_VOLTAGE, busbar_errors, losses
-from gridsec.network import by_place, hangs_on, reach
+from gridsec.network import bus_voltages, by_place, hangs_on, reach
 from gridsec.online import Estimate, Frame
 from gridsec.plant import Plant
 from gridsec.sequential.design import SequentialDesign
@@ -128,6 +128,29 @@ class Powers:
         v0 = self.v0_squared
         correction, off = losses(plant, self.frame.p, self.q, v0, p_error=p_error, q_error=q_error)
         return off, correction[plant.feeder.bus]
+
+    def bent(self, plant: Plant, which: Bools) -> Floats:
+        """What some customers' reports change at each meter, but for the linear effect of active power, (p,).
+
+        That is what a direction of the dictionary leaves of a report that is false: its reactive power, and
+        what the losses of both have added to the model.
+
+        Parameters
+        ----------
+        plant
+            The feeder.
+        which : (N,)
+            The customers.
+        """
+        if not any_of(which):
+            return np.zeros(plant.meters.size)
+        p, q = (np.stack([of, np.where(which, 0.0, of)]) for of in (self.frame.p, self.q))
+        with np.errstate(all="ignore"):
+            all_ = bus_voltages(plant.feeder, p, q, self.v0_squared, steps=plant.loss_correction)
+            active = bus_voltages(plant.feeder, p, q[0], self.v0_squared, steps=0)
+            off: Floats = np.abs((all_[1] - all_[0]) - (active[1] - active[0]))
+        at = plant.feeder.bus[plant.meters]
+        return np.minimum(np.nan_to_num(off[at], nan=NO_VOLTAGE), NO_VOLTAGE)
 
     def errors(self, plant: Plant, injected: Floats) -> tuple[Floats, Floats]:
         """How far the net powers may be off, (N,) each.

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, all_of, any_of
+from gridsec.sequential.bounds import Powers
 from gridsec.sequential.busbar import Doubt, Honest, aligned, opposed, weight
 from gridsec.sequential.conditional import Fit, drop, judge
 from gridsec.sequential.decoder import Accused, Evidence
@@ -96,7 +97,7 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats, hon
             if over or phases:
                 search = Search(design, scales, fits, trust, s)
                 outcome, believed = search(now, view) if over else (search.likeliest(now, view), trust)
-                outcome, liar = _without_busbar(search, outcome, now, doubt, phases)
+                outcome, liar = _without_busbar(search, outcome, now, (doubt, honest.powers), phases)
                 if liar is not None:
                     return Examined(state.trust, fits, (None,) * len(fits), {}, (liar, s))
                 # Where no meter was beyond chance nobody is suspected for what is said of the busbar.
@@ -129,18 +130,27 @@ def _beyond(design: SequentialDesign, here: Scale, now: Fit, honest: Honest, pha
     return [phase for phase in phases if not could[phase]]
 
 
-def _disputed(
-    design: SequentialDesign, here: Scale, best: Solution, doubt: Doubt, phases: list[int]
-) -> list[int]:
+def _disputed(search: Search, best: Solution, beyond: tuple[Doubt, Powers], phases: list[int]) -> list[int]:
     """Phases whose busbar those whom an explanation believes contradict too, or where it accuses many."""
     if not phases:
         return phases
+    design, here, (doubt, powers) = search.design, search.here, beyond
     accused = here.enough & ~best.trusted
     if np.count_nonzero(accused) > design.most:
         return phases
-    left = opposed(design, doubt, best.fit, best.judged)
+    bent = powers.bent(design.plant, _claimed(search, best))
+    left = opposed(design, replace(doubt, model=doubt.model + bent), best.fit, best.judged)
     many = _MANY * (accused @ design.hangs_on) > here.enough @ design.hangs_on
     return [phase for phase in phases if phase in left or many[phase]]
+
+
+def _claimed(search: Search, best: Solution) -> Bools:
+    """Customers who claim much, and whose powers are false if an explanation is right or may be, (N,)."""
+    design = search.design
+    out = np.zeros(design.customers, dtype=np.bool_)
+    out[design.plant.meters[search.here.enough & ~best.trusted]] = True
+    out[[k for k in best.loosened if k < design.customers]] = True
+    return out & (search.book.std[: design.customers] > design.options.hidden_power)
 
 
 # More than one in so many must be accused on a phase before its busbar's meter is doubted by that alone.
@@ -148,7 +158,7 @@ _MANY = 3
 
 
 def _without_busbar(
-    search: Search, found: Found, now: Fit, doubt: Doubt, phases: list[int]
+    search: Search, found: Found, now: Fit, beyond: tuple[Doubt, Powers], phases: list[int]
 ) -> tuple[Found, int | None]:
     """What was found, and the phase of the busbar of which it is far likelier that its meter lies.
 
@@ -156,7 +166,7 @@ def _without_busbar(
     can be told apart where the others do without.
     """
     design, here = search.design, search.scales[search.s]
-    phases = _disputed(design, here, found.best, doubt, phases)
+    phases = _disputed(search, found.best, beyond, phases)
     if not phases:
         return found, None
     each = [search.beside_busbar(now, phase) for phase in phases]

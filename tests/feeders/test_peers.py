@@ -27,7 +27,8 @@ from benchmarks.peers.measure import (
 )
 from benchmarks.peers.ours import Covariance
 from benchmarks.peers.scene import SIZE, Cell, Scene, mean, scene, snapshot
-from benchmarks.peers.served import suspects
+from benchmarks.peers.served import frame, suspects, watch
+from gridsec import sequential
 from gridsec.feeder import lindistflow
 
 FEEDER = "rural1-behind"
@@ -147,3 +148,26 @@ def test_honest_meters_that_contradict_a_false_power_are_not_accused_for_being_m
     cell = Cell(FEEDER, 0.001, 0.1, "coord+pq", 3)
     told = snapshot(scene(FEEDER), cell, np.random.default_rng([5, trial, 3]), 60)
     np.testing.assert_array_equal(suspects(scene(FEEDER), told), told.liars)
+
+
+@pytest.mark.parametrize(
+    ("feeder", "liars", "trial"),
+    [("rural1-behind", 2, 4), ("rural1-behind", 2, 9), ("rural1-behind", 2, 26), ("rural3-behind", 3, 17)],
+)
+def test_a_false_report_accuses_no_honest_neighbour_and_not_the_busbar(
+    feeder: str, liars: int, trial: int
+) -> None:
+    """A load that is not there bends all voltages, by its reactive power and its losses as well.
+
+    Either the busbar was accused of what these are, or two dozen neighbours, since the likeliest power to be
+    false was found before the liars were.
+    """
+    cell = Cell(feeder, 0.001, 0.1, "coord+pq", liars)
+    told = snapshot(scene(feeder), cell, np.random.default_rng([2026, trial, liars]), 60)
+    design = watch(scene(feeder), told)
+    state = sequential.init(design, 0.0)
+    for t in range(20):
+        state, _, verdict = sequential.step(design, state, frame(told, t))
+        assert not verdict.busbar.any()
+        assert not (verdict.suspects & ~told.liars).any()
+    np.testing.assert_array_equal(verdict.suspects, told.liars)
