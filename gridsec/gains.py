@@ -248,7 +248,10 @@ def negativity(matrix: Floats) -> float:
     if np.any(diagonal >= 0.0):
         return -float(np.max(diagonal)) / size if size > 0.0 and np.max(diagonal) > 0.0 else -np.inf
     scale = 1.0 / np.sqrt(-diagonal)
-    scaled = scale[:, None] * matrix * scale
+    with np.errstate(over="ignore", invalid="ignore"):
+        scaled = scale[:, None] * matrix * scale
+    if not np.isfinite(scaled).all():
+        return -np.inf  # an entry that is so large beside its two on the diagonal has a positive direction
     eigenvalues = np.linalg.eigvalsh(0.5 * (scaled + scaled.T))
     rounding = 4.0 * len(matrix) * np.finfo(np.float64).eps * float(np.max(np.abs(eigenvalues)))
     return float(-eigenvalues[-1]) - rounding

@@ -127,6 +127,8 @@ def test_negativity_of_what_is_no_number_or_empty() -> None:
     assert negativity(np.array([[np.nan]])) == -np.inf
     assert negativity(np.zeros((2, 2))) == -np.inf
     assert negativity(np.zeros((0, 0))) == np.inf
+    tiny = np.finfo(np.float64).tiny / 10.0
+    assert negativity(np.array([[-tiny, 0.5], [0.5, -tiny]])) == -np.inf
     # On the boundary there is no margin: rounding could have made it.
     assert negativity(-np.ones((3, 3))) <= 0.0
 
