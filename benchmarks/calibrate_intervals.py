@@ -22,6 +22,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 
+from benchmarks._arguments import count, positive
 from feeders.load import Site, load
 from feeders.meters import Channel, MeterErrors, Meters
 from feeders.recording import record
@@ -66,13 +67,14 @@ def errors(site: Site, what: Recorded, seed: int, folder: Path) -> tuple[Floats,
 
 def main(recordings: int, feeders: list[str], what: Recorded) -> None:
     """Count and print."""
+    each_way = max(1, recordings // 2)
     print("| feeder | q metered | recordings | intervals that hold, % | rms | largest | with a proposal |")
     print("|---|---|---|---|---|---|---|")
     for feeder in feeders:
         site = load(feeder)
         for told in (False, True):
             z, proposed = [], 0
-            for k in range(recordings // 2):
+            for k in range(each_way):
                 with tempfile.TemporaryDirectory() as folder:
                     each, any_ = errors(site, what, 2 * k + told, Path(folder))
                 z.append(each)
@@ -80,16 +82,16 @@ def main(recordings: int, feeders: list[str], what: Recorded) -> None:
             all_ = np.concatenate(z)
             held, rms = 100.0 * np.mean(np.abs(all_) < SURE), np.sqrt(np.mean(all_**2))
             largest = f"{np.abs(all_).max():.1f}"
-            cells = (feeder, "yes" if told else "no", recordings // 2, f"{held:.0f}", f"{rms:.2f}", largest)
+            cells = (feeder, "yes" if told else "no", each_way, f"{held:.0f}", f"{rms:.2f}", largest)
             print("| " + " | ".join(map(str, (*cells, proposed))) + " |", flush=True)
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(prog="python -m benchmarks.calibrate_intervals", description=__doc__)
-    parser.add_argument("recordings", type=int, nargs="?", default=16)
+    parser.add_argument("recordings", type=count, nargs="?", default=16)
     parser.add_argument("feeders", nargs="*", default=list(FEEDERS))
-    parser.add_argument("--days", type=float, default=4.0)
-    parser.add_argument("--step", type=float, default=900.0, help="interval of the readings, s")
+    parser.add_argument("--days", type=positive, default=4.0)
+    parser.add_argument("--step", type=positive, default=900.0, help="interval of the readings, s")
     parser.add_argument("--hidden-kw", type=float, default=0.2)
     wanted = parser.parse_args()
     main(wanted.recordings, wanted.feeders, Recorded(wanted.days, wanted.step, wanted.hidden_kw))

@@ -6,6 +6,8 @@ from collections.abc import Iterable
 from enum import StrEnum
 from typing import TypeVar
 
+from gridsec.errors import refuse
+
 __all__ = ["choice", "each_choice", "no_choice"]
 
 Choice = TypeVar("Choice", bound=StrEnum)
@@ -44,8 +46,7 @@ def each_choice(name: str, kind: type[Choice], values: Iterable[str]) -> tuple[C
     """
     given = tuple(values)
     problems = no_choice(name, kind, *given)
-    if problems:
-        raise ValueError("; ".join(problems))
+    refuse(problems)
     return tuple(kind(value) for value in given)
 
 

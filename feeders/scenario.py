@@ -25,6 +25,7 @@ from feeders.truth import Block, net_reactive, truth
 from feeders.variation import Variation
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.attack import Attack, InverterAttack, Reports, apply_all, manipulated, reach
+from gridsec.errors import refuse
 from gridsec.network import busbar_places
 
 if TYPE_CHECKING:
@@ -442,5 +443,4 @@ def check(site: Site, scenario: Scenario) -> None:
         if attack.t_off > then and reach(attack, then) > LONGEST_LOOK_BACK_S:
             back = reach(attack, then)
             problems.append(f"an attack looks back {back:.0f} s, further than can be played")
-    if problems:
-        raise ValueError("; ".join(problems))
+    refuse(problems)

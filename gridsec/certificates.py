@@ -448,14 +448,9 @@ def _quadratic_rate(P: Floats, multiplier: Floats, form: _Form) -> float:
     return float(eigenvalues[0] - rounding * np.max(np.abs(eigenvalues))) / 2.0
 
 
-def _decays(rate: float) -> bool:
-    """Whether a claimed rate claims anything: errors that may grow are no convergence."""
-    return bool(np.isfinite(rate) and rate > 0.0)
-
-
 def _quadratic_margin(P: Floats, multiplier: Floats, rate: float, form: _Form) -> float:
     """Slack of `_quadratic_rate` over the claimed rate, relative to the slowest inverter."""
-    sound = _decays(rate) and np.all(multiplier > 0) and np.array_equal(P, P.T)
+    sound = 0.0 < rate < np.inf and np.all(multiplier > 0) and np.array_equal(P, P.T)
     if not sound:
         return -np.inf
     return (_quadratic_rate(P, multiplier, form) - rate) * float(np.max(form.tau))
@@ -463,7 +458,7 @@ def _quadratic_margin(P: Floats, multiplier: Floats, rate: float, form: _Form) -
 
 def _small_gain_margin(weights: Floats, rate: float, form: _Form) -> float:
     """Slack of `T^-1 (I - D |S|) c >= rate c`, relative to the slowest inverter."""
-    if not (_decays(rate) and np.all(weights > 0)):
+    if not (0.0 < rate < np.inf and np.all(weights > 0)):
         return -np.inf
     loop = form.slope * (np.abs(form.S) @ weights) / weights
     rounding = 2.0 * weights.size * np.finfo(np.float64).eps * (1.0 + loop)

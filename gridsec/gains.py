@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gridsec.arrays import Floats, Ints, frozen
-from gridsec.errors import DesignInfeasible
+from gridsec.errors import DesignInfeasible, refuse
 from gridsec.lure import Lure
 
 # A meter that moves the observer by less than this part of what it could is not listened to.
@@ -70,8 +70,7 @@ class CircleOptions:
             )
             if bad
         ]
-        if problems:
-            raise ValueError("; ".join(problems))
+        refuse(problems)
         if not np.any(self.noise > 0.0):
             raise ValueError("at least one meter must have a noise scale above zero")
 

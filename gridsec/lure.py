@@ -22,7 +22,7 @@ from scipy.linalg import expm
 
 from gridsec.arrays import Floats, Ints, exponential_integrals, frozen, perron_bound
 from gridsec.droop import Droop
-from gridsec.errors import FeederInvalid
+from gridsec.errors import FeederInvalid, refuse
 from gridsec.feeder import LinDistFlow
 from gridsec.network import Network, Power, columns
 from gridsec.newton import Nonlinearity, settle
@@ -70,8 +70,7 @@ class Lure:
             for name, shape in wanted.items()
             if getattr(self, name).shape != shape
         ]
-        if wrong:
-            raise ValueError("; ".join(wrong))
+        refuse(wrong)
 
     @classmethod
     def of(

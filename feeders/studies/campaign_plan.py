@@ -26,6 +26,7 @@ from feeders.profiles import Season, library
 from feeders.trials import LoadError, Meters, Trial
 from feeders.variation import Variation
 from gridsec.arrays import Ints
+from gridsec.errors import refuse
 
 if TYPE_CHECKING:
     from feeders.load import Site
@@ -268,8 +269,7 @@ class Plan:
             ),
         )
         problems = [problem for problem, wrong in checks if wrong]
-        if problems:
-            raise ValueError("; ".join(problems))
+        refuse(problems)
 
     @classmethod
     def of(cls, site: Site, **chosen: Any) -> Plan:
@@ -414,8 +414,7 @@ class Plan:
                 problems.append(f"{name!r} is no setting of an estimator")
             elif isinstance(known[name], int) and not float(value).is_integer():
                 problems.append(f"{name} is {value}; expected a whole number")
-        if problems:
-            raise ValueError("; ".join(problems))
+        refuse(problems)
         # A whole number stays one, whatever the setting was written as.
         chosen = {name: type(known[name])(value) for name, value in self.settings}
         if self.learn_s:

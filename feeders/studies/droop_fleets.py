@@ -14,7 +14,7 @@ from feeders.studies.bases import Bases
 from feeders.studies.hidden import customer_indices
 from gridsec.arrays import Floats, Ints
 from gridsec.droop import Droop, fleet
-from gridsec.errors import FeederInvalid
+from gridsec.errors import FeederInvalid, refuse
 from gridsec.studies.droop_network import Box
 
 if TYPE_CHECKING:
@@ -227,8 +227,7 @@ def box(
         *range_problem("generation", pv_low, pv_high),
         *range_problem("busbar voltage", v0_low, v0_high),
     ]
-    if problems:
-        raise ValueError("; ".join(problems))
+    refuse(problems)
     known = site.loads
     return Box(
         p_low=pv_low * known.pv_peak - load_high * known.load_peak,

@@ -9,6 +9,7 @@ from typing import Final
 
 from feeders.studies.droop_fleets import Who, range_problem
 from gridsec.droop import PRESETS
+from gridsec.errors import refuse
 from gridsec.studies.droop_stability import Update
 
 __all__ = ["DroopOptions", "band_problem"]
@@ -85,8 +86,7 @@ class DroopOptions:
 
     def __post_init__(self) -> None:
         problems = [*self._fleet_problems(), *self._limit_problems(), *self._hosting_problems()]
-        if problems:
-            raise ValueError("; ".join(problems))
+        refuse(problems)
 
     def _fleet_problems(self) -> Iterator[str]:
         presets = [name for name in (self.preset, *self.presets) if name is not None]

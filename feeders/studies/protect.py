@@ -22,7 +22,7 @@ from feeders.studies.hidden import Attack, Curves, knowledge, meter_mask
 from feeders.studies.journal import Journal, Where
 from feeders.studies.operating import SHARE, box, false_powers, squared, volts_of_lie
 from gridsec.arrays import Bools, Ints
-from gridsec.errors import DesignInfeasible
+from gridsec.errors import DesignInfeasible, refuse
 from gridsec.studies.false_powers import FalsePowers, largest_of
 from gridsec.studies.lies import Box, largest_lie
 from gridsec.studies.patterns import Patterns, fewest_meters
@@ -301,8 +301,7 @@ def check(
     ):
         if wrong:
             problems.append(problem)
-    if problems:
-        raise ValueError("; ".join(problems))
+    refuse(problems)
 
 
 def _unmet(liars: Sequence[str]) -> str:

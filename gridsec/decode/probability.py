@@ -123,8 +123,7 @@ def quadratic_probability(values: Floats, limit: float, *, tol: float) -> float:
     top = float(np.max(values, initial=0.0))
     if not np.all(np.isfinite(values) & (values >= -_ROUNDING * top)):
         raise ValueError("weights must be finite and not negative")
-    if not limit >= 0.0:
-        raise ValueError(f"limit is {limit}; it must be a number that is not negative")
+    not_negative("limit", limit)
     used = values[values > 0.0]
     if limit == 0.0 or used.size == 0:
         return float(used.size == 0)

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from scipy.linalg import expm
 
 from gridsec.arrays import Floats, exponential_integrals, frozen, spectral_radius
+from gridsec.errors import refuse
 from gridsec.lure import Lure, as_floats, input_matrices
 from gridsec.newton import Nonlinearity
 
@@ -74,8 +75,7 @@ class DiscreteLure:
             wrong.append("a lower slope exceeds its upper slope")
         if not (np.isfinite(self.h) and self.h > 0.0):
             wrong.append(f"h is {self.h}; the time between steps must be positive")
-        if wrong:
-            raise ValueError("; ".join(wrong))
+        refuse(wrong)
 
     @classmethod
     def of(

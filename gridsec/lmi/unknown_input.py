@@ -27,7 +27,7 @@ from typing import Any, Literal
 import numpy as np
 
 from gridsec.arrays import Floats, frozen
-from gridsec.errors import DesignInfeasible
+from gridsec.errors import DesignInfeasible, refuse
 from gridsec.lmi.solver import cvxpy_late, solver_warnings_as_status
 
 Multiplier = Literal["diagonal", "scalar"]
@@ -80,8 +80,7 @@ class ErrorSystem:
             for name, shape in wanted.items()
             if getattr(self, name).shape != shape
         ]
-        if wrong:
-            raise ValueError("; ".join(wrong))
+        refuse(wrong)
         if not np.all(self.N > 0.0):
             raise ValueError("every sensor must have a positive error scale N")
         if np.any(self.half < 0.0):

@@ -28,6 +28,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, submatrix
+from gridsec.errors import refuse
 from gridsec.network import one_busbar
 from gridsec.sequential.conditional import invert
 from gridsec.sequential.design import SequentialDesign
@@ -341,8 +342,7 @@ def from_arrays(design: SequentialDesign, arrays: Mapping[str, Floats]) -> Commi
         If it does not fit; the message names every problem.
     """
     problems = _problems(design, arrays)
-    if problems:
-        raise ValueError("; ".join(problems))
+    refuse(problems)
     learned = Learned(*(arrays[name] for name in _KNOWN))
     if not any_of(np.isfinite(arrays["since"])):
         return Commission(learned, None)

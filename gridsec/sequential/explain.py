@@ -292,7 +292,7 @@ class Search:
         if min(np.count_nonzero(believed), np.count_nonzero(accused)) < 2:
             return np.inf
         ours, freedom = self._alike(best, believed)
-        if ours[self.s] - best.judged.misfit > freedom + _CHANCE * np.sqrt(2.0 * freedom):
+        if _beyond_chance(ours[self.s] - best.judged.misfit, freedom):
             return np.inf  # those it accuses do not tell one lie
         theirs, _ = self._alike(other, accused)
         return self._beside(best, other, ours, theirs)
@@ -324,8 +324,7 @@ class Search:
 
     def _unexplained(self, best: Solution) -> bool:
         """Whether more is left of the readings of those who are believed than chance leaves."""
-        freedom = np.count_nonzero(best.trusted)
-        return bool(best.judged.misfit > freedom + _CHANCE * np.sqrt(2.0 * freedom))
+        return _beyond_chance(best.judged.misfit, int(np.count_nonzero(best.trusted)))
 
     def _sets(self, found: Found) -> list[Bools]:
         """Whom the cheapest explanations believe, each set once.
@@ -431,6 +430,11 @@ class Search:
     def _believe(self, best: Explanation) -> Trust:
         accused = (*self.accused, *((k, self.s) for k in best.loosened))
         return believe(self.trust, self._trusted(best), self.s, accused)
+
+
+def _beyond_chance(left: float, freedom: int) -> bool:
+    """Whether a misfit of so many degrees of freedom is more than chance leaves."""
+    return bool(left > freedom + _CHANCE * np.sqrt(2.0 * freedom))
 
 
 def _linked(link: Bools) -> list[Ints]:

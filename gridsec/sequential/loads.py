@@ -18,6 +18,7 @@ import numpy as np
 from gridsec.accuracy import MeterAccuracy
 from gridsec.arrays import Floats, Ints
 from gridsec.droop import Droop
+from gridsec.errors import refuse
 from gridsec.network import Network, Power, bus_voltages, by_place, covariance, one_busbar, variances
 from gridsec.sequential.conditional import Prior
 
@@ -67,8 +68,7 @@ class LoadDoubt:
             for name in ("common_p", "common_q", "lasting", "together")
             if not (np.greater_equal(getattr(self, name), 0) & np.less_equal(getattr(self, name), 1)).all()
         ]
-        if problems:
-            raise ValueError("; ".join(problems))
+        refuse(problems)
 
 
 def prior(

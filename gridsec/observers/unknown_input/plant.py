@@ -20,7 +20,7 @@ from typing import Literal
 import numpy as np
 
 from gridsec.arrays import Floats, Ints, frozen
-from gridsec.errors import DesignInfeasible
+from gridsec.errors import DesignInfeasible, refuse
 from gridsec.lmi.sampled import DiscreteLure, sample
 from gridsec.lmi.unknown_input import ErrorSystem
 from gridsec.lure import Lure
@@ -69,8 +69,7 @@ class UnknownInputPlant:
             problems.append(f"drift has shape {self.drift.shape}; expected ({n}, d)")
         if self.span.shape != (n,) or not np.all(self.span > 0.0):
             problems.append(f"span must be positive, of shape ({n},)")
-        if problems:
-            raise ValueError("; ".join(problems))
+        refuse(problems)
 
     @property
     def scale(self) -> Floats:
