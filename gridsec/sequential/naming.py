@@ -16,7 +16,9 @@ from gridsec.arrays import Bools, Ints, all_of, any_of
 from gridsec.online import Explanation
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.examine import Examined
-from gridsec.sequential.search import swaps
+from gridsec.sequential.exchanges import swaps, turns
+from gridsec.sequential.scales import View
+from gridsec.sequential.search import Found
 from gridsec.sequential.state import Trust
 
 # An accusation of an inverter counts up with every tick that repeats it, and down with every other.
@@ -24,7 +26,7 @@ MOST_COUNTED = 12
 
 
 def name(
-    design: SequentialDesign, before: Trust, seen: Examined, live: Bools
+    design: SequentialDesign, before: Trust, seen: Examined, live: Bools, agrees: Bools
 ) -> tuple[Trust, tuple[Explanation, ...]]:
     """Who is named now; and explanations that fit about as well where somebody would have been named.
 
@@ -38,6 +40,8 @@ def name(
         What this tick brought.
     live : (p,)
         Which meters have a reading: silence clears nobody.
+    agrees : (m,)
+        Inverters whose metered injections are those of their curves: nobody else's is theirs.
     """
     trust = seen.trust
     if trust.calm and before.calm:
@@ -53,14 +57,23 @@ def name(
     need = design.confirmed[trust.scale]
     fresh = ~trusted & ~before.named & trust.bad.any(axis=0) & (age >= need) & _accused(seen, trusted.size)
     named = before.named & (quiet < design.options.release)
-    count, inverters = _inverters(design, before, trust)
+    count, inverters = _inverters(design, before, trust, seen)
     new = inverters & ~before.inverters
-    rivals = _rivals(design, seen, fresh, new) if any_of(fresh) or any_of(new) else ()
+    rivals = _Rivals(design, before.named, fresh, new, agrees)(seen) if any_of(fresh) or any_of(new) else ()
     for rival in rivals:
         fresh = fresh & rival.meters
         inverters = inverters & (before.inverters | rival.inverters)
-    trust = replace(trust, trusted=trusted, age=age, quiet=quiet, owed=owed, named=named | fresh)
-    return replace(trust, counted=count, inverters=inverters), rivals
+    trust = replace(
+        trust,
+        trusted=trusted,
+        age=age,
+        quiet=quiet,
+        owed=owed,
+        named=named | fresh,
+        counted=count,
+        inverters=inverters,
+    )
+    return trust, rivals
 
 
 def _accused(seen: Examined, meters: int) -> Bools:
@@ -71,8 +84,11 @@ def _accused(seen: Examined, meters: int) -> Bools:
     return out
 
 
-def _inverters(design: SequentialDesign, before: Trust, trust: Trust) -> tuple[Ints, Bools]:
-    """How long every inverter has been accused, and which are named, (m,) each."""
+def _inverters(design: SequentialDesign, before: Trust, trust: Trust, seen: Examined) -> tuple[Ints, Bools]:
+    """How long every inverter has been accused, and which are named, (m,) each.
+
+    As with meters, only where the likeliest explanation of this very tick accuses it.
+    """
     accused = [k for k, _ in trust.accused]
     if not accused and not any_of(before.counted):
         return before.counted, before.inverters
@@ -84,7 +100,8 @@ def _inverters(design: SequentialDesign, before: Trust, trust: Trust) -> tuple[I
     for k, s in trust.accused:
         if k >= design.customers:
             need[k - design.customers] = min(confirmed[s], MOST_COUNTED)
-    return count, (before.inverters & (count > 0)) | (now & (count >= need))
+    sought = inverters_of(design, [k for found in seen.found.values() for k in found.best.loosened])
+    return count, (before.inverters & (count > 0)) | (now & sought & (count >= need))
 
 
 def inverters_of(design: SequentialDesign, accused: Sequence[int]) -> Bools:
@@ -125,32 +142,59 @@ def _suspicions(design: SequentialDesign, accused: Sequence[int]) -> Bools:
     return out
 
 
-def _rivals(design: SequentialDesign, seen: Examined, fresh: Bools, new: Bools) -> tuple[Explanation, ...]:
-    """All explanations about as likely as the best, where one leaves out somebody about to be named."""
-    within = 2.0 * float(np.log(design.options.like))
-    out: dict[bytes, tuple[Bools, Bools, float, tuple[int, ...]]] = {}
-    for s, found in seen.found.items():
-        best, view = found.best, seen.views[s]
-        near = [(~each.trusted, each.loosened, each.cost - best.cost) for each in (best, *found.others)]
-        exchanges = swaps(best, np.isfinite(best.judged.offset), within, view.limits) if view else []
-        for swap in exchanges:
+class _Rivals:
+    """Explanations about as likely as the best, where one leaves out somebody about to be named.
+
+    named: who is named already. fresh, new: meters and inverters that are about to be, (p,) and (m,). agrees:
+    inverters that none can be taken for.
+    """
+
+    def __init__(
+        self, design: SequentialDesign, named: Bools, fresh: Bools, new: Bools, agrees: Bools
+    ) -> None:
+        self.design, self.named, self.fresh, self.new = design, named, fresh, new
+        self.others = design.customers + np.flatnonzero(~agrees)
+        self.within = 2.0 * float(np.log(design.options.like))
+        self.out: dict[bytes, tuple[Bools, Bools, float, tuple[int, ...]]] = {}
+
+    def __call__(self, seen: Examined) -> tuple[Explanation, ...]:
+        """All of them, the likeliest first; none where everybody is named by all."""
+        for s, found in seen.found.items():
+            view = seen.views[s]
+            if view is not None:
+                self._collect(found, view)
+        ways = sorted(self.out.values(), key=lambda way: -way[2])
+        if not any(self._differs(meters, inverters) for meters, inverters, *_ in ways):
+            return ()
+        design, total = self.design, sum(way[2] for way in ways)
+        return tuple(
+            Explanation(
+                meters, inverters, weight / total, powers_of(design, loosened), _busbar_of(design, loosened)
+            )
+            for meters, inverters, weight, loosened in ways
+        )
+
+    def _collect(self, found: Found, view: View) -> None:
+        """Those of one scale."""
+        best, within, heard = found.best, self.within, view.enough | self.named
+        near = [
+            (heard & ~each.trusted, each.loosened, each.cost - best.cost) for each in (best, *found.others)
+        ]
+        for swap in swaps(best, view.enough, within, view.limits):
             other = near[0][0].copy()
             other[swap.accused], other[swap.innocent] = False, True
             near.append((other, best.loosened, swap.worse))
+        accused = (self.design.customers + np.flatnonzero(self.new)).tolist()
+        for turn in turns(best, self.design.book, accused, self.others, within):
+            loosened = tuple(turn.innocent if k == turn.accused else k for k in best.loosened)
+            near.append((near[0][0], loosened, turn.worse))
         for k, (meters, loosened, worse) in enumerate(near):
-            inverters = inverters_of(design, loosened)
-            differs = any_of(fresh & ~meters) or any_of(new & ~inverters)
-            if not k or (worse <= within and differs):
+            inverters = inverters_of(self.design, loosened)
+            if not k or (worse <= within and self._differs(meters, inverters)):
                 who, weight = meters.tobytes() + inverters.tobytes(), float(np.exp(-0.5 * worse))
-                if who not in out or out[who][2] < weight:
-                    out[who] = (meters, inverters, weight, loosened)
-    ways = sorted(out.values(), key=lambda way: -way[2])
-    if not any(any_of(fresh & ~meters) or any_of(new & ~inverters) for meters, inverters, *_ in ways):
-        return ()
-    total = sum(way[2] for way in ways)
-    return tuple(
-        Explanation(
-            meters, inverters, weight / total, powers_of(design, loosened), _busbar_of(design, loosened)
-        )
-        for meters, inverters, weight, loosened in ways
-    )
+                if who not in self.out or self.out[who][2] < weight:
+                    self.out[who] = (meters, inverters, weight, loosened)
+
+    def _differs(self, meters: Bools, inverters: Bools) -> bool:
+        """Whether somebody about to be named is left out."""
+        return any_of(self.fresh & ~meters) or any_of(self.new & ~inverters)

@@ -161,7 +161,8 @@ def _judge(
     if seen.trust.calm and now.trust.calm:
         return seen, now.window, ()
     over = ended(design, now.trust, seen, now.window)
-    trust, rivals = name(design, now.trust, _acquit(seen, over), look.heard.live)
+    agrees = now.curves.agrees(design)
+    trust, rivals = name(design, now.trust, _acquit(seen, over), look.heard.live, agrees)
     trust = _distrust(trust, look.copies)
     rivals = rivals or _undecided(design, now.last, before, trust)
     seen = seen if trust is seen.trust else replace(seen, trust=trust)
@@ -192,7 +193,8 @@ def _undecided(
     design: SequentialDesign, last: tuple[Estimate, Verdict] | None, before: Trust, trust: Trust
 ) -> tuple[Explanation, ...]:
     """The last explanations, as long as the same are suspected: they are not looked for at every tick."""
-    if last is None or design.decoder is not None or all_of(trust.trusted):
+    anybody = not all_of(trust.trusted) or any_of(trust.counted)
+    if last is None or design.decoder is not None or not anybody:
         return ()
     names = ("trusted", "named", "inverters")
     same = all(np.array_equal(getattr(trust, name), getattr(before, name)) for name in names)

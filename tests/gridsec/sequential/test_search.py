@@ -13,8 +13,9 @@ from gridsec.arrays import Bools, Floats
 from gridsec.feeder import lindistflow
 from gridsec.sequential.conditional import Prior, fit, judge
 from gridsec.sequential.dictionary import Dictionary
+from gridsec.sequential.exchanges import swaps
 from gridsec.sequential.loads import LoadDoubt, prior
-from gridsec.sequential.search import Limits, descend, price, robust, swaps
+from gridsec.sequential.search import Limits, descend, price, robust
 from tests.gridsec.street import random_tree
 
 SIGMAS = 3.5
