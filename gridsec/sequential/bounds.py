@@ -213,7 +213,8 @@ def follow(
         # The map is monotone: from above its images stay above the error.
         top = np.where(which, span, np.maximum(before.error, target))
         lost, _ = powers.lost(plant, droop.per_customer(top, size))
-        known = np.where(metered, busbar_errors(plant, powers.v0_squared, design.sigmas[0]), NO_VOLTAGE)
+        meter = np.minimum(busbar_errors(plant, powers.v0_squared, design.sigmas[0]), NO_VOLTAGE)
+        known = np.where(metered, meter, NO_VOLTAGE)
         busbar = by_place(plant.feeder, known)[plant.feeder.bus]
         for _ in range(_ROUNDS):
             model = powers.linear(plant, droop.per_customer(top, size)) + lost + busbar

@@ -94,13 +94,13 @@ class Doubt:
         Standard deviations beyond which an offset is none of chance.
     model : (p,)
         What the model may be off, squared pu.
-    metered
-        Whether there is a busbar voltage that is believed; in three phases (3,).
+    metered : (b,)
+        Whether there is a busbar voltage that is believed.
     """
 
     sigmas: float
     model: Floats
-    metered: Bools | bool
+    metered: Bools
 
 
 def opposed(design: SequentialDesign, doubt: Doubt, now: Fit, judged: Judged) -> list[int]:

@@ -367,6 +367,7 @@ def _problems(design: SequentialDesign, arrays: Mapping[str, Floats]) -> list[st
         return problems
     widest, at, since = design.allowed * _ROUNDED, arrays["at"], arrays["since"]
     count, time_s = arrays["count"], arrays["time_s"]
+    idle = np.isnan(since) & (not design.options.commission_s > 0)
     # Comparisons with NaN are false: whatever is no number breaks its rule.
     rules = {
         "bias is beyond the class": np.abs(arrays["bias"]) <= widest,
@@ -375,7 +376,7 @@ def _problems(design: SequentialDesign, arrays: Mapping[str, Floats]) -> list[st
         "allowed is not within the class": (arrays["allowed"] >= 0) & (arrays["allowed"] <= widest),
         "at is no time": np.isnan(at) | np.isfinite(at),
         "since is no time": np.isnan(since) | np.isfinite(since),
-        "neither learned nor being learned": np.isfinite(at) ^ np.isfinite(since),
+        "neither learned nor being learned": (np.isfinite(at) ^ np.isfinite(since)) | (idle & np.isnan(at)),
         "total is no number": np.isfinite(arrays["total"]),
         "count is no number of readings": np.isfinite(count) & (count >= 0) & (count == np.floor(count)),
         "time_s is no time": np.isfinite(time_s) & (time_s >= 0),

@@ -194,7 +194,9 @@ def compare(design: SequentialDesign, before: Curves, now: Evidence) -> Curves:
     droop, at, size = design.plant.droop, design.plant.meters, design.customers
     own = np.bincount(droop.customer, minlength=size) > 0
     asked = now.reported[at] & now.trusted & own[at]
-    if now.fit is None or now.judged is None or not (any_of(asked) or any_of(before.count)):
+    if now.fit is None or now.judged is None:
+        return before
+    if not (any_of(asked) or any_of(before.count)):
         return before if before.idle else empty(at.size, droop.tau.size)
     x, error, slope, span = (
         droop.per_customer(of, size)[at] for of in (now.x, now.lag.error, droop.slope, now.lag.span)
@@ -207,12 +209,15 @@ def compare(design: SequentialDesign, before: Curves, now: Evidence) -> Curves:
     count = np.where(asked, np.clip(before.count + np.where(off, _EACH, -1), 0, _MOST), before.count)
     lasts = (count >= _ENOUGH) | (before.off & (count > 0))
     share, beyond = np.zeros(at.size), before.sure.copy()
-    for j in np.flatnonzero(lasts & asked).tolist():
-        told = bool(now.told[at[j]])
-        share[j], sigmas = _share(design, now.fit, judged.weights, j, float(amount[j]), told=told)
-        beyond[j] |= sigmas > design.sigmas[0]
-    share = np.where(asked, share, before.share * lasts)
     amount = np.where(asked, amount, before.amount) * lasts
+    for j in np.flatnonzero(lasts).tolist():
+        told = bool(asked[j] and now.told[at[j]])
+        share[j], sigmas = _share(design, now.fit, judged.weights, j, float(amount[j]), told=told)
+        beyond[j] |= bool(asked[j] and sigmas > design.sigmas[0])
+    # Who reports no more stays accused, unless the voltages say that it is over.
+    over = lasts & ~asked & (share <= 1.0 / design.options.like)
+    count = np.where(over, count - 1, count)
+    share = np.where(asked | over, share, before.share * lasts)
     sure = lasts & beyond & ((share >= 1.0 - 1.0 / design.options.like) | (before.sure & (share >= 0.5)))
     least, most = (of[at] for of in droop.saturated(size))
     enough = asked & (room < np.maximum(most - x, x - least))

@@ -27,7 +27,7 @@ from gridsec.sequential.decoder import Decoder
 from gridsec.sequential.dictionary import Dictionary
 from gridsec.sequential.effects import Effects
 from gridsec.sequential.kinds import Shapes, Traces, pace
-from gridsec.sequential.loads import LoadDoubt, injection_doubt, prior
+from gridsec.sequential.loads import UNMETERED, LoadDoubt, injection_doubt, prior
 from gridsec.sequential.repeats import rules
 
 YEAR_S = 365.25 * 86400.0
@@ -272,10 +272,10 @@ def design(
     lure = close_loop(plant.feeder, plant.droop, meters)
     effects = Effects(plant.feeder)
     injections = injection_doubt(plant.droop, plant.accuracy, meters, plant.feeder.bus.size)
-    busbar = busbar_error(plant.accuracy, plant.droop.vbar**2, 2.0) / 2.0
+    busbar = min(busbar_error(plant.accuracy, plant.droop.vbar**2, 2.0) / 2.0, UNMETERED)
     lengths = _lengths(options.scales_s, step_s)
     accuracy, slope = plant.accuracy, 2.0 * _HIGH * plant.droop.vbar
-    white = slope**2 * (accuracy.jitter**2 + accuracy.resolution**2 / 12.0)
+    white = np.maximum(slope**2 * (accuracy.jitter**2 + accuracy.resolution**2 / 12.0), _WHITE)
     fixed = slope**2 * accuracy.class_fraction**2 / 3.0
     known = prior(plant.feeder, plant.feeder.bus[meters], doubt, busbar=busbar, inverters=injections)
     suspect = -float(ndtri(0.5 * options.suspect / meters.size))
@@ -337,6 +337,9 @@ def _most_power(feeder: Network, power: Power) -> Floats:
     return np.asarray(_COLLAPSE / np.maximum(2.0 * own(feeder, power), _COLLAPSE / _NO_POWER))
 
 
+# Least variance of a reading, squared pu^2: two perfect meters at one bus are equal, and such a matrix has no
+# inverse.
+_WHITE = 1e-12
 # Voltage at which a meter's relative errors are turned into squared ones, in parts of the nominal.
 _HIGH = 1.03
 

@@ -1,7 +1,7 @@
 """How much less the frames know of powers than the design supposes, and what then holds on every scale.
 
 A mean over some ticks contains residuals of all of them, so on each scale a customer's power is as uncertain
-as it was at worst within the ticks of that scale.
+as it was at worst within the ticks of that scale, and the busbar is known only where it was at all of them.
 
 References
 ----------
@@ -32,8 +32,10 @@ class Doubts:
         mean of a scale was made with.
     p_calm, q_calm : (s, N)
         For how many ticks a smaller one would have done.
-    busbar
-        Whether there is a busbar voltage; in three phases (3,).
+    busbar : (s, b)
+        Whether there was a busbar voltage at all ticks of a scale; b is 3 in three phases, else 1.
+    busbar_calm : (s, b)
+        For how many ticks there has been one where there was none at all of them.
     priors : (s,)
         What follows.
     sizes : (k,)
@@ -47,7 +49,8 @@ class Doubts:
     q: Floats
     p_calm: Ints
     q_calm: Ints
-    busbar: Bools | bool
+    busbar: Bools
+    busbar_calm: Ints
     priors: tuple[Prior, ...]
     sizes: Floats
     heard: Doubts | None = None
@@ -61,9 +64,10 @@ def none(design: SequentialDesign) -> Doubts:
     design
         The design.
     """
-    shape = (len(design.lengths), design.customers)
-    one, never = np.ones(shape), np.zeros(shape, dtype=np.intp)
-    return Doubts(one, one, never, never, True, (design.prior,) * len(design.lengths), design.book.std)
+    scales, phases = len(design.lengths), design.hangs_on.shape[1]
+    one, never = np.ones((scales, design.customers)), np.zeros((scales, design.customers), dtype=np.intp)
+    known, unbroken = np.ones((scales, phases), dtype=np.bool_), np.zeros((scales, phases), dtype=np.intp)
+    return Doubts(one, one, never, never, known, unbroken, (design.prior,) * scales, design.book.std)
 
 
 # Frames that claim to know loads so much less well than the design assumes are believed.
@@ -106,30 +110,31 @@ def _doubts(design: SequentialDesign, before: Doubts, frame: Frame, busbar: Bool
     p, p_calm = _factors(frame.p_error, design.doubt.p, before.p, before.p_calm, lengths)
     q, q_calm = _factors(frame.q_error, design.doubt.q, before.q, before.q_calm, lengths)
     sizes = _claims(np.abs(frame.p), design.options.hidden_power, before.sizes)
-    alike = busbar is before.busbar or np.array_equal(busbar, before.busbar)
-    if alike and p is before.p and q is before.q:
+    metered, calm = _metered(busbar, before.busbar, before.busbar_calm, lengths)
+    if metered is before.busbar and p is before.p and q is before.q:
         return before if sizes is before.sizes else replace(before, sizes=sizes)
-    same = np.full(len(lengths), alike)
-    for new, old in ((p, before.p), (q, before.q)):
+    same = np.ones(len(lengths), dtype=np.bool_)
+    for new, old in ((p, before.p), (q, before.q), (metered, before.busbar)):
         if new is not old:
             same &= (new == old).all(axis=1)
     if all_of(same):
-        return replace(before, sizes=sizes, p_calm=p_calm, q_calm=q_calm)
+        return replace(before, sizes=sizes, p_calm=p_calm, q_calm=q_calm, busbar_calm=calm)
     priors: list[Prior] = []
     for s, known in enumerate(before.priors):
         if same[s]:
             priors.append(known)
             continue
         # Scales that are in doubt about the same share what follows.
-        shared = (k for k in range(s) if np.array_equal(p[k], p[s]) and np.array_equal(q[k], q[s]))
+        shared = (k for k in range(s) if all(np.array_equal(of[k], of[s]) for of in (p, q, metered)))
         k = next(shared, None)
-        priors.append(_prior(design, p[s], q[s], busbar) if k is None else priors[k])
-    return Doubts(p, q, p_calm, q_calm, busbar, tuple(priors), sizes)
+        priors.append(_prior(design, p[s], q[s], metered[s]) if k is None else priors[k])
+    return Doubts(p, q, p_calm, q_calm, metered, calm, tuple(priors), sizes)
 
 
-def _prior(design: SequentialDesign, p: Floats, q: Floats, busbar: Bools | bool) -> Prior:
-    if np.all(busbar) and all_of(p == 1.0) and all_of(q == 1.0):
+def _prior(design: SequentialDesign, p: Floats, q: Floats, busbar: Bools) -> Prior:
+    if all_of(busbar) and all_of(p == 1.0) and all_of(q == 1.0):
         return design.prior
+    unknown = np.where(busbar, design.busbar, UNMETERED)
     doubt = replace(
         design.doubt,
         p=np.where(p > 1.0, np.maximum(design.doubt.p, _EXACT) * p, design.doubt.p),
@@ -139,7 +144,7 @@ def _prior(design: SequentialDesign, p: Floats, q: Floats, busbar: Bools | bool)
         design.plant.feeder,
         design.prior.meters,
         doubt,
-        busbar=design.busbar if np.all(busbar) else np.where(busbar, design.busbar, UNMETERED),
+        busbar=unknown if unknown.size > 1 else float(unknown[0]),
         inverters=design.injections,
     )
 
@@ -152,6 +157,18 @@ def _claims(power: Floats, least: float, before: Floats) -> Floats:
         return before
     new = np.where(fine, old, np.exp2(np.ceil(np.log2(np.maximum(power, least)))))
     return np.concatenate([new, before[power.size :]])
+
+
+def _metered(busbar: Bools | bool, old: Bools, calm: Ints, lengths: tuple[int, ...]) -> tuple[Bools, Ints]:
+    """On which scales the busbar is known: where no residual is remembered that was made without it.
+
+    Such residuals are as far off as it had moved meanwhile, and all meters alike.
+    """
+    now = np.asarray(busbar)
+    if all_of(now) and all_of(old):
+        return old, calm
+    known = now & (old | (calm + 1 >= np.array(lengths)[:, None]))
+    return known, np.where(now & ~known, calm + 1, 0)
 
 
 def _factors(

@@ -68,7 +68,7 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats, hon
     honest
         What all other errors are bounded by.
     """
-    fits, tick, trust, metered = state.fits, state.ticks, state.trust, state.doubts.busbar
+    fits, tick, trust = state.fits, state.ticks, state.trust
     calm = trust.calm
     trust = trust if calm else _own(trust)
     views: list[View | None] = []
@@ -91,7 +91,8 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats, hon
             over = any_of(view.over & trust.trusted)
             over = over or _due(design, trust, view, s, tick, searched=bool(found))
             # Once something is beyond chance, less is suspected too.
-            doubt = Doubt(min(design.suspect, design.sigmas[s]) if over else design.sigmas[s], model, metered)
+            sigmas = min(design.suspect, design.sigmas[s]) if over else design.sigmas[s]
+            doubt = Doubt(sigmas, model, state.doubts.busbar[s])
             phases = opposed(design, doubt, now, view.judged)
             phases = phases if over else _beyond(design, here, now, honest, phases)
             if over or phases:
@@ -109,8 +110,9 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats, hon
             view = view_of(design, here, now)
             weight(design, now)
         if not calm:
-            # A scale that has caught somebody and does not know enough yet has not changed its mind.
-            stands = view.still | ((trust.owed > 0) & (trust.scale == s))
+            # A scale that has caught somebody and does not know enough, yet or any more, stands by it.
+            owed = (trust.owed > 0) & (trust.scale == s)
+            stands = np.where(view.enough, view.still, trust.still[s]) | owed
             trust.bad[s], trust.still[s] = view.over & ~trust.trusted, stands & ~trust.trusted
         views.append(view)
         after.append(now)

@@ -65,7 +65,7 @@ def possible(design: SequentialDesign, frame: Frame) -> Frame:
 
 def _possible(power: Floats, error: Floats, most: Floats) -> tuple[Floats, Floats]:
     good = np.abs(power) <= most
-    known = good & (np.abs(error) <= most)
+    known = good & (error >= 0.0) & (error <= most)
     if all_of(known):
         return power, error
     return np.where(good, power, 0.0), np.where(known, error, most)
@@ -85,7 +85,8 @@ def clean(design: SequentialDesign, state: SequentialState, frame: Frame) -> Hea
     live = frame.seen & np.isfinite(frame.y)
     told = np.zeros(frame.q.size, dtype=np.bool_)
     # As `possible` has it: who is sure of nothing tells nothing.
-    reported = (np.abs(frame.q_net) <= design.most_q) & (np.abs(frame.q_net_error) <= design.most_q)
+    within = (frame.q_net_error >= 0.0) & (frame.q_net_error <= design.most_q)
+    reported = (np.abs(frame.q_net) <= design.most_q) & within
     if any_of(reported):
         trusted = np.zeros(frame.q.size, dtype=np.bool_)
         trusted[plant.meters] = live & state.trust.trusted

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of
-from gridsec.online import Estimate, Verdict
+from gridsec.online import Estimate, Frame, Verdict
 from gridsec.sequential.bounds import Lag
 from gridsec.sequential.bounds import start as no_lag
 from gridsec.sequential.busbar import Busbar
@@ -89,6 +89,8 @@ class SequentialState:
     ----------
     t, since
         Time of the last frame used, and of the first one, s.
+    frame
+        The last one used; None before the first.
     ticks
         Frames used.
     x : (m,) or None
@@ -99,8 +101,6 @@ class SequentialState:
         How far the injections may be from the true ones.
     v0_squared
         Last squared busbar voltage that was believed, pu; in three phases (3,).
-    unmetered
-        For how many frames there has been none; in three phases (3,).
     busbar
         What is thought of its meter.
     window
@@ -130,13 +130,13 @@ class SequentialState:
     """
 
     t: float
+    frame: Frame | None
     since: float
     ticks: int
     x: Floats | None
     free: Free | None
     lag: Lag
     v0_squared: Floats | float
-    unmetered: Ints | int
     busbar: Busbar
     window: Window
     trust: Trust
@@ -179,13 +179,13 @@ def init(
     none = np.zeros((s, p), dtype=np.bool_)
     return SequentialState(
         t=t,
+        frame=None,
         since=t,
         ticks=0,
         x=None,
         free=None,
         lag=no_lag(design.plant, np.zeros(m)),
         v0_squared=design.plant.droop.vbar**2,
-        unmetered=0,
         busbar=believed_busbar(design.hangs_on.shape[1]),
         window=empty(design.lengths, p),
         trust=Trust(

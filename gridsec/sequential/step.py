@@ -25,7 +25,7 @@ from gridsec.sequential.heard import Heard, clean, possible
 from gridsec.sequential.kinds import Kinds, describe, listen, suspicious
 from gridsec.sequential.naming import name
 from gridsec.sequential.state import SequentialState, Trust
-from gridsec.sequential.windows import Window, forget, forget_last, push, shift
+from gridsec.sequential.windows import Window, empty, forget, push, shift
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,7 +95,7 @@ def _look(design: SequentialDesign, state: SequentialState, frame: Frame) -> _Lo
     x, free, lag = _inverters(design, state, frame, heard, doubts.sizes)
     q, v2_bus = _voltages(design, frame, heard, x)
     residual = heard.y - v2_bus[design.prior.meters] - state.learned.bias
-    window = push(_remembered(design, state, heard.busbar), design.lengths, residual, heard.live)
+    window = push(_remembered(design, state, frame.t), design.lengths, residual, heard.live)
     swing = _swing(design, v2_bus, heard.v0_squared)
     if state.ticks % _STALE == 0 or swing > max(_GROWN * state.swing, _CALM):
         error = _model_error(design, frame.p, q, heard.v0_squared)
@@ -116,13 +116,13 @@ def _answer(design: SequentialDesign, look: _Look, frame: Frame) -> tuple[Sequen
     after = replace(
         state,
         t=frame.t,
+        frame=frame,
         since=frame.t if state.x is None else state.since,
         ticks=state.ticks + 1,
         x=look.x,
         free=look.free,
         lag=look.lag if seen.trust.calm else look.lag.lied_to(_lied_to(design, state.trust, seen.trust)),
         v0_squared=heard.v0_squared,
-        unmetered=np.where(heard.busbar, 0, state.unmetered + 1),
         window=window,
         trust=seen.trust,
         fits=seen.fits,
@@ -131,9 +131,12 @@ def _answer(design: SequentialDesign, look: _Look, frame: Frame) -> tuple[Sequen
         kinds=_kinds(design, state, look.kinds, seen, window, v2, own),
         learning=_gathered(design, look, seen.trust, frame.t - state.t),
     )
+    tick = Tick(frame, heard, look.q, look.v2_bus, look.transient, seen, rivals)
+    after, estimate, verdict = conclude(design, after, tick)
     if after.learning is not state.learning:
+        # Only from the next frame on: this one was judged by what was known before.
         after = _learned(design, after)
-    return conclude(design, after, Tick(frame, heard, look.q, look.v2_bus, look.transient, seen, rivals))
+    return after, estimate, verdict
 
 
 def _lied_to(design: SequentialDesign, before: Trust, now: Trust) -> Bools:
@@ -169,18 +172,11 @@ def _judge(
     return seen, forget(now.window, over), rivals
 
 
-def _remembered(design: SequentialDesign, state: SequentialState, busbar: Bools | bool) -> Window:
-    """The residuals so far; where the busbar voltage is back, not those of the time without it.
-
-    They are as far off as it had moved meanwhile, and all meters alike.
-    """
-    if not any_of(np.asarray(state.unmetered)):
+def _remembered(design: SequentialDesign, state: SequentialState, t: float) -> Window:
+    """The residuals so far; none after a pause of the frames as long as the longest scale: loads moved on."""
+    if t - state.t < design.lengths[-1] * design.step_s or state.x is None:
         return state.window
-    since = np.where(busbar, state.unmetered, 0)
-    if not any_of(since):
-        return state.window
-    feeder, at = design.plant.feeder, design.prior.meters
-    return forget_last(state.window, design.lengths, by_place(feeder, since)[at].astype(np.intp))
+    return empty(design.lengths, design.prior.meters.size)
 
 
 def _transient(design: SequentialDesign, age: float) -> Floats:
@@ -248,7 +244,7 @@ def _curves(design: SequentialDesign, look: _Look, frame: Frame, seen: Examined)
     if before.idle and not any_of(heard.reported):
         return before
     believed = heard.live & seen.trust.trusted & (seen.trust.age == 0)
-    s = sum(length <= CONFIRM for length in design.lengths) - 1
+    s = max(sum(length <= CONFIRM for length in design.lengths) - 1, 0)
     view = seen.views[s]
     judged = None if view is None else view.judged
     now = Evidence(frame, heard.reported, heard.told, believed, look.x, look.lag, seen.fits[s], judged)
@@ -309,9 +305,9 @@ def _learned(design: SequentialDesign, state: SequentialState) -> SequentialStat
 
 def _known(design: SequentialDesign, doubts: Doubts) -> Bools:
     """Where what is not known is about as large as learning supposes, (p,)."""
-    if doubts.priors[-1] is design.prior:
+    if doubts.priors[0] is design.prior:
         return np.ones(design.prior.meters.size, dtype=np.bool_)
-    variance, at = doubts.priors[-1].variance, design.prior.meters
+    variance, at = doubts.priors[0].variance, design.prior.meters
     return np.asarray(variance[at] <= _WIDER**2 * design.prior.variance[at])
 
 
@@ -337,10 +333,10 @@ def _inverters(
         return np.asarray(droop(droop.vbar**2 - y)), None, begin(design.plant, y)
     w, follows, h = None, None, frame.t - state.t
     if not all_of(driven):
-        now, v2 = _linear(design, frame, state.x, heard)
-        if state.last is not None:
-            # What losses took off at the last frame is close enough for inverters without a meter.
-            v2 += state.last[0].v2 - now
+        now, v2 = _linear(design, frame, state.x, heard.v0_squared)
+        if state.last is not None and state.frame is not None:
+            # What losses took off at the last frame, and what the meters added, hardly changes between two.
+            v2 += state.last[0].v2 - _linear(design, state.frame, state.x, state.v0_squared)[0]
         w, y = droop.vbar**2 - v2, np.where(driven, y, now[droop.customer])
         follows = ~driven, _given(design, state, frame, heard, sizes), heard.busbar
     lag = follow(design, state.lag, y, follows, h)
@@ -355,11 +351,11 @@ def _given(
     return Powers(frame, _net(design, heard, x), heard.told, heard.v0_squared, state.trust.trusted, sizes)
 
 
-def _linear(design: SequentialDesign, frame: Frame, x: Floats, heard: Heard) -> Floats:
+def _linear(design: SequentialDesign, frame: Frame, x: Floats, v0_squared: Floats | float) -> Floats:
     """Squared voltages by the linear model with injections x and without any, (2, N)."""
     feeder = design.plant.feeder
     q = np.stack([frame.q + design.plant.droop.per_customer(x, frame.q.size), frame.q])
-    return np.asarray(bus_voltages(feeder, frame.p, q, heard.v0_squared, steps=0)[:, feeder.bus])
+    return np.asarray(bus_voltages(feeder, frame.p, q, v0_squared, steps=0)[:, feeder.bus])
 
 
 def _model_error(design: SequentialDesign, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:

@@ -104,28 +104,6 @@ def forget(window: Window, meters: Bools) -> Window:
     return Window(residuals, marks, window.turn, sums, counts)
 
 
-def forget_last(window: Window, lengths: tuple[int, ...], ticks: Ints) -> Window:
-    """Forget the last ticks of some meters.
-
-    Parameters
-    ----------
-    window
-        So far; not changed.
-    lengths : (s,)
-        Ticks of each scale.
-    ticks : (p,)
-        How many of each meter.
-    """
-    if not any_of(ticks):
-        return window
-    age = np.arange(len(window.heard))[::-1, None]
-    kept = np.stack(window.heard) & (age >= ticks)
-    residuals = np.where(kept, np.stack(window.residuals), 0.0)
-    sums = np.stack([residuals[-length:].sum(axis=0) for length in lengths])
-    counts = np.stack([kept[-length:].sum(axis=0, dtype=np.intp) for length in lengths])
-    return Window(tuple(residuals), tuple(kept), window.turn, sums, counts)
-
-
 def shift(window: Window, change: Floats) -> Window:
     """Express all residuals relative to something else.
 

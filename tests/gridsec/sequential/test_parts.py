@@ -14,7 +14,7 @@ from gridsec.sequential import LoadDoubt, SequentialOptions, design
 from gridsec.sequential.commission import Learning, begin, conclude, gather, nothing
 from gridsec.sequential.drive import Free, drive
 from gridsec.sequential.loads import injection_doubt, prior
-from gridsec.sequential.windows import empty, forget, forget_last, push, shift
+from gridsec.sequential.windows import empty, forget, push, shift
 from tests.gridsec.street import ac_voltages, accuracy, make_plant, random_tree
 
 
@@ -138,12 +138,6 @@ class TestWindows:
                 window = forget(window, gone)
                 rows = [np.where(gone, 0.0, row) for row in rows]
                 marks = [mark & ~gone for mark in marks]
-            if rng.random() < 0.1:
-                last = rng.integers(0, 12, 3)
-                window = forget_last(window, lengths, last)
-                ages = range(len(rows) - 1, -1, -1)
-                rows = [np.where(age < last, 0.0, row) for age, row in zip(ages, rows, strict=True)]
-                marks = [mark & (age >= last) for age, mark in zip(ages, marks, strict=True)]
             if rng.random() < 0.1:
                 change = rng.normal(size=3)
                 window = shift(window, change)
