@@ -329,19 +329,6 @@ def invert(matrix: Floats) -> None:
         matrix[first:last, last:] = matrix[last:, first:last].T
 
 
-def inverted(matrix: Floats) -> Floats:
-    """Inverse of a symmetric positive definite matrix, by Cholesky.
-
-    Parameters
-    ----------
-    matrix : (k, k)
-        The matrix.
-    """
-    inverse: Floats = np.array(matrix, order="F")
-    invert(inverse)
-    return inverse
-
-
 def judge(now: Fit, m: Floats) -> Judged:
     """Judge every meter by the trusted others; O(n p).
 
