@@ -67,6 +67,8 @@ class AlarmRules:
         Other delays for single kinds, s.
     memory_s
         A condition that returns within this time after it cleared raises the same alarm again, s.
+    silence_s
+        What is so only for want of readings must be seen for longer than this to raise an alarm, s.
     """
 
     on_delay_s: float = 2.0
@@ -74,12 +76,14 @@ class AlarmRules:
     on_delays_s: Mapping[AlarmKind, float] = field(default_factory=dict)
     off_delays_s: Mapping[AlarmKind, float] = field(default_factory=dict)
     memory_s: float = 600.0
+    silence_s: float = 0.0
 
     def __post_init__(self) -> None:
         times = (
             self.on_delay_s,
             self.off_delay_s,
             self.memory_s,
+            self.silence_s,
             *self.on_delays_s.values(),
             *self.off_delays_s.values(),
         )
@@ -223,7 +227,8 @@ def _settle(
     kind, alarm = key[0], entry.alarm
     lasted = t - entry.since
     if condition is not None:
-        if (alarm is None or not alarm.active) and lasted >= rules.on(kind):
+        due = lasted >= rules.on(kind) and (not condition.unheard or lasted > rules.silence_s)
+        if (alarm is None or not alarm.active) and due:
             alarm = _raise(alarm, condition, rules, entry.onset, t)
             return replace(entry, alarm=alarm), (Transition(alarm, Change.RAISED, t),)
         return entry, ()

@@ -73,7 +73,7 @@ class AlignRules:
     max_skew_s
         A reading whose time is further than this from now is refused: that clock is off.
     silence_s
-        A source whose last reading is older than this is silent.
+        A source whose last usable reading is older than this is silent.
     clock
         Who says what time it is.
     """
@@ -146,8 +146,8 @@ class Tick:
     busbar
         The usable reading of the busbar meter, or None.
     silent
-        (meter, seconds since its last reading) of those who are silent; None is the busbar meter, and
-        infinity says never.
+        (meter, seconds since its last usable reading) of those who are silent; None is the busbar meter,
+        and infinity says never.
     """
 
     t: float
@@ -161,6 +161,7 @@ class _Source:
     held: list[Reading] = field(default_factory=list)
     last_t: float = -math.inf
     last_heard: float = -math.inf
+    last_used: float = -math.inf
     heard: int = 0
     seq: int | None = None
 
@@ -264,8 +265,8 @@ class Aligner:
         source.last_t = max(source.last_t, t)
         # A reading from the future does not prove that its meter will still be alive then.
         source.last_heard = t if now is None or self.rules.clock is Clock.EVENTS else now
-        if self._next is not None and self._reported(source, self._next):
-            self._waiting.discard(reading.meter)
+        if self._next is not None:
+            self._wait_for(reading.meter, source, self._next)
         if late:
             return Outcome.LATE
         return Outcome.ACCEPTED if in_order else Outcome.OUT_OF_ORDER
@@ -358,7 +359,7 @@ class Aligner:
             self.restarts += 1
             for source in self._sources.values():
                 source.held.clear()
-                source.last_t = source.last_heard = -math.inf
+                source.last_t = source.last_heard = source.last_used = -math.inf
             self._latest = wall
             self._begin(wall)
         self._latest = max(self._latest, wall)
@@ -406,7 +407,6 @@ class Aligner:
 
     def _turn_to(self, number: int) -> None:
         self._next = number
-        t = self._time(number)
         before = self._time(number - 1) + self.rules.lead_s
         self._waiting.clear()
         for meter, source in self._sources.items():
@@ -414,15 +414,21 @@ class Aligner:
             done = bisect_left(source.held, math.nextafter(before, math.inf), key=_time_of)
             if done > 1:
                 del source.held[: done - 1]
-            if not self._reported(source, number) and not self._silent_for(source, t):
-                self._waiting.add(meter)
+            self._wait_for(meter, source, number)
 
-    def _reported(self, source: _Source, number: int) -> bool:
-        return source.last_t > self._time(number - 1) + self.rules.lead_s
+    def _wait_for(self, meter: str | None, source: _Source, number: int) -> None:
+        """Wait for a source at a tick, if it is alive and has not reported for it."""
+        reported = source.last_t > self._time(number - 1) + self.rules.lead_s
+        # Also if nothing of it could be used: at long ticks whoever comes after all others would otherwise
+        # be late at every tick, and silent for ever.
+        if reported or self._silent_for(source, source.last_t, self._time(number)):
+            self._waiting.discard(meter)
+        else:
+            self._waiting.add(meter)
 
-    def _silent_for(self, source: _Source, t: float) -> float:
-        """Return for how long a source has been silent at t, s; 0 if it is not silent."""
-        since = min(source.last_t, source.last_heard)
+    def _silent_for(self, source: _Source, last: float, t: float) -> float:
+        """Return for how long a source has been silent at t, s, if `last` was its last; 0 if it is not."""
+        since = min(last, source.last_heard)
         if since == -math.inf and self._first is not None:
             since = self._time(self._first)
             return math.inf if t - since > self.rules.silence_s else 0.0
@@ -430,10 +436,13 @@ class Aligner:
 
     def _tick(self, t: float) -> Tick:
         seen = {meter: self._usable(source, t) for meter, source in self._sources.items()}
+        for meter, reading in seen.items():
+            if reading is not None:
+                self._sources[meter].last_used = reading.t
         silent = tuple(
             (meter, seconds)
             for meter, source in self._sources.items()
-            if (seconds := self._silent_for(source, t)) > 0.0
+            if (seconds := self._silent_for(source, source.last_used, t)) > 0.0
         )
         return Tick(t, tuple(seen[meter] for meter in self.meters), seen[None], silent)
 

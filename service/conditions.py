@@ -71,6 +71,9 @@ class Condition:
         How bad, the numbers, and a sentence for the operator.
     known
         False: nobody can tell at this tick; the alarm, if there is one, is held as it is.
+    unheard
+        It is so because readings are missing from those who are not silent yet: worth an alarm only if it
+        lasts for longer than any of them could be missing unnoticed.
     """
 
     kind: AlarmKind
@@ -81,6 +84,7 @@ class Condition:
     reason: str = ""
     known: bool = True
     customer: str | None = None
+    unheard: bool = False
 
     @property
     def subject(self) -> str | None:
@@ -100,8 +104,8 @@ def conditions(report: FeederReport) -> list[Condition]:
       lying meter raises none. Unknown while the interval straddles a limit with its middle outside, or
       while the reconstruction itself carries no guarantee.
     - `data-loss`: a meter, or the busbar meter, is silent. Unknown while it is unseen but not for long.
-    - `undecided`: there is no verdict, for a cause of its own. Unknown while the monitor settles or a
-      silent meter is the cause: `data-loss` says that already.
+    - `undecided`: there is no verdict, for a cause of its own. Unknown while the monitor settles, or where
+      `data-loss` says already why: everybody of whom a reading is missing is silent.
 
     Parameters
     ----------
@@ -247,17 +251,22 @@ def _data_loss(report: FeederReport) -> Iterable[Condition]:
         yield Condition(AlarmKind.DATA_LOSS, report.feeder, meter, Severity.MINOR, known=False)
 
 
-_COVERED = frozenset({Cause.SETTLING, Cause.SILENT_METERS, Cause.NO_BUSBAR})
-
-
 def _undecided(report: FeederReport) -> Iterable[Condition]:
-    if report.verdict is Decision.UNDECIDED:
-        yield Condition(
-            AlarmKind.UNDECIDED,
-            report.feeder,
-            None,
-            Severity.MAJOR,
-            Evidence(explanations=report.explanations),
-            reason=report.reason,
-            known=report.cause not in _COVERED,
-        )
+    if report.verdict is not Decision.UNDECIDED:
+        return
+    unheard = report.cause in {Cause.SILENT_METERS, Cause.NO_BUSBAR}
+    gone = [meter.meter for meter in report.meters if not meter.seen] if unheard else []
+    if report.cause is Cause.NO_BUSBAR:
+        gone = [BUSBAR]
+    # Who is missing at every other tick is never silent, and nothing else would tell of it.
+    told = bool(gone) and {*gone} <= {meter for meter, _ in report.silent}
+    yield Condition(
+        AlarmKind.UNDECIDED,
+        report.feeder,
+        None,
+        Severity.MAJOR,
+        Evidence(explanations=report.explanations),
+        reason=report.reason,
+        known=not told and report.cause is not Cause.SETTLING,
+        unheard=unheard,
+    )

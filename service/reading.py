@@ -171,8 +171,15 @@ def to_reading(feeder: str, meter: str | None, raw: Raw) -> Reading:
         NOT_REPORTED if raw.p_kw is None else raw.p_kw,
         NOT_REPORTED if raw.q_kvar is None else raw.q_kvar,
         raw.seq,
-        None if raw.v_phases is None else tuple(math.nan if v is None else v for v in raw.v_phases),
+        _phases_of(raw),
     )
+
+
+def _phases_of(raw: Raw) -> tuple[float, ...] | None:
+    """Voltages of the phases; of none at all no more is known than without the field."""
+    if raw.v_phases is None or all(v is None for v in raw.v_phases):
+        return None
+    return tuple(math.nan if v is None else v for v in raw.v_phases)
 
 
 @dataclass(frozen=True, slots=True)

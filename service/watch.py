@@ -75,16 +75,16 @@ def align_rules(
     return rules(settings.tick_s, settings.silence_s, clock=clock, max_skew_s=max_skew_s, grace_s=grace_s)
 
 
-def alarm_rules(site: Site) -> AlarmRules:
+def alarm_rules(site: Site, times: AlignRules) -> AlarmRules:
     """Return the delays of a feeder's alarms.
 
     Parameters
     ----------
-    site
-        The feeder.
+    site, times
+        The feeder, and the times by which its readings are aligned.
     """
     settings = site.tables.meta.monitor
-    return AlarmRules(settings.on_delay_s, settings.off_delay_s)
+    return AlarmRules(settings.on_delay_s, settings.off_delay_s, silence_s=times.silence_s)
 
 
 def design(site: Site, progress: Callable[[int, int], None] | None = None) -> estimators.Watcher:
@@ -150,7 +150,7 @@ class Watch:
         self.problem = ""
         self.report: FeederReport | None = None
         self.defect: Exception | None = None
-        self._alarm_rules = alarm_rules(site)
+        self._alarm_rules = alarm_rules(site, rules)
         self._watcher: estimators.Watcher | None = None
         self._state: Any = None
 

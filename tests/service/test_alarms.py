@@ -175,6 +175,18 @@ def test_rules_refuse_impossible_times(bad: float) -> None:
         AlarmRules(on_delay_s=bad)
     with pytest.raises(ValueError, match="finite"):
         AlarmRules(off_delays_s={AlarmKind.UNDECIDED: bad})
+    with pytest.raises(ValueError, match="finite"):
+        AlarmRules(silence_s=bad)
+
+
+def test_for_want_of_readings_is_told_later_than_silence() -> None:
+    for unheard, expected in ((False, 2.0), (True, 11.0)):
+        book, rules, happened = AlarmBook(FEEDER), AlarmRules(silence_s=10.0), []
+        condition = Condition(AlarmKind.UNDECIDED, FEEDER, None, Severity.MAJOR, unheard=unheard)
+        for k in range(20):
+            book, new = advance(book, rules, [condition], T0 + k)
+            happened += new
+        assert times(happened) == [(expected, Change.RAISED)]
 
 
 def test_a_clock_set_back_holds() -> None:

@@ -163,6 +163,50 @@ def test_silence_yields_ticks_and_names_the_silent() -> None:
     assert w.ticks[-1].silent == (("b", 25.0), (None, 25.0))
 
 
+@pytest.mark.parametrize("lag_s", [2.6, 5.0, 30.0])
+@pytest.mark.parametrize("who", ["b", None])
+def test_whose_readings_are_all_too_old_is_silent(lag_s: float, who: str | None) -> None:
+    """A clock that is slow, though not slow enough to be refused."""
+    w = Wall(aligner(), T0 - 0.5)
+    for k in range(10):
+        w.all_at(T0 + k)
+    for k in range(10, 40):
+        w.all_at(T0 + k, skip=(who,))
+        assert w.at(T0 + k + 0.02, reading(who, T0 + k - lag_s))[0] is not Outcome.CLOCK_OFF
+    w.at(T0 + 39.6)
+    # Its last usable one is that of second 9: those of before the change are newer for as long as the lag.
+    assert next((t.t - T0, t.silent) for t in w.ticks if t.silent) == (20.0, ((who, 11.0),))
+    assert w.ticks[-1].silent == ((who, 30.0),)
+    never = Wall(aligner(), T0 - 0.5)
+    for k in range(15):
+        never.all_at(T0 + k, skip=(who,))
+        never.at(T0 + k + 0.02, reading(who, T0 + k - lag_s))
+    never.at(T0 + 14.6)
+    assert never.ticks[-1].silent == ((who, math.inf),)
+
+
+def test_whoever_comes_after_all_others_is_not_silent_for_ever() -> None:
+    """At long ticks a late reading is of no use for the next tick: it has to be waited for."""
+    w = Wall(aligner(tick_s=900.0), T0 - 1.0)
+    for k in range(8):
+        at = T0 + 900.0 * k
+        w.all_at(at, delay=5.0, skip=("b",))
+        if k >= 4:
+            w.at(at + 6.0, reading("b", at))
+        w.at(at + 60.0)
+    assert "".join(seen(tick)[1] for tick in w.ticks) == "-----bbb"
+    assert [tick.silent for tick in w.ticks[4:]] == [(("b", math.inf),), (), (), ()]
+
+
+def test_every_second_reading_lost_is_no_silence() -> None:
+    w = Wall(aligner(tick_s=900.0), T0 - 1.0)
+    for k in range(40):
+        w.all_at(T0 + 900.0 * k, delay=5.0, skip=("b",) if k % 2 else ())
+        w.at(T0 + 900.0 * k + 60.0)
+    assert [seen(tick)[1] for tick in w.ticks] == ["b", "-"] * 20
+    assert not any(tick.silent for tick in w.ticks)
+
+
 def test_the_silent_are_not_waited_for() -> None:
     w = Wall(aligner(), T0 - 0.5)
     for k in range(20):

@@ -155,9 +155,30 @@ def test_a_busbar_unseen_but_not_for_long_is_unknown(cause: Cause) -> None:
 
 @pytest.mark.parametrize("cause", UNDECIDED_CAUSES)
 def test_undecided_is_an_alarm_unless_something_else_says_it(cause: Cause) -> None:
-    found = conditions(report(meter("m1"), cause=cause))
+    silent = (("m2", 12.0), (BUSBAR, 12.0))
+    found = conditions(report(meter("m1"), meter("m2", seen=False), cause=cause, silent=silent))
     (undecided,) = (c for c in found if c.kind is AlarmKind.UNDECIDED)
     covered = cause in (Cause.SETTLING, Cause.SILENT_METERS, Cause.NO_BUSBAR)
     assert undecided.known is not covered
     assert undecided.reason == "the reason"
     assert undecided.meter is None
+
+
+@pytest.mark.parametrize(
+    ("cause", "silent", "covered"),
+    [
+        (Cause.SILENT_METERS, ("m2", "m3"), True),
+        (Cause.SILENT_METERS, ("m2",), False),
+        (Cause.SILENT_METERS, (BUSBAR,), False),
+        (Cause.NO_BUSBAR, (BUSBAR,), True),
+        (Cause.NO_BUSBAR, ("m2", "m3"), False),
+    ],
+)
+def test_undecided_for_want_of_readings_is_told_unless_data_loss_tells_all_of_it(
+    cause: Cause, silent: tuple[str, ...], covered: bool
+) -> None:
+    """Who is missing now and then is never silent, and the feeder may be undecided for ever over it."""
+    meters = (meter("m1"), meter("m2", seen=False), meter("m3", seen=False))
+    found = conditions(report(*meters, cause=cause, silent=tuple((name, 12.0) for name in silent)))
+    (undecided,) = (c for c in found if c.kind is AlarmKind.UNDECIDED)
+    assert (undecided.known, undecided.unheard) == (not covered, True)

@@ -51,6 +51,7 @@ def test_the_busbar_tells_its_phases_apart(site: Site) -> None:
     (reading,) = decode(site, v_phases=[239.0, None, 0.0]).readings
     np.testing.assert_array_equal(reading.v_phases, [239.0, np.nan, 0.0])
     assert decode(site, v_phases=None).readings[0].v_phases is None
+    assert decode(site, v_phases=[None, None, None]).readings[0].v_phases is None
 
 
 @pytest.mark.parametrize(
