@@ -5,11 +5,12 @@
     book = AlarmBook("village")
     book, transitions = advance(book, AlarmRules(), conditions(report), report.t)
 
-A condition is present, absent, or unknown at a tick. Unknown *holds*: the clock of that condition stands
-still, nothing is raised and nothing is cleared, because no answer must never look like no attack. So an
-alarm is raised once its condition has been seen for `on_delay_s` without a tick in between that saw it
-absent, and cleared once it has been seen absent for `off_delay_s` without a tick that saw it present; time
-next to an unknown tick counts for neither. A restart is a hold, too: see `restore`.
+A condition is present, absent, or unknown at a tick, and what a tick says stands until the next one. Unknown
+*holds*: the clock of that condition stands still, nothing is raised and nothing is cleared, because no answer
+must never look like no attack. So an alarm is raised once its condition has been seen for `on_delay_s`
+without a tick in between that saw it absent, and cleared once it has been seen absent for `off_delay_s`
+without a tick that saw it present; time after an unknown tick counts for neither. A restart is a hold, too:
+see `restore`.
 """
 
 from __future__ import annotations
@@ -115,7 +116,7 @@ class Entry:
     since
         The same, moved forward by every hold, so that t - since is the time that counts, s.
     t_known
-        The last tick that knew, s.
+        Until when its last answer stands: the last tick that knew, or the first after it that did not, s.
     held
         Whether there were ticks that did not know since then.
     alarm
@@ -197,7 +198,7 @@ def advance(
     for key in sorted({*book.entries, *seen}, key=_order):
         old, condition_now = book.entries.get(key), seen.get(key)
         if condition_now is not None and not condition_now.known:
-            entry = None if old is None else replace(old, held=True)
+            entry = None if old is None else _hold(old, t)
         else:
             entry, transition = _settle(
                 _timed(old, condition_now is not None, t, backwards), condition_now, rules, key, t
@@ -210,6 +211,12 @@ def advance(
 
 def _order(key: Key) -> tuple[str, str]:
     return key[0].value, key[1] or ""
+
+
+def _hold(old: Entry, t: float) -> Entry:
+    """Return the entry after a tick that does not know; its clock stands still from here on."""
+    # If it stood still from the answer before, whoever is heard at every other tick would raise no alarm.
+    return replace(old, held=True, t_known=old.t_known if old.held else max(old.t_known, t))
 
 
 def _timed(old: Entry | None, present: bool, t: float, backwards: bool) -> Entry:

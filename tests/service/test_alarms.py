@@ -123,13 +123,21 @@ def test_no_answer_holds_an_alarm() -> None:
 
 def test_no_answer_confirms_nothing_and_forgets_nothing() -> None:
     _, happened = run(at_1_hz("PP" + "U" * 50 + "PP"))
-    # One second before the hold, and one after it.
-    assert times(happened) == [(53.0, Change.RAISED)]
+    # Each of the two answers stood for a second, and the third raises.
+    assert times(happened) == [(52.0, Change.RAISED)]
+
+
+def test_an_answer_at_every_other_tick_is_enough() -> None:
+    """Who is heard of now and then only neither escapes an alarm nor keeps one for ever."""
+    _, happened = run(at_1_hz("PU" * 5 + "AU" * 10))
+    assert times(happened) == [(4.0, Change.RAISED), (20.0, Change.CLEARED)]
+    quarter_hours = [(T0 + 900.0 * k, truth) for k, truth in enumerate("UPUPUUAUAU")]
+    assert times(run(quarter_hours)[1]) == [(2700.0, Change.RAISED), (7200.0, Change.CLEARED)]
 
 
 def test_no_answer_does_not_count_for_clearing() -> None:
     _, happened = run(at_1_hz("PPP" + "AAA" + "U" * 50 + "AAAA"))
-    assert times(happened) == [(2.0, Change.RAISED), (59.0, Change.CLEARED)]
+    assert times(happened) == [(2.0, Change.RAISED), (58.0, Change.CLEARED)]
 
 
 def test_coming_back_soon_counts_up_coming_back_late_is_a_new_alarm() -> None:
@@ -237,11 +245,14 @@ def clocked(moves: list[tuple[float, str]]) -> list[Tick]:
 
 
 def seen_for(ticks: Sequence[Tick], k: int, truth: str) -> float:
-    """Seconds between neighbouring ticks that both say `truth`, back to the last one that says otherwise."""
+    """Seconds for which ticks that say `truth` stand, back to the last one that says otherwise.
+
+    Each stands until the next tick, unless that says otherwise.
+    """
     first = k
     while first > 0 and ticks[first - 1][1] in (truth, "U"):
         first -= 1
-    return sum(b[0] - a[0] for a, b in pairwise(ticks[first : k + 1]) if a[1] == b[1] == truth)
+    return sum(b[0] - a[0] for a, b in pairwise(ticks[first : k + 1]) if a[1] == truth)
 
 
 def oracle(ticks: Sequence[Tick], rules: AlarmRules) -> list[tuple[float, Change]]:

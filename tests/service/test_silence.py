@@ -94,3 +94,15 @@ def test_meters_that_are_missing_in_turn_leave_nobody_without_a_word(site: Site,
         assert street.watch.report is not None
         assert street.watch.report.cause is Cause.SILENT_METERS
         assert street.standing() == {(AlarmKind.UNDECIDED, None)}
+
+
+def test_a_liar_who_is_heard_at_every_other_tick_only_raises_an_alarm(site: Site, tmp_path: Path) -> None:
+    def says(second: int, meter: str) -> tuple[float, float] | None:
+        if meter != "m05":
+            return 0.0, QUIET_VOLT
+        return (1.6, 245.0) if second % 2 else None
+
+    with Store(f"sqlite:///{tmp_path}/gridsec.db") as store:
+        street = Street(site, store)
+        street.go_on(30, says)
+        assert (AlarmKind.METER_MANIPULATED, "m05") in street.standing()
