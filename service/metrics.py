@@ -8,6 +8,7 @@ from functools import partial
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 
 from service.bus import BusCounts
+from service.logs import LineLogger
 
 _STEP_BUCKETS = (0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 _DELAY_BUCKETS = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0, 60.0, 300.0)
@@ -80,6 +81,10 @@ class Metrics:
             "What was given up because the database stayed away: reports, bad readings, transitions.",
             ["what"],
         )
+        unwritten = Gauge(
+            "gridsec_log_lines_lost", "Lines of the log that could not be written.", registry=registry
+        )
+        unwritten.set_function(lambda: LineLogger.lost)
 
     def count_bus(self, counts: BusCounts) -> None:
         """Take over the counts of the zenoh bus.

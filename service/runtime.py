@@ -174,8 +174,11 @@ class Runtime:
         """Write in a thread of its own; what came of it is taken in between two rounds."""
 
         def run() -> None:
-            outcome = partial(then, write())
-            self._in_loop(partial(self._take_in, outcome))
+            try:
+                done = write()
+            except Exception as error:  # noqa: BLE001 - without an outcome nothing would ever be stored again
+                done = Done(error=StoreUnavailable(f"{type(error).__name__}: {error}"))
+            self._in_loop(partial(self._take_in, partial(then, done)))
 
         self._writer.submit(run)
 
@@ -251,11 +254,12 @@ class Runtime:
             except GridsecError as error:
                 problem = str(error)
             except Exception as error:  # noqa: BLE001 - shown to the operator as the feeder's problem
-                _log.exception("design failed", feeder=watch.name)
                 problem = f"{type(error).__name__}: {error}"
+                _log.exception("design failed", feeder=watch.name)
+            finally:
+                self._in_loop(partial(self._hand_over, partial(_install, watch, finished, problem)))
             seconds = round(time.monotonic() - started, 3)
             _log.info("design finished", feeder=watch.name, seconds=seconds, problem=problem or None)
-            self._in_loop(partial(self._hand_over, partial(_install, watch, finished, problem)))
 
         threading.Thread(target=run, name=f"gridsec-design-{watch.name}", daemon=True).start()
 

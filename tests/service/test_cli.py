@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TextIO
 
 import httpx
 import pytest
@@ -78,10 +79,12 @@ def refused(code: int, done: Done) -> str:
 
 
 @contextmanager
-def serving(folder: Path, *options: str) -> Iterator[tuple[subprocess.Popen[str], str, str]]:
+def serving(
+    folder: Path, *options: str, log: TextIO | None = None
+) -> Iterator[tuple[subprocess.Popen[str], str, str]]:
     """Run `gridsec serve`; yields the process, its URL and its zenoh endpoint."""
     zenoh = f"tcp/127.0.0.1:{free_port()}"
-    log = (folder / "log").open("w")
+    log = log or (folder / "log").open("w")
     child = subprocess.Popen(
         [*COMMAND, "serve", "--feeder", FEEDER, "--zenoh-listen", zenoh, "--http", "127.0.0.1:0",
          "--database", f"sqlite:///{folder / 'gridsec.db'}", *options],
@@ -374,6 +377,35 @@ def test_an_acknowledged_alarm_survives_kill_9(tmp_path: Path) -> None:
             for _ in play(site, later, meters, Pace(float("inf"), ahead=3)):
                 pass
         assert [a["id"] for a in httpx.get(f"{url}/api/v1/alarms").json()["alarms"]] == [alarm["id"]]
+
+
+@pytest.mark.parametrize("disk", [True, False])
+def test_a_log_that_cannot_be_written_stops_nothing(tmp_path: Path, disk: bool) -> None:
+    """A full disk, or a pipe whose reader has gone."""
+    if disk:
+        log = Path("/dev/full").open("w")  # noqa: SIM115 - `serving` closes it
+    else:
+        reader, writer = os.pipe()
+        os.close(reader)
+        log = os.fdopen(writer, "w")
+    site, start = load(FEEDER), 1_795_212_000.0
+    attacks = random_attacks(site, 2, "bias", 1, 0.03, t_on=start + 10, t_off=start + 20)
+    scenario = Scenario(seed=1, start=start, duration_s=40.0, attacks=attacks)
+    with serving(tmp_path, "--clock", "events", log=log) as (child, url, zenoh):
+        with Meters(BusConfig("client", connect=(zenoh,)), "gridsec") as meters:
+            for _ in play(site, scenario, meters, Pace(float("inf"), ahead=3)):
+                pass
+            until(
+                lambda: (
+                    [a["state"] for a in httpx.get(f"{url}/api/v1/alarms").json()["alarms"]] == ["cleared"]
+                )
+            )
+        assert child.poll() is None
+        assert httpx.get(f"{url}/readyz").status_code == 200
+        lines = httpx.get(f"{url}/metrics").text.splitlines()
+        assert (
+            next(float(line.split()[1]) for line in lines if line.startswith("gridsec_log_lines_lost")) >= 3
+        )
 
 
 def test_simulate_onto_zenoh_in_step_with_a_service(gridsec: Run, tmp_path: Path) -> None:

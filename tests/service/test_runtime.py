@@ -247,6 +247,30 @@ def test_a_write_that_fails_in_an_unforeseen_way_is_shown_and_tried_again(
         assert len(store.alarms()[0]) == 2
 
 
+def test_a_write_without_an_outcome_is_a_failed_one(
+    site: Site, path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Even where writing fails beyond what it was written for: nothing would ever be stored again."""
+
+    def broken(*_: object) -> None:
+        raise BrokenPipeError("a defect")
+
+    async def scene(store: Store) -> None:
+        runtime = Runtime(RuntimeConfig(), store, [site])
+        with monkeypatch.context() as patch:
+            patch.setattr("service.keeper._write", broken)
+            task = asyncio.create_task(runtime.run())
+            while not any("a defect" in problem for problem in runtime.ready()[1]):  # noqa: ASYNC110
+                await asyncio.sleep(0.02)
+        while not runtime.ready()[0]:  # noqa: ASYNC110 - readiness is what is tested
+            await asyncio.sleep(0.02)
+        runtime.stop()
+        await task
+
+    with Store(f"sqlite:///{path}") as store:
+        asyncio.run(asyncio.wait_for(scene(store), 20.0))
+
+
 def test_a_defect_of_the_decoder_costs_one_payload(
     site: Site, attacked: list[Sample], path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
