@@ -249,18 +249,21 @@ class Watch:
         return take_back
 
     def _run(self, ticks: Iterable[Tick]) -> list[TickResult]:
-        results = []
-        for tick in ticks:
+        return [self._result(tick) for tick in ticks]
+
+    def _result(self, tick: Tick) -> TickResult:
+        """Judge a tick; a defect costs the answer to it, and no alarm of the ticks before."""
+        for _ in range(2):  # watched, and given up
             try:
-                self.report = self._judge(tick)
+                report = self._judge(tick)
+                book, transitions = advance(self.book, self._alarm_rules, conditions(report), report.t)
             except Exception as error:  # noqa: BLE001 - whatever it is, ticks before and after have their answers
                 self.break_down(error)
-                self.report = self._judge(tick)
-            self.book, transitions = advance(
-                self.book, self._alarm_rules, conditions(self.report), self.report.t
-            )
-            results.append(TickResult(self.report, transitions))
-        return results
+            else:
+                self.report, self.book = report, book
+                return TickResult(report, transitions)
+        self.report = self._judge(tick)
+        return TickResult(self.report, ())
 
     def _judge(self, tick: Tick) -> FeederReport:
         if self._watcher is None:

@@ -15,11 +15,21 @@ import pytest
 from feeders.estimators import Watcher
 from feeders.load import Site, load
 from feeders.scenario import Scenario, by_arrival, random_attacks, simulate
-from gridsec.online import Frame
-from service.alarms import AlarmKind, AlarmState, AlarmUnknown, AlreadyAcknowledged, Change, Transition
+from gridsec.online import Cause, Frame
+from service.alarms import (
+    AlarmKind,
+    AlarmState,
+    AlarmUnknown,
+    AlreadyAcknowledged,
+    Change,
+    Condition,
+    Transition,
+    conditions,
+)
 from service.align import Clock
 from service.bus import Sample
 from service.errors import FeederUnknown
+from service.report import FeederReport
 from service.rounds import BAD_PER_ROUND, NOT_WATCHED, Rounds, RuntimeConfig
 from service.runtime import Runtime
 from service.simulate import key_of, payload_of
@@ -513,6 +523,37 @@ def test_what_was_found_before_a_defect_is_not_lost(
         assert [e["t"] for e in outlet.estimates] == [START + k for k in range(31)]
         assert {e["cause"] for e in outlet.estimates[17:]} == {"design-invalid"}
         assert "a defect" in live.watches[FEEDER].problem
+
+
+@pytest.mark.parametrize("for_ever", [True, False])
+def test_alarms_of_before_a_defect_in_the_alarms_reach_the_database(
+    site: Site, attacked: list[Sample], path: Path, monkeypatch: pytest.MonkeyPatch, for_ever: bool
+) -> None:
+    """All ticks go at once, and what makes alarms of them breaks at one or from one on."""
+
+    def breaks(now: FeederReport) -> list[Condition]:
+        if now.t >= START + 17 and (for_ever or now.cause is not Cause.DESIGN_INVALID):
+            raise ZeroDivisionError("a defect")
+        return conditions(now)
+
+    monkeypatch.setattr("service.watch.conditions", breaks)
+    wall = START - 0.5
+    with Store(f"sqlite:///{path}") as store:
+        live = Rounds(RuntimeConfig(clock=Clock.WALL), store, [site], wall=lambda: wall, stored=lambda: None)
+        live.keeper.publisher = outlet = Outlet()
+        live.watches[FEEDER].install(design(site))
+        live.begin()
+        live.round([replace(sample, arrival=wall) for sample in attacked])
+        wall = START + 30.5
+        live.round([])
+        watch = live.watches[FEEDER]
+        assert "a defect" in watch.problem
+        assert set(watch.book.active) == set(store.active(FEEDER))
+        kinds = [alarm.kind for alarm in watch.book.active]
+        assert kinds.count(AlarmKind.METER_MANIPULATED) == 2
+        assert kinds.count(AlarmKind.UNDECIDED) == (not for_ever)
+        assert [e["t"] for e in outlet.estimates] == [START + k for k in range(31)]
+        assert {e["cause"] for e in outlet.estimates[17:]} == {"design-invalid"}
 
 
 def test_the_task_ends_cleanly_and_refuses_commands_afterwards(site: Site, path: Path) -> None:
