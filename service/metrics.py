@@ -78,7 +78,8 @@ class Metrics:
         self.store_failures = counter("gridsec_store_failures", "Commits that the database refused.")
         self.forgotten = counter(
             "gridsec_records_forgotten",
-            "What was given up because the database stayed away: reports, bad readings, transitions.",
+            "What was given up: reports, bad readings, transitions while the database stayed away, "
+            "and bad readings of which too many came at once.",
             ["what"],
         )
         unwritten = Gauge(

@@ -25,6 +25,7 @@ from service.align import Clock, Outcome
 from service.bus import Sample
 from service.commissioning import Commissioning, Happened
 from service.commissioning import to_json as commissioning_json
+from service.crowd import some_of_each
 from service.errors import FeederUnknown
 from service.keeper import Apart, Keeper, alarm_key, at_once
 from service.metrics import Metrics
@@ -36,8 +37,6 @@ from service.suspicions import Suspicions
 from service.watch import TickResult, Watch, align_rules, known_of
 from service.wire import Decoded, Wire
 
-BAD_PER_ROUND = 50
-"""So many bad readings of one round are stored; the others are only counted."""
 NOT_WATCHED = "the feeder is not watched any more"
 
 _log = structlog.get_logger("gridsec.runtime")
@@ -206,7 +205,9 @@ class Rounds:
             skipped = watch.aligner.skipped
             results.extend(self._guarded(watch, partial(watch.due, until)))
             self.metrics.skipped.labels(watch.name).inc(watch.aligner.skipped - skipped)
-        self.keeper.waiting.add(rejected=bad[:BAD_PER_ROUND])
+        entries, left_out = some_of_each(bad)
+        self.keeper.waiting.add(rejected=entries)
+        self.metrics.forgotten.labels("bad-reading").inc(left_out)
         for result in results:
             self.keeper.waiting.add(transitions=result.transitions, reports=(result.report,))
             self._count_tick(result.report, now)

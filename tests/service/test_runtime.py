@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import sqlite3
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -28,9 +29,10 @@ from service.alarms import (
 )
 from service.align import Clock
 from service.bus import Sample
+from service.crowd import BAD_PER_ROUND, BAD_PER_SOURCE
 from service.errors import FeederUnknown
 from service.report import FeederReport
-from service.rounds import BAD_PER_ROUND, NOT_WATCHED, Rounds, RuntimeConfig
+from service.rounds import NOT_WATCHED, Rounds, RuntimeConfig
 from service.runtime import Runtime
 from service.simulate import key_of, payload_of
 from service.store import Store, StoreUnavailable, connect
@@ -460,15 +462,27 @@ def test_acknowledgements(site: Site, attacked: list[Sample], path: Path) -> Non
         assert outlet.events[-1][0]["acknowledged_by"] == "Bob"
 
 
-def test_a_flood_of_bad_readings_is_counted_in_full_and_stored_in_part(site: Site, path: Path) -> None:
-    flood = [Sample(f"gridsec/{FEEDER}/meter/m01/reading", b"{", "", START, 1)] * 400
+def test_a_flood_of_bad_readings_is_counted_in_full_and_leaves_room_for_others(
+    site: Site, path: Path
+) -> None:
+    def bad(key: str, payload: bytes, count: int = 1) -> list[Sample]:
+        return [Sample(f"gridsec/{key}", payload, "", START, len(payload))] * count
+
+    flood = bad(f"{FEEDER}/meter/m01/reading", b"{", 400)
+    quiet = bad(f"{FEEDER}/meter/m02/reading", b"{}") + bad(f"{FEEDER}/meter/m03/reading", b"{")
+    others = [one for k in range(200) for one in bad(f"nowhere-{k}/substation/reading", b"{}")]
     with Store(f"sqlite:///{path}") as store:
         live = rounds(store, site)
-        live.round(flood)
-        assert len(store.rejected(1000)) == BAD_PER_ROUND
-        assert f'gridsec_bad_readings_total{{feeder="{FEEDER}",reason="syntax"}} 400.0' in (
-            live.metrics.exposition().decode()
-        )
+        live.round(flood + quiet)
+        kept = Counter(one.key.split("/")[3] for one in store.rejected(1000))
+        assert kept == {"m01": BAD_PER_SOURCE + 1, "m02": 1, "m03": 1}
+        assert "syntax: 395 more on this key at the same time" in {r.reason for r in store.rejected(1000)}
+        live.round(others + flood + quiet)
+        kept = Counter(one.key.split("/")[1] for one in store.rejected(1000)[:BAD_PER_ROUND])
+        assert kept == {FEEDER: 8} | dict.fromkeys([f"nowhere-{k}" for k in range(BAD_PER_ROUND - 8)], 1)
+        told = live.metrics.exposition().decode()
+        assert f'gridsec_bad_readings_total{{feeder="{FEEDER}",reason="syntax"}} 802.0' in told
+        assert 'gridsec_records_forgotten_total{what="bad-reading"} 158.0' in told
 
 
 def test_a_defect_in_one_feeder_s_monitor_is_shown_and_blinds_no_other(
