@@ -39,7 +39,8 @@ class BusConfig:
 class Sample:
     """One put, copied out of zenoh: key, bytes, encoding, wall time of its arrival (Unix s).
 
-    Of a payload above the limit only the beginning is kept; `size` is its whole length.
+    Of a payload above the limit only the beginning is kept; `size` is its whole length. Of an absurdly long
+    key only the beginning is kept, too.
     """
 
     key: str

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -66,7 +67,7 @@ class Inbox:
         """
         dropped = 0
         for sample in batch:
-            size = len(sample.payload) + _OVERHEAD
+            size = _size(sample)
             with self._room:
                 while self._lossless and not self._closed and self._waiting and self._full(size):
                     self._wake()
@@ -76,7 +77,7 @@ class Inbox:
                 self._waiting.append(sample)
                 self._bytes += size
                 while len(self._waiting) > 1 and self._full(0):
-                    self._bytes -= len(self._waiting.popleft().payload) + _OVERHEAD
+                    self._bytes -= _size(self._waiting.popleft())
                     dropped += 1
         self._wake()
         return dropped
@@ -92,7 +93,7 @@ class Inbox:
         with self._room:
             count = min(limit, len(self._waiting))
             taken = [self._waiting.popleft() for _ in range(count)]
-            self._bytes -= sum(len(sample.payload) + _OVERHEAD for sample in taken)
+            self._bytes -= sum(map(_size, taken))
             self._room.notify_all()
         return taken
 
@@ -104,3 +105,8 @@ class Inbox:
 
     def _full(self, more: int) -> bool:
         return len(self._waiting) + (more > 0) > self._max_samples or self._bytes + more > self._max_bytes
+
+
+def _size(sample: Sample) -> int:
+    """What a waiting sample takes, bytes: its sender chooses the key and the encoding, too."""
+    return len(sample.payload) + sys.getsizeof(sample.key) + sys.getsizeof(sample.encoding) + _OVERHEAD

@@ -197,7 +197,9 @@ class Bus:
         payload = raw.payload.to_bytes()
         size = len(payload)
         kept = payload if size <= self._max_payload else payload[:_HEAD]
-        return Sample(str(raw.key_expr), kept, str(raw.encoding), time.time(), size)
+        # What is cut is longer than any key that is read, and stays so.
+        key = str(raw.key_expr)[: len(self._prefix) + _HEAD]
+        return Sample(key, kept, str(raw.encoding), time.time(), size)
 
     # ---------------------------------------------------------------- out
 

@@ -35,6 +35,25 @@ def test_bytes_are_bounded_too() -> None:
     assert keys(box.drain(100)) == [1]
 
 
+def test_keys_and_encodings_count_as_bytes() -> None:
+    box = Inbox(lambda: None, max_bytes=1 << 20, lossless=False)
+    long = [Sample("k" * 60_000, b"{}", "", 0.0, 2)] * 50 + [Sample("k", b"{}", "e" * 60_000, 0.0, 2)] * 50
+    assert box.put(long) == 100 - (1 << 20) // 60_307
+    assert len(box.drain(100)) == (1 << 20) // 60_307
+
+
+def test_what_has_been_taken_out_is_counted_no_more() -> None:
+    box = Inbox(lambda: None, max_samples=4, max_bytes=5_000, lossless=False)
+    for k in range(10_000):
+        assert box.put([sample(k, k % 1_000)]) == 0
+        assert keys(box.drain(1 + k % 3)) == [k]
+    # What was dropped is not counted either.
+    for k in range(10_000):
+        box.put([sample(k, 1_000)])
+    assert keys(box.drain(10)) == [9_997, 9_998, 9_999]
+    assert box.put([sample(k, 100) for k in range(4)]) == 0
+
+
 def test_lossless_lets_the_sender_wait() -> None:
     box = Inbox(lambda: None, max_samples=5, lossless=True)
     dropped: list[int] = []

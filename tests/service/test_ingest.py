@@ -94,6 +94,16 @@ def test_of_long_payloads_only_the_beginning_is_kept() -> None:
     assert [(len(s.payload), s.size) for s in sink.samples] == [(1024, 1 << 20), (10_000, 10_000)]
 
 
+def test_of_absurd_keys_only_the_beginning_is_kept() -> None:
+    sink = Sink()
+    with pair(sink) as (_, meters, _end):
+        meters.put(f"f/meter/{'a' * 50_000}/reading", b"{}")
+        until(lambda: sink.samples)
+    (found,) = sink.samples
+    assert found.key == "gridsec/f/meter/" + "a" * (len(found.key) - 16)
+    assert len(found.key) == len("gridsec") + 1024
+
+
 def test_a_slow_service_keeps_the_newest_and_does_not_hold_up_the_sender() -> None:
     sink = Sink()
     hold = threading.Event()
