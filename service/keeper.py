@@ -23,6 +23,7 @@ from service.bus import BusCounts
 from service.commissioning import Happened
 from service.kept import Kept
 from service.metrics import Metrics
+from service.report import FeederReport
 from service.store import Event, Store, StoreUnavailable
 from service.waiting import Batch, Waiting
 
@@ -101,6 +102,8 @@ class Keeper:
         Where failures and transitions are counted.
     stored
         Called after alarms have been stored.
+    kept
+        Called with the reports that have been stored.
     apart
         How writing is done apart from judging: called with what to do, in any thread, and with what to do
         with the outcome, between two rounds.
@@ -118,7 +121,12 @@ class Keeper:
     """
 
     def __init__(
-        self, store: Store, metrics: Metrics, stored: Callable[[], None], apart: Apart = at_once
+        self,
+        store: Store,
+        metrics: Metrics,
+        stored: Callable[[], None],
+        kept: Callable[[tuple[FeederReport, ...]], None],
+        apart: Apart = at_once,
     ) -> None:
         self.waiting = Waiting(lambda what, count: metrics.forgotten.labels(what).inc(count))
         self.publisher: Publisher | None = None
@@ -126,7 +134,7 @@ class Keeper:
         self.storing = False
         self._store = store
         self._metrics = metrics
-        self._stored = stored
+        self._stored, self._kept = stored, kept
         self._apart = apart
         self._retry_at = self._began = 0.0
         self._published: deque[int] = deque()
@@ -200,6 +208,7 @@ class Keeper:
             self.waiting.give_back(job.batch)
         else:
             self.waiting.stored()
+            self._kept(job.batch.reports)
             self._tell(job.batch.transitions, done.numbers)
         if done.marked:
             for _ in job.published:

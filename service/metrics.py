@@ -60,7 +60,7 @@ class Metrics:
         )
         self.delay = Histogram(
             "gridsec_report_delay_seconds",
-            "Wall time from a tick to its stored report.",
+            "Wall time from a tick until its report has been judged and stored.",
             ["feeder"],
             buckets=_DELAY_BUCKETS,
             registry=registry,

@@ -106,7 +106,7 @@ class Rounds:
         self.metrics = Metrics()
         self.watches: dict[str, Watch] = {}
         self._wall, self._stored = wall, stored
-        self.keeper = Keeper(store, self.metrics, stored, apart)
+        self.keeper = Keeper(store, self.metrics, stored, self._count_stored, apart)
         self._wire = Wire({}, config.prefix, config.max_payload)
         for site in sites:
             self.add(site)
@@ -210,7 +210,7 @@ class Rounds:
         self.metrics.forgotten.labels("bad-reading").inc(left_out)
         for result in results:
             self.keeper.waiting.add(transitions=result.transitions, reports=(result.report,))
-            self._count_tick(result.report, now)
+            self._count_tick(result.report)
         self.keep_states()
         self.keeper.commit()
         self._publish_estimates(results)
@@ -290,14 +290,18 @@ class Rounds:
         reason = f"{BadReason.CLOCK_OFF}: t = {reading.t:.3f} is too far from now"
         return Rejected(arrival, key, reason, head_of(reading).encode())
 
-    def _count_tick(self, report: FeederReport, now: float) -> None:
+    def _count_stored(self, reports: tuple[FeederReport, ...]) -> None:
+        if self.config.clock is Clock.WALL:
+            now = self._wall()
+            for report in reports:
+                self.metrics.delay.labels(report.feeder).observe(max(0.0, now - report.t))
+
+    def _count_tick(self, report: FeederReport) -> None:
         metrics, name = self.metrics, report.feeder
         metrics.ticks.labels(name, report.verdict).inc()
         metrics.seen.labels(name).set(sum(meter.seen for meter in report.meters))
         metrics.suspects.labels(name).set(len(report.suspects))
         metrics.alarms.labels(name).set(len(self.watches[name].book.active))
-        if self.config.clock is Clock.WALL:
-            metrics.delay.labels(name).observe(max(0.0, now - report.t))
 
     # ---------------------------------------------------------------- publishing
 

@@ -31,6 +31,7 @@ from service.align import Clock
 from service.bus import Sample
 from service.crowd import BAD_PER_ROUND, BAD_PER_SOURCE
 from service.errors import FeederUnknown
+from service.keeper import Done
 from service.report import FeederReport
 from service.rounds import NOT_WATCHED, Rounds, RuntimeConfig
 from service.runtime import Runtime
@@ -238,6 +239,42 @@ def test_nobody_who_watches_waits_for_a_locked_database(
 
     with Store(f"sqlite:///{path}") as store:
         asyncio.run(asyncio.wait_for(scene(store), 20.0))
+
+
+def test_the_delay_of_a_report_ends_when_it_is_stored(
+    site: Site, path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    step, wall = Watcher.step, START - 0.5
+    writes: list[tuple[Callable[[], Done], Callable[[Done], None]]] = []
+
+    def slow(self: Watcher, state: Any, frame: Frame) -> Any:
+        nonlocal wall
+        wall += 0.25
+        return step(self, state, frame)
+
+    with Store(f"sqlite:///{path}") as store:
+        live = Rounds(
+            RuntimeConfig(),
+            store,
+            [site],
+            wall=lambda: wall,
+            stored=lambda: None,
+            apart=lambda write, then: writes.append((write, then)),
+        )
+        live.watches[FEEDER].install(design(site))
+        live.begin()
+        monkeypatch.setattr(Watcher, "step", slow)
+        for begin in (START - 0.5, START + 0.5):
+            wall = begin
+            live.round([])
+            assert "gridsec_report_delay_seconds_sum" not in live.metrics.exposition().decode()
+            wall += 2.0
+            while writes:
+                write, then = writes.pop(0)
+                then(write())
+                live.keeper.commit()
+        told = f'gridsec_report_delay_seconds_sum{{feeder="{FEEDER}"}} 2.75'
+        assert told in live.metrics.exposition().decode()
 
 
 def test_a_write_that_fails_in_an_unforeseen_way_is_shown_and_tried_again(
