@@ -37,6 +37,8 @@ from service.store.schema import (
 BAD_READINGS_KEPT = 1000
 _PAYLOAD_KEPT = 256
 _PRUNE_EVERY = 500
+_STEADY_S = 86_400.0
+"""Nothing is forgotten before a feeder has reported for so long."""
 _log = structlog.get_logger("gridsec.store")
 _KEPT = {Matter.COMMISSION: COMMISSION, Matter.DISTRUST: DISTRUST}
 
@@ -291,12 +293,24 @@ class Store(Reader):
         }
         statement = self._connections.insert(HISTORY).values(row)
         connection.execute(statement.on_conflict_do_update(index_elements=["feeder", "t"], set_=row))
-        count = self._since_prune.get(report.feeder, 0) + 1
-        if count >= _PRUNE_EVERY:
-            h, keep = HISTORY.c, self._history_rules.keep_s
-            connection.execute(HISTORY.delete().where(h.feeder == report.feeder, h.t < report.t - keep))
-            count = 0
+        self._prune(connection, report)
+
+    def _prune(self, connection: sa.Connection, report: FeederReport) -> None:
+        """Forget what is too old, with the first row after a start and then every so many."""
+        before = self._since_prune.get(report.feeder)
+        count = 0 if before is None or before + 1 >= _PRUNE_EVERY else before + 1
         self._since_prune[report.feeder] = count
+        h, keep = HISTORY.c, self._history_rules.keep_s
+        # A clock that leaps must not cost the history: it has to have gone on steadily for a while.
+        steady = min(_STEADY_S, 0.5 * keep)
+        lately = h.t.between(report.t - 2.0 * steady, report.t - steady)
+        if count or not connection.scalar(sa.select(sa.exists().where(h.feeder == report.feeder, lately))):
+            return
+        whose = h.feeder == report.feeder
+        if before is not None:
+            # Of whom nothing has come since the start is watched no more; his time goes on with ours.
+            whose |= h.feeder.not_in([*self._marks, report.feeder])
+        connection.execute(HISTORY.delete().where(whose, h.t < report.t - keep))
 
     def _layout(self, connection: sa.Connection, report: FeederReport) -> int:
         meters = json.dumps([meter.meter for meter in rows(report)])

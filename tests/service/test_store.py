@@ -21,6 +21,7 @@ from service.alarms import (
     Transition,
     acknowledged,
 )
+from service.report import FeederReport
 from service.store import BAD_READINGS_KEPT, HistoryRules, Rejected, Store, StoreUnavailable
 from tests.service.databases import both
 from tests.service.stored import T0, a_report, an_alarm, raised
@@ -222,10 +223,52 @@ def test_history_of_a_replay_replaces(store: Store) -> None:
 
 def test_history_forgets_what_is_too_old(tmp_path: Path) -> None:
     with Store(f"sqlite:///{tmp_path}/h.db", history=HistoryRules(step_s=0.0, keep_s=100.0)) as store:
-        for k in range(500):
+        for k in range(501):
             store.commit(reports=[a_report(T0 + k)])
         kept = [p["t"] - T0 for p in store.history("village", limit=10_000)]
-    assert kept == list(range(399, 500))
+    assert kept == list(range(400, 501))
+
+
+def every(step_s: float, begin: float, end: float, feeder: str = "village") -> list[FeederReport]:
+    count = round((end - begin) / step_s)
+    return [replace(a_report(T0 + begin + k * step_s), feeder=feeder) for k in range(count)]
+
+
+SHORT = HistoryRules(step_s=0.0, keep_s=100.0)
+
+
+@both
+@pytest.mark.parametrize("leap_s", [150.0, 1e7])
+def test_a_clock_that_leaps_costs_no_history_unless_it_goes_on(url: str, leap_s: float) -> None:
+    with Store(url, history=SHORT) as store:
+        store.commit(reports=every(0.5, 0.0, 50.0))
+        leap = 50.0 + leap_s
+        store.commit(reports=every(0.05, leap, leap + 40.0))
+        assert len(store.history("village", until=T0 + 50.0, limit=10_000)) == 100
+    with Store(url, history=SHORT) as store:
+        store.commit(reports=every(0.05, leap + 40.0, leap + 45.0))
+        assert len(store.history("village", until=T0 + 50.0, limit=10_000)) == 100
+        store.commit(reports=every(0.05, leap + 45.0, leap + 210.0))
+        assert store.history("village", limit=10_000)[0]["t"] > T0 + leap
+
+
+def test_history_is_pruned_however_often_the_service_begins_anew(tmp_path: Path) -> None:
+    for begin in range(0, 300, 20):
+        with Store(f"sqlite:///{tmp_path}/h.db", history=SHORT) as store:
+            store.commit(reports=every(1.0, begin, begin + 20.0))
+            assert len(store.history("village", limit=10_000)) <= 120
+
+
+@both
+def test_history_of_a_feeder_that_is_watched_no_more_is_pruned_too(url: str) -> None:
+    with Store(url, history=SHORT) as store:
+        store.commit(reports=[*every(1.0, 0.0, 20.0, "gone"), *every(1.0, 0.0, 20.0)])
+    with Store(url, history=SHORT) as store:
+        store.commit(reports=every(1.0, 20.0, 100.0))
+        assert len(store.history("gone")) == 20
+        store.commit(reports=every(1.0, 100.0, 600.0))
+        assert store.history("gone") == []
+        assert store.history("village") != []
 
 
 @both
