@@ -1,0 +1,42 @@
+"""Rounds of a small feeder in which two meters lie for a while."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from feeders.load import Site
+from feeders.scenario import Scenario, by_arrival, random_attacks, simulate
+from service.align import Clock
+from service.bus import Sample
+from service.rounds import Rounds, RuntimeConfig
+from service.simulate import key_of, payload_of
+from service.store import Store
+from service.watch import design
+from tests.service.running import Outlet
+
+FEEDER = "simbench-lv-rural1"
+START = 1_795_212_000.0
+
+
+def two_liars(site: Site) -> list[Sample]:
+    """Forty seconds with two liars from the tenth to the twentieth."""
+    attacks = random_attacks(site, 2, "bias", 2, 0.03, t_on=START + 10, t_off=START + 20)
+    scenario = Scenario(seed=1, start=START, duration_s=40.0, attacks=attacks)
+    return [
+        Sample(f"gridsec/{key_of(FEEDER, r.meter)}", payload_of(r), "", r.arrival, 1)
+        for r in by_arrival(simulate(site, scenario))
+    ]
+
+
+def rounds(
+    store: Store, site: Site, outlet: Outlet | None = None, stored: Callable[[], None] = lambda: None
+) -> Rounds:
+    made = Rounds(RuntimeConfig(clock=Clock.EVENTS), store, [site], wall=lambda: START, stored=stored)
+    made.keeper.publisher = outlet
+    made.watches[FEEDER].install(design(site))
+    made.begin()
+    return made
+
+
+def until(samples: list[Sample], t: float) -> tuple[list[Sample], list[Sample]]:
+    return [s for s in samples if s.arrival < START + t], [s for s in samples if s.arrival >= START + t]
