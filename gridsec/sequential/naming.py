@@ -59,10 +59,13 @@ def name(
     named = before.named & (quiet < design.options.release)
     count, inverters = _inverters(design, before, trust, seen)
     new = inverters & ~before.inverters
-    rivals = _Rivals(design, before.named, fresh, new, agrees)(seen) if any_of(fresh) or any_of(new) else ()
-    for rival in rivals:
-        fresh = fresh & rival.meters
-        inverters = inverters & (before.inverters | rival.inverters)
+    rivals: tuple[Explanation, ...] = ()
+    if any_of(fresh) or any_of(new):
+        found = _Rivals(design, fresh, new, agrees)
+        found.collect(seen)
+        for meters, accused in found.ways():
+            fresh, inverters = fresh & meters, inverters & (before.inverters | accused)
+        rivals = found.explanations(live | before.named)
     trust = replace(
         trust,
         trusted=trusted,
@@ -145,41 +148,50 @@ def _suspicions(design: SequentialDesign, accused: Sequence[int]) -> Bools:
 class _Rivals:
     """Explanations about as likely as the best, where one leaves out somebody about to be named.
 
-    named: who is named already. fresh, new: meters and inverters that are about to be, (p,) and (m,). agrees:
-    inverters that none can be taken for.
+    fresh, new: meters and inverters that are about to be, (p,) and (m,). agrees: inverters that none can be
+    taken for.
     """
 
-    def __init__(
-        self, design: SequentialDesign, named: Bools, fresh: Bools, new: Bools, agrees: Bools
-    ) -> None:
-        self.design, self.named, self.fresh, self.new = design, named, fresh, new
+    def __init__(self, design: SequentialDesign, fresh: Bools, new: Bools, agrees: Bools) -> None:
+        self.design, self.fresh, self.new = design, fresh, new
         self.others = design.customers + np.flatnonzero(~agrees)
         self.within = 2.0 * float(np.log(design.options.like))
         self.out: dict[bytes, tuple[Bools, Bools, float, tuple[int, ...]]] = {}
 
-    def __call__(self, seen: Examined) -> tuple[Explanation, ...]:
-        """All of them, the likeliest first; none where everybody is named by all."""
+    def collect(self, seen: Examined) -> None:
+        """Take in what every scale found that was searched."""
         for s, found in seen.found.items():
             view = seen.views[s]
             if view is not None:
                 self._collect(found, view)
-        ways = sorted(self.out.values(), key=lambda way: -way[2])
-        if not any(self._differs(meters, inverters) for meters, inverters, *_ in ways):
-            return ()
-        design, total = self.design, sum(way[2] for way in ways)
+        if not any(self._differs(meters, inverters) for meters, inverters, *_ in self.out.values()):
+            self.out.clear()
+
+    def ways(self) -> list[tuple[Bools, Bools]]:
+        """Meters and inverters that each of them accuses; meters that were not heard are among the former."""
+        return [(meters, inverters) for meters, inverters, *_ in self.out.values()]
+
+    def explanations(self, heard: Bools) -> tuple[Explanation, ...]:
+        """All of them, the likeliest first; none where everybody is named by all.
+
+        Of meters that were not heard (p,) nothing is said.
+        """
+        design, total = self.design, sum(way[2] for way in self.out.values())
         return tuple(
             Explanation(
-                meters, inverters, weight / total, powers_of(design, loosened), _busbar_of(design, loosened)
+                meters & heard,
+                inverters,
+                weight / total,
+                powers_of(design, loosened),
+                _busbar_of(design, loosened),
             )
-            for meters, inverters, weight, loosened in ways
+            for meters, inverters, weight, loosened in sorted(self.out.values(), key=lambda way: -way[2])
         )
 
     def _collect(self, found: Found, view: View) -> None:
         """Those of one scale."""
-        best, within, heard = found.best, self.within, view.enough | self.named
-        near = [
-            (heard & ~each.trusted, each.loosened, each.cost - best.cost) for each in (best, *found.others)
-        ]
+        best, within = found.best, self.within
+        near = [(~each.trusted, each.loosened, each.cost - best.cost) for each in (best, *found.others)]
         for swap in swaps(best, view.enough, within, view.limits):
             other = near[0][0].copy()
             other[swap.accused], other[swap.innocent] = False, True
