@@ -172,7 +172,8 @@ def calibrate(
     Raises
     ------
     RecordingInvalid
-        If the readings are another feeder's, name unknown meters, lack the busbar, or are too few.
+        If the readings are another feeder's, name unknown meters, lack the busbar, are hardly in V, kW and
+        kvar, or are too few.
     ValueError
         If there is no such meter, or a number is out of range.
     FeederInvalid
@@ -183,7 +184,7 @@ def calibrate(
         If another process is writing it.
     """
     _check(site, risk, tolerance, exclude)
-    given = frames(site, readings)
+    given = frames(site, readings, exclude=exclude)
     subject = _subject(site, given, risk, tolerance) | {"exclude": sorted(exclude), "kinds": sorted(kinds)}
 
     def weighed(now: Round) -> Verdict:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -40,6 +41,12 @@ FARTHEST_S: Final = 10.0 * 365.25 * 86400.0
 
 NUMBERS: Final = ("t", "v_volt", "p_kw", "q_kvar")
 """Columns of numbers."""
+
+USUAL: Final = (0.5, 1.5)
+"""A meter's median voltage is within these parts of nominal, or not in V from phase to neutral."""
+
+_PAIR: Final = (0.9 * 3.0**0.5, 1.1 * 3.0**0.5)
+_KILOVOLT: Final = (0.5e-3, 2e-3)
 
 _EXPECTED: Final = {"t": "expected Unix time in seconds"}
 
@@ -98,7 +105,12 @@ def open_readings(path: Path | str) -> pd.DataFrame | Recording:
         raise RecordingInvalid(f"{path}: no table of readings: {error}") from error
 
 
-def frames(site: Site | ThreePhaseSite, readings: pd.DataFrame | Recording | Path | str) -> Frames:
+def frames(
+    site: Site | ThreePhaseSite,
+    readings: pd.DataFrame | Recording | Path | str,
+    *,
+    exclude: Collection[str] = (),
+) -> Frames:
     """Put readings into frames.
 
     Parameters
@@ -107,12 +119,15 @@ def frames(site: Site | ThreePhaseSite, readings: pd.DataFrame | Recording | Pat
         The feeder.
     readings
         A recording, a table, or a file with one.
+    exclude
+        Meters whose values may be of any size.
 
     Raises
     ------
     RecordingInvalid
-        If columns are missing or hold no numbers, times are not Unix seconds, meters are unknown, the
-        recording is another feeder's, the busbar has no reading, or there are too few.
+        If columns are missing or hold no numbers, times are not Unix seconds, voltages and powers are hardly
+        in V from phase to neutral, kW and kvar, meters are unknown, the recording is another feeder's, the
+        busbar has no reading, or there are too few.
     """
     given = open_readings(readings) if isinstance(readings, (Path, str)) else readings
     if not isinstance(given, pd.DataFrame):
@@ -134,6 +149,8 @@ def frames(site: Site | ThreePhaseSite, readings: pd.DataFrame | Recording | Pat
         problems.append(f"there are meters that {site.feeder.name} does not have: {shown}")
     if "meter" in given and not (column == len(site.meter_ids)).any():
         problems.append("none of the busbar (an empty meter); nothing to compare with")
+    if "meter" in given:
+        problems += _wrong_units(site, numbers, meter, exclude)
     if problems:
         raise RecordingInvalid(f"readings: {'; '.join(problems)}")
     return _binned(site, given, numbers, np.asarray(column, dtype=np.intp))
@@ -173,6 +190,48 @@ def _wrong_times(t: Floats) -> list[str]:
         if rows.size:
             problems.append(f"t of {_rows(rows)} is {t[rows[0]]:.15g}; {what}")
     return problems
+
+
+def _wrong_units(
+    site: Site | ThreePhaseSite, numbers: dict[str, Floats], meter: pd.Series, exclude: Collection[str]
+) -> list[str]:
+    """Columns that are hardly in their unit: the medians of meters show it, which no short fault moves."""
+    nominal = dict(zip(site.meter_ids, site.customer_nominal[site.meters].tolist(), strict=True))
+    nominal[BUSBAR] = site.tables.meta.voltage_volt
+    most = site.loads.credible[site.meters] * site.tables.meta.base_kva
+    credible = dict(zip(site.meter_ids, most.tolist(), strict=True))
+    found: dict[tuple[str, str], list[tuple[str, float, float]]] = {}
+    for name, limits in (("v_volt", nominal), ("p_kw", credible), ("q_kvar", credible)):
+        values = np.abs(numbers.get(name, np.full(len(meter), np.nan)))
+        there = np.isfinite(values)
+        middles = pd.Series(values[there]).groupby(meter.to_numpy()[there]).median()
+        for one, limit in limits.items():
+            if one not in middles.index or one in exclude:
+                continue
+            middle = float(middles[one])
+            doubt = _doubt(name, middle / limit)
+            if doubt:
+                found.setdefault((name, doubt), []).append((one, middle, limit))
+    problems = []
+    for (name, doubt), meters in found.items():
+        one, middle, limit = meters[0]
+        whose = (one or "the busbar") + (f" and {len(meters) - 1} more" if len(meters) > 1 else "")
+        than = (
+            f"where {limit:.4g} is nominal" if name == "v_volt" else f"where {limit:.4g} is the most credible"
+        )
+        problems.append(f"{name} of {whose} is usually {middle:.4g} {than}; {doubt}")
+    return problems
+
+
+def _doubt(name: str, part: float) -> str:
+    """What a median may be in place of its unit, by its part of the nominal voltage or the largest power."""
+    if name != "v_volt":
+        return "" if part <= 1.0 else "in W?" if name == "p_kw" else "in var?"
+    if USUAL[0] <= part <= USUAL[1]:
+        return ""
+    if _PAIR[0] <= part <= _PAIR[1]:
+        return "a phase-to-phase voltage?"
+    return "in kV?" if _KILOVOLT[0] <= part <= _KILOVOLT[1] else "expected V from phase to neutral"
 
 
 def _rows(which: Ints) -> str:

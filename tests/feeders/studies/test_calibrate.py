@@ -249,6 +249,28 @@ def test_times_that_are_none_are_named_before_memory_is_taken_for_them(tmp_path:
             frames(CIGRE, table.assign(**change))
 
 
+def test_readings_in_another_unit_are_refused_all_at_once(tmp_path: Path) -> None:
+    table = recorded(tmp_path, scenario(1)).frame()
+    v, p, q, busbar = table["v_volt"], table["p_kw"], table["q_kvar"], table["meter"] == ""
+    third = table["meter"] == "m03"
+    for change, said in (
+        (
+            {"v_volt": 3.0**0.5 * v},
+            r"v_volt of m01 and 6 more is usually 40\d.* where 230.9 is nominal; a phase-",
+        ),
+        ({"v_volt": v.mask(busbar, 3.0**0.5 * v)}, r"v_volt of the busbar is usually .*; a phase-to-phase v"),
+        ({"v_volt": v / 1000.0}, r"v_volt of m01 and 6 more is usually 0.2\d+ .*; in kV\?"),
+        ({"v_volt": v.mask(third, 0.0)}, "v_volt of m03 is usually 0 .*; expected V from phase to neutral"),
+        ({"p_kw": 1000.0 * p, "q_kvar": 1000.0 * q}, r"p_kw of m01 and .*; in W\?; q_kvar of .*; in var\?$"),
+        ({"v_volt": 3.0**0.5 * v, "p_kw": 1000.0 * p}, r"a phase-to-phase voltage\?; p_kw of .*; in W\?"),
+    ):
+        with pytest.raises(RecordingInvalid, match=said):
+            frames(CIGRE, table.assign(**change))
+    # A dead meter that is excluded keeps nobody from the study, and neither do a few absurd readings.
+    frames(CIGRE, table.assign(v_volt=v.mask(third, 0.0)), exclude=["m03"])
+    frames(CIGRE, table.assign(v_volt=v.mask(v.index < 200, 1e6)))
+
+
 def test_a_reading_years_later_changes_no_frame(tmp_path: Path) -> None:
     table = recorded(tmp_path, scenario(1)).frame()
     late = pd.concat([table, table[:1].assign(t=table["t"].max() + 3e7)])
