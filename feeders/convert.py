@@ -32,12 +32,16 @@ from feeders.convert_source import SOURCE_FILE, feeder_source, profiles_source, 
 from feeders.load import from_tables
 from feeders.origin import origin as origin_of
 from feeders.profiles import ENVELOPES, Season
+from feeders.raw import CUSTOMERS_FILE, LINES_FILE, META_FILE
 from feeders.schema import FeederTables, read, write
 from gridsec.errors import FeederInvalid, GridsecError
 
 PROFILES = "profiles"
 OPENDSS, PGM = "opendss", "power-grid-model"
 SIMBENCH_CODE = re.compile(r"[0-9]-[A-Za-z0-9.]+(-[A-Za-z0-9.]+)*--[0-9]-(no_)?sw")
+WRITTEN = (META_FILE, LINES_FILE, CUSTOMERS_FILE, CHANGES_FILE, SOURCE_FILE)
+"""What a converted feeder's folder has."""
+
 SEED = 1
 KERBER = "(G. Kerber, dissertation, TU Munich 2011)"
 
@@ -190,11 +194,15 @@ def convert(
         needed, ...; or with every option that makes nothing of a feeder's folder.
     GridsecError
         If the source does not exist, its own tool cannot read it, or the extra `convert` is not installed.
+    FileExistsError
+        If the folder holds a feeder that no conversion has written.
     """
     folder = Path(out)
     if source == PROFILES:
         _convert_profiles(folder)
         return Conversion((), None, "profiles have no power flow")
+    if (folder / META_FILE).exists() and not (folder / CHANGES_FILE).is_file():
+        raise FileExistsError(f"{folder}: a feeder that no conversion has written; expected another folder")
     recipe = RECIPES.get(source)
     again = recipe is None and Path(source).is_dir()  # such a feeder has a name, and tells where it is from
     before = origin_of(source) if again else None

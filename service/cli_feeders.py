@@ -14,7 +14,7 @@ from rich.table import Table
 
 from gridsec.errors import FeederInvalid
 from service.console import FEEDER, Feeder, complain, err, out
-from service.foreign import show_check
+from service.foreign import show_check, spared
 from service.places import see
 
 if TYPE_CHECKING:
@@ -176,21 +176,23 @@ def convert(
 ) -> None:
     """Convert another tool's network into a feeder's folder, and check it by AC power flow against that tool.
 
-    What could not be carried over as it was is printed, and written into conversion.csv and SOURCE.md.
+    What could not be carried over as it was is printed, and written into conversion.csv and SOURCE.md. A
+    feeder that was written by hand is never replaced; an earlier conversion that differs is kept as FOLDER-1.
     """
     from feeders.convert import convert as run
 
     see(over={"FOLDER": folder})
-    done = run(
-        source,
-        folder,
-        root=root,
-        name=name,
-        droop=droop,
-        opened=opened or (),
-        meshed=meshed,
-        one_voltage=one_voltage,
-    )
+    with spared(folder):
+        done = run(
+            source,
+            folder,
+            root=root,
+            name=name,
+            droop=droop,
+            opened=opened or (),
+            meshed=meshed,
+            one_voltage=one_voltage,
+        )
     _show_changes(done)
     out.print(f"[green]{escape(str(folder))} written[/]")
     show_check(done)

@@ -6,6 +6,8 @@ import re
 import shutil
 import tempfile
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -19,7 +21,7 @@ from service import console
 if TYPE_CHECKING:
     from feeders.convert import Conversion
 
-__all__ = ["FOLDER", "converted", "show_check"]
+__all__ = ["FOLDER", "converted", "show_check", "spared"]
 
 FOLDER: Final = "feeder"
 """Name of a converted feeder's folder within that of the results."""
@@ -29,7 +31,7 @@ def converted(feeder: str, out: Path | None) -> str:
     """Return a feeder as `feeders.load.load` takes it; another tool's network is converted, and that is told.
 
     It is converted again each time: an OpenDSS file may lead to others that have changed while it has not.
-    What an earlier conversion left there is kept under another name unless it is the same.
+    What an earlier conversion left there is kept under another name unless it is the same, see `spared`.
 
     Parameters
     ----------
@@ -64,40 +66,54 @@ def converted(feeder: str, out: Path | None) -> str:
         "--open LINE (to cut a loop) or --meshed (to keep loops closed); then study FOLDER"
     )
     done: Conversion | None = None
-    before = _aside(folder) if folder.exists() else None
+    fresh = not folder.exists()
     try:
-        done = convert(feeder, folder, name=_name(feeder))
+        with spared(folder):
+            done = convert(feeder, folder, name=_name(feeder))
     except FeederInvalid as error:
         raise FeederInvalid([*error.problems, advice]) from error
     except BusbarUnclear as error:
         raise BusbarUnclear(f"{error}\n{advice}") from error
     finally:
-        if done is None:
+        if done is None and fresh:
             shutil.rmtree(temporary or folder, ignore_errors=True)
-            if before is not None:
-                before.rename(folder)
     fates = Counter(change.done for change in done.changes)
     counts = ", ".join(f"{times} {fate}" for fate, times in fates.items()) or "nothing changed"
     console.out.print(escape(f"{feeder} becomes {folder}: {counts}; the list: {folder / CHANGES_FILE}"))
-    if before is not None:
-        _settle(before, folder)
     show_check(done)
     return str(folder)
 
 
-def _aside(folder: Path) -> Path:
-    """Move an earlier conversion to a name that is free: somebody may have worked on it since."""
-    names = (folder.with_name(f"{folder.name}-{k}") for k in count(1))
-    return folder.rename(next(name for name in names if not name.exists()))
+@contextmanager
+def spared(folder: Path) -> Iterator[None]:
+    """Keep a copy of an earlier conversion, as `FOLDER-1`, unless what is written over it is the same.
 
+    A copy, since the folder may be the source, hold its files, or be the one that the command runs in.
 
-def _settle(before: Path, folder: Path) -> None:
-    """Drop the earlier conversion if the new one says the same; otherwise keep it, and tell."""
-    kept = {path.relative_to(before): path.read_bytes() for path in before.rglob("*") if path.is_file()}
-    if all((folder / name).is_file() and (folder / name).read_bytes() == old for name, old in kept.items()):
-        shutil.rmtree(before)
-    else:
-        console.out.print(escape(f"what was in {folder} before is not the same; it is now in {before}"))
+    Parameters
+    ----------
+    folder
+        Where a conversion is written.
+    """
+    from feeders.convert import WRITTEN
+
+    old = {name: folder / name for name in WRITTEN if (folder / name).is_file()}
+    if not old:
+        yield
+        return
+    place = folder.resolve()
+    names = (place.with_name(f"{place.name}-{k}") for k in count(1))
+    kept = next(name for name in names if not name.exists())
+    kept.mkdir()
+    try:
+        for name, path in old.items():
+            shutil.copyfile(path, kept / name)
+        yield
+    finally:
+        if all((folder / name).read_bytes() == (kept / name).read_bytes() for name in old):
+            shutil.rmtree(kept)
+        else:
+            console.out.print(escape(f"what was in {folder} before is not the same; it is now in {kept}"))
 
 
 def _name(feeder: str) -> str:

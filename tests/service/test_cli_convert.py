@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
+from feeders.equipment import folder_of
+from feeders.load import load
 from service.cli import app
 from tests.feeders.foreign import opendss, pgm
 
@@ -44,3 +47,42 @@ def test_an_opendss_file_with_a_loop(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     assert "as asked for" in done.output
     assert 'name = "town"' in (tmp_path / "out" / "feeder.toml").read_text()
+
+
+def test_a_feeder_written_by_hand_is_never_replaced(tmp_path: Path) -> None:
+    source, own = pgm(tmp_path / "grid.json", 12, balanced=True), tmp_path / "mine"
+    bundled = folder_of("simbench-lv-rural1")
+    assert bundled is not None
+    shutil.copytree(bundled, own)
+    (own / "conversion.csv").unlink()
+    before = {path.name: path.read_bytes() for path in own.iterdir()}
+    for given in (source, own):
+        done = run(app, ["feeders", "convert", str(given), str(own)])
+        assert isinstance(done.exception, FileExistsError)
+        assert "that no conversion has written" in str(done.exception)
+        assert {path.name: path.read_bytes() for path in own.iterdir()} == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["grid.json", "mine"]
+
+
+def test_an_edited_conversion_is_kept_aside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source, folder = pgm(tmp_path / "grid.json", 12, balanced=True), tmp_path / "out"
+    again = ["feeders", "convert", str(source), str(folder)]
+    for _ in range(2):
+        assert run(app, again).exit_code == 0
+    assert not (tmp_path / "out-1").exists()
+    customers = folder / "customers.csv"
+    original = customers.read_bytes()
+    customers.write_bytes(original + b"# mine\n")
+    done = run(app, again)
+    assert done.exit_code == 0, done.output
+    assert "it is now in" in done.output
+    assert (tmp_path / "out-1" / "customers.csv").read_bytes() == original + b"# mine\n"
+    assert customers.read_bytes() == original
+    # The folder as its own source, from within; and a source that is none takes nothing away.
+    monkeypatch.chdir(folder)
+    done = run(app, ["feeders", "convert", ".", ".", "--name", "other"])
+    assert done.exit_code == 0, done.output
+    assert (tmp_path / "out-2" / "customers.csv").read_bytes() == original
+    assert load(folder).feeder.name == "other"
+    assert run(app, ["feeders", "convert", "nowhere.json", "."]).exit_code != 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["grid.json", "out", "out-1", "out-2"]
