@@ -74,7 +74,7 @@ def calibrate(
                 progress=tell,
             )
         _tell(found)
-        write_tables(out, found.tables)
+        write_tables(out, "calibrate", found.tables)
         if write is not None:
             found.corrected(feeder, write)
             console.out.print(escape(f"{write}: {found.feeder} with {len(found.corrections)} corrections"))

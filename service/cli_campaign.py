@@ -190,7 +190,7 @@ def campaign(
         with bar("scenarios") as tell:
             found = study(site, plan, runner=_runner(workers, dask), journal=kept, progress=tell)
         _print(found)
-        write_tables(out, found.tables)
+        write_tables(out, "campaign", found.tables)
 
 
 def _print(found: Campaign) -> None:

@@ -136,7 +136,7 @@ def droop(
             console.out.print(escape(f"{site.feeder.name}: {NOTHING} (--preset equips customers with some)"))
             return
         _tell(found, options)
-        write_tables(out, found.tables)
+        write_tables(out, "droop", found.tables)
 
 
 def _studied(

@@ -94,7 +94,7 @@ def redundancy(
         show("Liars inside one part", found.parts)
         if found.silent:
             show(f"What changes without {', '.join(found.silent)}", found.changes)
-        write_tables(out, found.tables)
+        write_tables(out, "redundancy", found.tables)
 
 
 def protect(
@@ -150,7 +150,7 @@ def protect(
                 progress=lambda known, done: tell(done, known),
             )
         _tell_protection(found, len(site.meter_ids))
-        write_tables(out, found.tables)
+        write_tables(out, "protect", found.tables)
 
 
 def _tell_protection(found: Protect, of: int) -> None:
@@ -213,7 +213,7 @@ def detectable(
         places = ["customer", "bus"]
         show(f"Lies, V: each alone, and with {more} more", found.meters.drop(columns=places).round(2))
         show(f"Errors of the voltage with {more + 1} unnoticed liars, V", found.customers.round(2))
-        write_tables(out, found.tables)
+        write_tables(out, "detectable", found.tables)
         if trials:
             with bar("simulated lies") as tell:
                 seen = rehearse(

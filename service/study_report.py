@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final
 from feeders.command_line import command_line, word
 from feeders.files import replace_file
 from feeders.report.book import Report
+from feeders.report.page import FEEDER
 from feeders.report.sections import Outcome, Result
 from feeders.studies.droop_fleets import NOTHING, NoInverters
 from gridsec.errors import GridsecError
@@ -342,7 +343,7 @@ def versions() -> dict[str, str]:
 
 
 def write(made: Report, out: Path, folder: Path) -> None:
-    """Write the files of a report; the page last, when all that it speaks of is there.
+    """Write the files of a report; the page last, when all that it speaks of is there, and nothing else.
 
     Parameters
     ----------
@@ -361,7 +362,13 @@ def write(made: Report, out: Path, folder: Path) -> None:
     figures.mkdir(parents=True, exist_ok=True)
     for name, data in made.pictures.items():
         (figures / name).write_bytes(data)
-    write_tables(folder / "tables", made.tables)
+    for part in (*STUDIES, FEEDER):
+        for old in figures.glob(f"{part}-*"):
+            if old.suffix in {".svg", ".png"} and old.name not in made.pictures:
+                old.unlink()
+        whose = f"{part}-"
+        tables = {name.removeprefix(whose): t for name, t in made.tables.items() if name.startswith(whose)}
+        write_tables(folder / "tables", part, tables)
     replace_file(out, lambda new: new.write_text(made.html, encoding="utf-8"))
 
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 __all__ = ["A_FEEDER", "is_feeder", "write_tables"]
 
-A_FEEDER: Final = "a feeder's folder; tables would replace its own files, they go into another folder"
+A_FEEDER: Final = "a feeder's folder; tables go into another folder"
 
 
 def is_feeder(folder: Path) -> bool:
@@ -29,15 +29,18 @@ def is_feeder(folder: Path) -> bool:
     return (folder / META_FILE).exists()
 
 
-def write_tables(folder: Path | None, tables: Mapping[str, pd.DataFrame]) -> None:
-    """Write every table into a folder, as `NAME.csv` and `NAME.parquet`.
+def write_tables(folder: Path | None, study: str, tables: Mapping[str, pd.DataFrame]) -> None:
+    """Write every table of a study into a folder, as `STUDY-NAME.csv` and `STUDY-NAME.parquet`.
 
-    A file is replaced when its new content is complete: an interruption leaves the old one.
+    A file is replaced when its new content is complete: an interruption leaves the old one. Tables that the
+    study has written there before, and that are no answer to the present question, are removed.
 
     Parameters
     ----------
     folder
         Where to; it is made if it does not exist. None: nothing is written.
+    study
+        The study's name.
     tables
         Table by name. Names are those of files, without ending.
 
@@ -46,7 +49,7 @@ def write_tables(folder: Path | None, tables: Mapping[str, pd.DataFrame]) -> Non
     ValueError
         If a name is not that of a file in the folder.
     FileExistsError
-        If the folder is a feeder's: tables have names like those of its own files.
+        If the folder is a feeder's.
     OSError
         If the folder cannot be written.
     """
@@ -58,8 +61,14 @@ def write_tables(folder: Path | None, tables: Mapping[str, pd.DataFrame]) -> Non
     for name, frame in tables.items():
         if Path(name).name != name or name in ("", ".."):
             raise ValueError(f"{name!r} is no name of a table's file")
-        replace_file(folder / f"{name}.csv", partial(frame.to_csv, index=False))
-        replace_file(folder / f"{name}.parquet", partial(_for_parquet(frame).to_parquet, index=False))
+        replace_file(folder / f"{study}-{name}.csv", partial(frame.to_csv, index=False))
+        replace_file(folder / f"{study}-{name}.parquet", partial(_for_parquet(frame).to_parquet, index=False))
+    for old in sorted(folder.glob(f"{study}-*.csv")):
+        # A table is two files: one alone is somebody's own.
+        twin = old.with_suffix(".parquet")
+        if old.stem.removeprefix(f"{study}-") not in tables and twin.is_file():
+            old.unlink()
+            twin.unlink()
 
 
 def _for_parquet(frame: pd.DataFrame) -> pd.DataFrame:

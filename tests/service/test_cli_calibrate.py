@@ -55,9 +55,9 @@ def test_a_wrong_bus_is_proposed_and_corrected_in_a_copy_only(
     assert "with 1 corrections" in told
     assert read(copy).customers == CIGRE.tables.customers
     assert (folder / "customers.csv").read_bytes() == before
-    assert pd.read_csv(out / "proposals.csv")["proposed"].tolist() == ["Bus R15"]
+    assert pd.read_csv(out / "calibrate-proposals.csv")["proposed"].tolist() == ["Bus R15"]
     assert {path.stem for path in out.glob("*.parquet")} == {
-        *("proposals", "meters", "lines", "customers", "loads", "errors")
+        f"calibrate-{name}" for name in ("proposals", "meters", "lines", "customers", "loads", "errors")
     }
 
 

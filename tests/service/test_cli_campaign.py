@@ -31,10 +31,10 @@ def test_tables_are_printed_and_written(
     assert code == 0
     assert "cigre-lv: 3 scenarios of 30 s watched by sequential" in told
     assert "By kind and size" in told
-    found = pd.read_csv(out / "scenarios.csv")
+    found = pd.read_csv(out / "campaign-scenarios.csv")
     assert found["kind"].tolist() == ["clean", "bias", "bias"]
     assert sorted(found["size"]) == [0.0, 3.0, 5.0]
-    assert pd.read_parquet(out / "by_size.parquet")["scenarios"].sum() == 3
+    assert pd.read_parquet(out / "campaign-by_size.parquet")["scenarios"].sum() == 3
     assert journal.read_text(encoding="utf-8").count("\n") == 2
     # Nothing is left to do, and the answer is the same.
     code, again, _ = run(monkeypatch, capsys, *FEW, *some, "--journal", str(journal))
@@ -52,11 +52,11 @@ def test_promises_are_played_and_counted(
     code, told, _ = run(monkeypatch, capsys, *words)
     assert code == 0
     assert "Promises of `study detectable`" in told
-    kept = pd.read_csv(tmp_path / "out" / "promises.csv").set_index("promise")
+    kept = pd.read_csv(tmp_path / "out" / "campaign-promises.csv").set_index("promise")
     assert kept["lies"].to_dict() == {"hidden": 4, "named": 4}
     assert kept["broken"].sum() == 0
     assert kept["scenes"].max() == 2
-    assert set(pd.read_csv(tmp_path / "out" / "liars.csv")["kind"]) >= {"hidden_alone", "named"}
+    assert set(pd.read_csv(tmp_path / "out" / "campaign-liars.csv")["kind"]) >= {"hidden_alone", "named"}
 
 
 def test_wrong_arguments_are_told(

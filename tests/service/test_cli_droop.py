@@ -27,9 +27,9 @@ def test_the_answer_is_told_and_its_tables_are_written(
     assert code == 0
     assert "village: the fleet (sampled every 1 s) is stable" in told
     assert "Random places, kW" in told
-    written = pd.read_parquet(out / "stability.parquet")
+    written = pd.read_parquet(out / "droop-stability.parquet")
     assert written["point"].tolist() == ["evening", "noon", "half", "any loads"]
-    assert pd.read_csv(out / "hosting.csv")["capacity_kw"].iloc[0] > 0
+    assert pd.read_csv(out / "droop-hosting.csv")["capacity_kw"].iloc[0] > 0
     assert journal.read_text(encoding="utf-8").count("\n") > 10
 
 

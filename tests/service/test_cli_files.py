@@ -53,7 +53,7 @@ def test_a_campaign_follows_the_files(
         "weighted-least-squares (feeder's files); allowed false alarms a year: 2 (feeder's files); powers of "
         "metered customers within 0.14 kW and 3.4 kvar, medians of 1 sigma (feeder's files)"
     ) in plain(told)
-    found = pd.read_csv(tmp_path / "out" / "scenarios.csv")
+    found = pd.read_csv(tmp_path / "out" / "campaign-scenarios.csv")
     assert set(found["alarms_per_year"]) == {2.0}
     onset = found["onset_s"].dropna()
     assert len(onset) == 2
@@ -119,7 +119,7 @@ def test_options_are_stronger_than_the_files(
         load_error=LoadError(0.1, 0.05),
     )
     expected = campaign(load(rare), plan).scenarios
-    written = pd.read_parquet(tmp_path / "out" / "scenarios.parquet")
+    written = pd.read_parquet(tmp_path / "out" / "campaign-scenarios.parquet")
     np.testing.assert_array_equal(written["error_others"], expected["error_others"])
     np.testing.assert_array_equal(written["onset_s"], expected["onset_s"])
 

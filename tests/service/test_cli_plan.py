@@ -25,7 +25,7 @@ def test_redundancy_prints_tables_and_writes_them(
     assert code == 0
     assert "m05 m12" in told
     assert "What changes without m04" in told
-    summary = pd.read_csv(folder / "summary.csv")
+    summary = pd.read_csv(folder / "redundancy-summary.csv")
     assert summary["liars"].tolist()[2] == "m05 m12"
     assert journal.exists()
 
@@ -49,7 +49,7 @@ def test_protect_tells_the_meters_and_what_they_are_worth(
     assert code == 0
     assert "protect 1 of 13 meters; no fewer suffice" in told
     assert "fewest liars that stay invisible: 1 before, ∞ after" in told
-    assert pd.read_csv(tmp_path / "out" / "meters.csv")["meter"].tolist() == ["m08"]
+    assert pd.read_csv(tmp_path / "out" / "protect-meters.csv")["meter"].tolist() == ["m08"]
 
 
 def test_the_usual_question_has_an_answer_where_all_powers_are_known(
@@ -58,7 +58,7 @@ def test_the_usual_question_has_an_answer_where_all_powers_are_known(
     code, told, _ = run(monkeypatch, capsys, "protect", "--out", str(tmp_path / "out"))
     assert code == 0
     assert "protect 1 of 13 meters; no fewer suffice" in told
-    row = pd.read_csv(tmp_path / "out" / "summary.csv").iloc[0]
+    row = pd.read_csv(tmp_path / "out" / "protect-summary.csv").iloc[0]
     assert row["goal"] == "contain"
     assert row["alone"] < row["after"] <= row["lie_volt"] < row["before"] < 8.0
     for goal in ("identify", "notice"):
@@ -87,7 +87,7 @@ def test_detectable_tells_sizes_and_keeps_its_word(
     assert code == 0
     assert "3 lies up to the hidden size: 0 led to a name" in told
     assert "3 lies from the named size on: 0 missed, 0 with an honest meter named" in told
-    assert len(pd.read_csv(tmp_path / "out" / "meters.csv")) == 6
+    assert len(pd.read_csv(tmp_path / "out" / "detectable-meters.csv")) == 6
 
 
 def test_feeders_in_three_phases_are_studied(
@@ -97,9 +97,9 @@ def test_feeders_in_three_phases_are_studied(
     code, told, _ = run(monkeypatch, capsys, "redundancy", "ieee-european-lv", *out)
     assert code == 0
     assert "53" in told
-    meters = pd.read_csv(tmp_path / "meters.csv")
+    meters = pd.read_csv(tmp_path / "redundancy-meters.csv")
     assert meters["bus"].str[-2:].isin([".a", ".b", ".c"]).all()
-    assert pd.read_csv(tmp_path / "summary.csv")["index"].tolist() == [float("inf"), 53.0]
+    assert pd.read_csv(tmp_path / "redundancy-summary.csv")["index"].tolist() == [float("inf"), 53.0]
     code, told, _ = run(monkeypatch, capsys, "protect", "ieee-european-lv", "--goal", "identify")
     assert code == 0
     assert "identify asks for nothing here, which is no safety" in told

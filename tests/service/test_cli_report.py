@@ -55,6 +55,16 @@ def test_a_report_and_everything_beside_it(
     assert "with work kept from before" in page.read_text(encoding="utf-8")
     assert {path.name: path.read_bytes() for path in (folder / "figures").iterdir()} == first
 
+    # Of another question the same report keeps nothing that is not in it.
+    (folder / "figures" / "logo.svg").write_text("mine")
+    code, _, _ = run(monkeypatch, capsys, "cigre-lv", "--out", str(page), "--studies", "redundancy")
+    assert code == 0
+    figures = {path.stem for path in (folder / "figures").iterdir()}
+    assert figures == {"feeder-map", "redundancy-map", "logo"}
+    tables = {path.stem for path in (folder / "tables").iterdir()}
+    expected = {f"redundancy-{name}" for name in ("summary", "meters", "parts")}
+    assert tables == {"feeder-conversion", *expected}
+
 
 def test_commands_in_a_report_say_exactly_what_was_asked() -> None:
     asked = Asked(

@@ -50,7 +50,8 @@ def test_a_study_of_another_tools_file(
     site = load(out / "feeder")
     assert site.feeder.name == file.stem
     expected = redundancy(site).tables
-    pd.testing.assert_frame_equal(pd.read_csv(out / "meters.csv")[["meter"]], expected["meters"][["meter"]])
+    written_meters = pd.read_csv(out / "redundancy-meters.csv")[["meter"]]
+    pd.testing.assert_frame_equal(written_meters, expected["meters"][["meter"]])
 
     # Again, into the same folder: the results are the same, and nobody asks.
     before = {path.name: path.read_bytes() for path in out.rglob("*.csv")}
