@@ -402,7 +402,7 @@ def replay(
 ) -> None:
     """Run a recording through the same chain as the live service, and show what it would have said."""
     from feeders.load import load
-    from feeders.recording import read_recording
+    from feeders.recording import RecordingInvalid, read_recording
     from service.alarms import to_json
     from service.replay import Tally
     from service.replay import replay as run
@@ -418,6 +418,8 @@ def replay(
             raise
         where = f"{file} was recorded on {name!r}: --feeder says where its folder is"
         raise FeederInvalid([where, *error.problems]) from error
+    if recording.feeder not in {None, site.feeder.name}:
+        raise RecordingInvalid(f"{file}: recorded on {recording.feeder}, not on {site.feeder.name}")
     if recording.digest not in {None, site.digest}:
         console.err.print(f"[yellow]{escape(name)} has changed since this was recorded.[/]")
     tally = Tally()

@@ -306,6 +306,15 @@ def test_a_recording_of_a_folder_asks_where_that_is(gridsec: Run, tmp_path: Path
     assert told.returncode == gridsec("replay", str(file), "--feeder", str(tmp_path / "no")).returncode > 0
 
 
+def test_a_recording_of_another_feeder_is_not_replayed(gridsec: Run, tmp_path: Path) -> None:
+    file = tmp_path / "day.parquet"
+    made = gridsec("simulate", FEEDER, "--out", str(file), "--duration", "2", "--start", "1795212000")
+    assert made.returncode == 0, made.stderr
+    told = gridsec("replay", str(file), "--feeder", "cigre-lv")
+    assert f"recorded on {FEEDER}, not on cigre-lv" in plain(refused(6, told))
+    assert not told.stdout
+
+
 def test_a_wrong_inverter_is_recorded_and_raises_its_alarm(gridsec: Run, tmp_path: Path) -> None:
     """Both named through files alone: a feeder's file that chooses the estimator, and a recording."""
     folder, file = tmp_path / FEEDER, tmp_path / "day.parquet"
