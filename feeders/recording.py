@@ -236,6 +236,25 @@ def read_recording(path: Path | str) -> Recording:
         raise RecordingInvalid(f"{path}: its metadata cannot be read: {error!r}") from error
 
 
+def is_simulated(path: Path) -> bool:
+    """Return whether a file is what `record` writes, readings or truth.
+
+    Parameters
+    ----------
+    path
+        The file.
+
+    Raises
+    ------
+    OSError
+        If it cannot be read.
+    """
+    try:
+        return KEY in (pq.read_schema(path).metadata or {})
+    except pa.ArrowException:
+        return False
+
+
 def _wrong_columns(schema: Any) -> list[str]:
     """What is wrong with the columns of a file, all at once."""
     missing = [name for name in REQUIRED if name not in schema.names]

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, Final, TypeVar
 
 import typer
 from rich.markup import escape
@@ -158,6 +158,8 @@ def _see_kind(kind: str, *, check: bool) -> None:
 
 # ------------------------------------------------------------------------------------------------- simulate
 
+PREFIX: Final = "gridsec"
+
 Attacks = Annotated[
     list[str] | None,
     typer.Option(
@@ -185,7 +187,10 @@ def simulate(
     *,
     connect: Endpoints = None,
     out: Annotated[
-        Path | None, typer.Option(help="Write a recording (Parquet) instead of publishing.")
+        Path | None,
+        typer.Option(
+            help="Write a recording (Parquet) instead of publishing; it replaces simulated ones only."
+        ),
     ] = None,
     duration: Annotated[float, typer.Option(min=0.0, help="How long, s; 0 is without end.")] = 600.0,
     dt: Annotated[
@@ -207,7 +212,7 @@ def simulate(
     ] = None,
     loss: Annotated[float, typer.Option(min=0.0, max=1.0, help="Part of the readings that is lost.")] = 0.0,
     report_q: Annotated[bool, typer.Option("--report-q", help="Meters report reactive power.")] = False,
-    prefix: Annotated[str, typer.Option(help="First chunks of all keys.")] = "gridsec",
+    prefix: Annotated[str, typer.Option(help="First chunks of all keys.")] = PREFIX,
 ) -> None:
     """Play a feeder's meters by full AC power flow: onto zenoh, or into a file.
 
@@ -226,7 +231,12 @@ def simulate(
     if out is not None:
         if math.isinf(length):
             problems.append("--duration: a recording has an end")
-        live = {"--connect": connect, "--lockstep": lockstep, "--speed": speed != 1.0}
+        live = {
+            "--connect": connect,
+            "--lockstep": lockstep,
+            "--speed": speed != 1.0,
+            "--prefix": prefix != PREFIX,
+        }
         problems += [f"{name} goes with publishing, not with --out" for name, given in live.items() if given]
     problems += no_choice("--season", Season, season)
     lies = _read_all("--attack", attack, _lie, problems)
@@ -234,7 +244,7 @@ def simulate(
     if problems:
         raise typer.BadParameter("; ".join(problems))
     if out is not None:
-        see(replaced={"--out": out, "--out, its truth": truth_path(out)})
+        see(simulated={"--out": out, "--out, its truth": truth_path(out)})
     tick = site.tables.meta.monitor.tick_s if dt is None else dt
     first = math.ceil(time.time() / tick) * tick if start is None else start
     with said():

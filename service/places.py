@@ -31,6 +31,7 @@ def see(
     new: Given = NONE,
     files: Given = NONE,
     replaced: Given = NONE,
+    simulated: Given = NONE,
     read: Given = NONE,
 ) -> None:
     """Refuse, all at once, what could not be read or written after the work. Nothing is left behind.
@@ -47,6 +48,8 @@ def see(
         That are written as they are; folders above them are made.
     replaced
         Files that are replaced as a whole, by others made beside them.
+    simulated
+        Files of a simulation, likewise: they replace only such files, never what was measured.
     read
         Files that are read.
 
@@ -55,13 +58,14 @@ def see(
     Unusable
         If there is something that cannot be used.
     """
-    written = {**folders, **over, **new, **files, **replaced}
+    written = {**folders, **over, **new, **files, **replaced, **simulated}
     checks: list[tuple[Given, Callable[[Path], str | None]]] = [
         (folders, _folder),
         (over, _over),
         (new, _new),
         (files, _file),
         (replaced, _replaced),
+        (simulated, _simulated),
         (read, _read),
     ]
     problems = [
@@ -70,7 +74,7 @@ def see(
         for option, path in given.items()
         if path is not None and (why := _why(check, path))
     ]
-    problems += _same({**written, **read}, {*files, *replaced})
+    problems += _same({**written, **read}, {*files, *replaced, *simulated})
     if problems:
         raise Unusable("\n".join(problems))
 
@@ -113,6 +117,14 @@ def _replaced(path: Path) -> str | None:
     if path.exists() and not path.is_file():
         return _file(path)
     return _room(Path(os.path.realpath(path)).parent)
+
+
+def _simulated(path: Path) -> str | None:
+    from feeders.recording import is_simulated
+
+    if path.is_file() and path.stat().st_size and not is_simulated(path):
+        return "already there, and not of a simulation; expected another file"
+    return _replaced(path)
 
 
 def _read(path: Path) -> str | None:

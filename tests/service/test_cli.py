@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TextIO
 
 import httpx
+import pandas as pd
 import pytest
 
 from feeders.load import load
@@ -222,6 +223,7 @@ def test_all_that_is_wrong_with_a_scenario_is_told_at_once(gridsec: Run, tmp_pat
     lies += ["bias:substation:nan:4:5"]
     wrong = ["LV1.101 Load 2:nan:4:5", "LV1.101 Load 2:4:5:5"]
     given = {"--season": "dry", "--dt": "0", "--start": "-5", "--lockstep": "3", "--speed": "2"}
+    given["--prefix"] = "test"
     words = [f"{name}={value}" for name, value in given.items()]
     words += [f"--attack={lie}" for lie in lies] + [f"--inverter-attack={each}" for each in wrong]
     done = gridsec("simulate", FEEDER, "--duration", "inf", *words, "--out", str(out))
@@ -230,12 +232,27 @@ def test_all_that_is_wrong_with_a_scenario_is_told_at_once(gridsec: Run, tmp_pat
     said = plain(done.stderr)
     for text in (*lies, *wrong, "--dt is 0", "--start is -5", "--season is 'dry'", "a recording has an end"):
         assert text in said
-    for text in ("--speed", "--lockstep"):
+    for text in ("--speed", "--lockstep", "--prefix"):
         assert f"{text} goes with publishing, not with --out" in said
     assert not out.exists()
     done = gridsec("simulate", FEEDER, "--attack=stuck:1:0:-1e9:5", "--out", str(out))
     assert done.returncode == 2
     assert "further than can be played" in plain(done.stderr)
+
+
+def test_a_simulation_replaces_simulations_only(gridsec: Run, tmp_path: Path) -> None:
+    field, notes = tmp_path / "field.parquet", tmp_path / "notes.parquet"
+    table = pd.DataFrame({"meter": ["m01"], "t": [1795212000.0], "v_volt": [230.0]})
+    table.to_parquet(field)
+    table.to_parquet(tmp_path / "own.truth.parquet")
+    notes.write_text("no parquet")
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    some = ("simulate", FEEDER, "--duration", "2", "--start", "1795212000", "--out")
+    for out in (field, notes, tmp_path / "own.parquet"):
+        assert "already there, and not of a simulation" in plain(refused(6, gridsec(*some, str(out))))
+        assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+    for _ in range(2):
+        assert gridsec(*some, str(tmp_path / "new.parquet")).returncode == 0
 
 
 def test_conversion_of_nothing(gridsec: Run, tmp_path: Path) -> None:
