@@ -443,4 +443,11 @@ def check(site: Site, scenario: Scenario) -> None:
         if attack.t_off > then and reach(attack, then) > LONGEST_LOOK_BACK_S:
             back = reach(attack, then)
             problems.append(f"an attack looks back {back:.0f} s, further than can be played")
+    every = (*scenario.attacks, *scenario.busbar_attacks, *scenario.inverter_attacks)
+    problems += [
+        f"an attack begins {attack.t_on - scenario.start:g} s after the start, when the scenario of "
+        f"{scenario.duration_s:g} s is over"
+        for attack in every
+        if attack.t_on >= scenario.start + scenario.duration_s
+    ]
     refuse(problems)

@@ -297,8 +297,10 @@ def _read_all(
 
 def _span(begin: float, end: float) -> tuple[float, float]:
     """Two times, s after the start, one before the other."""
-    if not (math.isfinite(begin) and begin < end):
-        raise ValueError(f"it must begin before it ends, not at {begin:g} and {end:g}")
+    if not (math.isfinite(begin) and begin < end and end > 0.0):
+        raise ValueError(
+            f"it must begin before it ends, and end after the start, not at {begin:g} and {end:g}"
+        )
     return begin, end
 
 

@@ -267,7 +267,7 @@ def test_a_busbar_meter_lies_as_it_is_told_to(site: Site, european: Site) -> Non
 def test_the_command_line_takes_it_where_it_takes_a_number_of_meters(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    run, file = command("simulate", FEEDER, "--duration", "2", "--out"), str(tmp_path / "x.parquet")
+    run, file = command("simulate", FEEDER, "--duration", "30", "--out"), str(tmp_path / "x.parquet")
     lies = ("--attack", "bias:substation:-0.03:20:55", "--attack", "bias:1:0.02:20:55")
     code, _, problem = run(monkeypatch, capsys, file, *lies)
     assert code == 0, problem

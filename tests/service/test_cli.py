@@ -238,6 +238,16 @@ def test_all_that_is_wrong_with_a_scenario_is_told_at_once(gridsec: Run, tmp_pat
     done = gridsec("simulate", FEEDER, "--attack=stuck:1:0:-1e9:5", "--out", str(out))
     assert done.returncode == 2
     assert "further than can be played" in plain(done.stderr)
+    late = ("--attack=bias:1:0.03:500:600", "--attack=bias:substation:0.03:60:inf")
+    late += ("--inverter-attack=LV1.101 Load 2:4:70:90",)
+    done = gridsec("simulate", FEEDER, "--duration", "60", *late, "--out", str(out))
+    assert done.returncode == 2
+    for begin in (500, 60, 70):
+        assert f"begins {begin} s after the start, when the scenario of 60 s is over" in plain(done.stderr)
+    done = gridsec("simulate", FEEDER, "--duration", "60", "--attack=bias:1:0.03:-20:-5", "--out", str(out))
+    assert done.returncode == 2
+    assert "end after the start, not at -20 and -5" in plain(done.stderr)
+    assert not out.exists()
 
 
 def test_a_simulation_replaces_simulations_only(gridsec: Run, tmp_path: Path) -> None:
