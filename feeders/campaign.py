@@ -41,6 +41,9 @@ if TYPE_CHECKING:
 LARGEST: Final = 1.5
 """Random displacements lie between `size` and this times `size`."""
 
+LARGEST_SIZE_PU: Final = 0.5
+"""A size beyond this is hardly meant: it was said in per cent."""
+
 LARGEST_SHIFT_PU: Final = 0.2
 """A fake load that drops any voltage by more than this would be absurd at first sight."""
 
@@ -62,6 +65,19 @@ class Kind(StrEnum):
     RANDOM = "random"
     COORDINATED = "coordinated"
     COORDINATED_POWER = "coordinated-power"
+
+
+def no_size(size: float) -> list[str]:
+    """Return what is wrong with a size that somebody asks for: one that was said in per cent.
+
+    Parameters
+    ----------
+    size
+        A part of nominal.
+    """
+    if abs(size) <= LARGEST_SIZE_PU:
+        return []
+    return [f"{size:g} is {100.0 * size:g} % of nominal; {size / 100.0:g} is {size:g} %"]
 
 
 class NoSuchAttack(GridsecError):

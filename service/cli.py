@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Final, TypeVar
 import typer
 from rich.markup import escape
 
-from gridsec.errors import DesignInfeasible, FeederInvalid, GridsecError, NotObservable
+from gridsec.errors import DesignInfeasible, FeederInvalid, GridsecError, NotObservable, refuse
 from service import cli_feeders, cli_reproduce, cli_serve, cli_study, console
 from service.cli_plan import said
 from service.cli_serve import Endpoints
@@ -102,7 +102,7 @@ def demo(
     duration: Annotated[float, typer.Option(min=30.0, help="How long it plays, s.")] = 120.0,
     attacked: Annotated[int, typer.Option(min=1, help="How many meters lie.")] = 2,
     size: Annotated[
-        float, typer.Option(help="By how much at least, as a part of the nominal voltage.")
+        float, typer.Option(help="By how much at least, as a part of the nominal voltage; 0.03 is 3 %.")
     ] = 0.03,
     kind: Annotated[
         str, typer.Option(help="bias, scaling, drift, stuck, replay, random, coordinated, coordinated-power.")
@@ -123,6 +123,7 @@ def demo(
     from service.demo import Plan, run, verdict
 
     _see_kind(kind, check=check)
+    _see_size(size)
     plan = Plan(feeder, duration, attacked, size, kind, seed, http)
     try:
         outcome = run(plan, console.out, check=check, keep=keep)
@@ -156,6 +157,15 @@ def _see_kind(kind: str, *, check: bool) -> None:
         )
 
 
+def _see_size(size: float) -> None:
+    """Refuse sizes that are none, or were said in per cent."""
+    from feeders.campaign import no_size
+
+    problems = no_size(size) if 0.0 < size < math.inf else [f"{size:g}; expected a positive part of nominal"]
+    if problems:
+        raise typer.BadParameter("; ".join(problems), param_hint="--size")
+
+
 # ------------------------------------------------------------------------------------------------- simulate
 
 PREFIX: Final = "gridsec"
@@ -164,9 +174,9 @@ Attacks = Annotated[
     list[str] | None,
     typer.Option(
         "--attack",
-        help="kind:count:size:from:to, e.g. bias:2:0.03:20:55 (size as a part of nominal, times in s after "
-        "the start); may be repeated. With 'substation' in place of the count the busbar's meter lies, by "
-        "just that size, which may be negative: bias:substation:0.03:20:55.",
+        help="kind:count:size:from:to, e.g. bias:2:0.03:20:55 (size as a part of nominal: 0.03 is 3 %, "
+        "times in s after the start); may be repeated. With 'substation' in place of the count the busbar's "
+        "meter lies, by just that size, which may be negative: bias:substation:0.03:20:55.",
     ),
 ]
 
@@ -317,7 +327,7 @@ class _Lie:
 
 def _lie(text: str) -> _Lie:
     """Read `kind:count:size:from:to`."""
-    from feeders.campaign import Kind
+    from feeders.campaign import Kind, no_size
     from service.busbar import BUSBAR
 
     try:
@@ -334,6 +344,8 @@ def _lie(text: str) -> _Lie:
     if not math.isfinite(part) or (sized and part <= 0.0):
         what = "positive" if sized else "finite"
         raise ValueError(f"its size is {size}; expected a {what} part of nominal")
+    if kind not in (Kind.STUCK, Kind.REPLAY):
+        refuse(no_size(part))
     if kind is Kind.DRIFT and math.isinf(off):
         raise ValueError("a drift must end, as its speed follows from that")
     return _Lie(kind, many, part, on, off)

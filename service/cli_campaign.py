@@ -37,7 +37,12 @@ Together = Annotated[
 Seed = Annotated[int, typer.Option(help="Chooses everything random.", min=0)]
 Kinds = Annotated[
     list[str] | None,
-    typer.Option(help="A kind of lie and its sizes, like bias:1,3; may be repeated. [default: six kinds]"),
+    typer.Option(
+        help="A kind of lie and its sizes, like bias:1,3; may be repeated. bias, together, scaling: % of "
+        "nominal; drift: % per minute; coordinated, coordinated-power, power: % by which a load that is none "
+        "moves the least affected liar; replay, clock-shift: s; inverter: % of its rating; stuck: no size. "
+        "[default: six kinds]"
+    ),
 ]
 Promised = Annotated[
     bool,

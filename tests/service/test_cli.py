@@ -215,12 +215,16 @@ def test_wrong_usage(gridsec: Run) -> None:
         assert done.returncode == 2
         assert "customer:kvar:from:to" in done.stderr
     assert gridsec("demo", "--duration", "1").returncode == 2
+    for size, why in (("3", "3 is 300 % of nominal; 0.03 is 3 %"), ("0", "a positive part"), ("nan", "nan")):
+        done = gridsec("demo", "--size", size)
+        assert done.returncode == 2
+        assert why in plain(done.stderr)
 
 
 def test_all_that_is_wrong_with_a_scenario_is_told_at_once(gridsec: Run, tmp_path: Path) -> None:
     out = tmp_path / "x.parquet"
     lies = ["bias:2:0.03:4:2", "bias:2:0.03:nan:55", "bias:-1:0.03:4:5", "bias:2:-1:4:5", "drift:1:0.1:4:inf"]
-    lies += ["bias:substation:nan:4:5"]
+    lies += ["bias:substation:nan:4:5", "bias:1:3:4:5", "scaling:substation:-3:4:5"]
     wrong = ["LV1.101 Load 2:nan:4:5", "LV1.101 Load 2:4:5:5"]
     given = {"--season": "dry", "--dt": "0", "--start": "-5", "--lockstep": "3", "--speed": "2"}
     given["--prefix"] = "test"
@@ -232,6 +236,8 @@ def test_all_that_is_wrong_with_a_scenario_is_told_at_once(gridsec: Run, tmp_pat
     said = plain(done.stderr)
     for text in (*lies, *wrong, "--dt is 0", "--start is -5", "--season is 'dry'", "a recording has an end"):
         assert text in said
+    assert "3 is 300 % of nominal; 0.03 is 3 %" in said
+    assert "-3 is -300 % of nominal; -0.03 is -3 %" in said
     for text in ("--speed", "--lockstep", "--prefix"):
         assert f"{text} goes with publishing, not with --out" in said
     assert not out.exists()
