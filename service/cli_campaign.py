@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Annotated, TypeVar
@@ -26,7 +27,12 @@ if TYPE_CHECKING:
     from feeders.studies.campaign_plan import Kind, Plan
     from feeders.studies.campaign_run import Runner
 
-Scenarios = Annotated[int, typer.Option(help="How many, the first of each scene without a lie.", min=1)]
+Scenarios = Annotated[
+    int,
+    typer.Option(
+        help="How many, rounded up to whole scenes; the first of each scene is without a lie.", min=1
+    ),
+]
 Together = Annotated[
     int,
     typer.Option(
@@ -159,8 +165,11 @@ def campaign(
     from feeders.studies.campaign_plan import Design, Place
     from feeders.trials import Meters
 
+    count = min(scenarios, together)
+    if count == 1:
+        _see_no_lies({"--kind": kind, "--promised": promised, "--liars": liars, "--place": place})
     see(folders={"--out": out}, files={"--journal": journal})
-    site, count = load(converted(feeder, out)), min(scenarios, together)
+    site = load(converted(feeder, out))
     with said(), keeping("campaign", feeder, journal, without=no_journal) as kept:
         plan = planned(
             site,
@@ -196,6 +205,17 @@ def campaign(
             found = study(site, plan, runner=_runner(workers, dask), journal=kept, progress=tell)
         _print(found)
         write_tables(out, "campaign", found.tables)
+
+
+def _see_no_lies(given: Mapping[str, object]) -> None:
+    """Refuse options about lies where no scenario has one: it would look as if nobody was named for them."""
+    wrong = [option for option, value in given.items() if value]
+    if wrong:
+        raise typer.BadParameter(
+            "with one scenario of each scene, which is the one without a lie, nobody lies; expected "
+            "--scenarios and --together of 2 or more",
+            param_hint=", ".join(wrong),
+        )
 
 
 def _print(found: Campaign) -> None:

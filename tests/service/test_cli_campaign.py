@@ -78,6 +78,23 @@ def test_wrong_arguments_are_told(
         assert why in told
 
 
+def test_options_about_lies_need_scenarios_with_lies(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lies = ("--kind", "bias:1", "--place", "street", "--liars", "1")
+    for count in (("--scenarios", "1"), ("--together", "1")):
+        code, _, told = run(monkeypatch, capsys, "campaign", "cigre-lv", *count, *lies)
+        assert code == 2
+        assert "--kind, --liars, --place" in plain(told)
+        assert "nobody lies; expected --scenarios and --together of 2 or more" in plain(told)
+        code, _, told = run(monkeypatch, capsys, "campaign", "cigre-lv", *count, "--promised")
+        assert (code, "nobody lies" in plain(told)) == (2, True)
+    clean = ("--scenarios", "1", "--duration", "30", "--workers", "1")
+    code, told, _ = run(monkeypatch, capsys, "campaign", "cigre-lv", *clean)
+    assert code == 0
+    assert "1 scenarios of 30 s" in told
+
+
 def test_no_cluster_is_told(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("distributed")
     code, _, told = run(monkeypatch, capsys, *FEW[:4], "--dask", "nonsense://127.0.0.1")
