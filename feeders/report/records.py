@@ -24,7 +24,7 @@ __all__ = ["calibrate"]
 ROWS = 40
 """So many meters a chart has at most: those that are off most."""
 
-UNTOLD, PROPOSED, EXCLUDED = "cannot be told", "proposed", "excluded"
+UNTOLD, PROPOSED, EXCLUDED, AS_FILED = "cannot be told", "proposed", "excluded", "as in the files"
 # Words of `feeders.studies.calibrate_tables`; `tests/feeders/report` holds them together.
 
 
@@ -41,8 +41,8 @@ def calibrate(site: Site, found: Calibrate) -> Section:
         Figure(
             "calibrate-map",
             "Whose place is in doubt",
-            "Diamonds: the files should be corrected. Triangles: the readings cannot tell. Discs: as in "
-            "the files.",
+            "Diamonds: the files should be corrected. Triangles: the readings cannot tell, or not all of it "
+            "was looked for. Discs: as in the files.",
             partial(_doubt_map, site, found.customers),
         )
     ]
@@ -126,13 +126,13 @@ def _said(found: Calibrate) -> Finding:
 
 def _doubt_map(site: Site, customers: pd.DataFrame, width: float) -> Drawing:
     verdicts = dict(zip(customers["customer"].astype(str), customers["verdict"].astype(str), strict=True))
-    shapes = {PROPOSED: Shape.ALARM, UNTOLD: Shape.OPEN, EXCLUDED: Shape.OPEN}
+    shapes = {PROPOSED: Shape.ALARM, AS_FILED: Shape.METER}
     spots = []
     for name in site.feeder.customers:
         verdict = verdicts.get(name, UNTOLD)
-        shape = shapes.get(verdict, Shape.METER)
+        shape = shapes.get(verdict, Shape.OPEN)
         spots.append(Spot(shape, name if shape is Shape.ALARM else "", f"{name}: {verdict}"))
-    meanings = {"to be corrected": Shape.ALARM, "cannot be told": Shape.OPEN, "as in the files": Shape.METER}
+    meanings = {"to be corrected": Shape.ALARM, "cannot be told": Shape.OPEN, AS_FILED: Shape.METER}
     return draw_map(site, spots, width, legend=legend_of(meanings, spots))
 
 

@@ -195,7 +195,7 @@ def calibrate(
 
     with Journal(journal, subject) as kept:
         now, verdict, found = _searched(State(site.tables, tuple(exclude)), fitted, weighed, risk, kept)
-    lines, ids = calibrate_tables.lines(now, tolerance)
+    lines, ids = calibrate_tables.lines(now, tolerance, kinds)
     wrongs = [_read(row["correction"]) for row in found]
     rows, sure = calibrate_tables.final(found, wrongs, lines, ids)
     return Calibrate(
@@ -206,7 +206,7 @@ def calibrate(
         risk=risk,
         meters=calibrate_tables.meters(now, risk),
         lines=lines,
-        customers=calibrate_tables.customers(now, verdict, wrongs, risk),
+        customers=calibrate_tables.customers(now, verdict, wrongs, risk, kinds),
         loads=calibrate_tables.loads(now),
         errors=calibrate_tables.errors(now),
         proposals=rows,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 __all__ = ["customers", "errors", "final", "lines", "loads", "meters", "present", "told"]
 
 AS_FILED, PROPOSED, UNTOLD, EXCLUDED = "as in the files", "proposed", "cannot be told", "excluded"
+UNASKED: Final = "not looked for"
 
 WIDE: Final = 1.96
 """Half-width of intervals, in standard errors: 95 %."""
@@ -74,7 +75,9 @@ def meters(now: Round, risk: float) -> pd.DataFrame:
     )
 
 
-def lines(now: Round, tolerance: float) -> tuple[pd.DataFrame, list[tuple[str, ...]]]:
+def lines(
+    now: Round, tolerance: float, kinds: Collection[Kind]
+) -> tuple[pd.DataFrame, list[tuple[str, ...]]]:
     """Length of every line, or lines in series, alone; and the ids of the lines of each row."""
     net, rows = now.net, now.state.tables.lines
     names = [tuple(rows[k].line for k in chain) for chain in net.lines]
@@ -86,6 +89,7 @@ def lines(now: Round, tolerance: float) -> tuple[pd.DataFrame, list[tuple[str, .
     base = np.array([now.state.lengths.get(chain[0], 1.0) for chain in names])
     factor, std = base * (1.0 + shift), base * std
     unknown = ~(std < UNSURE_LENGTH)
+    right = AS_FILED if Kind.LENGTH in kinds else UNASKED
     shown = [" ".join(chain[:1] if len(chain) == 1 else (chain[0], "to", chain[-1])) for chain in names]
     frame = pd.DataFrame(
         {
@@ -100,7 +104,7 @@ def lines(now: Round, tolerance: float) -> tuple[pd.DataFrame, list[tuple[str, .
                 _some([shown[k] for k in np.flatnonzero(row) if k != own_row])
                 for own_row, row in enumerate(same)
             ],
-            "verdict": np.where(unknown, UNTOLD, np.where(free, PROPOSED, AS_FILED)),
+            "verdict": np.where(unknown, UNTOLD, np.where(free, PROPOSED, right)),
         }
     )
     return frame, names
@@ -205,9 +209,11 @@ def told(wrong: Correction) -> str:
     )
 
 
-def customers(now: Round, said: Verdict, wrongs: Sequence[Correction], risk: float) -> pd.DataFrame:
+def customers(
+    now: Round, said: Verdict, wrongs: Sequence[Correction], risk: float, kinds: Collection[Kind]
+) -> pd.DataFrame:
     """Place of every customer, and which others the readings do not rule out."""
-    net = now.net
+    net, right = now.net, _as_filed(now.state.tables, kinds)
     moved = {name for wrong in wrongs if wrong.kind in (*PLACES, Kind.SWAP) for name in wrong.names}
     open_from = -float(np.log(1.0 / risk))
     others: dict[int, list[tuple[float, str]]] = {}
@@ -220,8 +226,8 @@ def customers(now: Round, said: Verdict, wrongs: Sequence[Correction], risk: flo
     for k, row in enumerate(now.state.tables.customers):
         ranked = sorted(others.get(k, []), reverse=True)
         possible = [place for factor, place in ranked if factor > open_from]
-        untold = not ranked or possible
-        verdict = UNTOLD if untold else PROPOSED if row.customer in moved else AS_FILED
+        untold = possible or (not ranked and right != UNASKED)
+        verdict = UNTOLD if untold else PROPOSED if row.customer in moved else right
         out.append(
             {
                 "customer": row.customer,
@@ -235,6 +241,15 @@ def customers(now: Round, said: Verdict, wrongs: Sequence[Correction], risk: flo
             }
         )
     return pd.DataFrame(out)
+
+
+def _as_filed(tables: FeederTables, kinds: Collection[Kind]) -> str:
+    """The verdict on a place against which nothing speaks: of what was not looked for, nothing is known."""
+    possible = PLACES if tables.in_phases else (Kind.BUS,)
+    missing = [kind for kind in possible if kind not in kinds]
+    if len(missing) == len(possible):
+        return UNASKED
+    return f"{AS_FILED}; {missing[0]} {UNASKED}" if missing else AS_FILED
 
 
 def loads(now: Round) -> pd.DataFrame:

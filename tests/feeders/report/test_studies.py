@@ -21,7 +21,7 @@ from feeders.report.section import Question, Section
 from feeders.report.sections import Outcome
 from feeders.report.words import Standing, said
 from feeders.studies.calibrate import Calibrate
-from feeders.studies.calibrate_tables import EXCLUDED, PROPOSED, UNTOLD
+from feeders.studies.calibrate_tables import AS_FILED, EXCLUDED, PROPOSED, UNTOLD
 from feeders.studies.campaign import Campaign
 from feeders.studies.detectable import Detectable
 from feeders.studies.droop import DroopStudy
@@ -108,7 +108,8 @@ def test_what_cannot_be_told_is_neither_right_nor_wrong(site: Site, *, sure: boo
 
 
 def test_words_of_the_calibration_are_its_own() -> None:
-    assert (records.UNTOLD, records.PROPOSED, records.EXCLUDED) == (UNTOLD, PROPOSED, EXCLUDED)
+    words = (records.UNTOLD, records.PROPOSED, records.EXCLUDED, records.AS_FILED)
+    assert words == (UNTOLD, PROPOSED, EXCLUDED, AS_FILED)
 
 
 def test_sizes_that_are_not_proved_are_said_to_be_none(site: Site, outcomes: list[Outcome]) -> None:

@@ -177,6 +177,19 @@ def test_a_wrong_phase_is_found(tmp_path: Path) -> None:
     found = calibrate(wrong, path, kinds=[Kind.PHASE])
     assert found.proposals[["kind", "what", "proposed"]].to_numpy().tolist() == [["phase", "LOAD5", was]]
     assert found.corrections[0].phases == was
+    assert "as in the files; bus not looked for" in set(found.customers["verdict"])
+    assert "as in the files" not in {*found.customers["verdict"], *found.lines["verdict"]}
+
+
+def test_what_was_not_looked_for_is_not_as_in_the_files(tmp_path: Path) -> None:
+    readings = recorded(tmp_path, scenario(1))
+    found = calibrate(CIGRE, readings, kinds=[Kind.METER])
+    assert set(found.lines["verdict"]) <= {"not looked for", "cannot be told"}
+    assert "not looked for" in set(found.lines["verdict"])
+    assert set(found.customers["verdict"]) == {"not looked for"}
+    found = calibrate(CIGRE, readings, kinds=[Kind.LENGTH, Kind.BUS])
+    assert "as in the files" in set(found.lines["verdict"])
+    assert set(found.customers["verdict"]) <= {"as in the files", "cannot be told"}
 
 
 def test_phases_of_the_busbar_that_are_apart_are_no_errors_of_meters(tmp_path: Path) -> None:
