@@ -363,9 +363,9 @@ def _injection(site: Site, text: str) -> InverterAttack:
         which, q = owners.index(customer), float(kvar) / site.feeder.base_kva
         times = float(begin), float(end)
     except ValueError:
-        raise ValueError(
-            f"expected customer:kvar:from:to with a customer who has an inverter: {', '.join(owners)}"
-        ) from None
+        known = f"a customer who has an inverter: {', '.join(owners)}"
+        whose = known if owners else f"an inverter, and {site.feeder.name} has none"
+        raise ValueError(f"expected customer:kvar:from:to with {whose}") from None
     return InverterAttack(np.array([which], dtype=np.intp), np.array([q]), *_span(*times))
 
 

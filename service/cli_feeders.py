@@ -160,9 +160,7 @@ def convert(
     root: Annotated[str | None, typer.Option(help="Bus that is the metered busbar.")] = None,
     name: Annotated[
         str | None,
-        typer.Option(
-            help="Name of the feeder. [default: that of the folder, or as a feeder's folder has it]"
-        ),
+        typer.Option(help="Name of the feeder. [default: that of FOLDER, or of a source that is a feeder]"),
     ] = None,
     droop: Annotated[str | None, typer.Option(help="Droop preset of the source's generators.")] = None,
     opened: Annotated[

@@ -224,6 +224,7 @@ def detectable(
                 f"{seen.trials} lies from the named size on: {seen.large_missed} missed, "
                 f"{seen.honest_named} with an honest meter named"
             )
+            write_tables(out, "detectable", {**found.tables, "trials": seen.table})
 
 
 def _unknowns(names: Sequence[str], feeder: str) -> str:

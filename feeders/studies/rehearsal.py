@@ -8,11 +8,12 @@ watch a few honest frames and then the lie.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cache, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 
 from feeders.studies.detectable import Detectable, monitor_rule
 from feeders.studies.journal import Progress, Where, worked
@@ -55,6 +56,11 @@ class Rehearsal:
     hidden_named: int
     large_missed: int
     honest_named: int
+
+    @property
+    def table(self) -> pd.DataFrame:
+        """All of it as a table of one row."""
+        return pd.DataFrame([asdict(self)])
 
 
 def rehearse(

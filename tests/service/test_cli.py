@@ -13,7 +13,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TextIO
 
@@ -24,6 +24,7 @@ import pytest
 from feeders.load import load
 from feeders.recording import read_recording
 from feeders.scenario import Scenario, random_attacks
+from feeders.schema import write
 from service.bus import BusConfig
 from service.demo import Outcome, verdict
 from service.ingest import Meters
@@ -219,6 +220,15 @@ def test_wrong_usage(gridsec: Run) -> None:
         done = gridsec("demo", "--size", size)
         assert done.returncode == 2
         assert why in plain(done.stderr)
+
+
+def test_a_feeder_without_inverters_says_so(gridsec: Run, tmp_path: Path) -> None:
+    tables = load("cigre-lv").tables
+    plain_rows = tuple(replace(row, inverter_kva=0.0, droop="") for row in tables.customers)
+    write(replace(tables, customers=plain_rows), tmp_path / "bare")
+    done = gridsec("simulate", str(tmp_path / "bare"), "--inverter-attack", "x:1:0:1", "--out", "x")
+    assert done.returncode == 2
+    assert "with an inverter, and cigre-lv has none" in plain(done.stderr)
 
 
 def test_all_that_is_wrong_with_a_scenario_is_told_at_once(gridsec: Run, tmp_path: Path) -> None:

@@ -88,6 +88,8 @@ def test_detectable_tells_sizes_and_keeps_its_word(
     assert "3 lies up to the hidden size: 0 led to a name" in told
     assert "3 lies from the named size on: 0 missed, 0 with an honest meter named" in told
     assert len(pd.read_csv(tmp_path / "out" / "detectable-meters.csv")) == 6
+    (trials,) = pd.read_csv(tmp_path / "out" / "detectable-trials.csv").to_dict("records")
+    assert trials == {"trials": 3, "hidden_named": 0, "large_missed": 0, "honest_named": 0}
 
 
 def test_feeders_in_three_phases_are_studied(
