@@ -89,7 +89,7 @@ def test_a_file_and_the_stream_it_was_made_of_agree(site: Site, scenario: Scenar
 
 
 def test_bad_readings_of_a_recording_are_counted(site: Site, scenario: Scenario) -> None:
-    good = list(by_arrival(simulate(site, replace(scenario, duration_s=10.0, channel=Channel()))))
+    good = list(by_arrival(simulate(site, replace(scenario, duration_s=10.0, channel=Channel(), attacks=()))))
     bad = [
         Reading("m99", START, 1, START, 230.0, None, None),
         Reading("m01", START, 1, START, float("nan"), None, None),
