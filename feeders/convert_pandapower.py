@@ -170,6 +170,8 @@ def _root(net: Any, network: Network, names: dict[int, str], wanted: str | None)
         if len(hits) != 1:
             raise GridsecError(f"{len(hits)} buses are called {wanted!r}; give the index of one")
         return names[hits[0]]
+    if not network.sources:
+        raise BusbarUnclear("there is no voltage source in service; name the busbar with --root")
     trafos = net.trafo[net.trafo.in_service.astype(bool)]
     sides = sorted({int(bus) for bus in trafos.lv_bus})
     if not sides:

@@ -14,6 +14,7 @@ from power_grid_model.utils import json_serialize_to_file
 from typer.testing import CliRunner
 
 from feeders.convert import Conversion, convert
+from feeders.convert_changes import BusbarUnclear
 from feeders.convert_check import UNBALANCED_PU, compare
 from feeders.convert_pandapower import from_pandapower
 from feeders.load import load
@@ -246,3 +247,11 @@ def test_a_voltage_without_the_other_is_no_agreement() -> None:
     assert check.sentence.endswith("; only one of them has a voltage at bus b2")
     with pytest.raises(GridsecError, match="no bus where"):
         compare(replace(state, volts=dict.fromkeys(state.volts, nothing)), done.tables)
+
+
+def test_without_a_source_the_busbar_has_to_be_named() -> None:
+    net = street(3)
+    net.ext_grid["in_service"] = False
+    with pytest.raises(BusbarUnclear, match=r"no voltage source in service; name the busbar with --root"):
+        from_pandapower(net, "x")
+    assert from_pandapower(net, "x", root="b0").tables.meta.busbar == "b0"
