@@ -300,21 +300,14 @@ def _converted(
     extent: Extent = EVERYTHING,
 ) -> tuple[Converted, str]:
     """Return a source as a feeder, and the package that holds its data or reads its file."""
-    found, package = _read(source, name, root=root, opened=opened, droop=droop, extent=extent)
-    if not extent.meshed:
-        return found, package
-    tables = replace(found.tables, meta=replace(found.tables.meta, meshed=True))
-    return replace(found, tables=tables), package
-
-
-def _read(
-    source: str, name: str, *, root: str | None, opened: Sequence[str], droop: str | None, extent: Extent
-) -> tuple[Converted, str]:
     recipe = RECIPES.get(source)
     origin = recipe.source if recipe else source
     path = Path(origin)
     if recipe is None and path.is_dir():
-        again = from_folder(path, name, root=root, opened=opened, droop=droop, one_voltage=extent.one_voltage)
+        one_voltage, meshed = extent.one_voltage, extent.meshed
+        again = from_folder(
+            path, name, root=root, opened=opened, droop=droop, one_voltage=one_voltage, meshed=meshed
+        )
         return again, "gridsec"
     kind = _kind(path) if path.is_file() else ""
     if kind == OPENDSS:

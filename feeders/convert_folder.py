@@ -29,6 +29,7 @@ def from_folder(
     opened: Sequence[str] = (),
     droop: str | None = None,
     one_voltage: bool = False,
+    meshed: bool = False,
 ) -> Converted:
     """Return a feeder of our own form, with all that an earlier conversion had changed.
 
@@ -42,6 +43,8 @@ def from_folder(
         Lines to take as open.
     root, droop, one_voltage
         As `feeders.convert.convert` takes them: only for networks of other tools.
+    meshed
+        Whether loops stay closed, whatever it says itself.
 
     Raises
     ------
@@ -69,6 +72,7 @@ def from_folder(
     meta = tables.meta
     if name:
         meta = replace(meta, name=name, title=name if meta.title == meta.name else meta.title)
+    meta = replace(meta, meshed=meshed or meta.meshed)
     tables = replace(tables, meta=meta, lines=tuple(lines))
     return Converted(tables, (*earlier, *changes), None, UNCHECKED)
 

@@ -173,6 +173,7 @@ def feeder_of(
         base_kva=base_kva(volt, sum(row.load_kw for row in rows)),
         busbar=part.busbar,
         busbar_xy=network.xy.get(part.busbar),
+        meshed=extent.meshed,
         load=LoadDefaults(power_factor=USUAL_POWER_FACTOR, power_factor_min=0.85),
     )
     tables = FeederTables(meta, tuple(lines), tuple(rows))
@@ -224,14 +225,19 @@ def finished(network: Network, part: Part, tables: FeederTables, power: Mapping[
         The feeder.
     power
         What each customer draws in the source's power flow, kVA.
+
+    Raises
+    ------
+    FeederInvalid
+        If values are doubtful, and no power flow of the source speaks for them.
     """
-    accepted = accepting(tables, part.changes)
+    unchecked = "" if network.volts else network.unsolved
+    if network.volts and not np.isfinite(network.volts[part.busbar]).all():
+        unchecked = f"the source's power flow has no voltage at the busbar {part.busbar!r}"
+    accepted = accepting(tables, part.changes, unchecked)
     changes = tuple(dict.fromkeys(part.changes))
-    if not network.volts:
-        return Converted(accepted, changes, None, network.unsolved)
-    if not np.isfinite(network.volts[part.busbar]).all():
-        dark = f"the source's power flow has no voltage at the busbar {part.busbar!r}"
-        return Converted(accepted, changes, None, dark)
+    if unchecked:
+        return Converted(accepted, changes, None, unchecked)
     state = SourceState(
         tool=network.tool,
         power_kva=power,
@@ -242,7 +248,7 @@ def finished(network: Network, part: Part, tables: FeederTables, power: Mapping[
     return Converted(accepted, changes, state)
 
 
-def accepting(tables: FeederTables, changes: list[Change]) -> FeederTables:
+def accepting(tables: FeederTables, changes: list[Change], unchecked: str) -> FeederTables:
     """Accept what is doubtful only because it might be in the wrong unit: the source's tool knows its units.
 
     Parameters
@@ -251,13 +257,25 @@ def accepting(tables: FeederTables, changes: list[Change]) -> FeederTables:
         A feeder.
     changes
         Takes every value that was doubted.
+    unchecked
+        Why the source's power flow says nothing of the feeder; empty if it has a solution. Without one,
+        somebody may have given the source itself a wrong unit.
+
+    Raises
+    ------
+    FeederInvalid
+        If there are doubts and no solution, with all that is wrong besides.
     """
     doubts: set[str] = set()
+    problems = []
     for problem in validate(tables):
         sentence, found, doubt = problem.partition(' (if it is right: accept = ["')
+        problems.append(sentence)
         if found:
             doubts.add(doubt.partition('"')[0])
             changes.append(Change("feeder", sentence, "accepted", "as the source has it"))
+    if doubts and unchecked:
+        raise FeederInvalid([*problems, f"{unchecked}; nothing else speaks for what is doubtful"])
     accept = tuple(name for name in SUSPICIONS if name in doubts)
     return replace(tables, meta=replace(tables.meta, accept=accept)) if accept else tables
 

@@ -156,6 +156,7 @@ def from_pandapower(
         base_kva=base_kva(volt, load),
         busbar=part.busbar,
         busbar_xy=network.xy.get(part.busbar),
+        meshed=extent.meshed,
         load=LoadDefaults(power_factor=USUAL_POWER_FACTOR, power_factor_min=0.85),
         monitor=MonitorDefaults(max_attacked=max_attacked),
     )

@@ -253,7 +253,7 @@ def test_what_is_no_number_is_told_and_not_a_traceback() -> None:
 
 def test_a_source_without_solution_is_converted_and_not_checked(tmp_path: Path) -> None:
     net = village()
-    net.load.loc[0, "p_mw"] = 5e3
+    net.load.loc[0, "p_mw"] = 90.0
     path = tmp_path / "heavy.json"
     pp.to_json(net, str(path))
     done = convert(str(path), tmp_path / "x", root="root")
@@ -265,6 +265,24 @@ def test_a_source_without_solution_is_converted_and_not_checked(tmp_path: Path) 
     assert "load side of transformer T1; 2 buses; what flows there is not known" in "\n".join(done.notes)
     with pytest.raises(GridsecError, match="own power flow fails"):
         check_against_source(str(path), tmp_path / "x", root="root")
+
+
+def test_what_is_doubtful_is_accepted_from_a_source_with_a_solution_only(tmp_path: Path) -> None:
+    """Loads in kW in a column of MW: the source's own power flow has no solution."""
+    path = tmp_path / "kw.json"
+    net = village(closed=True)
+    net.load["p_mw"] *= 1000.0
+    pp.to_json(net, str(path))
+    with pytest.raises(FeederInvalid) as caught:
+        convert(str(path), tmp_path / "x", root="root")
+    said = "\n".join(caught.value.problems)
+    for part in ("column load_kw: 2e+06 is very large", "form a loop", "own power flow fails: "):
+        assert part in said, part
+    assert "accept = [" not in said
+    assert not (tmp_path / "x").exists()
+    with pytest.raises(FeederInvalid) as caught:
+        convert(str(path), tmp_path / "x", root="root", meshed=True)
+    assert "form a loop" not in str(caught.value)
 
 
 def test_a_feeder_without_solution_is_told(tmp_path: Path) -> None:

@@ -371,7 +371,7 @@ def test_what_is_no_feeder_is_told(body: str, tail: str, words: str, tmp_path: P
 
 def test_without_a_solution_of_the_source_nothing_is_checked(tmp_path: Path) -> None:
     """OpenDSS lets a load beyond the line's capacity become an impedance; constant power has no solution."""
-    done = convert(master(tmp_path, "new load.big bus1=B1 kv=0.4 kw=9e4 pf=1\n"), tmp_path / "x")
+    done = convert(master(tmp_path, "new load.big bus1=B1 kv=0.4 kw=900 pf=1\n"), tmp_path / "x")
     assert done.check is None
     assert "does not converge" in done.unchecked
     assert "Not checked" in (tmp_path / "x" / "SOURCE.md").read_text()
