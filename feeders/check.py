@@ -7,12 +7,16 @@ wherever that cell does not matter, so that one run names everything there is to
 from __future__ import annotations
 
 from collections import defaultdict
-from typing import Any
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
 
 from feeders import levels, matrices, profiles, units
 from feeders.records import Parsed, Report, rows, some
 from feeders.topology import Edge, Tree, tree
 from gridsec.droop import PRESETS
+
+if TYPE_CHECKING:
+    from feeders.schema import LineRow
 
 RESERVED_METER = "substation"
 """What the busbar meter is called on the wire and in alarms."""
@@ -121,6 +125,24 @@ def _profiles(parsed: Parsed, report: Report) -> None:
 
 
 # --- the graph ----------------------------------------------------------------------------------
+
+
+def loops(busbar: str, lines: Iterable[LineRow]) -> list[str]:
+    """Return what is wrong with the loops of a radial feeder's lines.
+
+    Parameters
+    ----------
+    busbar, lines
+        The busbar, and rows of lines.csv.
+    """
+    edges = [
+        Edge(row.line, row.from_bus, row.to_bus, row.r_ohm == row.x_ohm == 0.0, phases=len(row.phases))
+        for row in lines
+        if row.closed
+    ]
+    report = Report()
+    _loops(tree(busbar, edges), edges, meshed=False, report=report)
+    return report.problems
 
 
 def _graph(parsed: Parsed, report: Report) -> tuple[list[Edge], Tree | None]:

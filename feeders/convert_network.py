@@ -13,6 +13,7 @@ from typing import Final
 
 import numpy as np
 
+from feeders.check import loops
 from feeders.columns import SUSPICIONS
 from feeders.convert_busbar import busbar_of, chosen, named_bus, opened_rows
 from feeders.convert_changes import WHOLE, Change
@@ -204,7 +205,8 @@ def below(network: Network, root: str | None, opened: Sequence[str], extent: Ext
     kept = _kept(network, rows, inside, changes)
     problems += levels_of(kept, network.nominal)
     if problems:
-        raise FeederInvalid(problems)
+        lines = merged(kept, busbar, [], network.nominal)
+        raise FeederInvalid([*problems, *(() if extent.meshed else loops(busbar, lines))])
     draws = [draw for draw in network.draws if draw.bus in inside]
     sums, summed = _behind(network, rows, inside, changes)
     draws += sums

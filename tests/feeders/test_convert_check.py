@@ -212,6 +212,20 @@ def test_truths_may_be_numbers_and_a_shunt_of_no_power_is_named() -> None:
     assert "shunt none" in [each.element for each in found.changes]
 
 
+def test_another_source_hides_no_loop() -> None:
+    net = village(closed=True)
+    pp.create_ext_grid(net, 3)  # bus B
+    with pytest.raises(FeederInvalid) as caught:
+        from_pandapower(net, "x", root="root")
+    source, loop = caught.value.problems
+    assert "bus 'B' has another voltage source" in source
+    assert loop.startswith("lines: ")
+    assert "form a loop" in loop
+    with pytest.raises(FeederInvalid) as caught:
+        from_pandapower(net, "x", root="root", extent=Extent(meshed=True))
+    assert caught.value.problems == (source,)
+
+
 def test_a_wrong_busbar_hides_no_other_wrong_choice(tmp_path: Path) -> None:
     net = village()
     for wrong, count in (({"droop": "nosuch"}, 1), ({"opened": ["no", "none"]}, 2)):
