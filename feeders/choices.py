@@ -13,7 +13,7 @@ __all__ = ["choice", "each_choice", "no_choice"]
 Choice = TypeVar("Choice", bound=StrEnum)
 
 
-def no_choice(name: str, kind: type[StrEnum], *values: str) -> list[str]:
+def no_choice(name: str, kind: Iterable[str], *values: str) -> list[str]:
     """Return what is wrong with values that are to be out of a few, one sentence each.
 
     Parameters

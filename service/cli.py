@@ -12,11 +12,10 @@ import math
 import os
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, TypeVar
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 from rich.markup import escape
@@ -26,6 +25,7 @@ from service import cli_feeders, cli_reproduce, cli_serve, cli_study, console
 from service.cli_plan import said
 from service.cli_serve import Endpoints
 from service.console import ADDRESS, DATABASE, FAILED, FEEDER, FILE, USAGE, Feeder, complain
+from service.options import read_all
 from service.places import Unusable, see
 
 if TYPE_CHECKING:
@@ -249,8 +249,8 @@ def simulate(
         }
         problems += [f"{name} goes with publishing, not with --out" for name, given in live.items() if given]
     problems += no_choice("--season", Season, season)
-    lies = _read_all("--attack", attack, _lie, problems)
-    wrong = _read_all("--inverter-attack", inverter_attack, partial(_injection, site), problems)
+    lies = read_all("--attack", attack, _lie, problems)
+    wrong = read_all("--inverter-attack", inverter_attack, partial(_injection, site), problems)
     if problems:
         raise typer.BadParameter("; ".join(problems))
     if out is not None:
@@ -287,22 +287,6 @@ def _wrong_times(dt: float | None, start: float | None) -> list[str]:
     if start is not None and not 0.0 <= start < LATEST_S:
         problems.append(f"--start is {start:g}; expected a Unix time in seconds")
     return problems
-
-
-Told = TypeVar("Told")
-
-
-def _read_all(
-    option: str, texts: list[str] | None, read: Callable[[str], Told], problems: list[str]
-) -> list[Told]:
-    """Read all texts of an option, and tell what is wrong with them."""
-    out = []
-    for text in texts or []:
-        try:
-            out.append(read(text))
-        except ValueError as error:
-            problems.append(f"{option} {text!r}: {error}")
-    return out
 
 
 def _span(begin: float, end: float) -> tuple[float, float]:

@@ -13,7 +13,7 @@ from service.cli_plan import Out, bar, said, show
 from service.console import Studied
 from service.foreign import converted
 from service.keeping import JournalAt, NoJournal, keeping
-from service.places import see
+from service.options import refuse_options
 from service.tables import write_tables
 
 if TYPE_CHECKING:
@@ -50,15 +50,19 @@ def calibrate(
 
     Only what is sure gets into the copy that `--write` makes; the feeder itself is never touched.
     """
+    from feeders.choices import no_choice
     from feeders.studies.calibrate import calibrate as study
+    from feeders.studies.calibrate import wrong_numbers
     from feeders.studies.calibrate_corrections import Kind
     from feeders.studies.calibrate_feeder import site_of
 
-    for name in look_for or ():
-        if name not in tuple(Kind):
-            raise typer.BadParameter(f"{name!r}: expected one of {', '.join(Kind)}", param_hint="--look-for")
-    written = {"folders": {"--out": out}, "new": {"--write": write}, "files": {"--journal": journal}}
-    see(**written, read={"--readings": readings})
+    refuse_options(
+        [*no_choice("--look-for", Kind, *(look_for or ())), *wrong_numbers(risk, tolerance)],
+        folders={"--out": out},
+        new={"--write": write},
+        files={"--journal": journal},
+        read={"--readings": readings},
+    )
     with keeping("calibrate", feeder, journal, without=no_journal) as kept:
         feeder = converted(feeder, out)
         site = site_of(feeder)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from enum import StrEnum
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
@@ -15,6 +15,7 @@ from service.cli_plan import Out, bar, said, show
 from service.console import Studied, finite
 from service.foreign import converted
 from service.keeping import JournalAt, Keeping, NoJournal, keeping
+from service.options import options_of, read_all
 from service.places import see
 from service.planned import planned, sources
 from service.tables import write_tables
@@ -165,31 +166,41 @@ def campaign(
     from feeders.studies.campaign_plan import Design, Place
     from feeders.trials import Meters
 
-    count = min(scenarios, together)
-    if count == 1:
-        _see_no_lies({"--kind": kind, "--promised": promised, "--liars": liars, "--place": place})
     see(folders={"--out": out}, files={"--journal": journal})
-    site = load(converted(feeder, out))
-    with said(), keeping("campaign", feeder, journal, without=no_journal) as kept:
-        plan = planned(
-            site,
-            step=step,
-            duration=duration,
-            load_error_kw=load_error_kw,
-            load_error_kvar=load_error_kvar,
-            scenes=-(-scenarios // count),
-            together=count,
-            seed=seed,
-            kinds=tuple(_kind(each, step or site.tables.meta.monitor.tick_s) for each in kind or ()) or None,
-            liars=tuple(liars or (1, 3)),
-            places=_each(place, Place, "--place"),
-            design=_each([design], Design, "--design")[0],
-            seasons=_each(season, Season, "--season"),
-            estimator=estimator,
-            alarms_per_year=tuple(sorted(set(alarms_per_year))) if alarms_per_year else None,
-            learn_s=3600.0 * learned,
-            settings=tuple(_setting(each) for each in setting or ()),
-            meters=_each([meters], Meters, "--meters")[0],
+    site, count = load(converted(feeder, out)), min(scenarios, together)
+    problems = ["--workers: a Dask cluster has its own workers"] * (dask is not None and workers is not None)
+    if count == 1:
+        lies = {"--kind": kind, "--promised": promised, "--liars": liars, "--place": place}
+        problems += [f"{option}: {NO_LIES}" for option, value in lies.items() if value]
+    kinds = read_all("--kind", kind, partial(_kind, step_s=step or site.tables.meta.monitor.tick_s), problems)
+    settings = read_all("--setting", setting, _setting, problems)
+    places = _each("--place", Place, place, problems)
+    seasons = _each("--season", Season, season, problems)
+    (drawn,) = _each("--design", Design, [design], problems) or (None,)
+    (quality,) = _each("--meters", Meters, [meters], problems) or (None,)
+    with keeping("campaign", feeder, journal, without=no_journal) as kept, said():
+        plan = options_of(
+            lambda: planned(
+                site,
+                step=step,
+                duration=duration,
+                load_error_kw=load_error_kw,
+                load_error_kvar=load_error_kvar,
+                scenes=-(-scenarios // count),
+                together=count,
+                seed=seed,
+                kinds=tuple(kinds) or None,
+                liars=tuple(liars or (1, 3)),
+                places=places,
+                design=drawn,
+                seasons=seasons,
+                estimator=estimator,
+                alarms_per_year=tuple(sorted(set(alarms_per_year))) if alarms_per_year else None,
+                learn_s=3600.0 * learned,
+                settings=tuple(settings),
+                meters=quality,
+            ),
+            problems,
         )
         given = {
             "--step": step,
@@ -207,15 +218,11 @@ def campaign(
         write_tables(out, "campaign", found.tables)
 
 
-def _see_no_lies(given: Mapping[str, object]) -> None:
-    """Refuse options about lies where no scenario has one: it would look as if nobody was named for them."""
-    wrong = [option for option, value in given.items() if value]
-    if wrong:
-        raise typer.BadParameter(
-            "with one scenario of each scene, which is the one without a lie, nobody lies; expected "
-            "--scenarios and --together of 2 or more",
-            param_hint=", ".join(wrong),
-        )
+NO_LIES = (
+    "with one scenario of each scene, which is the one without a lie, nobody lies; expected --scenarios and "
+    "--together of 2 or more"
+)
+"""Otherwise it would look as if nobody was named for lies that nobody told."""
 
 
 def _print(found: Campaign) -> None:
@@ -250,13 +257,15 @@ def _short(table: pd.DataFrame) -> pd.DataFrame:
 Choice = TypeVar("Choice", bound=StrEnum)
 
 
-def _each(chosen: list[str] | None, known: type[Choice], option: str) -> tuple[Choice, ...]:
-    if chosen is None:
-        return tuple(known)
-    for name in chosen:
-        if name not in tuple(known):
-            raise typer.BadParameter(f"{name!r}: expected one of {', '.join(known)}", param_hint=option)
-    return tuple(known(name) for name in dict.fromkeys(chosen))
+def _each(
+    option: str, known: type[Choice], chosen: list[str] | None, problems: list[str]
+) -> tuple[Choice, ...] | None:
+    """What was chosen; None: nothing, or what is wrong is among the problems."""
+    from feeders.choices import no_choice
+
+    wrong = no_choice(option, known, *(chosen or ()))
+    problems += wrong
+    return None if wrong or not chosen else tuple(known(name) for name in dict.fromkeys(chosen))
 
 
 def _kind(text: str, step_s: float) -> Kind:
@@ -264,16 +273,16 @@ def _kind(text: str, step_s: float) -> Kind:
     from feeders.studies.campaign_plan import KINDS, Kind
 
     name, _, sizes = text.partition(":")
-    (trick,) = _each([name], Trick, "--kind")
+    if name not in tuple(Trick):
+        raise ValueError(f"expected one of {', '.join(Trick)}")
+    trick = Trick(name)
     if not sizes:
         usual = [kind.every(step_s) for kind in KINDS if kind.trick is trick]
         sizes = ",".join(str(size) for kind in usual for size in kind.sizes)
     try:
         return Kind(name, trick, tuple(float(size) for size in sizes.split(",")))
     except ValueError as error:
-        raise typer.BadParameter(
-            f"{text!r}: expected something like bias:1,3", param_hint="--kind"
-        ) from error
+        raise ValueError("expected something like bias:1,3") from error
 
 
 def _setting(text: str) -> tuple[str, float]:
@@ -281,14 +290,10 @@ def _setting(text: str) -> tuple[str, float]:
     try:
         return name, float(value)
     except ValueError as error:
-        raise typer.BadParameter(f"{text!r}: expected NAME=NUMBER", param_hint="--setting") from error
+        raise ValueError("expected NAME=NUMBER") from error
 
 
 def _runner(workers: int | None, dask: str | None) -> Runner:
     from feeders.studies.campaign_run import Dask, cores
 
-    if dask is not None:
-        if workers is not None:
-            raise typer.BadParameter("a Dask cluster has its own workers", param_hint="--workers")
-        return Dask(dask)
-    return cores(workers)
+    return cores(workers) if dask is None else Dask(dask)

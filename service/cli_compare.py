@@ -17,7 +17,7 @@ from service.cli_campaign import LoadErrorKvar, LoadErrorKw, MetersAs
 from service.console import Studied, finite
 from service.foreign import converted
 from service.keeping import JournalAt, Keeping, NoJournal, keeping
-from service.places import see
+from service.options import refuse_options
 
 if TYPE_CHECKING:
     from feeders.comparison import Plan, Row
@@ -63,24 +63,35 @@ def compare(
     The truth is full AC power flow; what the estimators know of loads and meters is as uncertain as it is
     stated to be. Estimators that cannot watch the feeder are listed with the reason.
     """
+    from feeders.choices import no_choice
     from feeders.comparison import CASES, Plan, markdown, splice, write_csv
     from feeders.estimators import FAMILIES
     from feeders.files import replace_file
     from feeders.load import load
     from feeders.trials import LoadError, Meters
 
+    families, cases = tuple(FAMILIES), tuple(each.name for each in CASES)
+    refuse_options(
+        [
+            *no_choice("--meters", Meters, meters),
+            *no_choice("--family", families, *(family or ())),
+            *no_choice("--case", cases, *(case or ())),
+        ],
+        files={"--journal": journal},
+        replaced={"--csv": csv, "--write": write},
+        read={"--write": write},
+    )
     plan = Plan(
         max_attacked=max_attacked,
         seeds=seeds,
         duration_s=duration,
         load_error=LoadError(load_error_kw, load_error_kvar),
-        meters=Meters(_known([meters], tuple(Meters), "--meters")[0]),
+        meters=Meters(meters),
         report_q=report_q,
-        families=_known(family, tuple(FAMILIES), "--family"),
-        cases=_known(case, tuple(each.name for each in CASES), "--case"),
+        families=tuple(name for name in families if not family or name in family),
+        cases=tuple(name for name in cases if not case or name in case),
         workers=workers or os.cpu_count() or 1,
     )
-    see(files={"--journal": journal}, replaced={"--csv": csv, "--write": write}, read={"--write": write})
     if write is not None:
         splice(_read(write), "")  # a document without markers is refused before the work, not after it
     with keeping("compare", feeder, journal, without=no_journal) as kept:
@@ -115,14 +126,6 @@ def _compared(site: Site, plan: Plan, kept: Keeping) -> list[Row]:
         return study(
             site, plan, journal=kept, progress=lambda what: bar.update(task, description=escape(what))
         )
-
-
-def _known(chosen: list[str] | None, known: tuple[str, ...], option: str) -> tuple[str, ...]:
-    """Check names given as an option; all of them, if none is given."""
-    for name in chosen or ():
-        if name not in known:
-            raise typer.BadParameter(f"{name!r}: expected one of {', '.join(known)}", param_hint=option)
-    return tuple(name for name in known if not chosen or name in chosen)
 
 
 def _told(feeder: str, site: Site, plan: Plan) -> str:

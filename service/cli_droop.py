@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
 
+from gridsec.errors import FeederInvalid
 from service import console
 from service.cli_plan import Out, bar, said, show
 from service.console import Studied
 from service.foreign import converted
 from service.keeping import JournalAt, Keeping, NoJournal, keeping
-from service.places import see
+from service.options import options_of
 from service.tables import write_tables
 
 if TYPE_CHECKING:
@@ -96,18 +98,19 @@ def droop(
     out: Out = None,
 ) -> None:
     """Is the volt/VAR fleet stable, with what margins; does it keep the band; how much more is hosted."""
-    from feeders.load import load
+    from feeders.choices import no_choice
     from feeders.studies.droop import DroopOptions
     from feeders.studies.droop_fleets import NOTHING, NoInverters, Who
+    from gridsec.droop import PRESETS
 
     fleets = hosting_preset or ["none", "ieee1547-b"]
-    see_choice([who], tuple(Who), "--who")
-    _see_presets(preset, compare, fleets)
+    existing = ("none", *PRESETS)
+    problems = [*no_choice("--who", Who, who), *no_choice("--hosting-preset", existing, *fleets)]
     usual = DroopOptions()
-    with said():
-        options = DroopOptions(
+    options = options_of(
+        lambda: DroopOptions(
             preset=preset,
-            who=Who(who),
+            who=Who(who) if who in tuple(Who) else usual.who,
             interval_s=interval,
             dead=dead,
             v0_low=busbar[0],
@@ -119,15 +122,18 @@ def droop(
             presets=tuple(compare) if compare else usual.presets,
             tau_factors=tuple(tau_factor) if tau_factor else usual.tau_factors,
             hosting=hosting,
-            hosting_presets=tuple("" if name == "none" else name for name in fleets),
+            hosting_presets=tuple("" if name == "none" else name for name in fleets if name in existing),
             hosting_load=hosting_load,
             hosting_customers=tuple(at) if at else None,
             unit_kw=unit_kw,
             draws=draws,
-        )
-    see(folders={"--out": out}, files={"--journal": journal})
+        ),
+        problems,
+        folders={"--out": out},
+        files={"--journal": journal},
+    )
     with keeping("droop", feeder, journal, without=no_journal) as kept:
-        site, others = load(converted(feeder, out)), [load(converted(name, None)) for name in also or ()]
+        site, *others = _loaded([(feeder, out), *((name, None) for name in also or ())])
         try:
             found = _studied(site, others, options, seed, kept)
         except NoInverters:
@@ -156,25 +162,20 @@ def _studied(
     return found
 
 
-def _see_presets(preset: str | None, compare: Sequence[str] | None, hosting: Sequence[str]) -> None:
-    from gridsec.droop import PRESETS
+def _loaded(names: Sequence[tuple[str, Path | None]]) -> list[Site]:
+    """Feeders by name, each with the folder of its results; all problems of all of them are told."""
+    from feeders.load import load
 
-    see_choice([preset] if preset else [], PRESETS, "--preset")
-    see_choice(compare or [], PRESETS, "--compare")
-    see_choice(hosting, ("none", *PRESETS), "--hosting-preset")
-
-
-def see_choice(names: Sequence[str], known: Sequence[str], option: str) -> None:
-    """Refuse names that do not exist.
-
-    Parameters
-    ----------
-    names, known, option
-        What was given, what there is, and for which option.
-    """
-    for name in names:
-        if name not in known:
-            raise typer.BadParameter(f"{name!r}: expected one of {', '.join(known)}", param_hint=option)
+    sites: list[Site] = []
+    problems: list[str] = []
+    for name, out in names:
+        try:
+            sites.append(load(converted(name, out)))
+        except FeederInvalid as error:
+            problems += error.problems
+    if problems:
+        raise FeederInvalid(problems)
+    return sites
 
 
 def _tell(found: DroopStudy, options: DroopOptions) -> None:

@@ -84,7 +84,7 @@ def redundancy(
                 unknown=unknown,
                 silent=silent or (),
                 busbar_known=not busbar_unknown,
-                curves=_curves(curves),
+                curves=curves,
                 journal=kept,
                 progress=tell,
             )
@@ -230,14 +230,6 @@ def detectable(
 def _unknowns(names: Sequence[str], feeder: str) -> str:
     who = ", ".join(names) if names else "nobody"
     return escape(f"{feeder}: powers unknown of {who}")
-
-
-def _curves(name: str) -> Any:
-    from feeders.studies.hidden import Curves
-
-    if name not in tuple(Curves):
-        raise typer.BadParameter(f"{name!r}: expected one of {', '.join(Curves)}", param_hint="--curves")
-    return Curves(name)
 
 
 @contextmanager

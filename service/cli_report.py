@@ -15,12 +15,12 @@ from rich.markup import escape
 from feeders.command_line import command_line
 from service import console
 from service.cli_campaign import Estimator, KnownKvar, KnownKw, Seed, Step
-from service.cli_droop import Allowed, Preset, see_choice
-from service.cli_plan import BusbarUnknown, GoalOf, LieVolt, Silent, Unknown, bar, said
+from service.cli_droop import Allowed, Preset
+from service.cli_plan import BusbarUnknown, GoalOf, LieVolt, Silent, Unknown, bar
 from service.console import FAILED, Studied, complain
 from service.foreign import converted
 from service.keeping import keeping
-from service.places import see
+from service.options import options_of, read_all
 
 if TYPE_CHECKING:
     from service.study_report import Asked
@@ -80,25 +80,31 @@ def report(
 
     Interrupted, the same command goes on where it was. What a study cannot answer, the report says.
     """
+    from feeders.choices import no_choice
     from feeders.columns import ESTIMATORS
     from feeders.studies.protect import check as see_question
     from gridsec.droop import PRESETS
     from service.study_report import STUDIES, Asked
 
-    chosen = _studies(studies, tuple(STUDIES), recorded=readings is not None)
-    with said():
-        see_question(
+    problems: list[str] = []
+    chosen = _studies(studies, tuple(STUDIES), recorded=readings is not None, problems=problems)
+    problems += no_choice("--preset", PRESETS, *([preset] if preset else []))
+    problems += no_choice("--estimator", ESTIMATORS, *([estimator] if estimator else []))
+    problems += [*_no_limits("--busbar", busbar), *_no_limits("--band", band, apart=True)]
+    moments = [_now()] if at is None else read_all("--at", [at], _moment, problems)
+    options_of(
+        lambda: see_question(
             max_attacked=max_attacked,
             goal=goal,
             lie_volt=math.nan if lie_volt is None else lie_volt,
             unknown=unknown,
             busbar_known=not busbar_unknown,
-        )
-    see_choice([preset] if preset else [], PRESETS, "--preset")
-    see_choice([estimator] if estimator else [], ESTIMATORS, "--estimator")
-    _see_limits(busbar, "--busbar")
-    _see_limits(band, "--band", apart=True)
-    made = _moment(at)
+        ),
+        problems,
+        replaced={"--out": out},
+        folders={f"--out, {name}": _beside(out) / name for name in ("figures", "tables", "journals")},
+        read={"--readings": readings},
+    )
     asked = Asked(
         feeder=feeder,
         max_attacked=max_attacked,
@@ -120,18 +126,20 @@ def report(
         hosting=hosting,
         readings=readings,
     )
-    _make(asked, chosen, out, made=made, command=_command(asked, out, studies))
+    _make(asked, chosen, out, made=moments[0], command=_command(asked, out, studies))
 
 
-def _see_limits(limits: tuple[float, float] | None, option: str, *, apart: bool = False) -> None:
-    """Refuse limits before the work that the droop study would refuse."""
-    if limits is None:
-        return
-    low, high = limits
-    if not 0.0 < low <= high < math.inf or (apart and low == high):
-        raise typer.BadParameter(
-            f"expected two ascending numbers, not {low:g} and {high:g}", param_hint=option
-        )
+def _beside(out: Path) -> Path:
+    """The folder beside the page."""
+    return out.with_name(f"{out.stem}-files")
+
+
+def _no_limits(option: str, limits: tuple[float, float] | None, *, apart: bool = False) -> list[str]:
+    """What the droop study would refuse of limits, before the work."""
+    low, high = limits or (1.0, 2.0)
+    if 0.0 < low <= high < math.inf and not (apart and low == high):
+        return []
+    return [f"{option}: expected two ascending numbers, not {low:g} and {high:g}"]
 
 
 def _make(asked: Asked, chosen: tuple[str, ...], out: Path, *, made: str, command: str) -> None:
@@ -142,9 +150,7 @@ def _make(asked: Asked, chosen: tuple[str, ...], out: Path, *, made: str, comman
     from feeders.report.page import About
     from service.study_report import attacks, outcome, see_readings, seeds, versions, write
 
-    folder = out.with_name(f"{out.stem}-files")
-    parts = {f"--out, {name}": folder / name for name in ("figures", "tables", "journals")}
-    see(replaced={"--out": out}, folders=parts, read={"--readings": asked.readings})
+    folder = _beside(out)
     with keeping("report", asked.feeder, folder=folder / "journals") as kept:
         studied = converted(asked.feeder, folder)
         site, source = load(studied), origin(studied)
@@ -165,29 +171,34 @@ def _make(asked: Asked, chosen: tuple[str, ...], out: Path, *, made: str, comman
         raise typer.Exit(FAILED)
 
 
-def _studies(text: str | None, known: tuple[str, ...], *, recorded: bool) -> tuple[str, ...]:
+def _studies(
+    text: str | None, known: tuple[str, ...], *, recorded: bool, problems: list[str]
+) -> tuple[str, ...]:
     """Names of studies, each once; calibration only where there are readings."""
+    from feeders.choices import no_choice
+
     if text is None:
         return tuple(name for name in known if recorded or name != "calibrate")
     names = [name.strip() for name in text.split(",")]
-    for name in names:
-        if name not in known:
-            raise typer.BadParameter(f"{name!r}: expected some of {', '.join(known)}", param_hint="--studies")
+    problems += no_choice("--studies", known, *names)
     if "calibrate" in names and not recorded:
-        raise typer.BadParameter("calibrate needs --readings", param_hint="--studies")
+        problems.append("--studies: calibrate needs --readings")
     return tuple(name for name in known if name in names)
 
 
-def _moment(text: str | None) -> str:
-    """The time that the report bears."""
-    if text is None:
-        return f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"
+def _now() -> str:
+    return _told(datetime.now(UTC))
+
+
+def _moment(text: str) -> str:
+    """The time that the report is to bear."""
     try:
-        given = datetime.fromisoformat(text)
+        return _told(datetime.fromisoformat(text))
     except ValueError as error:
-        raise typer.BadParameter(
-            f"{text!r}: expected a date and time of ISO 8601", param_hint="--at"
-        ) from error
+        raise ValueError("expected a date and time of ISO 8601") from error
+
+
+def _told(given: datetime) -> str:
     return f"{given.astimezone(UTC) if given.tzinfo else given:%Y-%m-%d %H:%M} UTC"
 
 

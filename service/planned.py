@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-import typer
+
+from gridsec.errors import refuse
 
 if TYPE_CHECKING:
     from feeders.load import Site
@@ -29,7 +30,7 @@ def planned(
     load_error_kvar: float | None,
     **chosen: Any,
 ) -> Plan:
-    """The plan of a campaign.
+    """The plan of a campaign; all that is wrong with it is told at once.
 
     Parameters
     ----------
@@ -42,23 +43,31 @@ def planned(
 
     Raises
     ------
-    typer.BadParameter
-        If a scenario is too short for readings so far apart.
+    ValueError
+        If a scenario is too short for readings so far apart, there is no such setting, or as `Plan`.
     """
-    from feeders.studies.campaign_plan import Plan
+    from feeders.studies.campaign_plan import Plan, wrong_settings
     from feeders.trials import LoadError
 
+    problems = wrong_settings(site, chosen.get("settings") or ())
     step_s = step or site.tables.meta.monitor.tick_s
     if duration is not None and duration < SHORTEST * step_s:
-        raise typer.BadParameter(
-            f"{duration:g} s are too few where readings come every {step_s:g} s ({_from(step, '--step')}): "
-            f"at least {SHORTEST * step_s:g} s, or more frequent readings with --step",
-            param_hint="--duration",
+        problems.append(
+            f"--duration: {duration:g} s are too few where readings come every {step_s:g} s "
+            f"({_from(step, '--step')}): at least {SHORTEST * step_s:g} s, or more frequent readings with "
+            "--step"
         )
+        duration = None
     chosen |= {"step_s": step, "duration_s": duration}
     if load_error_kw is not None or load_error_kvar is not None:
         chosen["load_error"] = LoadError(load_error_kw or 0.0, load_error_kvar or 0.0)
-    return Plan.of(site, **{name: value for name, value in chosen.items() if value is not None})
+    try:
+        plan = Plan.of(site, **{name: value for name, value in chosen.items() if value is not None})
+    except ValueError as error:
+        refuse([*problems, str(error)])
+        raise
+    refuse(problems)
+    return plan
 
 
 def sources(site: Site, plan: Plan, given: Mapping[str, object]) -> str:

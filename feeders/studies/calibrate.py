@@ -33,6 +33,7 @@ from feeders.studies.calibrate_search import (
     prepare,
 )
 from feeders.studies.journal import Journal, Progress, Where
+from gridsec.errors import refuse
 
 if TYPE_CHECKING:
     from feeders.load import Site
@@ -40,7 +41,7 @@ if TYPE_CHECKING:
     from feeders.recording import Recording
     from feeders.schema import FeederTables
 
-__all__ = ["Calibrate", "OtherFeeder", "calibrate"]
+__all__ = ["Calibrate", "OtherFeeder", "calibrate", "wrong_numbers"]
 
 MOST_ERRORS: Final = 24
 """After so many errors the files are another feeder's."""
@@ -183,7 +184,10 @@ def calibrate(
     InUse
         If another process is writing it.
     """
-    _check(site, risk, tolerance, exclude)
+    problems = wrong_numbers(risk, tolerance)
+    if unknown := sorted(set(exclude) - set(site.meter_ids)):
+        problems.append(f"{site.feeder.name} has no meter {', '.join(unknown)}")
+    refuse(problems)
     given = frames(site, readings, exclude=exclude)
     subject = _subject(site, given, risk, tolerance) | {"exclude": sorted(exclude), "kinds": sorted(kinds)}
 
@@ -214,14 +218,20 @@ def calibrate(
     )
 
 
-def _check(site: Site | ThreePhaseSite, risk: float, tolerance: float, exclude: Sequence[str]) -> None:
+def wrong_numbers(risk: float, tolerance: float) -> list[str]:
+    """Return what is wrong with numbers of a calibration.
+
+    Parameters
+    ----------
+    risk, tolerance
+        As `calibrate` takes them.
+    """
+    problems = []
     if not 0.0 < risk < 1.0:
-        raise ValueError(f"risk is {risk}; it must be between 0 and 1")
+        problems.append(f"risk is {risk}; it must be between 0 and 1")
     if not 0.0 < tolerance < LENGTH_SPREAD:
-        raise ValueError(f"tolerance is {tolerance}; it must be between 0 and {LENGTH_SPREAD}")
-    unknown = sorted(set(exclude) - set(site.meter_ids))
-    if unknown:
-        raise ValueError(f"{site.feeder.name} has no meter {', '.join(unknown)}")
+        problems.append(f"tolerance is {tolerance}; it must be between 0 and {LENGTH_SPREAD}")
+    return problems
 
 
 def _searched(

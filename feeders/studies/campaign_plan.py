@@ -407,14 +407,8 @@ class Plan:
             If a setting has a value that it cannot have.
         """
         meta = stated.tables.meta
+        refuse(wrong_settings(stated, self.settings))
         known = asdict(meta.monitor)
-        problems = []
-        for name, value in self.settings:
-            if name not in known or name in ("estimator", "tick_s", "alarms_per_year"):
-                problems.append(f"{name!r} is no setting of an estimator")
-            elif isinstance(known[name], int) and not float(value).is_integer():
-                problems.append(f"{name} is {value}; expected a whole number")
-        refuse(problems)
         # A whole number stays one, whatever the setting was written as.
         chosen = {name: type(known[name])(value) for name, value in self.settings}
         if self.learn_s:
@@ -427,6 +421,24 @@ class Plan:
         """The plan as JSON has it."""
         told: dict[str, Any] = json.loads(json.dumps(plain(asdict(self))))
         return told
+
+
+def wrong_settings(site: Site, settings: Iterable[tuple[str, float]]) -> list[str]:
+    """Return what is wrong with settings of `[monitor]`, one sentence each.
+
+    Parameters
+    ----------
+    site, settings
+        The feeder, and settings by name.
+    """
+    known = asdict(site.tables.meta.monitor)
+    problems = []
+    for name, value in settings:
+        if name not in known or name in ("estimator", "tick_s", "alarms_per_year"):
+            problems.append(f"{name!r} is no setting of an estimator")
+        elif isinstance(known[name], int) and not float(value).is_integer():
+            problems.append(f"{name} is {value}; expected a whole number")
+    return problems
 
 
 # Streams of random numbers.

@@ -9,15 +9,25 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from feeders.choices import choice
+from feeders.choices import choice, no_choice
 from gridsec.arrays import Bools, Floats, Ints, unit_rows
+from gridsec.errors import refuse
 from gridsec.lure import close_loop
 from gridsec.studies.patterns import Patterns, patterns, unknown_pair, unknown_voltages
 
 if TYPE_CHECKING:
     from feeders.load import Site
 
-__all__ = ["TOLERANCE", "Attack", "Curves", "Knowledge", "customer_indices", "knowledge", "meter_mask"]
+__all__ = [
+    "TOLERANCE",
+    "Attack",
+    "Curves",
+    "Knowledge",
+    "customer_indices",
+    "knowledge",
+    "meter_mask",
+    "see_names",
+]
 
 TOLERANCE: Final = 1e-9
 """Products of unit vectors up to this count as zero, and rows up to this part of the longest.
@@ -140,6 +150,38 @@ def customer_indices(site: Site, names: Sequence[str]) -> Ints:
     return _indices(site.feeder.customers, names, "customer")
 
 
+def see_names(
+    site: Site,
+    *,
+    unknown: Sequence[str] | None = None,
+    meters: Sequence[str] = (),
+    curves: Curves | str = "",
+) -> None:
+    """Refuse, all at once, names of what a feeder does not have.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    unknown, meters
+        Names of customers and of meters.
+    curves
+        Where the inverters work; empty: not asked.
+
+    Raises
+    ------
+    ValueError
+        If there is no such customer, meter or part of the curves.
+    """
+    refuse(
+        [
+            *_strange(site.feeder.customers, unknown or (), "customer"),
+            *_strange(site.meter_ids, meters, "meter"),
+            *no_choice("curves", Curves, *([curves] if curves else [])),
+        ]
+    )
+
+
 def meter_mask(site: Site, names: Sequence[str]) -> Bools:
     """Which meters are named, (p,).
 
@@ -159,9 +201,13 @@ def meter_mask(site: Site, names: Sequence[str]) -> Bools:
 
 
 def _indices(known: Sequence[str], names: Sequence[str], what: str) -> Ints:
+    refuse(_strange(known, names, what))
     place = {name: k for k, name in enumerate(known)}
-    strange = [name for name in names if name not in place]
-    if strange:
-        few = ", ".join(list(known)[:5])
-        raise ValueError(f"there is no {what} {', '.join(map(repr, strange))}; there are {few}, ...")
     return np.array([place[name] for name in names], dtype=np.intp)
+
+
+def _strange(known: Sequence[str], names: Sequence[str], what: str) -> list[str]:
+    there = set(known)
+    strange = [name for name in names if name not in there]
+    few = ", ".join(list(known)[:5])
+    return [f"there is no {what} {', '.join(map(repr, strange))}; there are {few}, ..."] if strange else []

@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 
 from feeders.choices import choice, no_choice
-from feeders.studies.hidden import Attack, Curves, knowledge, meter_mask
+from feeders.studies.hidden import Attack, Curves, knowledge, meter_mask, see_names
 from feeders.studies.journal import Journal, Where
 from feeders.studies.operating import SHARE, box, false_powers, squared, volts_of_lie
 from gridsec.arrays import Bools, Ints
@@ -197,6 +197,7 @@ def protect(
         curves=curves,
         share=share,
     )
+    see_names(site, unknown=unknown, meters=never)
     attack, goal = Attack(attack), None if goal is None else Goal(goal)
     know = partial(knowledge, site, unknown=unknown, silent=(), busbar_known=busbar_known)
     if goal is None:

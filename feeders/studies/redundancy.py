@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import pandas as pd
 
-from feeders.choices import choice
-from feeders.studies.hidden import Attack, Curves, Knowledge, knowledge
+from feeders.studies.hidden import Attack, Curves, Knowledge, knowledge, see_names
 from feeders.studies.journal import Progress, Where, worked
 from gridsec.errors import DesignInfeasible
 from gridsec.index import Index
@@ -96,7 +95,7 @@ def redundancy(
     unknown: Sequence[str] | None = None,
     silent: Sequence[str] = (),
     busbar_known: bool = True,
-    curves: Curves = Curves.STEEPEST,
+    curves: Curves | str = Curves.STEEPEST,
     journal: Where = None,
     progress: Progress | None = None,
 ) -> Redundancy:
@@ -122,7 +121,8 @@ def redundancy(
     InUse
         If another process is writing it.
     """
-    curves = choice("curves", Curves, curves)
+    see_names(site, unknown=unknown, meters=silent, curves=curves)
+    curves = Curves(curves)
     subject = {
         "study": "redundancy",
         "digest": site.digest,

@@ -63,7 +63,7 @@ def test_wrong_arguments_are_told(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for wrong, why in (
-        (("--kind", "charm:3"), "'charm': expected one of bias, together"),
+        (("--kind", "charm:3"), "--kind 'charm:3': expected one of bias, together"),
         (("--kind", "bias:x"), "expected something like bias:1,3"),
         (("--kind", "inverter"), "expected something like bias:1,3"),
         (("--place", "nowhere"), "expected one of random, street, sensitive, colluding"),

@@ -138,7 +138,7 @@ def test_what_a_study_cannot_answer_is_in_the_report(
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("--studies", "protect,palmistry"), "'palmistry': expected some of"),
+        (("--studies", "protect,palmistry"), "--studies is 'palmistry'; expected one of"),
         (("--studies", "calibrate"), "calibrate needs --readings"),
         (("--goal", "all"), "expected one of identify, notice, bound, contain"),
         (("--goal", "bound"), "lie_volt is nan; to bound lies it must be a positive number"),
