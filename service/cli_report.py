@@ -84,7 +84,7 @@ def report(
     from feeders.columns import ESTIMATORS
     from feeders.studies.protect import check as see_question
     from gridsec.droop import PRESETS
-    from service.study_report import STUDIES, Asked
+    from service.study_report import STUDIES, Asked, misplaced
 
     problems: list[str] = []
     chosen = _studies(studies, tuple(STUDIES), recorded=readings is not None, problems=problems)
@@ -92,19 +92,6 @@ def report(
     problems += no_choice("--estimator", ESTIMATORS, *([estimator] if estimator else []))
     problems += [*_no_limits("--busbar", busbar), *_no_limits("--band", band, apart=True)]
     moments = [_now()] if at is None else read_all("--at", [at], _moment, problems)
-    options_of(
-        lambda: see_question(
-            max_attacked=max_attacked,
-            goal=goal,
-            lie_volt=math.nan if lie_volt is None else lie_volt,
-            unknown=unknown,
-            busbar_known=not busbar_unknown,
-        ),
-        problems,
-        replaced={"--out": out},
-        folders={f"--out, {name}": _beside(out) / name for name in ("figures", "tables", "journals")},
-        read={"--readings": readings},
-    )
     asked = Asked(
         feeder=feeder,
         max_attacked=max_attacked,
@@ -125,6 +112,21 @@ def report(
         band=band,
         hosting=hosting,
         readings=readings,
+    )
+    if chosen:
+        problems += misplaced(asked, chosen)
+    options_of(
+        lambda: see_question(
+            max_attacked=max_attacked,
+            goal=goal,
+            lie_volt=asked.lie_volt,
+            unknown=unknown,
+            busbar_known=not busbar_unknown,
+        ),
+        problems,
+        replaced={"--out": out},
+        folders={f"--out, {name}": _beside(out) / name for name in ("figures", "tables", "journals")},
+        read={"--readings": readings},
     )
     _make(asked, chosen, out, made=moments[0], command=_command(asked, out, studies))
 

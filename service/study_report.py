@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 import platform
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass, fields, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from feeders.studies.journal import Progress, Where
     from service.keeping import Keeping
 
-__all__ = ["STUDIES", "Asked", "Study", "outcome", "versions", "write"]
+__all__ = ["STUDIES", "Asked", "Study", "misplaced", "outcome", "versions", "write"]
 
 LIBRARIES: Final = (
     *("gridsec", "numpy", "scipy", "pandas", "cvxpy", "clarabel", "highspy", "power-grid-model"),
@@ -270,6 +270,25 @@ STUDIES: Final[dict[str, Study]] = {
     ),
 }
 """Studies of a report, in the order of its sections."""
+
+
+def misplaced(asked: Asked, chosen: Collection[str]) -> list[str]:
+    """Return what was asked of none of the chosen studies, one sentence each.
+
+    Parameters
+    ----------
+    asked, chosen
+        What was asked, and names of studies.
+    """
+    problems = []
+    for each in fields(asked):
+        if each.default is MISSING:
+            continue
+        without = replace(asked, **{each.name: each.default})
+        takers = [name for name, study in STUDIES.items() if study.options(asked) != study.options(without)]
+        if takers and not set(takers) & set(chosen):
+            problems.append(f"{option(each.name)} goes with {', '.join(takers)}")
+    return problems
 
 
 def outcome(

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import re
 import shlex
+from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
 from playwright.sync_api import Browser
 
 from service.cli_report import _command
-from service.study_report import STUDIES, Asked
+from service.study_report import STUDIES, Asked, misplaced
 from tests.service.commands import command, plain, text_of
 
 FEW = ("--studies", "redundancy,protect")
@@ -143,6 +145,13 @@ def test_what_a_study_cannot_answer_is_in_the_report(
         (("--goal", "all"), "expected one of identify, notice, bound, contain"),
         (("--goal", "bound"), "lie_volt is nan; to bound lies it must be a positive number"),
         (("--goal", "notice", "--lie-volt", "3"), "lie_volt goes with goals in volts, not with notice"),
+        (("--studies", "redundancy", "--hosting"), "--hosting goes with droop"),
+        (("--studies", "redundancy,droop", "--readings", "pyproject.toml"), "--readings goes with calibrate"),
+        (
+            ("--studies", "droop", "--max-attacked", "3"),
+            "--max-attacked goes with detectable, protect, campaign",
+        ),
+        (("--studies", "calibrate", "--unknown", "miller"), "--unknown goes with protect, redundancy"),
         (("--at", "tomorrow"), "expected a date and time of ISO 8601"),
     ],
 )
@@ -157,6 +166,25 @@ def test_wrong_arguments_are_told_before_the_work(
     assert code == 2
     assert said in plain(told)
     assert not list(tmp_path.iterdir())
+
+
+def test_every_option_of_a_report_belongs_to_a_study() -> None:
+    usual = Asked("cigre-lv")
+    others = {"feeder", "workers"}
+    given: dict[str, Any] = {
+        "max_attacked": 1, "goal": "contain", "lie_volt": 2.0, "unknown": ("a",), "silent": ("b",),
+        "busbar_unknown": True, "scenarios": 3, "seed": 4, "step": 5.0, "estimator": "sequential",
+        "load_error_kw": 1.0, "load_error_kvar": 1.0, "preset": "vde4105", "busbar": (0.9, 1.0),
+        "band": (0.9, 1.1), "hosting": True, "readings": Path("day.csv"),
+    }  # fmt: skip
+    assert {each.name for each in fields(Asked)} == given.keys() | others
+    for name, value in given.items():
+        asked = replace(usual, **{name: value})
+        (told,) = misplaced(asked, ())
+        takers = told.partition(" goes with ")[2].split(", ")
+        assert not misplaced(asked, takers[:1])
+    assert not misplaced(replace(usual, workers=7), ("droop",))
+    assert misplaced(replace(usual, seed=4), ("redundancy",)) == ["--seed goes with droop, campaign"]
 
 
 def test_a_feeder_that_is_none(
