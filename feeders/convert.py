@@ -20,7 +20,7 @@ from typing import Any
 
 from feeders import convert_simbench
 from feeders.command_line import command_line
-from feeders.convert_changes import CHANGES_FILE, Change, changes_csv, sentences
+from feeders.convert_changes import CHANGES_FILE, Change, SourceUnreadable, changes_csv, sentences
 from feeders.convert_check import SourceCheck, compare
 from feeders.convert_folder import from_folder, source_again
 from feeders.convert_levels import EVERYTHING, Extent
@@ -192,8 +192,10 @@ def convert(
     FeederInvalid
         If the result is no feeder that can be loaded: a loop, an island, no zero sequence where one is
         needed, ...; or with every option that makes nothing of a feeder's folder.
+    SourceUnreadable
+        If the source does not exist, or its own tool cannot read it.
     GridsecError
-        If the source does not exist, its own tool cannot read it, or the extra `convert` is not installed.
+        If its own power flow fails where that is needed, or the extra `convert` is not installed.
     FileExistsError
         If the folder holds a feeder that no conversion has written.
     """
@@ -267,8 +269,10 @@ def check_against_source(
 
     Raises
     ------
+    SourceUnreadable
+        If the source cannot be read.
     GridsecError
-        If the source cannot be read, or its own power flow fails.
+        If its own power flow fails.
     PowerFlowDiverged
         If the feeder's does.
     """
@@ -337,7 +341,7 @@ def _kind(path: Path) -> str:
 
     Raises
     ------
-    GridsecError
+    SourceUnreadable
         If it is for none of them.
     """
     if path.suffix.lower() == ".dss":
@@ -345,7 +349,7 @@ def _kind(path: Path) -> str:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
-        raise GridsecError(
+        raise SourceUnreadable(
             f"{path}: no valid JSON ({error}); expected a pandapower or power-grid-model JSON file, "
             "or an OpenDSS master file with the ending .dss"
         ) from error
@@ -354,7 +358,7 @@ def _kind(path: Path) -> str:
             return "pandapower"
         if "data" in content and "version" in content:
             return PGM
-    raise GridsecError(
+    raise SourceUnreadable(
         f"{path}: JSON, but neither a pandapower net (which says _class pandapowerNet) nor input data of "
         "power-grid-model (which has version, type and data)"
     )
@@ -396,6 +400,9 @@ def _convert_profiles(folder: Path) -> None:
 def _open(origin: str) -> tuple[Any, str]:
     """Return the pandapower net of a source and the name of the package that holds its data."""
     kind, _, rest = origin.partition(":")
+    path = Path(origin)
+    if path.suffix.lower() in (".json", ".dss") and not path.is_file():
+        raise SourceUnreadable(f"{origin}: there is no such file")
     try:
         import pandapower
         import pandapower.networks
@@ -405,10 +412,9 @@ def _open(origin: str) -> tuple[Any, str]:
         return convert_simbench.grid(rest or origin), "simbench"
     if kind == "pandapower" and rest:
         return _named(rest), "pandapower"
-    path = Path(origin)
     if not path.is_file():
-        raise GridsecError(
-            f"{origin!r} is no source; expected profiles, {', '.join(RECIPES)}, pandapower:<network>, "
+        raise SourceUnreadable(
+            f"{origin!r} is no source; expected {', '.join(RECIPES)}, pandapower:<network>, "
             "simbench:<code>, a pandapower or power-grid-model JSON file, an OpenDSS master file (.dss), "
             "or a feeder's folder"
         )
@@ -417,9 +423,9 @@ def _open(origin: str) -> tuple[Any, str]:
             warnings.simplefilter("ignore")
             net = pandapower.from_json(str(path))
     except Exception as error:  # whatever the foreign reader raises on a foreign file
-        raise GridsecError(f"{origin}: pandapower cannot read it: {error}") from error
+        raise SourceUnreadable(f"{origin}: pandapower cannot read it: {error}") from error
     if not isinstance(net, pandapower.pandapowerNet):
-        raise GridsecError(f"{origin}: holds no pandapower net")
+        raise SourceUnreadable(f"{origin}: holds no pandapower net")
     return net, "pandapower"
 
 
@@ -430,7 +436,7 @@ def _named(name: str) -> Any:
     found = [getattr(networks, maker, None) for maker in (name, f"create_{name}")]
     makers: list[Callable[[], Any]] = [maker for maker in found if callable(maker)]
     if not makers:
-        raise GridsecError(f"pandapower has no network {name!r}")
+        raise SourceUnreadable(f"pandapower has no network {name!r}")
     talk = logging.getLogger("pandapower")
     level = talk.level
     talk.setLevel(logging.ERROR)
@@ -439,9 +445,9 @@ def _named(name: str) -> Any:
             warnings.simplefilter("ignore")
             net = _seeded(makers[0])
     except Exception as error:  # whatever a maker that needs arguments, or is none, raises
-        raise GridsecError(f"pandapower cannot build {name!r} by itself: {error}") from error
+        raise SourceUnreadable(f"pandapower cannot build {name!r} by itself: {error}") from error
     finally:
         talk.setLevel(level)
     if not hasattr(net, "bus"):
-        raise GridsecError(f"pandapower's {name!r} is no network")
+        raise SourceUnreadable(f"pandapower's {name!r} is no network")
     return net

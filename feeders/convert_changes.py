@@ -25,6 +25,10 @@ class BusbarUnclear(GridsecError):
     """There are several buses, or none, that could be the metered busbar."""
 
 
+class SourceUnreadable(GridsecError):
+    """What is to be converted does not exist, or is nothing that can be read as a network."""
+
+
 @dataclass(frozen=True, slots=True)
 class Change:
     """One element of the source that is not, or not exactly, in the feeder.

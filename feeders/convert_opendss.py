@@ -17,7 +17,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from feeders.convert_changes import WHOLE, Change
+from feeders.convert_changes import WHOLE, Change, SourceUnreadable
 from feeders.convert_customers import rounded
 from feeders.convert_draws import Draw, is_even
 from feeders.convert_graph import Coupling
@@ -128,8 +128,10 @@ def read_opendss(path: Path) -> Network:
 
     Raises
     ------
+    SourceUnreadable
+        If OpenDSS cannot read it.
     GridsecError
-        If OpenDSS cannot read or solve it.
+        If OpenDSS cannot solve it.
     FeederInvalid
         With everything in it that no feeder can be.
     """
@@ -139,13 +141,13 @@ def read_opendss(path: Path) -> Network:
         except (FeederInvalid, GridsecError):
             raise
         except Exception as error:  # whatever the foreign engine raises on a foreign file
-            raise GridsecError(f"{path}: OpenDSS: {' '.join(str(error).split())}") from error
+            raise SourceUnreadable(f"{path}: OpenDSS: {' '.join(str(error).split())}") from error
 
 
 def _read(dss: Any, path: Path) -> Network:
     dss.Text.Command(f'redirect "{path.resolve()}"')
     if not dss.Basic.NumCircuits():
-        raise GridsecError(f"{path}: OpenDSS finds no circuit in it; expected 'new circuit...'")
+        raise SourceUnreadable(f"{path}: OpenDSS finds no circuit in it; expected 'new circuit...'")
     problems: list[str] = []
     _run(dss, (*_voltage_bases(dss), *SOLVER))
     found = _solved(dss)

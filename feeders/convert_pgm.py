@@ -20,7 +20,7 @@ from power_grid_model import (
 from power_grid_model.utils import json_deserialize  # type: ignore[attr-defined]  # documented, but not re-exported
 from power_grid_model.validation import validate_input_data
 
-from feeders.convert_changes import WHOLE, Change
+from feeders.convert_changes import WHOLE, Change, SourceUnreadable
 from feeders.convert_customers import rounded
 from feeders.convert_draws import SWITCHED_OFF, Draw
 from feeders.convert_graph import Coupling
@@ -78,8 +78,10 @@ def read_pgm(path: Path) -> Network:
 
     Raises
     ------
+    SourceUnreadable
+        If power-grid-model cannot read it.
     GridsecError
-        If power-grid-model cannot read or solve it.
+        If power-grid-model cannot solve it.
     FeederInvalid
         With everything that is wrong with its data.
     """
@@ -121,9 +123,9 @@ def _tables(path: Path) -> Tables:
     try:
         data = json_deserialize(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
-        raise GridsecError(f"{path}: cannot be read: {error}") from error
+        raise SourceUnreadable(f"{path}: cannot be read: {error}") from error
     except Exception as error:  # whatever the foreign reader raises on a foreign file
-        raise GridsecError(
+        raise SourceUnreadable(
             f"{path}: power-grid-model cannot read it: {' '.join(str(error).split())}"
         ) from error
     tables = {kind.value: rows for kind, rows in data.items()}

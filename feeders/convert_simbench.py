@@ -18,6 +18,7 @@ import numpy as np
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, QhullError
 
+from feeders.convert_changes import SourceUnreadable
 from feeders.profiles import Envelope, Season
 from gridsec.arrays import Floats
 from gridsec.errors import GridsecError
@@ -77,8 +78,10 @@ def grid(code: str) -> Any:
 
     Raises
     ------
+    SourceUnreadable
+        If SimBench has no grid of this code.
     GridsecError
-        If simbench is not installed, or has no grid of this code.
+        If simbench is not installed.
     """
     try:
         import simbench
@@ -87,7 +90,7 @@ def grid(code: str) -> Any:
             "SimBench grids need the extra 'convert': pip install 'gridsec[convert]'"
         ) from error
     if code not in simbench.collect_all_simbench_codes():
-        raise GridsecError(f"SimBench has no grid {code!r}; a code looks like 1-LV-rural1--0-sw")
+        raise SourceUnreadable(f"SimBench has no grid {code!r}; a code looks like 1-LV-rural1--0-sw")
     return simbench.get_simbench_net(code)
 
 

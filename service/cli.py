@@ -2,7 +2,7 @@
 
 Exit codes: 0 done; 1 a check failed or something unexpected; 2 wrong usage or settings; 3 a feeder is invalid
 or cannot be watched; 4 the database cannot be used; 5 an address cannot be used (HTTP or zenoh); 6 a file is
-no recording or cannot be written.
+no recording, no network of another tool, or cannot be written.
 """
 
 from __future__ import annotations
@@ -72,6 +72,7 @@ def exit_code(error: GridsecError) -> int:
     error
         The error.
     """
+    from feeders.convert_changes import SourceUnreadable
     from feeders.recording import RecordingInvalid
     from service.app import AddressUnavailable
     from service.bus import BusUnavailable
@@ -87,6 +88,7 @@ def exit_code(error: GridsecError) -> int:
         AddressUnavailable: ADDRESS,
         BusUnavailable: ADDRESS,
         RecordingInvalid: FILE,
+        SourceUnreadable: FILE,
         Unusable: FILE,
     }
     return next((code for kind, code in codes.items() if isinstance(error, kind)), FAILED)

@@ -12,7 +12,8 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from gridsec.errors import FeederInvalid
+from gridsec.errors import FeederInvalid, refuse
+from service.cli_plan import said
 from service.console import FEEDER, Feeder, complain, err, out
 from service.foreign import show_check, spared
 from service.places import see
@@ -117,16 +118,20 @@ def feeders_design(
         typer.Option(help="See `feeders estimators`. [default: as in the file]"),
     ] = None,
     max_attacked: Annotated[
-        int | None, typer.Option(help="How many meters may be manipulated. [default: as in the file]")
+        int | None, typer.Option(help="How many meters may be manipulated. [default: as in the file]", min=0)
     ] = None,
     workers: Annotated[
         int | None, typer.Option(help="Processes for matrix inequalities. [default: all cores]", min=1)
     ] = None,
 ) -> None:
     """Design a feeder's estimator ahead of time; designs that take long are kept for the next start."""
+    from feeders.choices import no_choice
+    from feeders.columns import ESTIMATORS
     from feeders.estimators import choose, design
     from feeders.load import load
 
+    with said():
+        refuse(no_choice("--estimator", ESTIMATORS, *([estimator] if estimator else [])))
     site = choose(load(feeder), estimator=estimator, max_attacked=max_attacked)
     columns = (TextColumn("observers"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     started = time.monotonic()

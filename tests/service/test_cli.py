@@ -282,7 +282,7 @@ def test_a_simulation_replaces_simulations_only(gridsec: Run, tmp_path: Path) ->
 
 
 def test_conversion_of_nothing(gridsec: Run, tmp_path: Path) -> None:
-    assert "nonsense" in refused(1, gridsec("convert", "pandapower:nonsense", str(tmp_path / "x")))
+    assert "nonsense" in refused(6, gridsec("convert", "pandapower:nonsense", str(tmp_path / "x")))
 
 
 # --- work ---------------------------------------------------------------------------------------------

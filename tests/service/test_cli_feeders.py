@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks.mesh import baran_wu
 from feeders.schema import write
-from tests.service.commands import command
+from tests.service.commands import command, plain
 
 run = command("feeders")
 
@@ -54,6 +54,14 @@ def test_a_meshed_feeder_is_checked_shown_and_designed(
     code, said, _ = run(monkeypatch, capsys, "design", str(tmp_path / "mesh"), "--estimator", "exact-bank")
     assert code == 0
     assert "528 observers" in " ".join(said.split())
+
+
+def test_an_estimator_that_there_is_not_is_wrong_usage(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, _, told = run(monkeypatch, capsys, "design", "cigre-lv", "--estimator", "zz")
+    assert code == 2
+    assert "--estimator is 'zz'; expected one of sequential, " in plain(told)
 
 
 def test_what_cannot_be_watched_is_said(

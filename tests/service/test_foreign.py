@@ -105,7 +105,7 @@ def test_what_was_edited_since_is_kept(
     assert customers.read_bytes() == original
     # A source that is none any more takes nothing away either.
     file.write_text("{}", encoding="utf-8")
-    assert run(monkeypatch, capsys, *again)[0] == 1
+    assert run(monkeypatch, capsys, *again)[0] == 6
     assert customers.read_bytes() == original
     assert sorted(path.name for path in out.glob("feeder*")) == ["feeder", "feeder-1"]
 
@@ -147,14 +147,37 @@ def test_a_busbar_that_is_not_clear(
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("name", ["nowhere.json", "simbench:7-LV--0-sw", "nowhere"])
-def test_what_is_not_there(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("name", "content", "code", "why"),
+    [
+        ("nowhere.json", None, 6, "nowhere.json: there is no such file"),
+        ("nowhere.dss", None, 6, "nowhere.dss: there is no such file"),
+        ("empty.json", "", 6, "empty.json: no valid JSON"),
+        ("half.json", '{"_module": "pandapower.auxiliary", "_cl', 6, "half.json: no valid JSON"),
+        ("net.json", '{"_class": "pandapowerNet"}', 6, "net.json: "),
+        ("empty.dss", "", 6, "finds no circuit in it"),
+        ("simbench:7-LV--0-sw", None, 6, "SimBench has no grid '7-LV--0-sw'"),
+        ("pandapower:nothing", None, 6, "pandapower has no network 'nothing'"),
+        ("nowhere", None, 3, "nowhere: there is neither such a folder nor such a feeder"),
+    ],
+)
+def test_what_is_no_feeder(
+    *,
+    name: str,
+    content: str | None,
+    code: int,
+    why: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
+    pytest.importorskip("simbench", reason="the extra `convert` is not installed")
     monkeypatch.chdir(tmp_path)
-    code, _, told = run(monkeypatch, capsys, "redundancy", name)
-    assert code != 0
-    assert name.removeprefix("simbench:") in plain(told)
+    if content is not None:
+        (tmp_path / name).write_text(content, encoding="utf-8")
+    found, _, told = run(monkeypatch, capsys, "redundancy", name, "--no-journal")
+    assert (found, why in plain(told)) == (code, True), told
+    assert "profiles" not in told
 
 
 def test_a_report_tells_what_was_not_carried_over(
