@@ -104,10 +104,11 @@ def find(path_or_name: Path | str) -> FeederTables:
     folder = folder_of(path_or_name)
     if folder is not None:
         return read(folder)
+    why = "there is neither such a folder nor such a feeder"
+    if Path(path_or_name).is_file():
+        why = "a file; expected a feeder's folder, or the name of a feeder"
     there, advised = ", ".join(names(balanced=False)), advice(path_or_name)
-    raise FeederInvalid(
-        [f"{path_or_name}: there is neither such a folder nor such a feeder; there are {there}{advised}"]
-    )
+    raise FeederInvalid([f"{path_or_name}: {why}; there are {there}{advised}"])
 
 
 def indices(values: Sequence[int]) -> Ints:

@@ -158,6 +158,7 @@ def test_a_busbar_that_is_not_clear(
         ("empty.dss", "", 6, "finds no circuit in it"),
         ("simbench:7-LV--0-sw", None, 6, "SimBench has no grid '7-LV--0-sw'"),
         ("pandapower:nothing", None, 6, "pandapower has no network 'nothing'"),
+        ("lines.csv", "line,from_bus", 3, "lines.csv: a file; expected a feeder's folder"),
         ("nowhere", None, 3, "nowhere: there is neither such a folder nor such a feeder"),
     ],
 )
