@@ -21,7 +21,7 @@ from service.places import see
 if TYPE_CHECKING:
     from feeders.convert import Conversion
 
-app = typer.Typer(no_args_is_help=True, help="List, show, check, convert and design feeders.")
+app = typer.Typer(no_args_is_help=True, help="List, show, validate, convert and design feeders.")
 
 SHOWN = 40
 """Rows of the table of changes that are printed; the file has all of them."""
@@ -83,15 +83,16 @@ def feeders_estimators() -> None:
 
 @app.command("validate")
 def feeders_validate(
-    folder: Annotated[list[Path], typer.Argument(help="Folders of feeders.")],
+    folder: Annotated[list[Path], typer.Argument(help="Folders, or names of gridsec's own feeders.")],
 ) -> None:
     """Check feeders and name every problem at once."""
+    from feeders.equipment import folder_of
     from feeders.load import from_tables
     from feeders.schema import examine
 
     invalid = False
     for path in folder:
-        found = examine(path)
+        found = examine(folder_of(path) or path)
         problems = found.problems
         if found.tables is not None:
             try:

@@ -10,6 +10,7 @@ import pytest
 
 from benchmarks.mesh import baran_wu
 from feeders.schema import write
+from service.cli_feeders import app
 from tests.service.commands import command, plain
 
 run = command("feeders")
@@ -54,6 +55,20 @@ def test_a_meshed_feeder_is_checked_shown_and_designed(
     code, said, _ = run(monkeypatch, capsys, "design", str(tmp_path / "mesh"), "--estimator", "exact-bank")
     assert code == 0
     assert "528 observers" in " ".join(said.split())
+
+
+def test_a_feeder_that_comes_with_gridsec_is_valid_by_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, told, wrong = run(monkeypatch, capsys, "validate", "cigre-lv", "atlantis")
+    assert "cigre-lv: valid" in told
+    assert (code, "atlantis does not exist" in wrong) == (3, True)
+    (tmp_path / "cigre-lv").mkdir()  # a folder goes before a name
+    code, _, wrong = run(monkeypatch, capsys, "validate", "cigre-lv")
+    assert (code, "feeder.toml" in wrong) == (3, True)
+    listed = re.findall(r"\w+", str(app.info.help).lower().replace(" and ", " ").removesuffix("feeders."))
+    assert set(listed) <= {each.name for each in app.registered_commands}
 
 
 def test_an_estimator_that_there_is_not_is_wrong_usage(
