@@ -407,7 +407,9 @@ def _open(origin: str) -> tuple[Any, str]:
         import pandapower
         import pandapower.networks
     except ImportError as error:
-        raise GridsecError("conversion needs the extra 'convert': pip install 'gridsec[convert]'") from error
+        raise GridsecError(
+            "conversion needs the extra 'convert', in a checkout: pip install -e '.[convert]'"
+        ) from error
     if (kind == "simbench" and rest) or SIMBENCH_CODE.fullmatch(origin):
         return convert_simbench.grid(rest or origin), "simbench"
     if kind == "pandapower" and rest:

@@ -99,7 +99,7 @@ def _engine() -> Iterator[Any]:
         from opendssdirect import dss
     except ImportError as error:
         raise GridsecError(
-            "OpenDSS files need the extra 'convert': pip install 'gridsec[convert]'"
+            "OpenDSS files need the extra 'convert', in a checkout: pip install -e '.[convert]'"
         ) from error
     here = Path.cwd()
     with tempfile.TemporaryDirectory() as scratch:

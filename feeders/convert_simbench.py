@@ -87,7 +87,7 @@ def grid(code: str) -> Any:
         import simbench
     except ImportError as error:
         raise GridsecError(
-            "SimBench grids need the extra 'convert': pip install 'gridsec[convert]'"
+            "SimBench grids need the extra 'convert', in a checkout: pip install -e '.[convert]'"
         ) from error
     if code not in simbench.collect_all_simbench_codes():
         raise SourceUnreadable(f"SimBench has no grid {code!r}; a code looks like 1-LV-rural1--0-sw")

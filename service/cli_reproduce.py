@@ -33,7 +33,7 @@ def reproduce(
     r"""Compute a paper's examples, show its numbers beside ours, and draw its figures.
 
     Exit code 1 if a number of a paper does not come out and no reason for it is known. The figures need
-    matplotlib: pip install 'gridsec\[plot]'.
+    matplotlib, in a checkout: pip install -e '.\[plot]'.
     """
     from gridsec.papers import draw
 
@@ -53,7 +53,7 @@ def reproduce(
             path.write_bytes(draw.png(figure))
             console.out.print(f"{escape(str(path))}: {escape(figure.caption)}")
     if not drawing:
-        complain("figures are not drawn: they need matplotlib, pip install 'gridsec[plot]'")
+        complain("figures are not drawn: they need matplotlib, in a checkout: pip install -e '.[plot]'")
     for claim in failed:
         complain(f"not met: {claim.what} ({claim.where}): {_printed(claim)}, ours {_text(claim.ours)}")
     if failed:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -40,6 +41,24 @@ def test_the_publishing_example_arrives(tmp_path: Path) -> None:
         meters = {m["meter"]: m for m in live.await_state(lambda s: s["meters"][0]["seen"])["meters"]}
         assert meters["m01"]["v_volt_reported"] == pytest.approx(231.4)
         assert not meters["m02"]["seen"]
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/operations.md"])
+def test_the_publishers_name_what_they_need(page: str) -> None:
+    needed = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
+    (zenoh,) = (each for each in needed if each.startswith("eclipse-zenoh"))
+    before, _, _ = (ROOT / page).read_text().partition("```python\nimport json, time, zenoh")
+    assert f"`pip install '{zenoh}'`" in before[-300:]
+
+
+def test_nothing_is_installed_by_a_name_that_is_not_published() -> None:
+    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+    extras = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"])
+    for page in pages:
+        text = page.read_text()
+        assert not re.search(r"install '?gridsec", text), page
+        for named in re.findall(r"pip install -e '\.\[(.*?)\]'", text):
+            assert set(named.split(",")) <= extras, page
 
 
 def test_every_link_leads_somewhere() -> None:

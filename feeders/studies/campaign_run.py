@@ -163,7 +163,7 @@ def _single(work: Work, piece: int) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Dask:
-    """A Dask cluster; it needs `pip install gridsec[cluster]`, and gridsec on its workers.
+    """A Dask cluster; it needs the extra `cluster`, and gridsec on its workers.
 
     Attributes
     ----------
@@ -195,7 +195,9 @@ class Dask:
         try:
             dask: Any = import_module("distributed")
         except ImportError as error:
-            raise ClusterUnusable("a Dask cluster needs `pip install gridsec[cluster]`") from error
+            raise ClusterUnusable(
+                "a Dask cluster needs the extra 'cluster', in a checkout: pip install -e '.[cluster]'"
+            ) from error
         try:
             client = dask.Client(self.address, timeout=self.timeout_s, set_as_default=False)
         except (OSError, ValueError) as error:

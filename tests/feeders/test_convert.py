@@ -362,10 +362,10 @@ def test_without_the_extra_the_error_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "simbench", None)
-    with pytest.raises(GridsecError, match=r"gridsec\[convert\]"):
+    with pytest.raises(GridsecError, match=r"pip install -e '\.\[convert\]'"):
         convert("simbench-lv-rural1", tmp_path / "out")
     monkeypatch.setitem(sys.modules, "pandapower", None)
-    with pytest.raises(GridsecError, match=r"gridsec\[convert\]"):
+    with pytest.raises(GridsecError, match=r"pip install -e '\.\[convert\]'"):
         convert("kerber-landnetz", tmp_path / "out")
 
 

@@ -83,7 +83,7 @@ def test_without_matplotlib_the_numbers_come_and_the_figures_are_missed_aloud(
     code, told, error = run(monkeypatch, capsys, "kim2018", "--out", str(tmp_path / "figures"))
     assert code == 0
     assert row(told, "2 M_z eta")[0] == "met"
-    assert "they need matplotlib, pip install 'gridsec[plot]'" in error
+    assert "they need matplotlib, in a checkout: pip install -e '.[plot]'" in error
     assert not (tmp_path / "figures").exists()
 
 
