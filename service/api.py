@@ -30,7 +30,7 @@ from service import models
 from service.alarms import AlarmKind, AlarmState, AlarmUnknown, Severity
 from service.alarms import to_json as alarm_json
 from service.backend import Backend
-from service.errors import FeederUnknown
+from service.errors import FeederNotLoaded, FeederUnknown
 from service.problem import Guard, handlers, problem
 from service.report import FeederReport
 from service.report import to_json as report_json
@@ -110,9 +110,11 @@ Until = Annotated[float | None, Query(allow_inf_nan=False, description="Before t
 
 
 def _known_feeder(backend: BackendHere, feeder: FeederName) -> str:
-    if not backend.known(feeder):
-        raise FeederUnknown(feeder)
-    return feeder
+    if backend.known(feeder):
+        return feeder
+    if problem := backend.unloaded(feeder):
+        raise FeederNotLoaded(feeder, problem)
+    raise FeederUnknown(feeder)
 
 
 def _latest(backend: BackendHere, feeder: Annotated[str, Depends(_known_feeder)]) -> FeederReport:
@@ -203,7 +205,7 @@ async def put_feeder(backend: BackendHere, feeder: FeederName, tables: dict[str,
 
 
 @_feeders.delete("/{feeder}", status_code=204)
-async def delete_feeder(backend: BackendHere, feeder: KnownFeeder) -> None:
+async def delete_feeder(backend: BackendHere, feeder: FeederName) -> None:
     """Watch a feeder no more that was put: its alarms are cleared, its history is kept."""
     await backend.delete_feeder(feeder)
 

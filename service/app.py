@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import signal
 import socket
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 
@@ -72,7 +72,8 @@ async def serve(
     with ExitStack() as stack:
         store = stack.enter_context(Store(settings.database))
         given = tuple(sites)
-        sites = _with_stored(sites, store)
+        stored, unloaded = _stored(sites, store)
+        sites |= stored
         config = RuntimeConfig(
             prefix=settings.prefix,
             clock=settings.clock,
@@ -82,7 +83,7 @@ async def serve(
             max_samples=settings.queue,
             max_feeders=settings.max_feeders,
         )
-        runtime = Runtime(config, store, sites.values(), given=given)
+        runtime = Runtime(config, store, sites.values(), given=given, unloaded=unloaded)
         listener = stack.enter_context(_listen(settings.http))
         bus = stack.enter_context(
             Bus(
@@ -218,16 +219,24 @@ def load_sites(names: Iterable[str]) -> dict[str, Site]:
     return sites
 
 
-def _with_stored(sites: dict[str, Site], store: Store) -> dict[str, Site]:
-    """Add the feeders that were put over REST; those given on the command line go before."""
-    together = dict(sites)
+def _stored(given: Mapping[str, Site], store: Store) -> tuple[dict[str, Site], dict[str, str]]:
+    """Load the feeders that were put over REST; those given on the command line go before.
+
+    Returns
+    -------
+    loaded, unloaded
+        By name: the feeders, and why others could not be loaded.
+    """
+    loaded: dict[str, Site] = {}
+    unloaded: dict[str, str] = {}
     for name, tables in store.feeders().items():
-        if name in sites:
+        if name in given:
             _log.warning("the feeder's files go before what was put over REST", feeder=name)
             continue
         try:
-            together[name] = from_tables(from_json(tables))
-        except FeederInvalid as error:
+            loaded[name] = from_tables(from_json(tables))
+        except GridsecError as error:
             # It was valid when it was put; an update of the program must not keep the others from starting.
-            _log.error("a stored feeder is not watched", feeder=name, problems=list(error.problems))
-    return together
+            unloaded[name] = "; ".join(error.problems) if isinstance(error, FeederInvalid) else str(error)
+            _log.error("a stored feeder is not watched", feeder=name, problem=unloaded[name])
+    return loaded, unloaded

@@ -25,6 +25,9 @@ class Backend(Protocol):
     def known(self, name: str) -> bool:
         """Whether there is such a feeder; costs nothing."""
 
+    def unloaded(self, name: str) -> str | None:
+        """Return why the stored tables of a feeder could not be loaded, or None if that is not so."""
+
     def report(self, name: str) -> FeederReport | None:
         """Return the latest report of a feeder, or None before its first tick."""
 

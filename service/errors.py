@@ -12,6 +12,13 @@ class FeederUnknown(GridsecError):
         super().__init__(f"there is no feeder {name!r}")
 
 
+class FeederNotLoaded(GridsecError):
+    """The feeder's stored tables cannot be loaded any more: nobody watches it."""
+
+    def __init__(self, name: str, problem: str) -> None:
+        super().__init__(f"nobody watches feeder {name!r}: its stored tables cannot be loaded: {problem}")
+
+
 class FeederFixed(GridsecError):
     """The feeder belongs to the command line."""
 

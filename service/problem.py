@@ -15,7 +15,7 @@ from feeders.outside import EstimatorUnusable
 from gridsec.errors import DesignInfeasible, FeederInvalid, GridsecError, NotObservable
 from service.alarms import AlarmUnknown, AlreadyAcknowledged
 from service.commissioning import NothingToLearn
-from service.errors import FeederFixed, FeederUnknown, TooManyFeeders
+from service.errors import FeederFixed, FeederNotLoaded, FeederUnknown, TooManyFeeders
 from service.store import StoreUnavailable
 
 _CSP = (
@@ -118,6 +118,7 @@ _STATUS: dict[type[GridsecError], int] = {
     FeederFixed: 409,
     NothingToLearn: 409,
     TooManyFeeders: 409,
+    FeederNotLoaded: 503,
     StoreUnavailable: 503,
     GridsecError: 500,
 }

@@ -9,7 +9,7 @@ Nobody who watches waits for the database: see `keeper`.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -89,6 +89,8 @@ class Rounds:
     apart
         How writing is done apart from judging: called with what to do, in any thread, and with what to do
         with the outcome, between two rounds.
+    unloaded
+        Feeders that are stored but cannot be loaded, and why.
     """
 
     def __init__(
@@ -100,11 +102,13 @@ class Rounds:
         wall: Callable[[], float],
         stored: Callable[[], None],
         apart: Apart = at_once,
+        unloaded: Mapping[str, str] | None = None,
     ) -> None:
         self.config = config
         self.store = store
         self.metrics = Metrics()
         self.watches: dict[str, Watch] = {}
+        self.unloaded = dict(unloaded or {})
         self._wall, self._stored = wall, stored
         self.keeper = Keeper(store, self.metrics, stored, self._count_stored, apart)
         self._wire = Wire({}, config.prefix, config.max_payload)
@@ -126,6 +130,7 @@ class Rounds:
         suspicions = Suspicions(site, self.store.distrust(name))
         watch = Watch(site, rules, restore(name, stored), commissioning, suspicions)
         self.watches = {**self.watches, name: watch}
+        self.unloaded.pop(name, None)
         self._learn()
         return watch
 
@@ -143,10 +148,12 @@ class Rounds:
             If there is none, or that cannot be stored; it is watched as before then.
         """
         watch = self.watches.get(name)
-        if watch is None:
+        if watch is None and name not in self.unloaded:
             raise FeederUnknown(name)
-        t = self._wall() if watch.book.t is None else watch.book.t
-        self.keeper.store_now(close(watch.book, t, NOT_WATCHED), without=name)
+        book = restore(name, self.store.active(name)) if watch is None else watch.book
+        t = self._wall() if book.t is None else book.t
+        self.keeper.store_now(close(book, t, NOT_WATCHED), without=name)
+        self.unloaded.pop(name, None)
         self.watches = {other: kept for other, kept in self.watches.items() if other != name}
         self._learn()
         self.metrics.forget(name)
@@ -162,15 +169,17 @@ class Rounds:
 
         Alarms of feeders that are neither watched nor stored any more are cleared: nobody else would.
         """
-        ours, t = self.watches.keys() | self.store.feeders().keys(), self._wall()
+        ours, t = self.watches.keys() | self.unloaded.keys() | self.store.feeders().keys(), self._wall()
         standing = self.store.active()
         for name in sorted({alarm.feeder for alarm in standing} - ours):
             gone = restore(name, [alarm for alarm in standing if alarm.feeder == name])
             self.keeper.waiting.add(transitions=close(gone, t, NOT_WATCHED))
         if self.keeper.publisher is not None:
-            for watch in self.watches.values():
-                for alarm in watch.book.active:
+            for alarm in standing:
+                if alarm.feeder in ours:
                     self.keeper.publisher.answer(alarm_key(alarm), msgspec.json.encode(alarm_json(alarm)))
+        for name in self.unloaded:
+            self.metrics.alarms.labels(name).set(sum(alarm.feeder == name for alarm in standing))
         self.keeper.commit()
 
     # ---------------------------------------------------------------- one round

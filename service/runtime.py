@@ -11,7 +11,7 @@ import contextlib
 import threading
 import time
 from collections import deque
-from collections.abc import AsyncGenerator, Callable, Iterable, Sequence
+from collections.abc import AsyncGenerator, Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, TypeVar
@@ -55,6 +55,8 @@ class Runtime:
         The feeders to watch.
     given
         Names of those that cannot be deleted over REST; None: all of them.
+    unloaded
+        Feeders that are stored but cannot be loaded, and why: nobody watches them.
     wall
         The wall clock, Unix s.
     """
@@ -66,6 +68,7 @@ class Runtime:
         sites: Iterable[Site],
         *,
         given: Iterable[str] | None = None,
+        unloaded: Mapping[str, str] | None = None,
         wall: Callable[[], float] = time.time,
     ) -> None:
         self._wall = wall
@@ -78,6 +81,7 @@ class Runtime:
             wall=wall,
             stored=self._wake_streams,
             apart=at_once if waits else self._write_apart,
+            unloaded=unloaded,
         )
         self._given = frozenset(self._rounds.watches) if given is None else frozenset(given)
         self._inbox = Inbox(
@@ -276,7 +280,7 @@ class Runtime:
 
     def feeders(self) -> list[dict[str, Any]]:
         """Return the summary of every feeder, with the phase of its monitor and of the commissioning."""
-        return [
+        watched = [
             {
                 **describe.summary(watch.site),
                 "phase": str(watch.phase),
@@ -285,6 +289,11 @@ class Runtime:
             }
             for watch in self._rounds.watches.values()
         ]
+        failed = [
+            {"name": name, "phase": str(Phase.FAILED), "problem": problem}
+            for name, problem in self._rounds.unloaded.copy().items()
+        ]
+        return watched + failed
 
     def feeder(self, name: str) -> dict[str, Any] | None:
         """Return everything about a feeder, or None.
@@ -306,6 +315,16 @@ class Runtime:
             Its name.
         """
         return name in self._rounds.watches
+
+    def unloaded(self, name: str) -> str | None:
+        """Return why the stored tables of a feeder could not be loaded, or None if that is not so.
+
+        Parameters
+        ----------
+        name
+            Its name.
+        """
+        return self._rounds.unloaded.get(name)
 
     def report(self, name: str) -> FeederReport | None:
         """Return a feeder's latest report, or None.
@@ -357,6 +376,8 @@ class Runtime:
                 problems.append(f"feeder {watch.name}: the monitor is still being designed")
             elif watch.phase is Phase.FAILED:
                 problems.append(f"feeder {watch.name}: {watch.problem}")
+        for name, problem in rounds.unloaded.copy().items():
+            problems.append(f"feeder {name}: {problem}")
         return not problems, problems
 
     async def put_feeder(self, name: str, tables: dict[str, Any]) -> None:
@@ -394,8 +415,9 @@ class Runtime:
 
     def _make_room(self, name: str) -> None:
         """See whether one more feeder may be put."""
-        watched, most = self._rounds.watches, self._rounds.config.max_feeders
-        if name not in watched and len(watched.keys() - self._given) >= most:
+        put = (self._rounds.watches.keys() | self._rounds.unloaded.keys()) - self._given
+        most = self._rounds.config.max_feeders
+        if name not in put | self._given and len(put) >= most:
             raise TooManyFeeders(most)
 
     async def delete_feeder(self, name: str) -> None:

@@ -15,7 +15,7 @@ const SIGNS = {
   none: "M16 5a11 11 0 1 0 .01 0M16 9v7l5 3",
 };
 
-const page = { feeder: null, report: null, selected: null, source: null, retry: null, heard: 0, linked: true, past: new Map(), turn: 0 };
+const page = { feeder: null, report: null, refused: null, selected: null, source: null, retry: null, heard: 0, linked: true, past: new Map(), turn: 0 };
 const diagram = new Diagram({ onSelect: (id) => select(id === page.selected ? null : id) });
 const alarms = new Alarms({
   onPick: async (feeder, meter, owner) => {
@@ -56,14 +56,16 @@ async function show(name) {
   page.source?.close();
   page.turn += 1;
   const { turn } = page;
-  const found = await getJson(`${API}/${encodeURIComponent(name)}`).catch(() => null);
+  const found = await getJson(`${API}/${encodeURIComponent(name)}`).catch((error) => error);
   if (turn !== page.turn) return; // Another choice has overtaken this answer.
-  if (found === null) {
-    page.linked = false;
+  if (found instanceof Error) {
+    if (found.answered) refused(name, found.message);
+    else page.linked = false;
     page.retry = setTimeout(() => show(name), 3000);
     return;
   }
   page.feeder = found;
+  page.refused = null;
   page.report = null;
   page.heard = 0;
   page.past = new Map();
@@ -77,6 +79,20 @@ async function show(name) {
   alarms.watch(name);
   commissioning.watch(name);
   listen(name);
+}
+
+// The service answers, and says why it does not watch this feeder.
+function refused(name, why) {
+  Object.assign(page, { feeder: null, report: null, heard: 0, past: new Map(), refused: why, linked: true });
+  byId("feeder").value = name;
+  history.replaceState(null, "", `#${encodeURIComponent(name)}`);
+  byId("meters").replaceChildren();
+  select(null);
+  diagram.clear();
+  verdict();
+  fresh();
+  alarms.watch(name);
+  commissioning.watch(null);
 }
 
 function listen(name) {
@@ -120,7 +136,7 @@ function verdict() {
   byId("verdict").dataset.verdict = decision;
   byId("sign").setAttribute("d", SIGNS[decision]);
   byId("decision").textContent = report ? decision.toUpperCase() : "NO DATA";
-  byId("reason").textContent = report ? report.reason : "Waiting for the first tick.";
+  byId("reason").textContent = report ? report.reason : page.refused ?? "Waiting for the first tick.";
   byId("busbar-meter").hidden = !report?.busbar?.suspect;
   byId("busbar-meter").textContent = report?.busbar?.suspect ? busbarWords(report.busbar) : "";
   document.title = `${report ? decision.toUpperCase() : "…"} – ${feeder?.title || feeder?.name || ""} – gridsec`;
@@ -164,10 +180,11 @@ function fresh() {
   const patience = Math.max(5, 3 * tick);
   const waiting = page.report === null;
   const stale = age !== null && age > patience;
-  const state = !page.linked ? "lost" : stale ? "stale" : waiting ? "connecting" : "live";
+  const state = !page.linked ? "lost" : stale ? "stale" : page.refused ? "refused" : waiting ? "connecting" : "live";
   const words = {
     live: "live",
     connecting: "waiting for data …",
+    refused: "not watched",
     lost: age === null ? "connection lost" : `connection lost, data ${duration(age)} old`,
     stale: `data stale, ${duration(age ?? 0)} old`,
   };

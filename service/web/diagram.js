@@ -83,6 +83,14 @@ export class Diagram {
     this.look("line");
   }
 
+  clear() {
+    this.feeder = this.report = null;
+    this.hover(null);
+    this.box.replaceChildren();
+    byId("scale").replaceChildren();
+    byId("view").hidden = true;
+  }
+
   look(view) {
     this.view = view;
     for (const button of byId("view").querySelectorAll("button")) {

@@ -74,7 +74,7 @@ export function nominals(feeder) {
 export async function getJson(url) {
   const response = await fetch(url, { headers: { Accept: "application/json" } });
   const body = await response.json().catch(() => ({}));
-  if (!response.ok) throw new Error(body.detail || `${response.status} ${response.statusText}`);
+  if (!response.ok) throw Object.assign(new Error(body.detail || `${response.status} ${response.statusText}`), { answered: true });
   return body;
 }
 

@@ -23,7 +23,7 @@ from gridsec.online import Cause, Decision
 from service.alarms import AlarmBook, AlarmRules, AlarmUnknown, acknowledge, advance, conditions, to_json
 from service.api import create_api
 from service.commissioning import Happened, Step
-from service.errors import FeederFixed, TooManyFeeders
+from service.errors import FeederFixed, FeederUnknown, TooManyFeeders
 from service.report import FeederReport, MeterReport
 from service.store import Store
 from tests.service.asking import T0, Setup
@@ -137,6 +137,7 @@ class SmallService:
         self.books = {name: AlarmBook(name) for name in self.villages}
         self.learning: set[str] = set()
         self.note = ""
+        self.cannot_load: dict[str, str] = {}
         self.is_ready: tuple[bool, list[str]] = (True, [])
         self.is_healthy: tuple[bool, list[str]] = (True, [])
         self.loop: asyncio.AbstractEventLoop | None = None
@@ -163,13 +164,17 @@ class SmallService:
             self.loop.call_soon_threadsafe(put)
 
     def feeders(self) -> list[dict[str, Any]]:
-        return [{"name": v.name, "title": v.detail()["title"]} for v in self.villages.values()]
+        watched = [{"name": v.name, "title": v.detail()["title"]} for v in self.villages.values()]
+        return watched + [{"name": name, "problem": why} for name, why in self.cannot_load.items()]
 
     def feeder(self, name: str) -> dict[str, Any] | None:
         return self.villages[name].detail() if name in self.villages else None
 
     def known(self, name: str) -> bool:
         return name in self.villages
+
+    def unloaded(self, name: str) -> str | None:
+        return self.cannot_load.get(name)
 
     def report(self, name: str) -> FeederReport | None:
         return self.reports.get(name)
@@ -228,6 +233,8 @@ class SmallService:
     async def delete_feeder(self, name: str) -> None:
         if name == "village":
             raise FeederFixed(name)
+        if name not in self.villages:
+            raise FeederUnknown(name)
         del self.villages[name], self.books[name]
         self.reports.pop(name, None)
         self.wake({"type": "state", "data": None})

@@ -21,8 +21,10 @@ from feeders.meters import Channel, Silence
 from feeders.scenario import Sample, Scenario, random_attacks, simulate
 from feeders.schema import to_json, write
 from service.simulate import Pace, key_of, payload_of, play
+from service.store import Store
 from tests.service.databases import both
 from tests.service.running import FEEDER, InProcess, service, until
+from tests.service.stored import an_alarm, raised
 
 START = 1_795_212_000.0
 STEP = Pace(float("inf"), ahead=3)
@@ -282,6 +284,48 @@ def test_feeders_over_rest_have_an_end_and_stay_deleted(tmp_path: Path) -> None:
     with service(tmp_path, clock="events") as live:
         names = {f["name"] for f in live.get("/api/v1/feeders")["feeders"]}
         assert names == {FEEDER, "village-0", "village-2"}
+
+
+def test_a_stored_feeder_that_cannot_be_loaded_any_more_is_shown_until_somebody_sees_to_it(
+    tmp_path: Path,
+) -> None:
+    """Two of them, as after an update that has become stricter: one is deleted, one is put again."""
+    tables = {}
+    with Store(f"sqlite:///{tmp_path / 'gridsec.db'}") as store:
+        for k, name in enumerate(("town", "village")):
+            tables[name] = to_json(load("kerber-landnetz").tables)
+            tables[name]["feeder"]["name"] = name
+            limits = {**tables[name]["feeder"]["limits"], "v_min_pu": "x"}
+            store.put_feeder(name, {**tables[name], "feeder": {**tables[name]["feeder"], "limits": limits}})
+            store.commit([raised(an_alarm(k, feeder=name))])
+    with service(tmp_path, clock="events") as live:
+        until(lambda: "designed" not in live.http.get("/readyz").text, "the designs")
+        ready = live.http.get("/readyz")
+        assert ready.status_code == 503
+        assert [reason.partition(":")[0] for reason in ready.json()["reasons"]] == [
+            "feeder town",
+            "feeder village",
+        ]
+        assert all("v_min_pu" in reason for reason in ready.json()["reasons"])
+        shown = {f["name"]: f for f in live.get("/api/v1/feeders")["feeders"]}
+        assert [shown[name].get("phase") for name in (FEEDER, "town", "village")] == [
+            "watching",
+            "failed",
+            "failed",
+        ]
+        assert "v_min_pu" in shown["town"]["problem"]
+        state = live.http.get("/api/v1/feeders/town/state")
+        assert (state.status_code, "v_min_pu" in state.json()["detail"]) == (503, True)
+        assert live.metric("gridsec_alarms_active", feeder="town") == 1.0
+        assert len(live.meters.query("town/alarm/*", 2.0)) == 1
+        assert live.http.delete("/api/v1/feeders/town").status_code == 204
+        assert live.http.put("/api/v1/feeders/village", json=tables["village"]).status_code == 200
+        assert live.http.get("/readyz").status_code == 200
+        assert [a["state"] for a in live.alarms(feeder="town")] == ["cleared"]
+        assert [a["state"] for a in live.alarms(feeder="village")] == ["raised"]
+        assert live.http.delete("/api/v1/feeders/town").status_code == 404
+    with service(tmp_path, clock="events") as live:
+        assert {f["name"] for f in live.get("/api/v1/feeders")["feeders"]} == {FEEDER, "village"}
 
 
 @both

@@ -66,6 +66,22 @@ def test_before_the_first_tick_nothing_is_claimed(site: Site) -> None:
     expect(page.locator("#decision")).to_have_text("CLEAN")
 
 
+def test_a_feeder_that_cannot_be_loaded_is_said_to_be_watched_by_nobody(site: Site) -> None:
+    site.service.cannot_load["town"] = "key v_min_pu: 'x' is no number"
+    site.expected = "503"
+    site.tick(T0)
+    page = site.open()
+    expect(page.locator("#decision")).to_have_text("CLEAN")
+    page.select_option("#feeder", "town")
+    expect(page.locator("#decision")).to_have_text("NO DATA")
+    expect(page.locator("#reason")).to_contain_text("nobody watches feeder 'town'")
+    expect(page.locator("#link")).to_have_text("not watched")
+    expect(page.locator("#diagram .customer")).to_have_count(0)
+    page.select_option("#feeder", "village")
+    expect(page.locator("#decision")).to_have_text("CLEAN")
+    expect(page.locator("#link")).to_have_text("live")
+
+
 def test_an_attack_shows_without_reloading(site: Site) -> None:
     site.tick(T0, 3)
     page = site.open()
