@@ -326,8 +326,11 @@ def list_alarms(
 ) -> Any:
     """A page of alarms, those that began last first; `since` and `until` are about `t_raised`."""
     last_event = backend.store.last_event
+    # Before the page is read: what waits no longer by then is in it.
+    unstored, trouble = backend.unstored()
     # Event numbers say what has changed within one database, and a run has only one.
-    if known := _unchanged(response, f'W/"{request.app.state.run}-{last_event}"', if_none_match):
+    waits = hashlib.sha256(f"{unstored} {trouble}".encode()).hexdigest()[:16]
+    if known := _unchanged(response, f'W/"{request.app.state.run}-{last_event}-{waits}"', if_none_match):
         return known
     page, following = backend.store.alarms(
         state=state or (),
@@ -340,7 +343,9 @@ def list_alarms(
         cursor=cursor,
         limit=limit,
     )
-    return {"alarms": [alarm_json(alarm) for alarm in page], "next": following, "last_event": last_event}
+    found = [alarm_json(alarm) for alarm in page]
+    state_of_store = {"last_event": last_event, "unstored": unstored, "problem": trouble}
+    return {"alarms": found, "next": following, **state_of_store}
 
 
 @_alarms.get("/stream", response_class=EventSourceResponse, dependencies=[Depends(_slot)], tags=["streams"])

@@ -34,6 +34,9 @@ class Backend(Protocol):
     def commissioning(self, name: str) -> dict[str, Any] | None:
         """Return the fields of `models.Commissioning` but `kept`, or None if there is no such feeder."""
 
+    def unstored(self) -> tuple[int, str | None]:
+        """Return how many changes of alarms wait for the database, and what is wrong with it, or None."""
+
     def metrics(self) -> bytes:
         """Return the metrics in Prometheus's text format."""
 

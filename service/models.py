@@ -318,6 +318,12 @@ class Alarms(BaseModel):
     alarms: list[AlarmModel]
     next: str | None = Field(description="Cursor of the next page; null on the last one.")
     last_event: int = Field(description="Newest event number: `after` of the stream that goes on from here.")
+    unstored: int = Field(
+        default=0, description="So many changes of alarms wait for the database and are not among these."
+    )
+    problem: str | None = Field(
+        default=None, description="What is wrong with the database; null while it takes what it is given."
+    )
 
 
 class AlarmEvent(BaseModel):

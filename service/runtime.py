@@ -348,6 +348,11 @@ class Runtime:
         watch = self._rounds.watches.get(name)
         return None if watch is None else commissioning_json(watch.commissioning.progress())
 
+    def unstored(self) -> tuple[int, str | None]:
+        """Return how many changes of alarms wait for the database, and what is wrong with it, or None."""
+        keeper = self._rounds.keeper
+        return len(keeper.waiting), "; ".join(keeper.problems()) or None
+
     def metrics(self) -> bytes:
         """Return the metrics in Prometheus's text format."""
         return self._rounds.metrics.exposition()

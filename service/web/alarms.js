@@ -11,6 +11,7 @@ const KIND = {
   undecided: "Undecided",
 };
 const PAGE = 50;
+const EVERY_MS = 5000;
 
 export class Alarms {
   constructor({ onPick, onLink }) {
@@ -23,6 +24,8 @@ export class Alarms {
     this.feeder = null;
     this.source = null;
     this.retry = null;
+    this.problem = null; // Why alarms may stand that are not listed: the database does not take them.
+    setInterval(() => this.check(), EVERY_MS);
     for (const id of ["alarm-state", "alarm-kind"]) byId(id).addEventListener("change", () => this.reload());
     byId("alarm-scope").addEventListener("change", () => this.reload());
     byId("alarm-more").addEventListener("click", () => this.reload({ more: true }));
@@ -95,6 +98,7 @@ export class Alarms {
     if (turn !== this.turn) return page.last_event; // A newer choice has overtaken this answer.
     byId("alarm-error").hidden = true;
     if (!more) this.alarms.clear();
+    this.tell(page);
     for (const alarm of page.alarms) this.alarms.set(alarm.id, alarm);
     // The stream may have been faster than this answer, and tells nothing twice.
     for (const [id, { seq, alarm }] of this.heard) {
@@ -104,6 +108,24 @@ export class Alarms {
     this.next = page.next;
     this.render();
     return page.last_event;
+  }
+
+  // What no event says.
+  async check() {
+    if (!this.source) return;
+    try {
+      this.tell(await getJson(`${API}?limit=1`));
+    } catch (error) {
+      if (error.answered) this.tell({ problem: error.message });
+    }
+    this.render();
+  }
+
+  tell({ unstored, problem }) {
+    this.problem = problem;
+    const waiting = unstored ? `, ${unstored} change${unstored === 1 ? " waits" : "s wait"}` : "";
+    byId("alarm-unstored").hidden = !problem;
+    byId("alarm-unstored").textContent = problem ? `Alarms may be missing here${waiting}. ${problem}` : "";
   }
 
   take(event) {
@@ -125,7 +147,7 @@ export class Alarms {
     const open = [...this.alarms.values()].filter((a) => a.state === "raised").length;
     byId("alarm-count").hidden = open === 0;
     byId("alarm-count").textContent = `${open} new`;
-    byId("alarm-none").hidden = list.length > 0 || !byId("alarm-error").hidden;
+    byId("alarm-none").hidden = list.length > 0 || !byId("alarm-error").hidden || this.problem !== null;
     byId("alarm-more").hidden = !this.next;
     const focused = document.activeElement?.closest?.("[data-alarm]")?.dataset.alarm;
     // What has not changed stays where it is: nobody's click may fall between two copies of a button.

@@ -138,6 +138,7 @@ class SmallService:
         self.learning: set[str] = set()
         self.note = ""
         self.cannot_load: dict[str, str] = {}
+        self.waits: tuple[int, str | None] = (0, None)
         self.is_ready: tuple[bool, list[str]] = (True, [])
         self.is_healthy: tuple[bool, list[str]] = (True, [])
         self.loop: asyncio.AbstractEventLoop | None = None
@@ -212,6 +213,9 @@ class SmallService:
         await asyncio.to_thread(partial(self.store.commit, happened=[event]))
         self.learning.update(chosen)
         return self.commissioning(name) or {}
+
+    def unstored(self) -> tuple[int, str | None]:
+        return self.waits
 
     def metrics(self) -> bytes:
         return b"# HELP gridsec_up Whether it runs.\n# TYPE gridsec_up gauge\ngridsec_up 1.0\n"

@@ -147,7 +147,10 @@ def test_every_problem_of_a_feeder_is_told_at_once(setup: Setup) -> None:
 
 
 def test_an_alarm_and_its_fields(setup: Setup) -> None:
-    assert setup.get("/alarms").json() == {"alarms": [], "next": None, "last_event": 0}
+    assert setup.get("/alarms").json() == {
+        **{"alarms": [], "next": None, "last_event": 0},
+        **{"unstored": 0, "problem": None},
+    }
     setup.attack()
     alarm = setup.one()
     contract = {
@@ -236,6 +239,10 @@ def test_filters_and_pages(setup: Setup) -> None:
 def test_the_list_is_not_sent_twice(setup: Setup) -> None:
     first = setup.get("/alarms")
     header = {"If-None-Match": first.headers["etag"]}
+    assert setup.get("/alarms", headers=header).status_code == 304
+    setup.service.waits = (2, "database: it is locked")
+    assert setup.get("/alarms", headers=header).json()["unstored"] == 2
+    setup.service.waits = (0, None)
     assert setup.get("/alarms", headers=header).status_code == 304
     setup.attack()
     assert setup.get("/alarms", headers=header).status_code == 200

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sqlite3
 import threading
 import time
 from collections.abc import Iterator
@@ -326,6 +327,24 @@ def test_a_stored_feeder_that_cannot_be_loaded_any_more_is_shown_until_somebody_
         assert live.http.delete("/api/v1/feeders/town").status_code == 404
     with service(tmp_path, clock="events") as live:
         assert {f["name"] for f in live.get("/api/v1/feeders")["feeders"]} == {FEEDER, "village"}
+
+
+def test_alarms_that_the_database_does_not_take_are_not_hidden(site: Site, tmp_path: Path) -> None:
+    """While it refuses, the list says that it does not know all, and why."""
+    attacks = random_attacks(site, 6, "bias", 1, 0.03, t_on=START + 10, t_off=START + 1000)
+    with service(tmp_path, clock="events") as live:
+        assert live.get("/api/v1/alarms")["problem"] is None
+        other = sqlite3.connect(tmp_path / "gridsec.db", isolation_level=None)
+        other.execute("BEGIN IMMEDIATE")
+        run(live, site, Scenario(seed=4, start=START, duration_s=25.0, attacks=attacks))
+        assert live.state()["verdict"] == "attacked"
+        first = live.http.get("/api/v1/alarms")
+        assert (first.json()["alarms"], first.json()["unstored"]) == ([], 1)
+        assert "locked" in first.json()["problem"]
+        other.close()
+        until(live.alarms, "the alarm")
+        again = live.http.get("/api/v1/alarms", headers={"If-None-Match": first.headers["etag"]})
+        assert (again.json()["unstored"], again.json()["problem"]) == (0, None)
 
 
 @both

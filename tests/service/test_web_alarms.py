@@ -205,6 +205,20 @@ def test_a_list_that_cannot_be_loaded_is_said_and_asked_for_again(site: Site) ->
     expect(page.locator(".alarm")).to_have_count(2)
 
 
+def test_a_list_that_may_not_be_complete_says_so(site: Site) -> None:
+    site.tick(T0)
+    page = site.open()
+    expect(page.locator("#alarm-none")).to_be_visible()
+    site.service.waits = (2, "database: it is locked")
+    told = page.locator("#alarm-unstored")
+    words = "Alarms may be missing here, 2 changes wait. database: it is locked"
+    expect(told).to_have_text(words, timeout=10_000)
+    expect(page.locator("#alarm-none")).to_be_hidden()
+    site.service.waits = (0, None)
+    expect(told).to_be_hidden(timeout=10_000)
+    expect(page.locator("#alarm-none")).to_be_visible()
+
+
 def test_filters(site: Site, village: type) -> None:
     town = village("town", 4)
     site.service.villages["town"] = town
