@@ -165,7 +165,9 @@ _feeders = APIRouter(prefix="/api/v1/feeders", tags=["feeders"])
 
 def _summary(backend: Backend, fields: dict[str, Any]) -> models.FeederSummary:
     report = backend.report(fields["name"])
-    now = {} if report is None else {"t": report.t, "verdict": report.verdict}
+    now: dict[str, Any] = {}
+    if report is not None:
+        now = {"t": report.t, "verdict": report.verdict, "age_s": backend.age(report)}
     return models.FeederSummary.model_validate({**fields, **now})
 
 
@@ -211,10 +213,14 @@ async def delete_feeder(backend: BackendHere, feeder: FeederName) -> None:
 
 
 @_feeders.get("/{feeder}/state")
-def get_state(report: Latest, response: Response) -> models.State:
+def get_state(backend: BackendHere, report: Latest, response: Response) -> models.State:
     """The latest tick: verdict, and every meter with what it says and what is true there."""
     response.headers["Cache-Control"] = "no-store"
-    return models.State.model_validate(report_json(report))
+    return _state(backend, report)
+
+
+def _state(backend: Backend, report: FeederReport) -> models.State:
+    return models.State.model_validate({**report_json(report), "age_s": backend.age(report)})
 
 
 @_feeders.get("/{feeder}/meters/{meter}")
@@ -299,7 +305,7 @@ async def stream_states(backend: BackendHere, feeder: KnownFeeder) -> AsyncItera
         report = backend.report(feeder)
         if report is not None and report is not last:
             last = report
-            yield ServerSentEvent(event="state", data=models.State.model_validate(report_json(report)))
+            yield ServerSentEvent(event="state", data=_state(backend, report))
 
 
 # --------------------------------------------------------------------- alarms

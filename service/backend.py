@@ -31,6 +31,9 @@ class Backend(Protocol):
     def report(self, name: str) -> FeederReport | None:
         """Return the latest report of a feeder, or None before its first tick."""
 
+    def age(self, report: FeederReport) -> float:
+        """Return how old a feeder's latest report is by the service's clock, s."""
+
     def commissioning(self, name: str) -> dict[str, Any] | None:
         """Return the fields of `models.Commissioning` but `kept`, or None if there is no such feeder."""
 

@@ -139,6 +139,7 @@ class State(BaseModel):
 
     feeder: str
     t: float = Field(description="Unix time of the tick, s.")
+    age_s: float = Field(description="How old it was when this was sent, by the service's clock, s.")
     verdict: Decision
     reason: str
     cause: Cause
@@ -228,6 +229,8 @@ class FeederSummary(BaseModel):
     name: str
     title: str = ""
     t: Number = Field(default=None, description="Latest tick; null before the first one.")
+    age_s: Number = Field(default=None, description="How old that is by the service's clock, s.")
+    patience_s: Number = Field(default=None, description="An older tick is stale, s.")
     verdict: Decision | None = None
 
 
@@ -272,6 +275,7 @@ class FeederDetail(BaseModel):
     v_min_volt: float
     v_max_volt: float
     tick_s: float = 1.0
+    patience_s: Number = Field(default=None, description="A state that is older is stale, s.")
     layout: Layout
     tables: dict[str, Any]
 

@@ -109,6 +109,7 @@ class Rounds:
         self.metrics = Metrics()
         self.watches: dict[str, Watch] = {}
         self.unloaded = dict(unloaded or {})
+        self.reported: dict[str, float] = {}
         self._wall, self._stored = wall, stored
         self.keeper = Keeper(store, self.metrics, stored, self._count_stored, apart)
         self._wire = Wire({}, config.prefix, config.max_payload)
@@ -220,6 +221,7 @@ class Rounds:
         for result in results:
             self.keeper.waiting.add(transitions=result.transitions, reports=(result.report,))
             self._count_tick(result.report)
+            self.reported[result.report.feeder] = time.monotonic()
         self.keep_states()
         self.keeper.commit()
         self._publish_estimates(results)

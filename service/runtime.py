@@ -285,6 +285,7 @@ class Runtime:
                 **describe.summary(watch.site),
                 "phase": str(watch.phase),
                 "problem": watch.problem or None,
+                "patience_s": watch.patience_s,
                 "commissioning": str(watch.commissioning.progress().state),
             }
             for watch in self._rounds.watches.values()
@@ -304,7 +305,7 @@ class Runtime:
             Its name.
         """
         watch = self._rounds.watches.get(name)
-        return None if watch is None else describe.detail(watch.site)
+        return None if watch is None else {**describe.detail(watch.site), "patience_s": watch.patience_s}
 
     def known(self, name: str) -> bool:
         """Whether a feeder is watched.
@@ -336,6 +337,20 @@ class Runtime:
         """
         watch = self._rounds.watches.get(name)
         return None if watch is None else watch.report
+
+    def age(self, report: FeederReport) -> float:
+        """Return how old a feeder's latest report is by the service's clock, s.
+
+        Where the readings tell the time, it counts from when the report was made.
+
+        Parameters
+        ----------
+        report
+            The report.
+        """
+        now = time.monotonic()
+        since = now - self._rounds.reported.get(report.feeder, now)
+        return since if self._rounds.config.clock is Clock.EVENTS else max(since, self._wall() - report.t)
 
     def commissioning(self, name: str) -> dict[str, Any] | None:
         """Return how far a feeder's meters are known, or None.
@@ -381,6 +396,10 @@ class Runtime:
                 problems.append(f"feeder {watch.name}: the monitor is still being designed")
             elif watch.phase is Phase.FAILED:
                 problems.append(f"feeder {watch.name}: {watch.problem}")
+            # Where the readings tell the time, it may well stand still.
+            told, waits = watch.report, rounds.config.clock is Clock.WALL
+            if waits and told is not None and (age := self.age(told)) > watch.patience_s:
+                problems.append(f"feeder {watch.name}: the latest report is {age:.0f} s old")
         for name, problem in rounds.unloaded.copy().items():
             problems.append(f"feeder {name}: {problem}")
         return not problems, problems

@@ -28,6 +28,9 @@ from service.voltages import snapshot
 POWER_MAX_FACTOR = 100.0
 """Powers beyond this many times the feeder's base power are no readings."""
 
+PATIENCE_MIN_S = 5.0
+"""A younger report is never stale."""
+
 
 class Phase(StrEnum):
     """Whether a feeder has a monitor."""
@@ -153,6 +156,12 @@ class Watch:
         self._alarm_rules = alarm_rules(site, rules)
         self._watcher: estimators.Watcher | None = None
         self._state: Any = None
+
+    @property
+    def patience_s(self) -> float:
+        """An older report is stale: three ticks have gone by without one, and the grace, s."""
+        rules = self.aligner.rules
+        return max(PATIENCE_MIN_S, 3.0 * rules.tick_s + rules.grace_s)
 
     def install(self, finished: estimators.Watcher) -> None:
         """Begin to watch with a finished design.

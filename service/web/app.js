@@ -15,7 +15,7 @@ const SIGNS = {
   none: "M16 5a11 11 0 1 0 .01 0M16 9v7l5 3",
 };
 
-const page = { feeder: null, report: null, refused: null, selected: null, source: null, retry: null, heard: 0, linked: true, past: new Map(), turn: 0 };
+const page = { feeder: null, report: null, refused: null, selected: null, source: null, retry: null, heard: null, linked: true, past: new Map(), turn: 0 };
 const diagram = new Diagram({ onSelect: (id) => select(id === page.selected ? null : id) });
 const alarms = new Alarms({
   onPick: async (feeder, meter, owner) => {
@@ -67,7 +67,7 @@ async function show(name) {
   page.feeder = found;
   page.refused = null;
   page.report = null;
-  page.heard = 0;
+  page.heard = null;
   page.past = new Map();
   page.opened = performance.now();
   byId("feeder").value = name;
@@ -83,7 +83,7 @@ async function show(name) {
 
 // The service answers, and says why it does not watch this feeder.
 function refused(name, why) {
-  Object.assign(page, { feeder: null, report: null, heard: 0, past: new Map(), refused: why, linked: true });
+  Object.assign(page, { feeder: null, report: null, heard: null, past: new Map(), refused: why, linked: true });
   byId("feeder").value = name;
   history.replaceState(null, "", `#${encodeURIComponent(name)}`);
   byId("meters").replaceChildren();
@@ -108,10 +108,13 @@ function listen(name) {
 
 function take(report) {
   if (report.feeder !== page.feeder?.name) return;
+  // By the service's clock; a state that comes again does not grow younger on the way.
+  const made = performance.now() - 1000 * report.age_s;
+  const again = page.report?.t === report.t;
+  page.heard = again ? Math.min(page.heard, made) : made;
   page.report = report;
-  page.heard = performance.now();
   page.linked = true;
-  for (const meter of report.meters) {
+  for (const meter of again ? [] : report.meters) {
     const past = page.past.get(meter.meter) ?? [];
     past.push(point(report.t, meter));
     if (past.length > KEPT) past.shift();
@@ -175,11 +178,9 @@ function verdict() {
 // ------------------------------------------------- can it still be believed?
 
 function fresh() {
-  const tick = page.feeder?.tick_s ?? 1;
-  const age = page.heard ? (performance.now() - page.heard) / 1000 : null;
-  const patience = Math.max(5, 3 * tick);
+  const age = page.heard === null ? null : (performance.now() - page.heard) / 1000;
   const waiting = page.report === null;
-  const stale = age !== null && age > patience;
+  const stale = age !== null && age > page.feeder.patience_s;
   const state = !page.linked ? "lost" : stale ? "stale" : page.refused ? "refused" : waiting ? "connecting" : "live";
   const words = {
     live: "live",
@@ -197,7 +198,7 @@ function fresh() {
     byId("decision").textContent = "NO LIVE DATA";
     byId("verdict").dataset.verdict = "none";
     byId("sign").setAttribute("d", SIGNS.none);
-    byId("reason").textContent = `Nothing heard for ${duration(age)}. Last verdict, at ${clock(page.report.t)}: ${page.report.verdict}.`;
+    byId("reason").textContent = `Nothing new for ${duration(age)}. Last verdict, at ${clock(page.report.t)}: ${page.report.verdict}.`;
     document.title = `NO LIVE DATA – ${page.feeder.title || page.feeder.name} – gridsec`;
   } else if (byId("decision").textContent === "NO LIVE DATA") {
     verdict();

@@ -60,6 +60,7 @@ class Village:
             "v_min_volt": 0.9 * NOMINAL,
             "v_max_volt": 1.1 * NOMINAL,
             "tick_s": 1.0,
+            "patience_s": 5.0,
             "layout": {"buses": self.buses, "parent": self.parent, "xy": None, "customers": self.customers},
             "tables": {"meta": {"name": self.name}, "lines": [], "customers": []},
         }
@@ -137,6 +138,8 @@ class SmallService:
         self.books = {name: AlarmBook(name) for name in self.villages}
         self.learning: set[str] = set()
         self.note = ""
+        self.heard: dict[str, float] = {}
+        self.delay_s = 0.0
         self.cannot_load: dict[str, str] = {}
         self.waits: tuple[int, str | None] = (0, None)
         self.is_ready: tuple[bool, list[str]] = (True, [])
@@ -150,6 +153,7 @@ class SmallService:
             book, transitions = advance(self.books[report.feeder], self.rules, conditions(report), report.t)
             self.store.commit(transitions, reports=[report])
             self.books[report.feeder], self.reports[report.feeder] = book, report
+            self.heard[report.feeder] = time.monotonic()
         self.wake({"type": "state", "data": report})
         for transition in transitions:
             self.wake({"type": "alarm", "data": to_json(transition.alarm)})
@@ -179,6 +183,9 @@ class SmallService:
 
     def report(self, name: str) -> FeederReport | None:
         return self.reports.get(name)
+
+    def age(self, report: FeederReport) -> float:
+        return self.delay_s + time.monotonic() - self.heard[report.feeder]
 
     def commissioning(self, name: str) -> dict[str, Any] | None:
         village = self.villages.get(name)

@@ -156,6 +156,8 @@ def test_nothing_malformed_stops_the_service(site: Site, tmp_path: Path) -> None
         assert kept["unknown-feeder"]["key"] == "gridsec/nowhere/meter/m01/reading"
         run(live, site, Scenario(seed=1, start=START + 5.0, duration_s=10.0))
         assert live.state()["verdict"] == "clean"
+        # Of whatever time the readings are: it has just been made.
+        assert live.state()["age_s"] < 60.0
         assert live.http.get("/readyz").status_code == 200
         assert live.alarms() == []
 
@@ -170,7 +172,7 @@ def test_concentrators(site: Site, tmp_path: Path) -> None:
             for sample in simulate(site, Scenario(seed=2, start=START, duration_s=5.0)):
                 _send(live, sample, together=name == "columns")
             until(lambda live=live: live.state().get("t", 0.0) >= START + 4.0)
-            states.append(live.state())
+            states.append({**live.state(), "age_s": None})
     assert states[0] == states[1]
     assert states[0]["verdict"] == "clean"
 

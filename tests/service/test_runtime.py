@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import sqlite3
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -29,7 +30,7 @@ from service.keeper import Done
 from service.rounds import NOT_WATCHED, Rounds, RuntimeConfig
 from service.runtime import Runtime
 from service.store import Store, StoreUnavailable, connect
-from service.watch import design
+from service.watch import Watch, design
 from tests.service.liars import FEEDER, START, rounds, two_liars, until
 from tests.service.running import Outlet
 
@@ -397,6 +398,42 @@ def test_acknowledgements(site: Site, attacked: list[Sample], path: Path) -> Non
         assert known.state is AlarmState.CLEARED
         assert live.acknowledge(second, "Bob", "")["acknowledged_by"] == "Bob"
         assert outlet.events[-1][0]["acknowledged_by"] == "Bob"
+
+
+def test_an_old_report_is_told_to_be_old(
+    site: Site, attacked: list[Sample], path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A round hangs for a minute of the service's clock: the last report stays, and says how old it is."""
+    wall, goes_on, due = START + 3.5, threading.Event(), Watch.due
+    some = [sample for sample in attacked if START + 4 <= sample.arrival < START + 6]
+
+    def hangs(self: Watch, now: float) -> Any:
+        goes_on.wait(20.0)
+        return due(self, now)
+
+    async def scene(store: Store) -> None:
+        nonlocal wall
+        runtime = Runtime(RuntimeConfig(), store, [site], wall=lambda: wall)
+        task = asyncio.create_task(runtime.run())
+        runtime.deliver(some)
+        wall = START + 6.0
+        while runtime.report(FEEDER) is None or not runtime.ready()[0]:  # noqa: ASYNC110
+            await asyncio.sleep(0.01)
+        monkeypatch.setattr(Watch, "due", hangs)
+        report = runtime.report(FEEDER)
+        assert report is not None
+        assert runtime.age(report) < 5.0
+        wall += 60.0
+        assert runtime.age(report) > 60.0
+        assert runtime.ready()[1] == [f"feeder {FEEDER}: the latest report is {wall - report.t:.0f} s old"]
+        goes_on.set()
+        while not runtime.ready()[0]:  # noqa: ASYNC110
+            await asyncio.sleep(0.01)
+        runtime.stop()
+        await asyncio.wait_for(task, 5.0)
+
+    with Store(f"sqlite:///{path}") as store:
+        asyncio.run(scene(store))
 
 
 def test_the_task_ends_cleanly_and_refuses_commands_afterwards(site: Site, path: Path) -> None:

@@ -31,7 +31,7 @@ def real(village: type, of: FeederSite) -> Any:
     """A village with the tree of a real feeder."""
     made = village(of.feeder.name, 0)
     made.detail = lambda: known
-    known = detail(of)
+    known = {**detail(of), "patience_s": 5.0}
     layout = known["layout"]
     made.buses, made.parent, made.customers = layout["buses"], layout["parent"], layout["customers"]
     made.meters = [c["meter"] for c in made.customers]

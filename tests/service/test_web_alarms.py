@@ -274,6 +274,25 @@ def test_a_lost_connection_is_said_and_healed(site: Site) -> None:
     expect(page.locator(".alarm")).to_have_count(0)
 
 
+def test_a_state_that_is_old_when_it_comes_is_not_live(site: Site) -> None:
+    """It counts from its tick by the service's clock, and does not grow younger when it comes again."""
+    site.tick(T0)
+    site.service.delay_s = 2400.0
+    page = site.open()
+    expect(page.locator("#link")).to_have_text(re.compile("data stale, 40 min old"))
+    expect(page.locator("#decision")).to_have_text("NO LIVE DATA")
+    site.expected = "net::ERR_"
+    site.server.stop()
+    expect(page.locator("#link")).to_contain_text("connection lost, data 40 min old")
+    site.server = site.serve(site.service, site.server.port)
+    expect(page.locator("#link")).to_contain_text("data stale", timeout=20_000)
+    expect(page.locator("#decision")).to_have_text("NO LIVE DATA")
+    site.service.delay_s = 0.0
+    site.tick(T0 + 1)
+    expect(page.locator("#link")).to_have_text("live")
+    expect(page.locator("#decision")).to_have_text("CLEAN")
+
+
 def test_old_data_is_not_shown_as_an_answer(site: Site) -> None:
     site.tick(T0)
     context = site.browser.new_context()
