@@ -15,7 +15,7 @@ const SIGNS = {
   none: "M16 5a11 11 0 1 0 .01 0M16 9v7l5 3",
 };
 
-const page = { feeder: null, report: null, refused: null, selected: null, source: null, retry: null, heard: null, linked: true, past: new Map(), turn: 0 };
+const page = { feeder: null, report: null, refused: null, selected: null, source: null, retry: null, heard: null, linked: true, alarmsLinked: true, past: new Map(), turn: 0 };
 const diagram = new Diagram({ onSelect: (id) => select(id === page.selected ? null : id) });
 const alarms = new Alarms({
   onPick: async (feeder, meter, owner) => {
@@ -24,7 +24,7 @@ const alarms = new Alarms({
     const customer = page.feeder?.layout.customers.find((c) => (owner ? c.customer === owner : c.meter === meter));
     if (customer) select(customer.customer);
   },
-  onLink: (up) => { page.linked = up; },
+  onLink: (up) => { page.alarmsLinked = up; },
 });
 
 const commissioning = new Commissioning({ onChange: () => detail() });
@@ -182,15 +182,19 @@ function fresh() {
   const waiting = page.report === null;
   const stale = age !== null && age > page.feeder.patience_s;
   const state = !page.linked ? "lost" : stale ? "stale" : page.refused ? "refused" : waiting ? "connecting" : "live";
+  const shown = state === "live" && !page.alarmsLinked ? "alarms" : state;
   const words = {
     live: "live",
     connecting: "waiting for data …",
     refused: "not watched",
+    alarms: "connection lost for alarms",
     lost: age === null ? "connection lost" : `connection lost, data ${duration(age)} old`,
     stale: `data stale, ${duration(age ?? 0)} old`,
   };
-  byId("link").dataset.state = state;
-  byId("link").lastElementChild.textContent = words[state];
+  byId("link").dataset.state = shown;
+  byId("link").lastElementChild.textContent = words[shown];
+  // One feeder that nobody watches makes no old alarms of the others'.
+  byId("main").dataset.alarms = page.alarmsLinked && state !== "lost" && state !== "stale" ? "yes" : "no";
   const believable = state === "live";
   byId("main").dataset.fresh = believable ? "yes" : "no";
   if (!believable && !waiting) {

@@ -15,6 +15,7 @@ from tests.service.looking import DESKTOP, PHONE, Site, customer
 
 pytestmark = pytest.mark.browser
 
+ALARMS = re.compile(r"/api/v1/alarms")
 LIST = re.compile(r"/api/v1/alarms\?")
 
 
@@ -267,6 +268,8 @@ def test_a_lost_connection_is_said_and_healed(site: Site) -> None:
     expect(page.locator("#decision")).to_have_text("NO LIVE DATA")
     expect(page.locator("#reason")).to_contain_text("attacked")
     expect(page.locator("#main")).to_have_attribute("data-fresh", "no")
+    for old in (".diagram", ".table", ".facts", ".alarm-list"):
+        expect(page.locator(old)).to_have_css("filter", "grayscale(1)")
     site.tick(T0 + 4, 8)
     site.server = site.serve(site.service, site.server.port)
     expect(page.locator("#link")).to_have_text("live", timeout=20_000)
@@ -291,6 +294,24 @@ def test_a_state_that_is_old_when_it_comes_is_not_live(site: Site) -> None:
     site.tick(T0 + 1)
     expect(page.locator("#link")).to_have_text("live")
     expect(page.locator("#decision")).to_have_text("CLEAN")
+
+
+def test_alarms_that_come_no_more_look_old_while_states_go_on(site: Site) -> None:
+    site.tick(T0, 4, lies={"H3": 9.0})
+    site.expected = "net::ERR_"
+    page = site.open()
+    expect(page.locator("#link")).to_have_text("live")
+    page.route(ALARMS, lambda route: route.abort())
+    page.select_option("#alarm-kind", "meter-manipulated")
+    for k in range(3):
+        site.tick(T0 + 4 + k, lies={"H3": 9.0})
+        expect(page.locator("#link")).to_have_text("connection lost for alarms")
+    expect(page.locator("#decision")).to_have_text("ATTACKED")
+    expect(page.locator(".alarm-list")).to_have_css("filter", "grayscale(1)")
+    expect(page.locator(".table")).to_have_css("filter", "none")
+    page.unroute(ALARMS)
+    expect(page.locator("#link")).to_have_text("live", timeout=10_000)
+    expect(page.locator(".alarm-list")).to_have_css("filter", "none")
 
 
 def test_old_data_is_not_shown_as_an_answer(site: Site) -> None:
