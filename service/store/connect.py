@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import os
 import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -47,6 +48,7 @@ class Connections:
         self._lock_file: IO[bytes] | None = None
         self._engines: tuple[sa.Engine, ...] = ()
         self._path: Path | None = None
+        self._lock_path: Path | None = None
         self._file: tuple[int, int] | None = None
         try:
             parsed = sa.make_url(url)
@@ -83,6 +85,7 @@ class Connections:
         """
         with self._guard(doing):
             self._in_place()
+            self._locked()
             with self._engines[0].begin() as connection:
                 yield connection
 
@@ -103,6 +106,14 @@ class Connections:
             what = "removed" if place is None else "replaced"
             raise OSError(f"the file has been {what}; put it back, or restart to begin with what is there")
 
+    def _locked(self) -> None:
+        """See that our lock is the one that others meet: another file of that name keeps nobody away."""
+        if self._lock_path is None or self._lock_file is None:
+            return
+        held = os.fstat(self._lock_file.fileno())
+        if _place(self._lock_path) != (held.st_dev, held.st_ino):
+            raise OSError(f"{self._lock_path} has been removed or replaced, and others may write; restart")
+
     @contextmanager
     def _guard(self, doing: str) -> Iterator[None]:
         try:
@@ -115,8 +126,10 @@ class Connections:
     def _open_sqlite(self, url: sa.URL) -> tuple[sa.Engine, sa.Engine]:
         if not url.database or url.database == ":memory:":
             raise StoreUnavailable(f"{self.name}: name a file; what is in memory does not survive")
-        path = self._path = Path(url.database).absolute()
-        lock = self._lock_file = path.with_name(path.name + ".lock").open("ab")
+        # One file has one lock, under whatever name it was given.
+        path = self._path = Path(os.path.realpath(url.database))
+        self._lock_path = path.with_name(path.name + ".lock")
+        lock = self._lock_file = self._lock_path.open("ab")
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:

@@ -57,6 +57,29 @@ def test_only_one_process_writes(url: str, family: str, monkeypatch: pytest.Monk
         again.check()
 
 
+def test_a_database_of_two_names_has_one_writer(tmp_path: Path) -> None:
+    (tmp_path / "link.db").symlink_to("gridsec.db")
+    file, link = f"sqlite:///{tmp_path}/gridsec.db", f"sqlite:///{tmp_path}/link.db"
+    for one, other in ((file, link), (link, file)):
+        with Store(one), pytest.raises(StoreUnavailable, match="another process writes it"):
+            Store(other)
+    assert not (tmp_path / "link.db.lock").exists()
+
+
+def test_a_writer_whose_lock_was_removed_writes_no_more(tmp_path: Path) -> None:
+    """Without its file the lock keeps nobody away: there would be two writers."""
+    with Store(f"sqlite:///{tmp_path}/gridsec.db") as first:
+        first.commit([raised(an_alarm())])
+        (tmp_path / "gridsec.db.lock").unlink()
+        with pytest.raises(StoreUnavailable, match=r"gridsec\.db\.lock has been removed or replaced"):
+            first.check()
+        with Store(f"sqlite:///{tmp_path}/gridsec.db") as second:
+            second.check()
+            with pytest.raises(StoreUnavailable, match="removed or replaced"):
+                first.commit([raised(an_alarm(1))])
+            assert [alarm.id for alarm in first.active()] == [an_alarm().id]
+
+
 @both
 def test_readers_cannot_write(store: Store, family: str) -> None:
     words = "readonly" if family == "sqlite" else "read-only"
