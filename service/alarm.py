@@ -44,6 +44,17 @@ class AlreadyAcknowledged(GridsecError):
         super().__init__(f"alarm {alarm.id} has already been acknowledged by {alarm.acknowledged_by}")
 
 
+class RaisedAgain(GridsecError):
+    """The answer is to another occurrence than the one that stands."""
+
+    def __init__(self, alarm: Alarm, count: int) -> None:
+        self.alarm = alarm
+        super().__init__(
+            f"this answers occurrence {count} of alarm {alarm.id}, which has been "
+            f"raised {alarm.count} times by now: {alarm.reason}"
+        )
+
+
 @dataclass(frozen=True, slots=True)
 class Alarm:
     """An alarm as operators see it. Times are Unix seconds.

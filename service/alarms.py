@@ -26,6 +26,7 @@ from service.alarm import (
     AlarmUnknown,
     AlreadyAcknowledged,
     Change,
+    RaisedAgain,
     Transition,
     from_json,
     to_json,
@@ -43,6 +44,7 @@ __all__ = [
     "Change",
     "Condition",
     "Evidence",
+    "RaisedAgain",
     "Severity",
     "Transition",
     "acknowledge",
@@ -294,7 +296,7 @@ def alarm_id(condition: Condition, onset: float) -> str:
     return "".join(_CROCKFORD[number >> shift & 31] for shift in range(125, -1, -5))
 
 
-def acknowledged(alarm: Alarm, who: str, comment: str, t: float) -> Transition:
+def acknowledged(alarm: Alarm, who: str, comment: str, t: float, *, count: int | None = None) -> Transition:
     """Return the transition by which an operator answers an alarm.
 
     An alarm that has cleared unanswered can still be answered; it stays cleared.
@@ -307,12 +309,18 @@ def acknowledged(alarm: Alarm, who: str, comment: str, t: float) -> Transition:
         The operator, and what they say.
     t
         Unix time, s.
+    count
+        Which occurrence they have seen; None: whichever it is.
 
     Raises
     ------
+    RaisedAgain
+        If the alarm has come back since: what they answer is not what stands.
     AlreadyAcknowledged
         If somebody did so before, for the same occurrence.
     """
+    if count is not None and count != alarm.count:
+        raise RaisedAgain(alarm, count)
     if alarm.acknowledged_by is not None:
         raise AlreadyAcknowledged(alarm)
     answered = replace(
@@ -326,7 +334,7 @@ def acknowledged(alarm: Alarm, who: str, comment: str, t: float) -> Transition:
 
 
 def acknowledge(
-    book: AlarmBook, alarm_id: str, who: str, comment: str, t: float
+    book: AlarmBook, alarm_id: str, who: str, comment: str, t: float, *, count: int | None = None
 ) -> tuple[AlarmBook, tuple[Transition, ...]]:
     """Answer an alarm of the book.
 
@@ -336,6 +344,8 @@ def acknowledge(
         The feeder's alarms.
     alarm_id, who, comment, t
         Which alarm, who answers it, with what words, and when (Unix s).
+    count
+        Which occurrence; None: whichever it is.
 
     Returns
     -------
@@ -346,12 +356,12 @@ def acknowledge(
     ------
     AlarmUnknown
         If the book holds no such alarm: never raised, or cleared and forgotten (the store may know it).
-    AlreadyAcknowledged
-        If somebody was faster.
+    RaisedAgain, AlreadyAcknowledged
+        If the alarm has come back since, or somebody was faster.
     """
     for key, entry in book.entries.items():
         if entry.alarm is not None and entry.alarm.id == alarm_id:
-            transition = acknowledged(entry.alarm, who, comment, t)
+            transition = acknowledged(entry.alarm, who, comment, t, count=count)
             entries = {**book.entries, key: replace(entry, alarm=transition.alarm)}
             return replace(book, entries=entries), (transition,)
     raise AlarmUnknown(alarm_id)

@@ -404,7 +404,7 @@ def get_events(backend: BackendHere, alarm_id: AlarmId) -> models.AlarmEvents:
 @_alarms.post("/{alarm_id}/ack", response_model=models.AlarmModel, dependencies=[Depends(_json_only)])
 async def acknowledge(backend: BackendHere, alarm_id: AlarmId, answer: models.Acknowledgement) -> Any:
     """Answer an alarm: say who has seen it."""
-    return await backend.acknowledge(alarm_id, answer.who, answer.comment)
+    return await backend.acknowledge(alarm_id, answer.who, answer.comment, count=answer.count)
 
 
 def _event(event: Event) -> models.AlarmEvent:

@@ -55,8 +55,10 @@ class Backend(Protocol):
     async def delete_feeder(self, name: str) -> None:
         """Watch a feeder no more; raises FeederUnknown or FeederFixed."""
 
-    async def acknowledge(self, alarm_id: str, who: str, comment: str) -> dict[str, Any]:
-        """Answer an alarm and return it; raises AlarmUnknown or AlreadyAcknowledged."""
+    async def acknowledge(
+        self, alarm_id: str, who: str, comment: str, *, count: int | None = None
+    ) -> dict[str, Any]:
+        """Answer an alarm and return it; raises AlarmUnknown, RaisedAgain or AlreadyAcknowledged."""
 
     async def recommission(self, name: str, meters: Sequence[str], who: str, reason: str) -> dict[str, Any]:
         """Learn meters' errors anew, none for all; raises FeederUnknown or NothingToLearn."""

@@ -354,9 +354,12 @@ class Acknowledgement(BaseModel):
 
     who: Line
     comment: Text = ""
-
+    count: int | None = Field(
+        default=None, ge=1, description="The alarm's `count` as it was seen; 409 if it has been raised since."
+    )
 
 class Recommissioning(BaseModel):
+
     """The wish of an operator to have meters learned anew."""
 
     model_config = ConfigDict(extra="forbid")

@@ -13,7 +13,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from feeders.outside import EstimatorUnusable
 from gridsec.errors import DesignInfeasible, FeederInvalid, GridsecError, NotObservable
-from service.alarms import AlarmUnknown, AlreadyAcknowledged
+from service.alarms import AlarmUnknown, AlreadyAcknowledged, RaisedAgain
 from service.commissioning import NothingToLearn
 from service.errors import FeederFixed, FeederNotLoaded, FeederUnknown, TooManyFeeders
 from service.store import StoreUnavailable
@@ -115,6 +115,7 @@ _STATUS: dict[type[GridsecError], int] = {
     AlarmUnknown: 404,
     FeederUnknown: 404,
     AlreadyAcknowledged: 409,
+    RaisedAgain: 409,
     FeederFixed: 409,
     NothingToLearn: 409,
     TooManyFeeders: 409,

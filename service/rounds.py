@@ -326,17 +326,21 @@ class Rounds:
 
     # ---------------------------------------------------------------- operators
 
-    def acknowledge(self, alarm_id: str, who: str, comment: str) -> dict[str, Any]:
+    def acknowledge(
+        self, alarm_id: str, who: str, comment: str, *, count: int | None = None
+    ) -> dict[str, Any]:
         """Answer an alarm; it is on the disk when this returns.
 
         Parameters
         ----------
         alarm_id, who, comment
             Which alarm, who answers it, and with what words.
+        count
+            Which occurrence; None: whichever it is.
 
         Raises
         ------
-        AlarmUnknown, AlreadyAcknowledged, StoreUnavailable
+        AlarmUnknown, RaisedAgain, AlreadyAcknowledged, StoreUnavailable
             If it cannot be answered; nothing has changed then.
         """
         t = self._wall()
@@ -344,7 +348,7 @@ class Rounds:
             if all(alarm.id != alarm_id for alarm in watch.book.alarms):
                 continue
             before = watch.book
-            transitions = watch.acknowledge(alarm_id, who, comment, t)
+            transitions = watch.acknowledge(alarm_id, who, comment, t, count=count)
             try:
                 self.keeper.store_now(transitions)
             except StoreUnavailable:
@@ -353,7 +357,7 @@ class Rounds:
             return alarm_json(transitions[-1].alarm)
         if self.keeper.problem is not None:
             raise StoreUnavailable(self.keeper.problem)
-        alarm = self.store.acknowledge(alarm_id, who, comment, t).alarm
+        alarm = self.store.acknowledge(alarm_id, who, comment, t, count=count).alarm
         self.keeper.publish(self.store.last_event, alarm)
         self.keeper.commit()
         self._stored()

@@ -462,20 +462,24 @@ class Runtime:
         await self._command(partial(self._rounds.remove, name))
         self._notify("state")
 
-    async def acknowledge(self, alarm_id: str, who: str, comment: str) -> dict[str, Any]:
+    async def acknowledge(
+        self, alarm_id: str, who: str, comment: str, *, count: int | None = None
+    ) -> dict[str, Any]:
         """Answer an alarm; it is on the disk when this returns.
 
         Parameters
         ----------
         alarm_id, who, comment
             Which alarm, who answers it, and with what words.
+        count
+            Which occurrence; None: whichever it is.
 
         Raises
         ------
-        AlarmUnknown, AlreadyAcknowledged, StoreUnavailable
+        AlarmUnknown, RaisedAgain, AlreadyAcknowledged, StoreUnavailable
             If it cannot be answered; nothing has changed then.
         """
-        return await self._command(partial(self._rounds.acknowledge, alarm_id, who, comment))
+        return await self._command(partial(self._rounds.acknowledge, alarm_id, who, comment, count=count))
 
     async def recommission(self, name: str, meters: Sequence[str], who: str, reason: str) -> dict[str, Any]:
         """Learn meters' errors anew; it is on the disk when this returns.

@@ -224,15 +224,17 @@ class Watch:
         """Do what the readings so far allow: nothing more will come."""
         return self._run(self.aligner.flush())
 
-    def acknowledge(self, alarm_id: str, who: str, comment: str, t: float) -> tuple[Transition, ...]:
+    def acknowledge(
+        self, alarm_id: str, who: str, comment: str, t: float, *, count: int | None = None
+    ) -> tuple[Transition, ...]:
         """Answer an alarm of this feeder.
 
         Parameters
         ----------
-        alarm_id, who, comment, t
+        alarm_id, who, comment, t, count
             As in `alarms.acknowledge`.
         """
-        self.book, transitions = acknowledge(self.book, alarm_id, who, comment, t)
+        self.book, transitions = acknowledge(self.book, alarm_id, who, comment, t, count=count)
         return transitions
 
     def recommission(self, meters: Sequence[str], t: float, who: str, reason: str) -> Callable[[], None]:

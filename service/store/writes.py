@@ -160,7 +160,9 @@ class Store(Reader):
             self._last_event = max((self._last_event, *numbers))
             return numbers
 
-    def acknowledge(self, alarm_id: str, who: str, comment: str, t: float) -> Transition:
+    def acknowledge(
+        self, alarm_id: str, who: str, comment: str, t: float, *, count: int | None = None
+    ) -> Transition:
         """Answer an alarm that no book holds any more.
 
         For an alarm of a running book use `alarms.acknowledge` and `commit`, or the book will not know.
@@ -169,17 +171,19 @@ class Store(Reader):
         ----------
         alarm_id, who, comment, t
             Which alarm, who answers it, with what words, and when (Unix s).
+        count
+            Which occurrence; None: whichever it is.
 
         Raises
         ------
-        AlarmUnknown, AlreadyAcknowledged
-            If there is no such alarm, or somebody was faster.
+        AlarmUnknown, RaisedAgain, AlreadyAcknowledged
+            If there is no such alarm, it has come back since, or somebody was faster.
         """
         with self._lock:
             alarm = self.alarm(alarm_id)
             if alarm is None:
                 raise AlarmUnknown(alarm_id)
-            transition = acknowledged(alarm, who, comment, t)
+            transition = acknowledged(alarm, who, comment, t, count=count)
             self.commit((transition,))
             return transition
 

@@ -192,7 +192,7 @@ export class Alarms {
   }
 
   ask(alarm) {
-    this.asking = alarm.id;
+    this.asking = alarm;
     byId("ack-what").textContent = `${KIND[alarm.kind] ?? alarm.kind}: ${alarm.customer ?? alarm.meter ?? alarm.feeder}. ${alarm.reason}`;
     byId("ack-who").value = localStorage.getItem("gridsec.who") ?? "";
     byId("ack-comment").value = "";
@@ -209,10 +209,10 @@ export class Alarms {
     }
     localStorage.setItem("gridsec.who", who);
     try {
-      const response = await fetch(`${API}/${encodeURIComponent(this.asking)}/ack`, {
+      const response = await fetch(`${API}/${encodeURIComponent(this.asking.id)}/ack`, {
         method: "POST",
         headers: { "Content-Type": "application/json" },
-        body: JSON.stringify({ who, comment: byId("ack-comment").value }),
+        body: JSON.stringify({ who, comment: byId("ack-comment").value, count: this.asking.count }),
       });
       const body = await response.json();
       if (!response.ok) throw new Error(body.detail);

@@ -250,11 +250,13 @@ class SmallService:
         self.reports.pop(name, None)
         self.wake({"type": "state", "data": None})
 
-    async def acknowledge(self, alarm_id: str, who: str, comment: str) -> dict[str, Any]:
+    async def acknowledge(
+        self, alarm_id: str, who: str, comment: str, *, count: int | None = None
+    ) -> dict[str, Any]:
         for name, book in self.books.items():
             if any(alarm.id == alarm_id for alarm in book.alarms):
                 t = self.reports[name].t
-                self.books[name], transitions = acknowledge(book, alarm_id, who, comment, t)
+                self.books[name], transitions = acknowledge(book, alarm_id, who, comment, t, count=count)
                 await asyncio.to_thread(self.store.commit, transitions)
                 self.wake({"type": "alarm", "data": to_json(transitions[0].alarm)})
                 return to_json(transitions[0].alarm)

@@ -249,6 +249,22 @@ def test_the_list_is_not_sent_twice(setup: Setup) -> None:
     assert setup.get("/alarms", headers=header).status_code == 200
 
 
+def test_an_answer_is_to_the_occurrence_that_was_seen(setup: Setup) -> None:
+    setup.attack()
+    seen = setup.one()
+    setup.calm(T0 + 4)
+    setup.attack(T0 + 12, lies={"H3": 40.0})
+    now = setup.one()
+    assert (now["id"], now["count"], now["state"]) == (seen["id"], 2, "raised")
+    path = f"/api/v1/alarms/{seen['id']}/ack"
+    refused = is_problem(setup.http.post(path, json={"who": "Ada", "count": seen["count"]}), 409)
+    assert "raised 2 times" in refused["detail"]
+    assert setup.one() == now
+    answered = setup.http.post(path, json={"who": "Ada", "count": now["count"]})
+    assert answered.json()["state"] == "acknowledged"
+    assert is_problem(setup.http.post(path, json={"who": "Ada", "count": 0}), 422)
+
+
 def test_acknowledging(setup: Setup) -> None:
     setup.attack()
     alarm = setup.one()

@@ -21,6 +21,7 @@ from service.alarms import (
     AlarmUnknown,
     AlreadyAcknowledged,
     Change,
+    RaisedAgain,
     Transition,
 )
 from service.align import Clock
@@ -385,6 +386,8 @@ def test_acknowledgements(site: Site, attacked: list[Sample], path: Path) -> Non
         assert live.acknowledge(first, "Ada", "on my way")["acknowledged_by"] == "Ada"
         with pytest.raises(AlreadyAcknowledged):
             live.acknowledge(first, "Bob", "")
+        with pytest.raises(RaisedAgain):
+            live.acknowledge(second, "Bob", "", count=2)
         with pytest.raises(AlarmUnknown):
             live.acknowledge("0" * 26, "Ada", "")
         live.round(until(attacked, 15.0)[1])
@@ -396,7 +399,9 @@ def test_acknowledgements(site: Site, attacked: list[Sample], path: Path) -> Non
         known = store.alarm(second)
         assert known is not None
         assert known.state is AlarmState.CLEARED
-        assert live.acknowledge(second, "Bob", "")["acknowledged_by"] == "Bob"
+        with pytest.raises(RaisedAgain):
+            live.acknowledge(second, "Bob", "", count=2)
+        assert live.acknowledge(second, "Bob", "", count=1)["acknowledged_by"] == "Bob"
         assert outlet.events[-1][0]["acknowledged_by"] == "Bob"
 
 

@@ -151,6 +151,24 @@ def test_the_second_operator_hears_who_was_first(site: Site) -> None:
     expect(two.locator("#ack-error")).to_contain_text("already been acknowledged by Ada")
 
 
+def test_nobody_answers_an_alarm_that_has_come_back_behind_the_dialogue(site: Site) -> None:
+    site.tick(T0, 4, lies={"H3": 2.0})
+    page = site.open()
+    page.locator("button.ack").click()
+    site.tick(T0 + 4, 8)
+    site.tick(T0 + 12, 4, lies={"H3": 40.0})
+    expect(page.locator(".alarm .times")).to_have_text("× 2")
+    site.expected = "409"
+    page.fill("#ack-who", "Ada")
+    page.locator("#ack-form .primary").click()
+    expect(page.locator("#ack-error")).to_contain_text("raised 2 times by now")
+    expect(page.locator(".alarm")).to_have_attribute("data-state", "raised")
+    page.locator("#ack-cancel").click()
+    page.locator("button.ack").click()
+    page.locator("#ack-form .primary").click()
+    expect(page.locator(".alarm .answer")).to_contain_text("Ada")
+
+
 def test_what_has_not_changed_stays_where_it_is(site: Site) -> None:
     """Else a click whose halves fall on two copies of a button is none."""
     site.tick(T0, 4, lies={"H3": 9.0})
