@@ -40,6 +40,8 @@ MAX_BODY = 4 << 20
 """Longest request body that is read, bytes."""
 MAX_STREAMS = 100
 """Event streams that may be open at once."""
+MAX_EVENT = (1 << 63) - 1
+"""The highest number that an event can have."""
 _WEB = FilePath(__file__).with_name("web")
 _NAME = r"^[A-Za-z0-9_-]{1,64}$"
 
@@ -393,12 +395,18 @@ def get_alarm(backend: BackendHere, alarm_id: AlarmId) -> Any:
 
 
 @_alarms.get("/{alarm_id}/events")
-def get_events(backend: BackendHere, alarm_id: AlarmId) -> models.AlarmEvents:
-    """Everything that happened to an alarm, oldest first."""
-    events = backend.store.events(alarm_id)
-    if not events:
+def get_events(
+    backend: BackendHere,
+    alarm_id: AlarmId,
+    after: Annotated[int, Query(ge=0, le=MAX_EVENT, description="Only events with a higher number.")] = 0,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+) -> models.AlarmEvents:
+    """A page of what happened to an alarm, oldest first."""
+    found = backend.store.events(alarm_id, after=after, limit=limit + 1)
+    if not found and backend.store.alarm(alarm_id) is None:
         raise AlarmUnknown(alarm_id)
-    return models.AlarmEvents(events=[_event(event) for event in events])
+    page = [_event(event) for event in found[:limit]]
+    return models.AlarmEvents(events=page, next=page[-1].seq if len(found) > limit else None)
 
 
 @_alarms.post("/{alarm_id}/ack", response_model=models.AlarmModel, dependencies=[Depends(_json_only)])

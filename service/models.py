@@ -342,9 +342,10 @@ class AlarmEvent(BaseModel):
 
 
 class AlarmEvents(BaseModel):
-    """Everything that happened to an alarm, oldest first."""
+    """A page of what happened to an alarm, oldest first."""
 
     events: list[AlarmEvent]
+    next: int | None = Field(description="`after` of the next page; null on the last one.")
 
 
 class Acknowledgement(BaseModel):
@@ -358,8 +359,8 @@ class Acknowledgement(BaseModel):
         default=None, ge=1, description="The alarm's `count` as it was seen; 409 if it has been raised since."
     )
 
-class Recommissioning(BaseModel):
 
+class Recommissioning(BaseModel):
     """The wish of an operator to have meters learned anew."""
 
     model_config = ConfigDict(extra="forbid")

@@ -131,16 +131,21 @@ class Reader:
         with self._read() as connection:
             return [from_json(json.loads(data)) for data in connection.scalars(query)]
 
-    def events(self, alarm_id: str) -> list[Event]:
-        """Return everything that happened to an alarm, oldest first.
+    def events(self, alarm_id: str, *, after: int = 0, limit: int = 1000) -> list[Event]:
+        """Return what happened to an alarm, oldest first.
 
         Parameters
         ----------
         alarm_id
             The id.
+        after
+            Only events with a higher number.
+        limit
+            At most so many.
         """
+        query = sa.select(EVENT).where(EVENT.c.alarm_id == alarm_id, EVENT.c.seq > after)
+        query = query.order_by(EVENT.c.seq).limit(limit)
         with self._read() as connection:
-            query = sa.select(EVENT).where(EVENT.c.alarm_id == alarm_id).order_by(EVENT.c.seq)
             return [_event(row) for row in connection.execute(query).mappings()]
 
     def events_after(self, number: int, *, feeder: str | None = None, limit: int = 100) -> list[Event]:

@@ -249,6 +249,25 @@ def test_the_list_is_not_sent_twice(setup: Setup) -> None:
     assert setup.get("/alarms", headers=header).status_code == 200
 
 
+def test_the_events_of_an_alarm_come_page_by_page(setup: Setup) -> None:
+    for k in range(4):
+        setup.attack(T0 + 12 * k)
+        setup.calm(T0 + 12 * k + 4)
+    path = f"/alarms/{setup.one()['id']}/events"
+    whole = setup.get(path).json()
+    assert ([e["seq"] for e in whole["events"]], whole["next"]) == (list(range(1, 9)), None)
+    pages, after = [], 0
+    while after is not None:
+        page = setup.get(f"{path}?limit=3&after={after}").json()
+        pages.append(page["events"])
+        after = page["next"]
+    assert [len(page) for page in pages] == [3, 3, 2]
+    assert [event for page in pages for event in page] == whole["events"]
+    assert setup.get(f"{path}?after=8").json() == {"events": [], "next": None}
+    for wrong in ("limit=0", "limit=1001", "after=-1", f"after={1 << 63}"):
+        is_problem(setup.get(f"{path}?{wrong}"), 422)
+
+
 def test_an_answer_is_to_the_occurrence_that_was_seen(setup: Setup) -> None:
     setup.attack()
     seen = setup.one()
