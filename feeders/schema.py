@@ -13,7 +13,7 @@ import json
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 from feeders import check, raw
 from feeders.columns import (
@@ -384,10 +384,15 @@ def _parse_table(
     records = []
     for number, row in rows:
         key = row.get(columns[0].name)
-        label = f" ({key.strip()})" if isinstance(key, str) and key.strip() and len(key) <= 128 else ""
+        label = f" ({key.strip()})" if _can_be_read(key) else ""
         where = f"{name}, row {number}{label}"
         records.append(Record(where, _parse_cells(where, "column", wanted, row, problems)))
     return records
+
+
+def _can_be_read(key: object) -> TypeGuard[str]:
+    """Whether a row's name says which one it is."""
+    return isinstance(key, str) and bool(key.strip()) and len(key) <= 128 and key.strip().isprintable()
 
 
 def _parse_cells(

@@ -384,7 +384,7 @@ class Recommissioning(BaseModel):
         """
         try:
             given = json.loads(body)
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             return [{"loc": ("body",), "msg": f"no JSON: {error}", "type": "json_invalid"}]
         found, problems = None, list[Any]()
         try:

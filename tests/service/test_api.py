@@ -332,6 +332,7 @@ ERRORS: list[tuple[str, str, bytes | None, dict[str, str], int]] = [
     ("PUT", "/api/v1/feeders/x", b"[1]", JSON, 422),
     ("PUT", "/api/v1/feeders/x", b"", JSON, 422),
     ("PUT", "/api/v1/feeders/x", b" " * (5 << 20), JSON, 413),
+    ("POST", "/api/v1/feeders/village/commissioning", b"[" * 100_000, JSON, 400),
     ("POST", ACK, b'{"who": " "}', JSON, 422),
     ("POST", ACK, b'{"who": 1}', JSON, 422),
     ("POST", ACK, b'{"who": "Ada\\u0000"}', JSON, 422),

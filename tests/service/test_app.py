@@ -254,6 +254,13 @@ def test_feeders_over_rest(tmp_path: Path) -> None:
         refused = live.http.put(f"/api/v1/feeders/{other.feeder.name}", json=wrong)
         assert refused.status_code == 422
         assert len(refused.json()["problems"]) >= 3
+        wrong["customers"][0]["customer"] = "\ud800"
+        unheard = live.http.put(
+            f"/api/v1/feeders/{other.feeder.name}",
+            content=json.dumps(wrong),
+            headers={"Content-Type": "application/json"},
+        )
+        assert (unheard.status_code, "'\\ud800'" in unheard.json()["detail"]) == (422, True)
         misplaced = live.http.put("/api/v1/feeders/elsewhere", json=tables)
         assert misplaced.status_code == 422
         answer = live.http.put(f"/api/v1/feeders/{other.feeder.name}", json=tables)
