@@ -352,8 +352,14 @@ def list_alarms(
         limit=limit,
     )
     found = [alarm_json(alarm) for alarm in page]
-    state_of_store = {"last_event": last_event, "unstored": unstored, "problem": trouble}
-    return {"alarms": found, "next": following, **state_of_store}
+    return {
+        "alarms": found,
+        "next": following,
+        "last_event": last_event,
+        "raised": backend.store.raised(),
+        "unstored": unstored,
+        "problem": trouble,
+    }
 
 
 @_alarms.get("/stream", response_class=EventSourceResponse, dependencies=[Depends(_slot)], tags=["streams"])

@@ -322,6 +322,7 @@ class Alarms(BaseModel):
     alarms: list[AlarmModel]
     next: str | None = Field(description="Cursor of the next page; null on the last one.")
     last_event: int = Field(description="Newest event number: `after` of the stream that goes on from here.")
+    raised: int = Field(description="So many alarms of all feeders and kinds stand that nobody has answered.")
     unstored: int = Field(
         default=0, description="So many changes of alarms wait for the database and are not among these."
     )

@@ -111,6 +111,12 @@ class Reader:
         page = [from_json(json.loads(row.data)) for row in rows[:limit]]
         return page, (page[-1].id if len(rows) > limit else None)
 
+    def raised(self) -> int:
+        """Return how many alarms stand that nobody has answered."""
+        query = sa.select(sa.func.count()).where(ALARM.c.state == str(AlarmState.RAISED))
+        with self._read() as connection:
+            return int(connection.execute(query).scalar_one())
+
     def active(self, feeder: str | None = None, *, cleared_since: float | None = None) -> list[Alarm]:
         """Return what `alarms.restore` needs.
 

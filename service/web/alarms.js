@@ -12,12 +12,16 @@ const KIND = {
 };
 const PAGE = 50;
 const EVERY_MS = 5000;
+const SOON_MS = 200;
 
 export class Alarms {
   constructor({ onPick, onLink }) {
     this.alarms = new Map();
     this.items = new Map();
-    this.heard = new Map(); // Newest event of each alarm that the list loaded last may not know yet.
+    this.loading = 0;
+    this.heard = new Map(); // Newest event of each alarm that a list on its way may not know yet.
+    this.raised = 0; // So many nobody has answered, loaded or not.
+    this.soon = null;
     this.turn = 0;
     this.onPick = onPick;
     this.onLink = onLink;
@@ -94,20 +98,26 @@ export class Alarms {
     if (more && this.next) query.set("cursor", this.next);
     this.turn += 1;
     const { turn } = this;
-    const page = await getJson(`${API}?${query}`);
-    if (turn !== this.turn) return page.last_event; // A newer choice has overtaken this answer.
+    this.loading += 1;
+    try {
+      const page = await getJson(`${API}?${query}`);
+      if (turn === this.turn) this.list(page, more); // Or else a newer choice has overtaken this answer.
+      return page.last_event;
+    } finally {
+      this.loading -= 1;
+      if (this.loading === 0) this.heard.clear();
+    }
+  }
+
+  list(page, more) {
     byId("alarm-error").hidden = true;
     if (!more) this.alarms.clear();
     this.tell(page);
     for (const alarm of page.alarms) this.alarms.set(alarm.id, alarm);
     // The stream may have been faster than this answer, and tells nothing twice.
-    for (const [id, { seq, alarm }] of this.heard) {
-      if (seq > page.last_event) this.alarms.set(id, alarm);
-      else this.heard.delete(id);
-    }
+    for (const { seq, alarm } of this.heard.values()) if (seq > page.last_event) this.put(alarm);
     this.next = page.next;
     this.render();
-    return page.last_event;
   }
 
   // What no event says.
@@ -121,7 +131,8 @@ export class Alarms {
     this.render();
   }
 
-  tell({ unstored, problem }) {
+  tell({ raised = this.raised, unstored, problem }) {
+    this.raised = raised;
     this.problem = problem;
     const waiting = unstored ? `, ${unstored} change${unstored === 1 ? " waits" : "s wait"}` : "";
     byId("alarm-unstored").hidden = !problem;
@@ -130,23 +141,31 @@ export class Alarms {
 
   take(event) {
     const { alarm } = event;
-    this.heard.set(alarm.id, event);
-    this.alarms.set(alarm.id, alarm);
+    if (this.loading > 0) this.heard.set(alarm.id, event);
+    this.put(alarm);
     this.render();
+    this.soon ??= setTimeout(() => { this.soon = null; this.check(); }, SOON_MS);
+  }
+
+  // What the filters do not show is not kept: the service has it.
+  put(alarm) {
+    if (this.fits(alarm)) this.alarms.set(alarm.id, alarm);
+    else this.alarms.delete(alarm.id);
+  }
+
+  fits(alarm) {
+    const { state, kind, feeder } = this.filters();
+    return (!state.length || state.includes(alarm.state)) && (!kind || alarm.kind === kind) && (!feeder || alarm.feeder === feeder);
   }
 
   shown() {
-    const { state, kind, feeder } = this.filters();
-    return [...this.alarms.values()]
-      .filter((a) => (!state.length || state.includes(a.state)) && (!kind || a.kind === kind) && (!feeder || a.feeder === feeder))
-      .sort((a, b) => (a.id < b.id ? 1 : -1));
+    return [...this.alarms.values()].filter((a) => this.fits(a)).sort((a, b) => (a.id < b.id ? 1 : -1));
   }
 
   render() {
     const list = this.shown();
-    const open = [...this.alarms.values()].filter((a) => a.state === "raised").length;
-    byId("alarm-count").hidden = open === 0;
-    byId("alarm-count").textContent = `${open} new`;
+    byId("alarm-count").hidden = this.raised === 0;
+    byId("alarm-count").textContent = `${this.raised} new`;
     byId("alarm-none").hidden = list.length > 0 || !byId("alarm-error").hidden || this.problem !== null;
     byId("alarm-more").hidden = !this.next;
     const focused = document.activeElement?.closest?.("[data-alarm]")?.dataset.alarm;
@@ -216,7 +235,7 @@ export class Alarms {
       });
       const body = await response.json();
       if (!response.ok) throw new Error(body.detail);
-      this.alarms.set(body.id, body);
+      this.put(body);
       this.render();
       byId("ack").close();
     } catch (error) {

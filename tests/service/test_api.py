@@ -150,7 +150,7 @@ def test_every_problem_of_a_feeder_is_told_at_once(setup: Setup) -> None:
 def test_an_alarm_and_its_fields(setup: Setup) -> None:
     assert setup.get("/alarms").json() == {
         **{"alarms": [], "next": None, "last_event": 0},
-        **{"unstored": 0, "problem": None},
+        **{"raised": 0, "unstored": 0, "problem": None},
     }
     setup.attack()
     alarm = setup.one()
@@ -228,6 +228,7 @@ def test_filters_and_pages(setup: Setup) -> None:
 
     assert count("state=cleared") == 7
     assert count("state=raised") == 2
+    assert setup.get("/alarms?limit=1&state=cleared").json()["raised"] == 2
     assert count("state=raised&state=cleared") == 9
     assert count("kind=data-loss") == 1
     assert count("severity=critical&feeder=village") == 8

@@ -9,9 +9,11 @@ import pytest
 from playwright.sync_api import APIResponse, Route, expect
 
 from gridsec.online import Cause
+from service.alarms import AlarmState, Change, Transition
 from service.report import BusbarReport, CustomerReport, InverterReport
 from tests.service.asking import T0
 from tests.service.looking import DESKTOP, PHONE, Site, customer
+from tests.service.stored import an_alarm, raised
 
 pytestmark = pytest.mark.browser
 
@@ -273,6 +275,30 @@ def test_older_alarms_come_page_by_page(site: Site) -> None:
 
 
 # ------------------------------------------------------------ can it be believed?
+
+
+def test_the_badge_counts_what_is_not_loaded_too(site: Site) -> None:
+    """One alarm that nobody has answered is older than a page of others that have come and gone."""
+    site.service.store.commit([raised(an_alarm())])
+    gone = [an_alarm(k, state=AlarmState.CLEARED, t_cleared=T0 + k + 1) for k in range(1, 61)]
+    site.service.store.commit([Transition(alarm, Change.CLEARED, T0) for alarm in gone])
+    page = site.open()
+    badge = page.locator("#alarm-count")
+    expect(badge).to_have_text("1 new")
+    page.select_option("#alarm-state", "all")
+    expect(page.locator(".alarm")).to_have_count(50)
+    expect(badge).to_have_text("1 new")
+    page.select_option("#alarm-kind", "data-loss")
+    expect(page.locator(".alarm")).to_have_count(0)
+    site.tick(T0 + 100, 4, lies={"H3": 9.0})
+    expect(badge).to_have_text("2 new")
+    expect(page.locator(".alarm")).to_have_count(0)
+    page.select_option("#alarm-kind", "")
+    page.select_option("#alarm-state", "raised")
+    expect(page.locator(".alarm")).to_have_count(2)
+    site.tick(T0 + 104, 8)
+    expect(page.locator(".alarm")).to_have_count(1)
+    expect(badge).to_have_text("1 new")
 
 
 def test_a_lost_connection_is_said_and_healed(site: Site) -> None:
