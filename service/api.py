@@ -12,7 +12,7 @@ import asyncio
 import hashlib
 import json
 import secrets
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Collection
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path as FilePath
@@ -46,13 +46,15 @@ _WEB = FilePath(__file__).with_name("web")
 _NAME = r"^[A-Za-z0-9_-]{1,64}$"
 
 
-def create_api(backend: Backend) -> FastAPI:
+def create_api(backend: Backend, hosts: Collection[str] = ()) -> FastAPI:
     """Return the HTTP application.
 
     Parameters
     ----------
     backend
         The running service.
+    hosts
+        Names by which it may be asked to change something, besides `localhost` and this machine's.
     """
     app = FastAPI(
         title="gridsec",
@@ -66,7 +68,7 @@ def create_api(backend: Backend) -> FastAPI:
     app.state.backend = backend
     app.state.streams = 0
     app.state.run = secrets.token_hex(4)
-    app.add_middleware(Guard, max_body=MAX_BODY)
+    app.add_middleware(Guard, max_body=MAX_BODY, hosts=hosts)
     for error, handler in handlers().items():
         app.add_exception_handler(error, handler)
     app.add_exception_handler(RequestValidationError, _validation_handler)

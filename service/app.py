@@ -9,6 +9,7 @@ import socket
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
+from typing import Any
 
 import structlog
 import uvicorn
@@ -97,11 +98,13 @@ async def serve(
             )
         )
         runtime.attach(bus)
-        await _run(runtime, listener, tuple(sites), announce=announce, signals=signals)
+        api = create_api(runtime, settings.http_hosts)
+        await _run(runtime, api, listener, tuple(sites), announce=announce, signals=signals)
 
 
 async def _run(
     runtime: Runtime,
+    api: Callable[..., Any],
     listener: socket.socket,
     feeders: tuple[str, ...],
     *,
@@ -110,7 +113,7 @@ async def _run(
 ) -> None:
     server = _Server(
         uvicorn.Config(
-            create_api(runtime),
+            api,
             lifespan="off",
             log_config=None,
             access_log=False,

@@ -30,6 +30,10 @@ Config = Annotated[
 ]
 Prefix = Annotated[str | None, typer.Option(help="First chunks of all keys. [default: gridsec]")]
 Http = Annotated[str | None, typer.Option(help="Address of REST and web page. [default: 127.0.0.1:8000]")]
+HttpHost = Annotated[
+    list[str] | None,
+    typer.Option(help="Host name by which REST may change something, behind a proxy; may be repeated."),
+]
 Database = Annotated[
     str | None,
     typer.Option(help="sqlite:///file or postgresql+psycopg://... [default: sqlite:///gridsec.db]"),
@@ -62,6 +66,7 @@ def serve(
     zenoh_config: Config = None,
     prefix: Prefix = None,
     http: Http = None,
+    http_host: HttpHost = None,
     database: Database = None,
     clock: ClockOf = None,
     max_skew: MaxSkew = None,
@@ -75,7 +80,8 @@ def serve(
 ) -> None:
     """Watch feeders until interrupted. Every option can also be set as GRIDSEC_..., e.g. GRIDSEC_HTTP.
 
-    `--feeder` is GRIDSEC_FEEDERS, `--max-skew` GRIDSEC_MAX_SKEW_S and `--grace` GRIDSEC_GRACE_S.
+    `--feeder` is GRIDSEC_FEEDERS, `--http-host` GRIDSEC_HTTP_HOSTS, `--max-skew` GRIDSEC_MAX_SKEW_S and
+    `--grace` GRIDSEC_GRACE_S.
     """
     import structlog
 
@@ -93,6 +99,7 @@ def serve(
             "zenoh_config": zenoh_config,
             "prefix": prefix,
             "http": http,
+            "http_hosts": tuple(http_host) if http_host else None,
             "database": database,
             "clock": clock,
             "max_skew_s": max_skew,

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
+import socket
+from collections.abc import Awaitable, Callable, Collection
 from http import HTTPStatus
+from ipaddress import ip_address
 from typing import Any, cast
+from urllib.parse import urlsplit
 
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
@@ -62,7 +65,10 @@ def problem(
 
 
 class Guard:
-    """Security headers on every answer, and an end to bodies that are too long.
+    """Security headers on every answer, an end to bodies that are too long, and no change for strangers.
+
+    A foreign web page can give its own name our address and then ask us as if it were ours. So whoever
+    changes something must call us by an address or a name of ours, and a page that does must come from there.
 
     Parameters
     ----------
@@ -70,11 +76,37 @@ class Guard:
         The application behind it.
     max_body
         Longest body that is read, bytes.
+    hosts
+        Names of ours, besides `localhost` and this machine's.
     """
 
-    def __init__(self, app: ASGIApp, max_body: int) -> None:
+    def __init__(self, app: ASGIApp, max_body: int, hosts: Collection[str] = ()) -> None:
         self.app = app
         self.max_body = max_body
+        self.hosts = frozenset(name.lower() for name in hosts)
+        self.own = self.hosts | {"localhost", socket.gethostname().lower()}
+
+    def stranger(self, request: Request) -> tuple[int, str] | None:
+        """Return why a request may change nothing, as status and sentence, or None.
+
+        Parameters
+        ----------
+        request
+            What is asked.
+        """
+        if request.method in _READS:
+            return None
+        host, origin = request.headers.get("host", ""), request.headers.get("origin")
+        name = _name_of(f"//{host}")
+        if name not in self.own and not _is_address(name):
+            return 421, f"{host!r} is no name of this service; `--http-host` of `gridsec serve` makes it one"
+        if (
+            origin is None
+            or origin.partition("://")[2].lower() == host.lower()
+            or _name_of(origin) in self.hosts
+        ):
+            return None
+        return 403, f"a page of {origin!r} may change nothing at {host!r}"
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on."""
@@ -99,10 +131,31 @@ class Guard:
                 message = {**message, "headers": [*message.get("headers", []), *_HEADERS]}
             await send(message)
 
-        if declared.isdecimal() and int(declared) > self.max_body:
+        if strange := self.stranger(request):
+            await problem(request, *strange, headers={"Connection": "close"})(scope, receive, guarded)
+        elif declared.isdecimal() and int(declared) > self.max_body:
             await problem(request, 413, text, headers={"Connection": "close"})(scope, receive, guarded)
         else:
             await self.app(scope, limited, guarded)
+
+
+_READS = frozenset({"GET", "HEAD", "OPTIONS"})
+
+
+def _name_of(address: str) -> str:
+    """Return the host of an address in small letters; empty if there is none."""
+    try:
+        return urlsplit(address).hostname or ""
+    except ValueError:
+        return ""
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ip_address(name)
+    except ValueError:
+        return False
+    return True
 
 
 Handler = Callable[[Request, Exception], Awaitable[Response]]

@@ -21,6 +21,7 @@ from service.align import Clock
 ENV_PREFIX = "GRIDSEC_"
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 _ENDPOINT = re.compile(r"^(tcp|udp|tls|quic|ws|unixsock-stream|unixpipe|vsock|serial)/\S+$")
+_HOST = re.compile(r"^[A-Za-z0-9_-]+(\.[A-Za-z0-9_-]+)*$")
 _PREFIX = re.compile(r"^[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*$")
 
 
@@ -54,6 +55,7 @@ class Settings(BaseSettings):
     zenoh_config: Path | None = None
     prefix: str = "gridsec"
     http: str = "127.0.0.1:8000"
+    http_hosts: Listed = ()
     database: str = "sqlite:///gridsec.db"
     clock: Clock = Clock.WALL
     max_skew_s: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
@@ -71,7 +73,7 @@ class Settings(BaseSettings):
             return self.zenoh_listen
         return (DEFAULT_ENDPOINT,)
 
-    @field_validator("feeders", "zenoh_listen", "zenoh_connect", mode="before")
+    @field_validator("feeders", "zenoh_listen", "zenoh_connect", "http_hosts", mode="before")
     @classmethod
     def _split(cls, value: object) -> object:
         if isinstance(value, str):
@@ -84,6 +86,14 @@ class Settings(BaseSettings):
         wrong = [end for end in value if not _ENDPOINT.match(end)]
         if wrong:
             raise ValueError(f"{', '.join(wrong)}: an endpoint looks like tcp/127.0.0.1:7447")
+        return value
+
+    @field_validator("http_hosts")
+    @classmethod
+    def _names(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        wrong = [name for name in value if not _HOST.match(name)]
+        if wrong:
+            raise ValueError(f"{', '.join(wrong)}: a host name looks like grid.example, without a port")
         return value
 
     @field_validator("estimator")
@@ -178,7 +188,7 @@ _OTHERS = ("GRIDSEC_CACHE_DIR", "GRIDSEC_TESTS_REQUIRE_ALL")
 def _problem(error: Any) -> str:
     name = str(error["loc"][0]) if error["loc"] else "settings"
     option, variable = "--" + name.replace("_", "-").removesuffix("-s"), ENV_PREFIX + name.upper()
-    option = {"--feeders": "--feeder"}.get(option, option)
+    option = {"--feeders": "--feeder", "--http-hosts": "--http-host"}.get(option, option)
     message = str(error["msg"]).removeprefix("Value error, ")
     shown = "" if error["type"] == "value_error" else f" (is {error['input']!r})"
     return f"{option} or {variable}: {message}{shown}"

@@ -281,7 +281,7 @@ class Server:
     def __init__(self, service: SmallService, port: int = 0) -> None:
         self.service = service
         config = uvicorn.Config(
-            create_api(service),
+            create_api(service, ["grid.example"]),
             host="127.0.0.1",
             port=port,
             log_level="critical",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import socket
 import sqlite3
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -340,6 +341,39 @@ ERRORS: list[tuple[str, str, bytes | None, dict[str, str], int]] = [
     ("POST", ACK, b'{"who": "Ada", "comment": "a\\u001b[2J"}', JSON, 422),
     ("POST", ACK, b'{"who": "Ada", "state": "cleared"}', JSON, 422),
 ]
+
+
+HOSTS = [
+    ("127.0.0.1:8000", None, 200),
+    ("[::1]:8000", "http://[::1]:8000", 200),
+    ("localhost:8000", "http://localhost:8000", 200),
+    (socket.gethostname(), None, 200),
+    ("Grid.example", "https://grid.example", 200),
+    ("127.0.0.1:8000", "https://grid.example", 200),
+    ("evil.example:8000", "http://evil.example:8000", 421),
+    ("evil.example:8000", None, 421),
+    ("127.0.0.1.evil.example", None, 421),
+    ("grid.example.evil.example", None, 421),
+    ("localhost:8000", "http://localhost:9000", 403),
+    ("localhost:8000", "http://evil.example", 403),
+    ("localhost:8000", "null", 403),
+]
+
+
+def test_only_under_a_name_of_ours_is_anything_changed(setup: Setup) -> None:
+    """A foreign page that gives its own name our address (DNS rebinding) may read, and change nothing."""
+    path = "/api/v1/feeders/village/commissioning"
+    for host, origin, status in HOSTS:
+        headers = {"Host": host} | ({} if origin is None else {"Origin": origin})
+        done = setup.http.post(path, json={"who": "Ada", "reason": host}, headers=headers)
+        assert done.status_code == status, (host, origin, done.text)
+        if status != 200:
+            is_problem(done, status)
+        assert setup.get("/feeders", headers=headers).status_code == 200
+    reasons = [
+        event["reason"] for event in setup.get("/feeders/village/commissioning/events").json()["events"]
+    ]
+    assert reasons == [host for host, _, status in HOSTS if status == 200]
 
 
 def test_every_error_is_a_problem(setup: Setup) -> None:

@@ -280,6 +280,15 @@ def test_feeders_over_rest(tmp_path: Path) -> None:
         assert len(detail["layout"]["parent"]) == len(detail["layout"]["buses"]) == len(other.feeder.buses)
 
 
+def test_names_given_are_names_of_the_service(tmp_path: Path) -> None:
+    with service(tmp_path, clock="events", http_hosts=("grid.example",)) as live:
+        asked = [
+            live.http.delete(f"/api/v1/feeders/{FEEDER}", headers={"Host": host}).status_code
+            for host in ("grid.example:8000", "evil.example:8000")
+        ]
+        assert asked == [409, 421]
+
+
 def test_feeders_over_rest_have_an_end_and_stay_deleted(tmp_path: Path) -> None:
     tables = [to_json(load("kerber-landnetz").tables) for _ in range(3)]
     for k, one in enumerate(tables):

@@ -45,12 +45,14 @@ def test_every_problem_at_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
                 "zenoh_config": tmp_path / "none.json5",
                 "max_skew_s": -1.0,
                 "prefix": "a//b",
+                "http_hosts": ("grid.example", "grid.example:80"),
             }
         )
     problems = "\n".join(caught.value.problems)
-    assert len(caught.value.problems) == 7
+    assert len(caught.value.problems) == 8
     for words in (
         "--http or GRIDSEC_HTTP: 'localhost'",
+        "--http-host or GRIDSEC_HTTP_HOSTS: grid.example:80: a host name",
         "--clock or GRIDSEC_CLOCK",
         "tcp/127.0.0.1:7447",
         "none.json5 is no file",
