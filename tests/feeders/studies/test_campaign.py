@@ -184,17 +184,14 @@ def test_places() -> None:
     def chosen(place: Place) -> tuple[np.ndarray, np.ndarray]:
         return liars(site, Case(1, "bias", 1.0, 4, str(place), 0.0, (1,)), random)
 
-    street, signs = chosen(Place.STREET)
-    assert set(np.abs(signs)) == {1.0}
-    apart = own[:, None] + own - 2.0 * model.R
-    within = apart[np.ix_(site.meters[street], site.meters[street])].min(axis=0)
-    some_one = [
-        set(np.argsort(apart[k][site.meters], kind="stable")[:4]) == set(street)
-        or apart[np.ix_([k], site.meters[street])].max() <= np.sort(apart[k][site.meters])[3]
-        for k in site.meters[street]
-    ]
-    assert any(some_one)
-    assert within.max() >= 0.0
+    apart = (own[:, None] + own - 2.0 * model.R)[np.ix_(site.meters, site.meters)]
+    for _ in range(20):
+        street, signs = chosen(Place.STREET)
+        assert set(np.abs(signs)) == {1.0}
+        within = apart[np.ix_(street, street)].max(axis=1)
+        outside = np.delete(apart[street], street, axis=1).min(axis=1)
+        # Seen from one of them, nobody outside is nearer than any of them.
+        assert (within <= outside).any()
     far, _ = chosen(Place.SENSITIVE)
     felt = np.sqrt((model.R**2).sum(axis=1) + (model.X**2).sum(axis=1))[site.meters]
     assert felt[far].min() >= np.delete(felt, far).max()
