@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 from functools import lru_cache
 
@@ -115,10 +116,7 @@ def test_nothing_in_a_box_is_outside_of_its_bounds(seed: int, size: float) -> No
     site = random_site(seed, phased=True)
     rng = np.random.default_rng([seed, 1])
     net, given_box = Subject.of(site).net, random_box(site, rng, size)
-    try:
-        found = region(net, given_box)
-    except DesignInfeasible:
-        return
+    found = region(net, given_box)
     before: tuple[Floats, Floats, Floats, Floats] | None = None
     for _ in range(5):
         p, q, v0 = corner(given_box, rng)
@@ -145,35 +143,44 @@ def settled(site: Site, fleet: Droop, p: Floats, q: Floats, v0: Floats) -> tuple
     return x, v
 
 
-@FEW
-@given(seed=st.integers(0, 200))
-def test_no_voltage_leaves_its_proven_band(seed: int) -> None:
-    site = random_site(seed, phased=True)
-    rng = np.random.default_rng([seed, 2])
-    subject, fleet = Subject.of(site), equip(site, "ieee1547-b", Who.ALL)
-    loads = random_box(site, rng, 1.0)
-    try:
+def test_no_voltage_leaves_its_proven_band() -> None:
+    told: Counter[str] = Counter()
+
+    @FEW
+    @given(seed=st.integers(0, 200))
+    def holds(seed: int) -> None:
+        site = random_site(seed, phased=True)
+        rng = np.random.default_rng([seed, 2])
+        subject, fleet = Subject.of(site), equip(site, "ieee1547-b", Who.ALL)
+        loads = random_box(site, rng, 1.0)
+        told["drawn"] += 1
         ever = always(subject.net, fleet, loads)
-        still = at_rest(subject.net, fleet, loads)
-    except DesignInfeasible:
-        return
-    assert np.all(still.low >= ever.low)
-    before: Floats | None = None
-    for _ in range(4):
-        p, q, v0 = corner(loads, rng)
-        x, v = settled(site, fleet, p, q, v0)
-        assert np.all(v >= still.low - 1e-7)
-        assert np.all(v <= still.high + 1e-7)
-        if np.ptp(v0) == 0.0:
-            found, V = rest(subject.net, fleet, p + 1j * q, float(v0[0]))
-            np.testing.assert_allclose(found, x, atol=1e-6)
-            np.testing.assert_allclose(np.abs(V), v, atol=1e-6)
-        if before is not None:  # a jump of all loads
-            s = injected(fleet, p + 1j * q, before)
-            jumped = volts(site, s.real, s.imag, v0)
-            assert np.all(jumped >= ever.low - 1e-7)
-            assert np.all(jumped <= ever.high + 1e-7)
-        before = x
+        try:
+            still = at_rest(subject.net, fleet, loads)
+        except DesignInfeasible:
+            return
+        told["at rest"] += 1
+        assert np.all(still.low >= ever.low)
+        before: Floats | None = None
+        for _ in range(4):
+            p, q, v0 = corner(loads, rng)
+            x, v = settled(site, fleet, p, q, v0)
+            assert np.all(v >= still.low - 1e-7)
+            assert np.all(v <= still.high + 1e-7)
+            if np.ptp(v0) == 0.0:
+                found, V = rest(subject.net, fleet, p + 1j * q, float(v0[0]))
+                np.testing.assert_allclose(found, x, atol=1e-6)
+                np.testing.assert_allclose(np.abs(V), v, atol=1e-6)
+            if before is not None:  # a jump of all loads
+                s = injected(fleet, p + 1j * q, before)
+                jumped = volts(site, s.real, s.imag, v0)
+                assert np.all(jumped >= ever.low - 1e-7)
+                assert np.all(jumped <= ever.high + 1e-7)
+            before = x
+
+    holds()
+    # Few fleets are too steep: of the seeds 7 %.
+    assert told["at rest"] >= 0.7 * told["drawn"]
 
 
 def test_phases_that_do_not_touch_are_three_fleets() -> None:

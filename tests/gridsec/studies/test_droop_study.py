@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -112,10 +113,7 @@ def test_nothing_in_a_box_is_outside_of_its_bounds(seed: int, size: float) -> No
     feeder = random_feeder(seed)
     rng = np.random.default_rng([seed, 1])
     net, box = network(feeder), random_box(feeder, rng, size)
-    try:
-        found = region(net, box)
-    except DesignInfeasible:
-        return
+    found = region(net, box)
     before: tuple[Floats, Floats, Floats] | None = None
     for _ in range(6):
         p, q, v0 = corners(box, rng)
@@ -244,13 +242,10 @@ def test_small_gain_needs_no_interval_and_no_dead_time() -> None:
 @FEW
 @given(seed=st.integers(0, 100))
 def test_every_trajectory_ends_within_reach(seed: int) -> None:
-    feeder, droop, _ = random_loop(seed, gain=0.5)
+    feeder, droop, _ = random_loop(seed, gain=0.4)
     net, rng = network(feeder), np.random.default_rng(seed)
     loads = random_box(feeder, rng, 0.2)
-    try:
-        within = reach(net, droop, loads)
-    except DesignInfeasible:
-        return
+    within = reach(net, droop, loads)
     assert np.all(within.x_low >= droop.q[:, 3] - 1e-15)
     x = rng.uniform(droop.q[:, 3], droop.q[:, 0])
     p, q, v0 = corners(loads, rng)
@@ -326,31 +321,42 @@ def test_where_there_is_no_power_flow_there_is_no_rest() -> None:
     assert np.isnan(V).all()
 
 
-@FEW
-@given(seed=st.integers(0, 300))
-def test_no_voltage_leaves_its_proven_band(seed: int) -> None:
-    feeder, droop, _ = random_loop(seed, gain=0.6)
-    net, rng = network(feeder), np.random.default_rng(seed)
-    loads = random_box(feeder, rng, 1.0)
-    try:
-        ever = always(net, droop, loads)
-    except DesignInfeasible:
-        return
-    drawn = [corners(loads, rng) for _ in range(8)]
-    s, v0 = np.array([p + 1j * q for p, q, _ in drawn]), np.array([v for *_, v in drawn])
-    x, V = rest(net, droop, s, v0)
-    assert np.all(np.abs(V) >= ever.low)
-    assert np.all(np.abs(V) <= ever.high)
-    jumped = np.abs(solve(net, injected(droop, s, np.roll(x, 1, axis=0)), v0))
-    assert np.all(jumped >= ever.low)
-    assert np.all(jumped <= ever.high)
-    try:
-        still = at_rest(net, droop, loads)
-    except DesignInfeasible:
-        return
-    assert np.all(np.abs(V) >= still.low)
-    assert np.all(np.abs(V) <= still.high)
-    assert np.all(still.low >= ever.low)
+def test_no_voltage_leaves_its_proven_band() -> None:
+    told: Counter[str] = Counter()
+
+    @FEW
+    @given(seed=st.integers(0, 300))
+    def holds(seed: int) -> None:
+        feeder, droop, _ = random_loop(seed, gain=0.6)
+        net, rng = network(feeder), np.random.default_rng(seed)
+        loads = random_box(feeder, rng, 1.0)
+        told["drawn"] += 1
+        try:
+            ever = always(net, droop, loads)
+        except DesignInfeasible:
+            return
+        told["ever"] += 1
+        drawn = [corners(loads, rng) for _ in range(8)]
+        s, v0 = np.array([p + 1j * q for p, q, _ in drawn]), np.array([v for *_, v in drawn])
+        x, V = rest(net, droop, s, v0)
+        assert np.all(np.abs(V) >= ever.low)
+        assert np.all(np.abs(V) <= ever.high)
+        jumped = np.abs(solve(net, injected(droop, s, np.roll(x, 1, axis=0)), v0))
+        assert np.all(jumped >= ever.low)
+        assert np.all(jumped <= ever.high)
+        try:
+            still = at_rest(net, droop, loads)
+        except DesignInfeasible:
+            return
+        told["at rest"] += 1
+        assert np.all(np.abs(V) >= still.low)
+        assert np.all(np.abs(V) <= still.high)
+        assert np.all(still.low >= ever.low)
+
+    holds()
+    # Few boxes reach too near to collapse, few fleets are too steep: of the seeds 1 % and 8 %.
+    assert told["ever"] >= 0.9 * told["drawn"]
+    assert told["at rest"] >= 0.7 * told["drawn"]
 
 
 def test_the_band_at_rest_is_reached_where_all_sensitivities_are_positive() -> None:
