@@ -83,17 +83,27 @@ def test_reactance_with_different_time_constants_decays_where_it_holds(
     assert np.ptp(droop.tau) > 0
 
 
-@settings(max_examples=50)
-@given(seed=seeds, gain=st.sampled_from([0.1, 0.5, 0.9]), amount=st.sampled_from([0.02, 0.3]))
-def test_asymmetry_is_charged_for(seed: int, gain: float, amount: float) -> None:
-    _, droop, lure = random_loop(seed, gain=gain)
-    skewed = asymmetric(lure, droop, seed, amount)
-    try:
-        certificate = reactance(skewed)
-    except DesignInfeasible:
-        return
-    assert certificate.rate <= reactance(lure).rate * (1 + 1e-9)
-    switched_decay(skewed, certificate, seed)
+def test_asymmetry_is_charged_for() -> None:
+    refused: list[bool] = []
+
+    @settings(max_examples=50)
+    @given(seed=seeds, gain=st.sampled_from([0.1, 0.5, 0.9]), amount=st.sampled_from([0.02, 0.3]))
+    def holds(seed: int, gain: float, amount: float) -> None:
+        _, droop, lure = random_loop(seed, gain=gain)
+        skewed = asymmetric(lure, droop, seed, amount)
+        refused.append(False)
+        try:
+            certificate = reactance(skewed)
+        except DesignInfeasible:
+            refused[-1] = True
+            assert (gain, amount) == (0.9, 0.3)
+            return
+        assert certificate.rate <= reactance(lure).rate * (1 + 1e-9)
+        switched_decay(skewed, certificate, seed)
+
+    holds()
+    # Of the seeds fewer than 1 %.
+    assert sum(refused) <= 0.1 * len(refused)
 
 
 def test_strong_asymmetry_at_high_gain_is_refused() -> None:
