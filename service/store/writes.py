@@ -231,7 +231,9 @@ class Store(Reader):
             return
         try:
             with self._write() as connection:
-                connection.execute(VERSION.update().values(version=VERSION.c.version))
+                # SQLite writes nothing where nothing changes.
+                for change in (1, -1):
+                    connection.execute(VERSION.update().values(version=VERSION.c.version + change))
         finally:
             self._lock.release()
 

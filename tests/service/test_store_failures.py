@@ -261,7 +261,12 @@ FULL_DISK = """
             done += 1
     except StoreUnavailable as error:
         print(error)
-    assert not store.writable() or store.rejected()
+    # What was too large left room for something small.
+    assert done and store.writable()
+    assert len(store.rejected(5000)) == 100 * done
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, resource.RLIM_INFINITY))
+    assert not store.writable()
+    assert len(store.rejected(5000)) == 100 * done
     resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
     assert store.writable()
     assert len(store.rejected(5000)) == 100 * done
