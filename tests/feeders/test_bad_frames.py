@@ -17,6 +17,8 @@ from gridsec.online import Decision, Frame
 NAMES = sorted(set(FAMILIES) - {"exact-bank-lmi"})
 # These have a prior of powers that nobody knows; for all others such a power leaves everything open.
 PRIOR = {"sequential", "weighted-least-squares", "l0-decoder", "basis-pursuit", "matching-pursuit"}
+# These are not sure of honest readings either after so short a time.
+SLOW = {"unknown-input", "windowed-bank"}
 BEFORE, BAD, WHO = 20, 6, 2
 
 
@@ -47,6 +49,9 @@ def put(frame: Frame, name: str, value: float) -> Frame:
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("what", ["p", "p_error", "q", "q_error", "q_net", "q_net_error"])
 def test_a_power_that_is_none_is_not_known(name: str, what: str) -> None:
+    known = Decision.UNDECIDED if name in SLOW else Decision.CLEAN
+    # Nobody needs the reactive power that is reported on top.
+    then = known if name in PRIOR or what.startswith("q_net") else Decision.UNDECIDED
     for value in (np.nan, np.inf, -np.inf, 1e300):
         state = watcher(name).init(START - 1.0)
         if what == "q_net" and value == 1e300:
@@ -57,8 +62,8 @@ def test_a_power_that_is_none_is_not_known(name: str, what: str) -> None:
             assert not verdict.suspects.any(), (value, k)
             for numbers in (estimate.v2, estimate.bound, estimate.v2_bus, verdict.threshold):
                 assert np.isfinite(numbers).all(), (value, k)
-            if k >= BEFORE and verdict.decision is Decision.CLEAN:
-                assert name in PRIOR or what.startswith("q_net"), (value, k)
+            if k >= BEFORE - 1:
+                assert verdict.decision is (then if k >= BEFORE else known), (value, k)
 
 
 @pytest.mark.parametrize("name", NAMES)
