@@ -105,9 +105,7 @@ def test_the_power_flow_is_within_the_bound(charging: float, seed: int, size: fl
     p, q = loads(feeder, seed, size)
     v0 = float(np.random.default_rng(seed).uniform(0.95, 1.05) ** 2)
     bound = model_error_bound(feeder, p, q, v0)
-    if not np.isfinite(bound).all():
-        assert size > 0.02
-        return
+    assert np.isfinite(bound).all()
     exact, found = ac(feeder, p, q, v0), bus_voltages(feeder, p, q, v0)
     error = np.abs(found - exact)[feeder.bus]
     assert (error <= bound + 2e-9).all()

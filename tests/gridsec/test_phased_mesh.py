@@ -144,9 +144,7 @@ def test_the_power_flow_is_within_the_bound(charging: float, seed: int, size: fl
     p, q = loads(feeder, seed, size)
     v0 = np.random.default_rng(seed).uniform(0.95, 1.05, 3) ** 2
     bound = model_error_bound(feeder, p, q, v0)
-    if not np.isfinite(bound).all():
-        assert size > 0.005
-        return
+    assert np.isfinite(bound).all()
     exact, found = ac_places(feeder, p, q, v0), bus_voltages(feeder, p, q, v0)
     assert (np.abs(found - exact)[feeder.bus] <= bound + 1e-12).all()
     reach = float((feeder.size @ np.hypot(p, q)).max())
