@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
+from gridsec.arrays import Floats
 from gridsec.droop import fleet
 from gridsec.feeder import lindistflow
 from gridsec.sequential import LoadDoubt, SequentialOptions, design
@@ -80,21 +81,31 @@ class TestLoads:
 
 
 class TestInverters:
-    def test_those_without_a_meter_follow_the_model(self) -> None:
+    @pytest.mark.parametrize(
+        ("driven", "w", "steps"),
+        [
+            ((), (-0.08, 0.08), (1.0, 1.0, 0.3, 1.0, 4.0)),
+            ((0, 2, 4, 6, 8), (0.06, 0.1), (0.5, 0.5, 0.3, 0.5, 1.0)),
+        ],
+    )
+    def test_those_without_a_meter_follow_the_model(
+        self, driven: tuple[int, ...], w: tuple[float, float], steps: tuple[float, ...]
+    ) -> None:
         """Against an adaptive integrator; step lengths change, and what was prepared is used again."""
         rng = np.random.default_rng(5)
         plant = make_plant(rng, drop=0.06)
         doubt = LoadDoubt(np.full(9, 0.01), np.full(9, 0.01), 600.0)
         made = design(plant, doubt=doubt, step_s=1.0)
         X, droop = 2.0 * lindistflow(plant.feeder).X, plant.droop
-        w = rng.uniform(-0.08, 0.08, 9)
+        known, y, who = rng.uniform(*w, 9), np.full(9, 0.9), np.isin(np.arange(9), driven)
         x, free = np.zeros(9), None
-        nobody = np.zeros(9, dtype=np.bool_)
-        for h in (1.0, 1.0, 0.3, 1.0, 4.0):
-            x, free = drive(made, x, np.ones(9), nobody, w, h, free)
-        exact = solve_ivp(
-            lambda _, x: (droop(w - X @ x) - x) / droop.tau, (0.0, 7.3), np.zeros(9), rtol=1e-10, atol=1e-12
-        ).y[:, -1]
+        for h in steps:
+            x, free = drive(made, x, y, who, known, h, free)
+
+        def change(_: float, x: Floats) -> Floats:
+            return np.asarray((droop(np.where(who, droop.vbar**2 - y, known - X @ x)) - x) / droop.tau)
+
+        exact = solve_ivp(change, (0.0, sum(steps)), np.zeros(9), rtol=1e-10, atol=1e-12).y[:, -1]
         np.testing.assert_allclose(x, exact, atol=2e-3 * np.abs(exact).max())
 
     @settings(max_examples=40, deadline=None)
