@@ -97,6 +97,13 @@ def test_order_of_answers() -> None:
             assert reason.endswith(".")
 
 
+def test_who_is_silent_contradicts_nobody() -> None:
+    """One of two that are named says nothing: what is left can be told apart."""
+    two = replace(calm(), named=only(0, 1), suspected=only(0, 1))
+    assert decide(two)[1] is Cause.TOO_MANY_SUSPECTS
+    assert decide(replace(two, live=~only(1)))[:2] == (Decision.ATTACKED, Cause.RESIDUALS)
+
+
 def test_reasons_name_the_meters() -> None:
     assert "b, d" in decide(replace(calm(), max_attacked=2, named=only(1, 3)))[2]
     assert "c" in decide(replace(calm(), live=~only(2)))[2]
