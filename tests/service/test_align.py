@@ -457,3 +457,46 @@ def test_whatever_arrives(stream: list[tuple[str | None, float, float]]) -> None
                 assert one.meter == meter
                 assert (meter, one.t) in offered
                 assert -0.1 - 1e-6 <= tick.t - one.t < a.rules.max_age_s
+
+
+# --- before the time is known -------------------------------------------------------------------------
+
+
+def test_events_a_first_reading_from_the_far_future_is_forgotten() -> None:
+    a = aligner(Clock.EVENTS)
+    others = tuple(meter for meter in ALL if meter != "d")
+
+    def said(*readings: Reading) -> list[tuple[Outcome, list[Tick]]]:
+        return [a.take(one, math.nan) for one in readings]
+
+    accepted = (Outcome.ACCEPTED, [])
+    assert said(reading("d", T0 + 7200.0)) == [accepted]
+    assert said(*(reading(meter, T0 - 0.5) for meter in others)) == [accepted] * 4
+    assert [one.t for one in a.refused()] == [T0 + 7200.0]
+    assert a.counts == {Outcome.ACCEPTED: 4, Outcome.CLOCK_OFF: 1}
+    # The tick waits for this meter as for any other, and takes what it says now.
+    assert said(*(reading(meter, T0) for meter in others)) == [accepted] * 4
+    ((outcome, (tick,)),) = said(reading("d", T0, 231.0))
+    assert outcome is Outcome.ACCEPTED
+    assert (tick.t, seen(tick), tick.silent) == (T0, "abcd0", ())
+
+
+# --- a reading in a quarter of an hour ----------------------------------------------------------------
+
+
+def test_long_ticks_take_what_is_read_up_to_a_second_later() -> None:
+    w = Wall(aligner(tick_s=900.0), T0 - 1.0)
+    w.at(T0 + 3.0, reading("a", T0 + 0.9), reading("b", T0 + 2.0))
+    w.at(T0 + 60.0)
+    assert [seen(tick) for tick in w.ticks] == ["a----"]
+    w.at(T0 + 960.0)
+    # That of a is of the tick before; that of b is younger than a tick.
+    assert [seen(tick) for tick in w.ticks[1:]] == ["-b---"]
+
+
+@pytest.mark.parametrize(("off_s", "refused"), [(1700.0, False), (1900.0, True)])
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_clocks_of_long_ticks_may_be_off_by_two_of_them(off_s: float, sign: float, refused: bool) -> None:
+    w = Wall(aligner(tick_s=900.0), T0 - 1.0)
+    (outcome,) = w.at(T0, reading("a", T0 + sign * off_s))
+    assert (outcome is Outcome.CLOCK_OFF) == refused
