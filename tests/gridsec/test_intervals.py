@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import hypothesis.strategies as st
 import numpy as np
+import pytest
 from hypothesis import given, settings
 
 from gridsec.arrays import Floats
+from gridsec.intervals import Sweeps, bounds
 from gridsec.mesh import MeshedFeeder
 from gridsec.network import InPhases, bus_voltages, interval_bounds, loss_correction
 from gridsec.phases import PhasedFeeder
@@ -62,6 +64,30 @@ def test_loops(seed: int, charging: float) -> None:
 def test_loops_in_three_phases(seed: int, charging: float) -> None:
     rng = np.random.default_rng(seed)
     contained(random_phased_mesh(seed, charging=charging), rng, rng.uniform(0.95, 1.05, 3) ** 2, 0.01)
+
+
+@pytest.mark.parametrize(("load", "shrink"), [(0.1, 0.11), (0.8, 0.9)])
+def test_one_place_by_hand(load: float, shrink: float) -> None:
+    """The formulas of a scalar, for which the sum of all further changes is a geometric series."""
+    flat, first, second, Z, e = 1.01 + 0.0j, 1.0 - 0.01j, 1.0 - 0.011j, 0.9, 2e-3
+    place = Sweeps(
+        *(np.array([v]) for v in (flat, first, second)),
+        power=np.array([load]),
+        reach=lambda currents: Z * currents,
+        charge=np.zeros_like,
+    )
+    (moved,), (rest,) = bounds(place, np.array([e]))
+    d = Z * e / abs(flat)
+    low = abs(first) - d
+    c = Z * (e * (abs(first - flat) + d) / (low * abs(flat)) + load * d / (low * abs(first)))
+    m = 0.9 * (abs(second) - d - c)
+    ratio = Z * (load + e) / (m * min(m, low))
+    assert ratio == pytest.approx(shrink, abs=0.01)
+    assert moved == pytest.approx(
+        2.0 * abs(second - flat) * d + 2.0 * abs(second) * c + (d + c) ** 2, rel=1e-12
+    )
+    off = ratio / (1.0 - ratio) * (abs(second - first) + c)
+    assert rest == pytest.approx(off * (2.0 * (abs(second) + d + c) + off), rel=1e-12)
 
 
 def test_without_intervals_only_the_model_is_left() -> None:
