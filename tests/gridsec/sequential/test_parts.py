@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,7 +13,7 @@ from scipy.integrate import solve_ivp
 from gridsec.arrays import Floats
 from gridsec.droop import fleet
 from gridsec.feeder import lindistflow
-from gridsec.sequential import LoadDoubt, SequentialOptions, design
+from gridsec.sequential import LoadDoubt, SequentialOptions, curves, design
 from gridsec.sequential.commission import Learning, begin, conclude, gather, nothing
 from gridsec.sequential.drive import Free, drive
 from gridsec.sequential.loads import injection_doubt, prior
@@ -129,6 +131,14 @@ class TestInverters:
             if kept and np.array_equal(before.rows, free.rows):
                 assert free.loop is before.loop
             before = free
+
+    def test_several_of_a_customer_share_what_is_metered(self) -> None:
+        rng = np.random.default_rng(7)
+        plant = make_plant(rng, customers=4, inverters=np.array([0, 0, 1, 3]), meters=np.array([0, 1, 2]))
+        made = design(plant, doubt=LoadDoubt(np.full(4, 0.01), np.full(4, 0.01), 600.0), step_s=1.0)
+        np.testing.assert_array_equal(made.meter_of, [0, 0, 1, -1])
+        found = replace(curves.empty(3, 4), amount=np.array([0.04, -0.03, 0.5])).amounts(made)
+        np.testing.assert_array_equal(found, [0.02, 0.02, -0.03, 0.0])
 
 
 class TestWindows:
