@@ -2,16 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import cache
+from itertools import combinations
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from feeders.load import Site, from_tables
 from feeders.meters import BUSBAR, Channel, MeterErrors, Meters, Silence
-from tests.feeders.villages import village
+from tests.feeders.villages import tables, village
 
 START = 1_780_272_000.0
 TICKS = np.arange(600)
+
+
+@cache
+def unlike() -> Site:
+    """A village whose meters are of another class for each power."""
+    plain = tables()
+    meters = replace(plain.meta.meters, p_error_percent=2.0, q_error_percent=0.5)
+    return from_tables(replace(plain, meta=replace(plain.meta, meters=meters)))
 
 
 def truth(ticks: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -25,7 +38,7 @@ def truth(ticks: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray
 @settings(max_examples=40)
 @given(seed=st.integers(0, 2**32))
 def test_honest_meters_keep_their_promise(seed: int) -> None:
-    site = village()
+    site = unlike()
     meters = Meters(site, MeterErrors(report_q=True), Channel(), seed)
     accuracy, nominal = site.accuracy, site.tables.meta.voltage_volt
     v, p, q, v0 = truth(TICKS.size, seed)
@@ -64,14 +77,25 @@ def test_bias_is_fixed_and_jitter_has_its_size() -> None:
 
 
 def test_biases_fill_the_class_evenly() -> None:
-    drawn = [Meters(village(), MeterErrors(), Channel(), seed) for seed in range(400)]
-    share = np.array([m.bias / village().accuracy.class_fraction for m in drawn]).ravel()
-    bound = 5.0 / np.sqrt(share.size)
-    assert abs(share.mean()) < bound
-    assert abs((share**2).mean() - 1 / 3) < bound
-    gains = np.array([m.p_gain / village().loads.p_fraction[village().meters] for m in drawn]).ravel()
-    assert abs((gains**2).mean() - 1 / 3) < bound
-    assert abs(np.mean(gains * share)) < bound
+    site = unlike()
+    drawn = [Meters(site, MeterErrors(), Channel(), seed) for seed in range(400)]
+    p_fraction, q_fraction = (of[site.meters] for of in (site.loads.p_fraction, site.loads.q_fraction))
+    assert not np.isclose(p_fraction, q_fraction, rtol=0.5).any()
+    shares = [
+        np.array(each).ravel()
+        for each in (
+            [made.bias / site.accuracy.class_fraction for made in drawn],
+            [made.p_gain / p_fraction for made in drawn],
+            [made.q_gain / q_fraction for made in drawn],
+        )
+    ]
+    bound = 5.0 / np.sqrt(shares[0].size)
+    for share in shares:
+        assert np.abs(share).max() <= 1.0
+        assert abs(share.mean()) < bound
+        assert abs((share**2).mean() - 1 / 3) < bound
+    for one, other in combinations(shares, 2):
+        assert abs(np.mean(one * other)) < bound
 
 
 def test_registers_have_their_resolution() -> None:
