@@ -171,7 +171,8 @@ def campaign(
     problems = ["--workers: a Dask cluster has its own workers"] * (dask is not None and workers is not None)
     if count == 1:
         lies = {"--kind": kind, "--promised": promised, "--liars": liars, "--place": place}
-        problems += [f"{option}: {NO_LIES}" for option, value in lies.items() if value]
+        if told := [option for option, value in lies.items() if value]:
+            problems.append(f"{', '.join(told)}: {NO_LIES}")
     kinds = read_all("--kind", kind, partial(_kind, step_s=step or site.tables.meta.monitor.tick_s), problems)
     settings = read_all("--setting", setting, _setting, problems)
     places = _each("--place", Place, place, problems)

@@ -119,7 +119,7 @@ def feeders_design(
         typer.Option(help="See `feeders estimators`. [default: as in the file]"),
     ] = None,
     max_attacked: Annotated[
-        int | None, typer.Option(help="How many meters may be manipulated. [default: as in the file]", min=0)
+        int | None, typer.Option(help="How many meters may be manipulated. [default: as in the file]")
     ] = None,
     workers: Annotated[
         int | None, typer.Option(help="Processes for matrix inequalities. [default: all cores]", min=1)
@@ -131,8 +131,11 @@ def feeders_design(
     from feeders.estimators import choose, design
     from feeders.load import load
 
+    problems = no_choice("--estimator", ESTIMATORS, *([estimator] if estimator else []))
+    if max_attacked is not None and max_attacked < 0:
+        problems.append(f"--max-attacked is {max_attacked}; it must not be negative")
     with said():
-        refuse(no_choice("--estimator", ESTIMATORS, *([estimator] if estimator else [])))
+        refuse(problems)
     site = choose(load(feeder), estimator=estimator, max_attacked=max_attacked)
     columns = (TextColumn("observers"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     started = time.monotonic()

@@ -150,7 +150,7 @@ def test_explanations_and_the_monitor_s_own_sentence_name_it_too(site: Site) -> 
 
 def test_the_state_says_it_and_older_ones_can_be_read(site: Site) -> None:
     base = site.feeder.base_volt
-    state = to_json(build(site, tick(site, base + 6.9), 2, *said(site, [True], [6.9])))
+    state = to_json(build(site, tick(site, base + 6.9), 2, *said(site, [True], [6.9]))) | {"age_s": 0.0}
     read = State.model_validate(json.loads(json.dumps(state, allow_nan=False))).busbar
     assert (read.meter, read.judged, read.seen, read.suspect) == (BUSBAR, True, True, True)
     assert (read.phases, read.phase, read.attack_volt_estimated) == ([], None, pytest.approx(6.9))
