@@ -23,15 +23,8 @@ from feeders.profiles import Envelope, Season
 from gridsec.arrays import Floats
 from gridsec.errors import GridsecError
 
-# Grids whose loads and generators together use every low-voltage profile of SimBench.
-PROFILE_GRIDS = (
-    "1-LV-rural1--0-sw",
-    "1-LV-rural2--0-sw",
-    "1-LV-rural3--0-sw",
-    "1-LV-semiurb4--0-sw",
-    "1-LV-semiurb5--0-sw",
-    "1-LV-urban6--0-sw",
-)
+# SimBench counts voltage levels from extra-high (1) to low voltage.
+LOW_VOLTAGE = 7
 STEP_S = 900
 STEPS_PER_DAY = 96
 DIGITS = 4
@@ -83,12 +76,7 @@ def grid(code: str) -> Any:
     GridsecError
         If simbench is not installed.
     """
-    try:
-        import simbench
-    except ImportError as error:
-        raise GridsecError(
-            "SimBench grids need the extra 'convert', in a checkout: pip install -e '.[convert]'"
-        ) from error
+    simbench = _simbench()
     if code not in simbench.collect_all_simbench_codes():
         raise SourceUnreadable(f"SimBench has no grid {code!r}; a code looks like 1-LV-rural1--0-sw")
     return simbench.get_simbench_net(code)
@@ -102,15 +90,33 @@ def version() -> str:
 
 
 def year() -> dict[str, Floats]:
-    """Return every low-voltage profile of the year: load profiles as `_pload`, `_qload`, and PV."""
+    """Return every low-voltage profile of the year: load profiles as `_pload`, `_qload`, and PV.
+
+    Raises
+    ------
+    GridsecError
+        If simbench is not installed.
+    """
+    simbench = _simbench()
+    folder = simbench.complete_data_path(0)
     columns: dict[str, Floats] = {}
-    for code in PROFILE_GRIDS:
-        net = grid(code)
-        for table in ("load", "renewables"):
-            for name in net.profiles[table].columns:
-                if name != "time":
-                    columns[name] = net.profiles[table][name].to_numpy(dtype=np.float64)
+    for kind, parts in (("Load", ("_pload", "_qload")), ("RES", ("",))):
+        units = simbench.read_csv_data(folder, ";", kind)
+        profiles = simbench.read_csv_data(folder, ";", f"{kind}Profile")
+        for name in units.profile[units.voltLvl == LOW_VOLTAGE].dropna().unique():
+            for part in parts:
+                columns[name + part] = profiles[name + part].to_numpy(dtype=np.float64)
     return columns
+
+
+def _simbench() -> Any:
+    try:
+        import simbench
+    except ImportError as error:
+        raise GridsecError(
+            "SimBench grids need the extra 'convert', in a checkout: pip install -e '.[convert]'"
+        ) from error
+    return simbench
 
 
 def library_csv(columns: Mapping[str, Floats], season: Season) -> bytes:

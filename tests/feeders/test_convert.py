@@ -72,9 +72,9 @@ def test_recipe_builds_the_committed_folder(name: str, tmp_path: Path) -> None:
     assert done.check.exact
 
 
+@pytest.mark.usefixtures("simbench_tables")
 @pytest.mark.parametrize("name", FROM_SIMBENCH)
 def test_recipe_builds_the_committed_simbench_folder(name: str, tmp_path: Path) -> None:
-    pytest.importorskip("simbench", reason="the extra `convert` is not installed")
     done = convert(name, tmp_path / "out")
     assert done.check is not None
     assert done.check.largest_pu < 1e-8
@@ -290,9 +290,9 @@ def test_any_pandapower_network_by_name(tmp_path: Path) -> None:
     assert load(tmp_path / "cable").feeder.name == "cable"
 
 
+@pytest.mark.usefixtures("simbench_tables")
 @pytest.mark.slow
 def test_simbench_code_alone_medium_voltage(tmp_path: Path) -> None:
-    pytest.importorskip("simbench", reason="the extra `convert` is not installed")
     done = convert("1-MV-comm--0-sw", tmp_path / "mv")
     assert done.check is not None
     assert done.check.buses == 105
@@ -362,8 +362,9 @@ def test_without_the_extra_the_error_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "simbench", None)
-    with pytest.raises(GridsecError, match=r"pip install -e '\.\[convert\]'"):
-        convert("simbench-lv-rural1", tmp_path / "out")
+    for source in ("simbench-lv-rural1", "profiles"):
+        with pytest.raises(GridsecError, match=r"pip install -e '\.\[convert\]'"):
+            convert(source, tmp_path / "out")
     monkeypatch.setitem(sys.modules, "pandapower", None)
     with pytest.raises(GridsecError, match=r"pip install -e '\.\[convert\]'"):
         convert("kerber-landnetz", tmp_path / "out")

@@ -22,6 +22,7 @@ def stations(tables: FeederTables) -> dict[str, float]:
     return {row.line: row.to_volt for row in tables.lines if row.to_volt is not None}
 
 
+@pytest.mark.usefixtures("simbench_tables")
 @pytest.mark.parametrize(
     ("source", "root", "buses", "behind"),
     [
