@@ -1,9 +1,10 @@
 """From a voltage reading on zenoh to the right alarm over REST, on a real feeder.
 
-SimBench LV rural 1: 13 customers, watched by the sequential monitor or by the exact bank of 78 + 715
-observers (M = 2), six seeds each in turn. Customers' meters of class 0.5 with 0.1 V resolution and 0.05 %
-jitter, a busbar meter of class 0.1, p metered within 1 %, q not reported. The truth is full AC power flow
-with the droop inverters in closed loop, at 1 Hz for ten minutes.
+SimBench LV rural 1: 13 customers, watched by the sequential monitor, six seeds with one liar or two of every
+kind, and by the exact bank of 78 + 715 observers (M = 2), the two seeds with two liars who scale their
+readings or lie in agreement. Customers' meters of class 0.5 with 0.1 V resolution and 0.05 % jitter, a busbar
+meter of class 0.1, p metered within 1 %, q not reported. The truth is full AC power flow with the droop
+inverters in closed loop, at 1 Hz for four minutes; clean time at length is in test_clean_days.py.
 """
 
 from __future__ import annotations
@@ -18,10 +19,9 @@ from feeders.scenario import START, Scenario, random_attacks, simulate
 from tests.acceptance.live import Fleet, serve
 
 FEEDER = "simbench-lv-rural1"
-SEEDS = range(8)
 KINDS = ("bias", "scaling", "coordinated")
-ESTIMATORS = ("sequential", "exact-bank")
-DURATION_S = 600.0
+RUNS = [*(("sequential", seed) for seed in range(6)), ("exact-bank", 4), ("exact-bank", 5)]
+DURATION_S = 240.0
 LIE_PU = 0.03
 NAMED_WITHIN_S = 5.0
 SETTLED_S = 5.0
@@ -29,12 +29,12 @@ VOLTAGE_ERROR_PU = 0.003
 
 
 def scenario_of(site: Site, seed: int) -> Scenario:
-    """One seed's ten minutes: any time of the fourteen days, any onset, one or two liars anywhere."""
+    """One seed's four minutes: any time of the fourteen days, any onset, one or two liars anywhere."""
     random = np.random.default_rng([2020, seed])
     quiet = Scenario(
         seed=seed, duration_s=DURATION_S, profile_s=float(random.uniform(0.0, 13.9 * 86_400.0)), dt_s=1.0
     )
-    t_on = START + float(random.integers(60, 240))
+    t_on = START + float(random.integers(30, 90))
     attacks = random_attacks(
         site,
         seed,
@@ -42,15 +42,15 @@ def scenario_of(site: Site, seed: int) -> Scenario:
         1 + seed // len(KINDS) % 2,
         LIE_PU,
         t_on=t_on,
-        t_off=t_on + float(random.integers(180, 300)),
+        t_off=t_on + float(random.integers(60, 120)),
         scenario=quiet,
     )
     return Scenario(seed=seed, duration_s=DURATION_S, profile_s=quiet.profile_s, dt_s=1.0, attacks=attacks)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", SEEDS)
-def test_exactly_the_manipulated_meters_are_named(seed: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("estimator", "seed"), RUNS)
+def test_exactly_the_manipulated_meters_are_named(estimator: str, seed: int, tmp_path: Path) -> None:
     site = load(FEEDER)
     nominal = site.feeder.base_volt
     limits = site.tables.meta.limits
@@ -61,7 +61,6 @@ def test_exactly_the_manipulated_meters_are_named(seed: int, tmp_path: Path) -> 
     worst = 0.0
     named_in_state: dict[str, float] = {}
 
-    estimator = ESTIMATORS[seed // 6 % len(ESTIMATORS)]
     with serve(FEEDER, tmp_path, "--estimator", estimator) as live:
         with Fleet(live) as fleet:
             for sample, state in fleet.play(simulate(site, scenario)):
