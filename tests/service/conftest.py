@@ -314,7 +314,7 @@ class Server:
         self.service.loop = None
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def cluster() -> Iterator[Cluster]:
     binaries = find_postgresql()
     if binaries is None:

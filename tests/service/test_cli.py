@@ -20,6 +20,7 @@ from typing import TextIO
 import httpx
 import pandas as pd
 import pytest
+import structlog
 
 from feeders.load import load
 from feeders.recording import read_recording
@@ -48,15 +49,21 @@ Run = Callable[..., Done]
 
 
 @pytest.fixture
-def gridsec(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Run:
+def gridsec(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
     """Run a command in this process, from `main` to its exit code."""
     for name in [name for name in os.environ if name.startswith("GRIDSEC_")]:
         monkeypatch.delenv(name)
+    # `serve` sets up the log of the whole process: no logger may keep what this test captures beyond its end.
+    configure = structlog.configure
+    monkeypatch.setattr(
+        structlog, "configure", lambda **given: configure(**given | {"cache_logger_on_first_use": False})
+    )
 
     def run(*arguments: str) -> Done:
         return Done(*command()(monkeypatch, capsys, *arguments))
 
-    return run
+    yield run
+    structlog.reset_defaults()
 
 
 def process(*arguments: str, env: dict[str, str] | None = None) -> Done:
@@ -149,10 +156,10 @@ def test_a_zenoh_port_in_use(tmp_path: Path) -> None:
     assert "Address already in use" in message
 
 
-def test_a_database_that_cannot_be_written(tmp_path: Path) -> None:
+def test_a_database_that_cannot_be_written(gridsec: Run, tmp_path: Path) -> None:
     (tmp_path / "folder.db").mkdir()
     for url in ("sqlite:////proc/gridsec.db", f"sqlite:///{tmp_path}/folder.db", "mysql://x", "what"):
-        assert url in refused(4, process("serve", "--feeder", FEEDER, "--database", url))
+        assert url in refused(4, gridsec("serve", "--feeder", FEEDER, "--database", url))
 
 
 def test_a_database_that_another_service_writes(tmp_path: Path) -> None:
@@ -165,7 +172,7 @@ def test_a_feeder_with_five_mistakes(gridsec: Run) -> None:
     folder = CASES / "broken" / "five-mistakes"
     expected = (folder / "problems.txt").read_text().splitlines()
     assert len(expected) == 5
-    for done in (process("serve", "--feeder", str(folder)), gridsec("feeders", "validate", str(folder))):
+    for done in (gridsec("serve", "--feeder", str(folder)), gridsec("feeders", "validate", str(folder))):
         message = refused(3, done)
         assert "5 problems" in message
         for problem in expected:
@@ -179,8 +186,9 @@ def test_unknown_feeders_are_all_named() -> None:
     assert "utopia" in message
 
 
-def test_wrong_settings_are_all_named() -> None:
-    message = refused(2, process("serve", "--http", "nowhere", env={"GRIDSEC_CLOCK": "sundial"}))
+def test_wrong_settings_are_all_named(gridsec: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GRIDSEC_CLOCK", "sundial")
+    message = refused(2, gridsec("serve", "--http", "nowhere"))
     assert "--http or GRIDSEC_HTTP" in message
     assert "--clock or GRIDSEC_CLOCK" in message
 
