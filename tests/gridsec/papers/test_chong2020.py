@@ -16,11 +16,12 @@ from gridsec.lmi import circle
 from gridsec.lure import advance, close_loop, equilibrium, known_input
 from gridsec.papers import chong2020
 from gridsec.papers.claims import Reproduction
+from tests.gridsec.papers.made import made
 
 
 @pytest.fixture(scope="module")
 def result() -> Reproduction:
-    return chong2020.reproduce()
+    return made("chong2020")
 
 
 class TestSetting:

@@ -12,9 +12,10 @@ from gridsec.observers.high_gain import groups
 from gridsec.observers.high_gain.constants import Slopes, decay_componentwise, decay_lee, margin, riccati
 from gridsec.observers.high_gain.form import at, jacobian_at
 from gridsec.online import Decision
-from gridsec.papers import kim2018, lee2018_chapter5
+from gridsec.papers import lee2018_chapter5
 from gridsec.papers import uniformly_observable as example
 from gridsec.papers.claims import Line, at_most, number, rounded_up, statement
+from tests.gridsec.papers.made import made
 
 
 def box(count: int, seed: int = 0) -> np.ndarray:
@@ -23,13 +24,13 @@ def box(count: int, seed: int = 0) -> np.ndarray:
 
 
 def test_every_claim_of_kim2018_comes_out_except_the_erratum() -> None:
-    made = kim2018.reproduce()
-    assert [claim.where for claim in made.unmet] == ["section IV"]
-    assert "printed twice" in made.unmet[0].what
-    by_name = {claim.what: claim for claim in made.claims}
+    found = made("kim2018")
+    assert [claim.where for claim in found.unmet] == ["section IV"]
+    assert "printed twice" in found.unmet[0].what
+    by_name = {claim.what: claim for claim in found.claims}
     assert by_name["sets in use after 6 s"].ours == "1 -> 2 -> 3"
     assert by_name["sets in use after 17 s"].ours == "3 -> 4 -> 1 -> 2"
-    (figure,) = made.figures
+    (figure,) = found.figures
     assert [panel.title[:3] for panel in figure.panels] == ["(a)", "(b)", "(c)", "(d)"]
     assert all(np.all(np.isfinite(line.y)) for panel in figure.panels for line in panel.lines)
 

@@ -8,11 +8,12 @@ import pytest
 from gridsec import windows
 from gridsec.papers import sampled_feeder, yang2019
 from gridsec.papers.claims import Reproduction
+from tests.gridsec.papers.made import made
 
 
 @pytest.fixture(scope="module")
 def result() -> Reproduction:
-    return yang2019.reproduce()
+    return made("yang2019")
 
 
 def test_every_claim_is_met_or_explained(result: Reproduction) -> None:
