@@ -97,18 +97,23 @@ def ac_net(site: Site) -> Any:
     meta = site.tables.meta
     net = pp.create_empty_network(f_hz=50.0, sn_mva=0.1)
     closed = [line for line in site.tables.lines if line.closed]
-    bus = {meta.busbar: pp.create_bus(net, meta.voltage_volt * np.sqrt(3) / 1000.0)}
-    for line in closed:
-        for end in (line.from_bus, line.to_bus):
-            if end not in bus:
-                bus[end] = pp.create_bus(net, meta.voltage_volt * np.sqrt(3) / 1000.0)
-        nf = line.b_us * 1e3 / (2 * np.pi * 50.0)
-        pp.create_line_from_parameters(
-            net, bus[line.from_bus], bus[line.to_bus], 1.0, line.r_ohm, line.x_ohm, nf, 1.0
-        )
+    names = list(
+        dict.fromkeys([meta.busbar, *(end for line in closed for end in (line.from_bus, line.to_bus))])
+    )
+    made = pp.create_buses(net, len(names), meta.voltage_volt * np.sqrt(3) / 1000.0)
+    bus = dict(zip(names, made, strict=True))
+    pp.create_lines_from_parameters(
+        net,
+        [bus[line.from_bus] for line in closed],
+        [bus[line.to_bus] for line in closed],
+        1.0,
+        [line.r_ohm for line in closed],
+        [line.x_ohm for line in closed],
+        [line.b_us * 1e3 / (2 * np.pi * 50.0) for line in closed],
+        1.0,
+    )
     pp.create_ext_grid(net, bus[meta.busbar])
-    for row in site.tables.customers:
-        pp.create_load(net, bus[row.bus], 0.0)
+    pp.create_loads(net, [bus[row.bus] for row in site.tables.customers], 0.0)
     return net
 
 

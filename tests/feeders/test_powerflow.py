@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from feeders.powerflow import Grid, PowerFlow, PowerFlowDiverged
 OMEGA = 2.0 * np.pi * 50.0
 
 
+@cache
 def solved_pandapower(build: Callable[[], Any], busbar: int | None) -> tuple[Grid, Any, list[int]]:
     """A pandapower network, solved by pandapower, and the part of it below `busbar` as SI arrays."""
     net = build()

@@ -11,9 +11,9 @@ from feeders.load import load
 from feeders.studies.campaign_run import Here, Processes
 from feeders.studies.detectable import Detectable, detectable, workers
 from feeders.studies.rehearsal import Rehearsal, rehearse
+from tests.feeders.studies.rural import RURAL, rural_sizes
 
 CIGRE = load("cigre-lv")
-RURAL = load("simbench-lv-rural1")
 
 
 @pytest.fixture(scope="module")
@@ -40,8 +40,7 @@ def test_the_monitor_keeps_what_is_promised_on_a_small_feeder(cigre: Detectable)
 
 @pytest.mark.slow
 def test_the_monitor_keeps_what_is_promised() -> None:
-    found = detectable(RURAL, max_attacked=2)
-    assert rehearse(RURAL, found, trials=120, seed=1) == Rehearsal(120, 0, 0, 0)
+    assert rehearse(RURAL, rural_sizes(), trials=120, seed=1) == Rehearsal(120, 0, 0, 0)
 
 
 def test_lies_half_as_large_as_the_noticed_are_mostly_not_named(cigre: Detectable) -> None:

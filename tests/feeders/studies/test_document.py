@@ -7,14 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from feeders.load import load
-from feeders.studies.detectable import detectable
 from feeders.studies.protect import Goal, protect
 from feeders.studies.redundancy import redundancy
+from tests.feeders.studies.rural import RURAL, rural_sizes
 
 PAGE = (Path(__file__).resolve().parents[3] / "docs" / "studies.md").read_text(encoding="utf-8")
 PROGRAMS = re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)
-RURAL = load("simbench-lv-rural1")
 
 
 STUDIES = [re.findall(r"feeders\.studies\.(\w+)", program)[0] for program in PROGRAMS]
@@ -56,7 +54,7 @@ def test_numbers_of_protect() -> None:
 
 @pytest.mark.slow
 def test_numbers_of_detectable() -> None:
-    found = detectable(RURAL, max_attacked=2)
+    found = rural_sizes()
     names = ["hidden", "noticed", "named", "fits", "identified"]
     meters = found.meters.set_index("meter")
     for meter in ("m02", "m13"):
