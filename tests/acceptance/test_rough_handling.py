@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import json
 import math
+import socket
 import sqlite3
 import statistics
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, TypedDict
 
@@ -147,8 +149,8 @@ def packed(columns: Columns, form: int) -> tuple[bytes, str]:
     return sink.getvalue().to_pybytes(), f"application/vnd.apache.arrow.{name}"
 
 
-def reached(t: float, state: dict[str, Any]) -> bool:
-    return bool(state["t"] >= t)
+# A machine that is busy may drop ticks; what is sent goes on meanwhile.
+TICKS = 120
 
 
 @pytest.mark.slow
@@ -158,28 +160,56 @@ def test_a_concentrator_in_every_format_and_its_silence(tmp_path: Path) -> None:
     settings = replace(tables.meta.monitor, tick_s=0.5, on_delay_s=0.5, off_delay_s=0.5, silence_s=2.0)
     tables = replace(tables, meta=replace(tables.meta, monitor=settings))
     write(tables, folder)
-    samples = sampled(from_tables(tables), 15.0, dt_s=0.5)
-    meters = {r.meter for r in samples[0].readings if r.meter}
+    samples = iter(sampled(from_tables(tables), 3 * 0.5 * TICKS, dt_s=0.5))
+    meters = {row.meter for row in tables.customers if row.meter}
     with serve(str(folder), tmp_path, clock="wall") as live:
         live.feeder = FEEDER
         with Fleet(live) as fleet:
-            begin = 0.5 * math.ceil(2.0 * time.time()) + 0.5
-            for number, sample in enumerate(samples):
-                t = begin + 0.5 * number
-                time.sleep(max(0.0, t - time.time()))
-                talking = not 8 <= number < 20
-                if talking:
-                    in_batch(fleet, sample, t, number)
-                fleet.put(replace(next(r for r in sample.readings if not r.meter), t=t))
-                if number in (7, 19, 29):
-                    state = live.await_state(partial(reached, t - 0.5))
-                    assert state["verdict"] == ("clean" if talking else "undecided"), state["reason"]
-                    assert {s["meter"] for s in state["silent"]} == (set() if talking else meters)
-            alarms = live.alarms()
-    assert {(a["kind"], a["meter"], a["state"]) for a in alarms if a["kind"] == "data-loss"} == {
-        ("data-loss", meter, "cleared") for meter in meters
-    }
-    assert not [a for a in alarms if a["kind"] in ("meter-manipulated", "voltage-limit")]
+
+            def lost(state: str) -> set[str | None]:
+                return {meter for kind, meter, now in kinds(live) if (kind, now) == ("data-loss", state)}
+
+            clean: set[int] = set()
+            for number, state in by_the_clock(fleet, islice(samples, TICKS), talking=True):
+                if state["verdict"] == "clean" and not state["silent"]:
+                    clean.add(number % 4)
+                if len(clean) == 4:
+                    break
+            assert clean == set(range(4)), "a format never led to a clean state"
+            for number, state in by_the_clock(fleet, islice(samples, TICKS), talking=False):
+                # Readings are fresh for a tick or two.
+                assert state["verdict"] == "undecided" or number < 4, state["reason"]
+                if {s["meter"] for s in state["silent"]} == meters and lost("raised") == meters:
+                    break
+            assert lost("raised") == meters
+            for _, state in by_the_clock(fleet, islice(samples, TICKS), talking=True):
+                if state["verdict"] == "clean" and not state["silent"] and lost("cleared") == meters:
+                    break
+            assert lost("cleared") == meters
+            assert live.get("/api/v1/bad-readings")["readings"] == []
+            assert not [a for a in live.alarms() if a["kind"] in ("meter-manipulated", "voltage-limit")]
+
+
+def by_the_clock(
+    fleet: Fleet, samples: Iterable[Sample], *, talking: bool
+) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Publish a sample every half second, and yield the states of ticks as they are heard, with their number.
+
+    The substation always reports; customers, through their concentrator, only where they are talking.
+    """
+    sent: dict[float, int] = {}
+    t = 0.0
+    for number, sample in enumerate(samples):
+        t = max(0.5 * math.ceil(2.0 * time.time()), t + 0.5)
+        time.sleep(max(0.0, t - time.time()))
+        if talking:
+            in_batch(fleet, sample, t, number)
+        fleet.put(replace(next(r for r in sample.readings if not r.meter), t=t))
+        sent[t] = number
+        while (heard := fleet.estimates.try_recv()) is not None:
+            state = json.loads(heard.payload.to_bytes())
+            if state["t"] in sent:
+                yield sent[state["t"]], state
 
 
 # ------------------------------------------------------------------- quarter hours
@@ -290,31 +320,17 @@ def resident_mb(live: Live) -> float:
 # ------------------------------------------------------------ ports, database, files
 
 
-def start(*options: str) -> subprocess.CompletedProcess[str]:
-    command = [str(Path(sys.executable).parent / "gridsec"), "serve", "--feeder", FEEDER, *options]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-
-
-@pytest.mark.slow
-def test_a_second_service_says_what_is_taken_and_leaves_the_first_alone(tmp_path: Path) -> None:
+def test_a_second_service_leaves_the_first_alone(tmp_path: Path) -> None:
+    """It wants the same database; what it says of all that may be taken is in tests/service/test_cli.py."""
     samples = sampled(load(FEEDER), 25)
     with serve(FEEDER, tmp_path) as live, Fleet(live) as fleet:
         verdicts(fleet, samples[:10])
-        mine = f"sqlite:///{tmp_path / 'second.db'}"
-        http, zenoh_end = f"127.0.0.1:{live.http.base_url.port}", f"tcp/127.0.0.1:{live.zenoh_port}"
-        free_http, free_zenoh = f"127.0.0.1:{free_port()}", f"tcp/127.0.0.1:{free_port()}"
-        theirs = f"sqlite:///{tmp_path / 'alarms.db'}"
-        for told, options in {
-            f"HTTP cannot listen on {http}": (http, free_zenoh, mine),
-            f"zenoh cannot be opened on {zenoh_end}": (free_http, zenoh_end, mine),
-            "another process writes it": (free_http, free_zenoh, theirs),
-            "No such file": (free_http, free_zenoh, "sqlite:////proc/no/such/folder/x.db"),
-        }.items():
-            ended = start("--http", options[0], "--zenoh-listen", options[1], "--database", options[2])
-            assert ended.returncode != 0
-            said = " ".join((ended.stdout + ended.stderr).split())
-            assert told in said, said
-            assert "Traceback" not in said
+        command = [str(Path(sys.executable).parent / "gridsec"), "serve", "--feeder", FEEDER]
+        command += ["--http", f"127.0.0.1:{free_port()}", "--zenoh-listen", f"tcp/127.0.0.1:{free_port()}"]
+        command += ["--database", f"sqlite:///{tmp_path / 'alarms.db'}"]
+        ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+        assert ended.returncode != 0
+        assert "another process writes it" in " ".join((ended.stdout + ended.stderr).split())
         assert {verdict for _, verdict, _ in verdicts(fleet, samples[10:])} == {"clean"}
 
 
@@ -369,6 +385,37 @@ def test_a_feeder_with_five_mistakes_by_file_and_by_rest(tmp_path: Path) -> None
         for word in ("base_kva", "r_ohm", "nowhere", "no-such-curve", "power_factor"):
             assert any(word in problem for problem in problems), problems
         assert {verdict for _, verdict, _ in verdicts(fleet, samples[10:])} == {"clean"}
+        answer_s, echo_s = delays(live)
+        assert answer_s < 0.03 + 10.0 * echo_s
+
+
+def delays(live: Live) -> tuple[float, float]:
+    """Medians of how long a small answer takes, and an echo from a thread of this process, s.
+
+    An answer must not wait for Nagle's algorithm and the other side's delayed acknowledgement, 40 ms; on a
+    busy machine both take longer.
+    """
+    asked, echoed = [], []
+    near, far = socket.socketpair()
+    with near, far:
+
+        def echo() -> None:
+            while data := far.recv(16):
+                far.sendall(data)
+
+        other = threading.Thread(target=echo)
+        other.start()
+        for _ in range(21):
+            begin = time.perf_counter()
+            near.sendall(b"echo")
+            near.recv(16)
+            between = time.perf_counter()
+            live.get("/api/v1/feeders")
+            echoed.append(between - begin)
+            asked.append(time.perf_counter() - between)
+        near.shutdown(socket.SHUT_WR)
+        other.join()
+    return statistics.median(asked), statistics.median(echoed)
 
 
 def test_a_feeder_put_while_running_is_watched_and_the_other_goes_on(tmp_path: Path) -> None:
@@ -389,14 +436,3 @@ def test_a_feeder_put_while_running_is_watched_and_the_other_goes_on(tmp_path: P
             told = {str(r.ok.key_expr): json.loads(r.ok.payload.to_bytes()) for r in replies if r.ok}
         assert {state["feeder"] for state in told.values()} == {FEEDER, "second"}
         assert told[f"gridsec/{FEEDER}/estimate"] == live.get(f"/api/v1/feeders/{FEEDER}/state")
-
-
-def test_answers_come_without_delay(tmp_path: Path) -> None:
-    """Small answers must not wait for Nagle's algorithm and the other side's delayed acknowledgement."""
-    with serve(FEEDER, tmp_path) as live:
-        times = []
-        for _ in range(21):
-            begin = time.perf_counter()
-            live.get("/api/v1/feeders")
-            times.append(time.perf_counter() - begin)
-    assert statistics.median(times) < 0.03
