@@ -190,6 +190,17 @@ class Fleet:
                 states.append(self._estimate_at(samples[number - ahead].t))
         return states + [self._estimate_at(sample.t) for sample in samples[len(states) :]]
 
+    def first(self, good: Callable[[Any], bool]) -> Any:
+        """The first good state of those that have been said since the last one that was asked for."""
+        end = time.monotonic() + ECHO_S
+        while time.monotonic() < end:
+            heard = self.estimates.try_recv()
+            if heard is None:
+                time.sleep(0.01)
+            elif good(state := json.loads(heard.payload.to_bytes())):
+                return state
+        raise AssertionError(f"no such state was heard in {ECHO_S} s")
+
     def _estimate_at(self, t: float) -> dict[str, Any]:
         end = time.monotonic() + ECHO_S
         while time.monotonic() < end:
