@@ -15,6 +15,7 @@ from service import api
 from service.alarms import Change, Transition
 from service.report import to_json as report_json
 from tests.service.asking import T0, Setup, Stream, is_problem
+from tests.service.running import PATIENCE_S, until
 
 
 def test_alarms_arrive_as_they_happen(setup: Setup) -> None:
@@ -91,7 +92,7 @@ def test_a_slow_client_costs_nothing_and_loses_nothing(setup: Setup) -> None:
     transition = Transition(alarm, Change.RAISED, T0, None, "x" * 60_000)
     with socket.create_connection(("127.0.0.1", setup.server.port)) as client:
         client.sendall(b"GET /api/v1/alarms/stream?after=1 HTTP/1.1\r\nHost: x\r\n\r\n")
-        time.sleep(0.2)
+        until(lambda: setup.service.queues, "the stream")
         for _ in range(20):  # 18 MB for a client that reads nothing, more than the sockets hold
             setup.service.store.commit([transition] * 15)
             setup.service.wake({"type": "alarm", "data": None})
@@ -111,7 +112,7 @@ def test_streams_are_counted(setup: Setup, monkeypatch: pytest.MonkeyPatch) -> N
     assert one.next()["comment"] == two.next()["comment"] == "connected"
     is_problem(setup.get("/alarms/stream"), 503)
     two.close()
-    deadline = time.monotonic() + 10
+    deadline = time.monotonic() + PATIENCE_S
     while True:
         third = Stream(setup, "/alarms/stream")
         if third.response.status_code == 200:
@@ -127,7 +128,7 @@ def test_streams_are_counted(setup: Setup, monkeypatch: pytest.MonkeyPatch) -> N
 def test_streams_end_when_the_service_stops(setup: Setup) -> None:
     stream = Stream(setup, "/alarms/stream")
     assert stream.next()["comment"] == "connected"
-    time.sleep(0.1)
+    until(lambda: setup.service.queues, "the stream")
     begun = time.perf_counter()
     setup.server.stop()
     assert stream.next() == {"end": "true"}

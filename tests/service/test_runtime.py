@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import sqlite3
 import threading
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -172,7 +171,7 @@ def test_nobody_who_watches_waits_for_a_locked_database(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """With the wall clock, rounds go on while a write waits; commands wait for it, and nothing is lost."""
-    monkeypatch.setattr(connect, "BUSY_S", 3.0)
+    monkeypatch.setattr(connect, "BUSY_S", 15.0)
     some = [sample for sample in attacked if START + 4 <= sample.arrival < START + 20]
     wall = START + 3.5
 
@@ -185,15 +184,15 @@ def test_nobody_who_watches_waits_for_a_locked_database(
         while not runtime.ready()[0]:  # noqa: ASYNC110 - readiness is what is tested
             await asyncio.sleep(0.01)
         other = locked()
-        begin = time.monotonic()
         for k in range(0, len(some), 28):
             wall = some[k : k + 28][-1].arrival
             runtime.deliver(some[k : k + 28])
             await asyncio.sleep(0.02)
         while len(outlet.estimates) < 8:  # noqa: ASYNC110
             await asyncio.sleep(0.01)
-        assert time.monotonic() - begin < 2.0
+        # The first write is still waiting: it has not been given up either.
         monkeypatch.setattr("service.keeper.SLOW_S", 0.01)
+        assert "gridsec_store_failures_total 0.0" in runtime.metrics().decode()
         assert "under way" in runtime.ready()[1][0]
         assert runtime.healthy()[0]
         assert outlet.events == []
@@ -204,12 +203,12 @@ def test_nobody_who_watches_waits_for_a_locked_database(
         name = store.alarms()[0][0].id
         assert (await runtime.acknowledge(name, "Ada", ""))["acknowledged_by"] == "Ada"
         runtime.stop()
-        await asyncio.wait_for(task, 5.0)
+        await asyncio.wait_for(task, 20.0)
         assert [alarm["state"] for alarm, _ in outlet.events[:2]] == ["raised", "raised"]
         assert store.alarm(name).acknowledged_by == "Ada"  # type: ignore[union-attr]
 
     with Store(f"sqlite:///{path}") as store:
-        asyncio.run(asyncio.wait_for(scene(store), 20.0))
+        asyncio.run(asyncio.wait_for(scene(store), 60.0))
 
 
 def test_the_delay_of_a_report_ends_when_it_is_stored(
@@ -456,7 +455,7 @@ def test_the_task_ends_cleanly_and_refuses_commands_afterwards(site: Site, path:
             await runtime.acknowledge("0" * 26, "Ada", "")
         runtime.stop()
         assert await waiting is None
-        await asyncio.wait_for(task, 2.0)
+        await asyncio.wait_for(task, 20.0)
         with pytest.raises(StoreUnavailable, match="stopping"):
             await runtime.acknowledge("0" * 26, "Ada", "")
 

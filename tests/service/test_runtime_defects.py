@@ -231,7 +231,7 @@ def test_a_dead_task_is_not_healthy(site: Site, path: Path, monkeypatch: pytest.
         runtime = Runtime(RuntimeConfig(), store, [site])
         monkeypatch.setattr(Rounds, "round", broken)
         with pytest.raises(ZeroDivisionError):
-            await asyncio.wait_for(runtime.run(), 5.0)
+            await asyncio.wait_for(runtime.run(), 20.0)
         alive, problems = runtime.healthy()
         assert not alive
         assert "a defect" in problems[0]
