@@ -86,6 +86,7 @@ class TestHonestStreets:
         assert widths[1] < 0.9 * widths[0]
 
 
+@pytest.mark.no_cover  # long runs of what other tests cover
 class TestLiars:
     @settings(max_examples=25)
     @given(

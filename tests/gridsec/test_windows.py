@@ -207,6 +207,7 @@ class TestRules:
         assert not windows.isolation(part, at, sets, 6, "survivors").decided.any()
 
 
+@pytest.mark.no_cover  # long runs of what other tests cover
 class TestPropositions:
     """Example 1 with proven gains. e(0) = 0, hence epsilon = 0 and k* = 0, as in the paper."""
 

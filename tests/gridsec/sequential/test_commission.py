@@ -214,6 +214,7 @@ class TestArrays:
             from_arrays(design, arrays)
 
 
+@pytest.mark.no_cover  # long runs of what other tests cover
 class TestStreets:
     def test_a_restart_in_the_middle_goes_on(self) -> None:
         rng = np.random.default_rng(12)
