@@ -396,7 +396,7 @@ def test_no_circuit_and_no_file(tmp_path: Path) -> None:
     (tmp_path / "empty.dss").write_text("clear\n")
     with pytest.raises(GridsecError, match=r"no circuit|OpenDSS"):
         convert(str(tmp_path / "empty.dss"), tmp_path / "x")
-    with pytest.raises(GridsecError, match="is no source"):
+    with pytest.raises(GridsecError, match="there is no such file"):
         convert(str(tmp_path / "absent.dss"), tmp_path / "x")
 
 
