@@ -122,10 +122,8 @@ class Processes:
                     break
         except BrokenProcessPool:
             pass  # while a piece was handed over; it is still waiting
-        except BaseException:
+        finally:
             stop(pool)
-            raise
-        pool.shutdown()
         return sorted(running.values())
 
 

@@ -234,10 +234,8 @@ def solve_many(
                 }
             for job in as_completed(jobs):
                 collect(jobs[job], job.result())
-        except BaseException:
+        finally:
             stop(pool)
-            raise
-        pool.shutdown()
     return tuple(results[index] for index in range(len(subsets)))
 
 

@@ -435,4 +435,6 @@ def test_a_feeder_put_while_running_is_watched_and_the_other_goes_on(tmp_path: P
             replies = fleet.session.get("gridsec/*/estimate", timeout=5.0)
             told = {str(r.ok.key_expr): json.loads(r.ok.payload.to_bytes()) for r in replies if r.ok}
         assert {state["feeder"] for state in told.values()} == {FEEDER, "second"}
-        assert told[f"gridsec/{FEEDER}/estimate"] == live.get(f"/api/v1/feeders/{FEEDER}/state")
+        state = live.get(f"/api/v1/feeders/{FEEDER}/state")
+        assert state.pop("age_s") >= 0.0
+        assert told[f"gridsec/{FEEDER}/estimate"] == state

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -351,6 +352,24 @@ def test_processes_compute_with_one_thread(monkeypatch: pytest.MonkeyPatch) -> N
     ((_, found),) = Processes(1).run(threads, [0])
     assert found
     assert set(found) == {1}
+
+
+def kills_whoever_waits(first: Path, piece: int) -> int:
+    """The first piece is done at once; with the second, the process that did the first is killed."""
+    if not piece:
+        first.write_text(str(os.getpid()), encoding="ascii")
+        return piece
+    time.sleep(1.0)
+    pid = int(first.read_text(encoding="ascii"))
+    if pid != os.getpid():
+        os.kill(pid, signal.SIGKILL)
+    return piece
+
+
+def test_who_dies_with_nothing_in_hand_keeps_nobody_waiting(tmp_path: Path) -> None:
+    work = partial(kills_whoever_waits, tmp_path / "pid")
+    assert sorted(Processes(2).run(work, [0, 1])) == [(0, 0), (1, 1)]
+    assert not multiprocessing.active_children()
 
 
 def test_whoever_stops_listening_stops_the_processes() -> None:
