@@ -52,8 +52,8 @@ def listen() -> None:
 def stop(pool: ProcessPoolExecutor) -> None:
     """End a pool at once: what its processes have in hand is not wanted any more.
 
-    Where all is done, too: processes that are asked to end wait for ever where one of them was killed while it
-    waited for work.
+    Where all is done, too: processes that are asked to end wait for ever where one of them was killed while
+    it waited for work.
 
     Parameters
     ----------
