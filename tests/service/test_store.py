@@ -239,16 +239,19 @@ SHORT = HistoryRules(step_s=0.0, keep_s=100.0)
 
 @both
 @pytest.mark.parametrize("leap_s", [150.0, 1e7])
-def test_a_clock_that_leaps_costs_no_history_unless_it_goes_on(url: str, leap_s: float) -> None:
+def test_a_clock_that_leaps_costs_no_history_unless_it_goes_on(
+    url: str, leap_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.store.writes._PRUNE_EVERY", 100)
     with Store(url, history=SHORT) as store:
         store.commit(reports=every(0.5, 0.0, 50.0))
         leap = 50.0 + leap_s
-        store.commit(reports=every(0.05, leap, leap + 40.0))
+        store.commit(reports=every(0.25, leap, leap + 40.0))
         assert len(store.history("village", until=T0 + 50.0, limit=10_000)) == 100
     with Store(url, history=SHORT) as store:
-        store.commit(reports=every(0.05, leap + 40.0, leap + 45.0))
+        store.commit(reports=every(0.25, leap + 40.0, leap + 45.0))
         assert len(store.history("village", until=T0 + 50.0, limit=10_000)) == 100
-        store.commit(reports=every(0.05, leap + 45.0, leap + 210.0))
+        store.commit(reports=every(0.25, leap + 45.0, leap + 210.0))
         assert store.history("village", limit=10_000)[0]["t"] > T0 + leap
 
 
