@@ -29,6 +29,7 @@ from feeders.convert_opendss import read_opendss
 from feeders.convert_pandapower import Fleet, from_pandapower
 from feeders.convert_pgm import read_pgm
 from feeders.convert_source import SOURCE_FILE, feeder_source, profiles_source, versioned
+from feeders.extras import extra
 from feeders.load import from_tables
 from feeders.origin import origin as origin_of
 from feeders.profiles import ENVELOPES, Season
@@ -407,9 +408,7 @@ def _open(origin: str) -> tuple[Any, str]:
         import pandapower
         import pandapower.networks
     except ImportError as error:
-        raise GridsecError(
-            "conversion needs the extra 'convert', in a checkout: pip install -e '.[convert]'"
-        ) from error
+        raise GridsecError(f"conversion needs {extra('convert')}") from error
     if (kind == "simbench" and rest) or SIMBENCH_CODE.fullmatch(origin):
         return convert_simbench.grid(rest or origin), "simbench"
     if kind == "pandapower" and rest:

@@ -33,6 +33,7 @@ from feeders.convert_opendss_draws import (
     beyond_limits,
     voltage_dependence,
 )
+from feeders.extras import extra
 from feeders.schema import LineRow
 from gridsec.arrays import Floats, Phasors
 from gridsec.errors import FeederInvalid, GridsecError
@@ -98,9 +99,7 @@ def _engine() -> Iterator[Any]:
     try:
         from opendssdirect import dss
     except ImportError as error:
-        raise GridsecError(
-            "OpenDSS files need the extra 'convert', in a checkout: pip install -e '.[convert]'"
-        ) from error
+        raise GridsecError(f"OpenDSS files need {extra('convert')}") from error
     here = Path.cwd()
     with tempfile.TemporaryDirectory() as scratch:
         engine = dss.NewContext()

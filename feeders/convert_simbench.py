@@ -19,6 +19,7 @@ from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, QhullError
 
 from feeders.convert_changes import SourceUnreadable
+from feeders.extras import extra
 from feeders.profiles import Envelope, Season
 from gridsec.arrays import Floats
 from gridsec.errors import GridsecError
@@ -113,9 +114,7 @@ def _simbench() -> Any:
     try:
         import simbench
     except ImportError as error:
-        raise GridsecError(
-            "SimBench grids need the extra 'convert', in a checkout: pip install -e '.[convert]'"
-        ) from error
+        raise GridsecError(f"SimBench grids need {extra('convert')}") from error
     return simbench
 
 

@@ -19,6 +19,7 @@ from typing import Any, Final, Protocol
 
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]  # has no stubs
 
+from feeders.extras import extra
 from feeders.studies.journal import versions
 from gridsec.errors import GridsecError
 from gridsec.processes import deaf, listen, stop
@@ -193,9 +194,7 @@ class Dask:
         try:
             dask: Any = import_module("distributed")
         except ImportError as error:
-            raise ClusterUnusable(
-                "a Dask cluster needs the extra 'cluster', in a checkout: pip install -e '.[cluster]'"
-            ) from error
+            raise ClusterUnusable(f"a Dask cluster needs {extra('cluster')}") from error
         try:
             client = dask.Client(self.address, timeout=self.timeout_s, set_as_default=False)
         except (OSError, ValueError) as error:

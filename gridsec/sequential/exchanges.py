@@ -22,7 +22,7 @@ class Swap:
     Attributes
     ----------
     accused, innocent
-        Meters.
+        Meters; or directions, as indices into the dictionary.
     worse
         By how much J would rise; half of it is the logarithm of the likelihood ratio.
     """
@@ -83,26 +83,9 @@ def swaps(found: Solution, live: Bools, within: float, limits: Limits) -> list[S
     return sorted(out, key=lambda swap: swap.worse)
 
 
-@dataclass(frozen=True, slots=True)
-class Turn:
-    """Doubting `innocent` instead of `accused` fits almost as well.
-
-    Attributes
-    ----------
-    accused, innocent
-        Indices into the dictionary.
-    worse
-        By how much J would rise.
-    """
-
-    accused: int
-    innocent: int
-    worse: float
-
-
 def turns(
     found: Solution, dictionary: Dictionary, accused: Sequence[int], instead: Ints, within: float
-) -> list[Turn]:
+) -> list[Swap]:
     """Exchanges of one loosened direction for another that cost at most `within`; O(p^2) per direction.
 
     With the accused direction, u times its standard deviation, closed again,
@@ -123,7 +106,7 @@ def turns(
         Largest rise of J.
     """
     now, weights = found.fit, found.judged.weights
-    out: list[Turn] = []
+    out: list[Swap] = []
     who = [k for k in accused if k in found.loosened]
     others = instead[~np.isin(instead, found.loosened)]
     if not who or not others.size:
@@ -142,5 +125,5 @@ def turns(
         gain = (along + both * own / d) ** 2 / (dictionary.std[others] ** -2.0 + form + both**2 / d)
         # Of the accused itself: (u^T Q' m)^2 / (1 + u^T Q' u) with u^T Q' m = own / d, 1 + u^T Q' u = 1 / d.
         worse = np.maximum(own**2 / d - gain, 0.0)
-        out += [Turn(k, int(others[j]), float(worse[j])) for j in np.flatnonzero(worse <= within).tolist()]
-    return sorted(out, key=lambda turn: turn.worse)
+        out += [Swap(k, int(others[j]), float(worse[j])) for j in np.flatnonzero(worse <= within).tolist()]
+    return sorted(out, key=lambda swap: swap.worse)

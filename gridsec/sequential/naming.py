@@ -14,6 +14,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Ints, all_of, any_of
 from gridsec.online import Explanation
+from gridsec.sequential.curves import Curves
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.examine import Examined
 from gridsec.sequential.exchanges import swaps, turns
@@ -26,7 +27,7 @@ MOST_COUNTED = 12
 
 
 def name(
-    design: SequentialDesign, before: Trust, seen: Examined, live: Bools, agrees: Bools
+    design: SequentialDesign, before: Trust, seen: Examined, live: Bools, curves: Curves
 ) -> tuple[Trust, tuple[Explanation, ...]]:
     """Who is named now; and explanations that fit about as well where somebody would have been named.
 
@@ -40,8 +41,9 @@ def name(
         What this tick brought.
     live : (p,)
         Which meters have a reading: silence clears nobody.
-    agrees : (m,)
-        Inverters whose metered injections are those of their curves: nobody else's is theirs.
+    curves
+        What metered reactive powers said so far: an inverter that does what its curve asks for is nobody's
+        rival.
     """
     trust = seen.trust
     if trust.calm and before.calm:
@@ -61,7 +63,7 @@ def name(
     new = inverters & ~before.inverters
     rivals: tuple[Explanation, ...] = ()
     if any_of(fresh) or any_of(new):
-        found = _Rivals(design, fresh, new, agrees)
+        found = _Rivals(design, fresh, new, curves.agrees(design))
         found.collect(seen)
         for meters, accused in found.ways():
             fresh, inverters = fresh & meters, inverters & (before.inverters | accused)

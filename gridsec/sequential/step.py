@@ -164,8 +164,7 @@ def _judge(
     if seen.trust.calm and now.trust.calm:
         return seen, now.window, ()
     over = ended(design, now.trust, seen, now.window)
-    agrees = now.curves.agrees(design)
-    trust, rivals = name(design, now.trust, _acquit(seen, over), look.heard.live, agrees)
+    trust, rivals = name(design, now.trust, _acquit(seen, over), look.heard.live, now.curves)
     trust = _distrust(trust, look.copies)
     rivals = rivals or _undecided(design, now.last, before, trust)
     seen = seen if trust is seen.trust else replace(seen, trust=trust)
@@ -333,10 +332,12 @@ def _inverters(
         return np.asarray(droop(droop.vbar**2 - y)), None, begin(design.plant, y)
     w, follows, h = None, None, frame.t - state.t
     if not all_of(driven):
-        now, v2 = _linear(design, frame, state.x, heard.v0_squared)
+        injected = droop.per_customer(state.x, frame.q.size)
+        now, v2 = _linear(design, frame.p, np.stack([frame.q + injected, frame.q]), heard.v0_squared)
         if state.last is not None and state.frame is not None:
+            before = state.frame
             # What losses took off at the last frame, and what the meters added, hardly changes between two.
-            v2 += state.last[0].v2 - _linear(design, state.frame, state.x, state.v0_squared)[0]
+            v2 += state.last[0].v2 - _linear(design, before.p, before.q + injected, state.v0_squared)
         w, y = droop.vbar**2 - v2, np.where(driven, y, now[droop.customer])
         follows = ~driven, _given(design, state, frame, heard, sizes), heard.busbar
     lag = follow(design, state.lag, y, follows, h)
@@ -351,11 +352,10 @@ def _given(
     return Powers(frame, _net(design, heard, x), heard.told, heard.v0_squared, state.trust.trusted, sizes)
 
 
-def _linear(design: SequentialDesign, frame: Frame, x: Floats, v0_squared: Floats | float) -> Floats:
-    """Squared voltages by the linear model with injections x and without any, (2, N)."""
+def _linear(design: SequentialDesign, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:
+    """Squared voltages of the customers by the linear model, (…, N) as q."""
     feeder = design.plant.feeder
-    q = np.stack([frame.q + design.plant.droop.per_customer(x, frame.q.size), frame.q])
-    return np.asarray(bus_voltages(feeder, frame.p, q, v0_squared, steps=0)[:, feeder.bus])
+    return np.asarray(bus_voltages(feeder, p, q, v0_squared, steps=0)[..., feeder.bus])
 
 
 def _model_error(design: SequentialDesign, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:
