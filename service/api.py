@@ -8,7 +8,6 @@ loses no alarm. Every error is `application/problem+json` (RFC 9457).
 
 from __future__ import annotations
 
-import asyncio
 import hashlib
 import json
 import secrets
@@ -29,7 +28,7 @@ from gridsec.errors import FeederInvalid
 from service import models
 from service.alarms import AlarmKind, AlarmState, AlarmUnknown, Severity
 from service.alarms import to_json as alarm_json
-from service.backend import Backend
+from service.backend import Backend, wakes
 from service.errors import FeederNotLoaded, FeederUnknown
 from service.problem import Guard, handlers, problem
 from service.report import FeederReport
@@ -303,7 +302,7 @@ async def stream_states(backend: BackendHere, feeder: KnownFeeder) -> AsyncItera
     """Server-sent events `state`: the latest tick and each that follows; a slow client skips some."""
     yield ServerSentEvent(comment="connected", retry=2000)
     last: FeederReport | None = None
-    async for _ in _wakes(backend):
+    async for _ in wakes(backend):
         if not backend.known(feeder):
             return
         report = backend.report(feeder)
@@ -380,7 +379,7 @@ async def stream_alarms(
     # A number from the future belongs to another database: begin now, or nothing would ever come.
     seen = store.last_event if start is None else min(start, store.last_event)
     yield ServerSentEvent(comment="connected", id=str(seen), retry=2000)
-    async for _ in _wakes(backend):
+    async for _ in wakes(backend):
         while seen < (newest := store.last_event):
             try:
                 events = await to_thread.run_sync(partial(store.events_after, seen, feeder=feeder))
@@ -432,24 +431,6 @@ def _event(event: Event) -> models.AlarmEvent:
         comment=event.comment,
         alarm=models.AlarmModel.model_validate(alarm_json(event.alarm)),
     )
-
-
-async def _wakes(backend: Backend) -> AsyncIterator[None]:
-    """Yield once the subscription stands, and again after each wake-up, until the service stops."""
-    subscription = backend.subscribe()
-    waiting: asyncio.Future[dict[str, Any] | None] | None = None
-    try:
-        while True:
-            waiting = asyncio.ensure_future(anext(subscription, None))
-            await asyncio.sleep(0)  # The first step subscribes: nothing that happens from here on is missed.
-            yield
-            if await waiting is None:
-                return
-    finally:
-        if waiting is not None:
-            waiting.cancel()
-            await asyncio.gather(waiting, return_exceptions=True)
-        await subscription.aclose()
 
 
 # ----------------------------------------------------------------- operations

@@ -49,6 +49,7 @@ async def serve(
     *,
     announce: Callable[[Running], None] = lambda _: None,
     signals: bool = True,
+    settled: Callable[[], None] = lambda: None,
 ) -> None:
     """Run the service until SIGINT, SIGTERM or `Running.stop`.
 
@@ -60,6 +61,8 @@ async def serve(
         Called once HTTP answers.
     signals
         Whether to listen to signals; not possible outside of the main thread.
+    settled
+        As in `Runtime`.
 
     Raises
     ------
@@ -84,7 +87,7 @@ async def serve(
             max_samples=settings.queue,
             max_feeders=settings.max_feeders,
         )
-        runtime = Runtime(config, store, sites.values(), given=given, unloaded=unloaded)
+        runtime = Runtime(config, store, sites.values(), given=given, unloaded=unloaded, settled=settled)
         listener = stack.enter_context(_listen(settings.http))
         bus = stack.enter_context(
             Bus(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncGenerator, Sequence
+import asyncio
+from collections.abc import AsyncGenerator, AsyncIterator, Sequence
 from typing import Any, Protocol
 
 from service.report import FeederReport
@@ -70,3 +71,27 @@ class Backend(Protocol):
         report replaced. Only the type is read here, so the backend may drop wake-ups of a client that is
         slow, as long as one is left. The first step into the generator subscribes, closing it ends that.
         """
+
+
+async def wakes(backend: Backend) -> AsyncIterator[None]:
+    """Yield once the subscription stands, and again after each wake-up, until the service stops.
+
+    Parameters
+    ----------
+    backend
+        The running service.
+    """
+    subscription = backend.subscribe()
+    waiting: asyncio.Future[dict[str, Any] | None] | None = None
+    try:
+        while True:
+            waiting = asyncio.ensure_future(anext(subscription, None))
+            await asyncio.sleep(0)  # The first step subscribes: nothing that happens from here on is missed.
+            yield
+            if await waiting is None:
+                return
+    finally:
+        if waiting is not None:
+            waiting.cancel()
+            await asyncio.gather(waiting, return_exceptions=True)
+        await subscription.aclose()

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import threading
 import time
 from collections import deque
 from collections.abc import AsyncGenerator, Callable, Iterable, Mapping, Sequence
@@ -16,13 +15,11 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, TypeVar
 
-import structlog
-
 from feeders.estimators import Watcher
 from feeders.load import Site, from_tables
 from feeders.schema import from_json
 from gridsec.errors import FeederInvalid, GridsecError
-from service import describe
+from service import describe, designs
 from service.align import Clock
 from service.bus import Sample
 from service.commissioning import to_json as commissioning_json
@@ -32,14 +29,13 @@ from service.keeper import Done, Publisher, at_once
 from service.report import FeederReport
 from service.rounds import Rounds, RuntimeConfig
 from service.store import Store, StoreUnavailable
-from service.watch import Phase, Watch, design
+from service.watch import Phase, design
 
 SAMPLES_PER_ROUND = 512
 IDLE_S = 1.0
 STUCK_S = 30.0
 
 T = TypeVar("T")
-_log = structlog.get_logger("gridsec.runtime")
 
 
 class Runtime:
@@ -59,6 +55,8 @@ class Runtime:
         Feeders that are stored but cannot be loaded, and why: nobody watches them.
     wall
         The wall clock, Unix s.
+    settled
+        Called between two rounds when a feeder has got its monitor and no other is still being designed.
     """
 
     def __init__(
@@ -70,8 +68,9 @@ class Runtime:
         given: Iterable[str] | None = None,
         unloaded: Mapping[str, str] | None = None,
         wall: Callable[[], float] = time.time,
+        settled: Callable[[], None] = lambda: None,
     ) -> None:
-        self._wall = wall
+        self._wall, self._settled = wall, settled
         # Where the readings tell the time, nothing is late by waiting for the database.
         waits = config.clock is Clock.EVENTS
         self._rounds = Rounds(
@@ -129,7 +128,7 @@ class Runtime:
         try:
             await self._in_worker(self._rounds.begin)
             for watch in self._rounds.watches.values():
-                self._start_design(watch)
+                designs.begin(watch, lambda install: self._in_loop(partial(self._hand_over, install)))
             while not self._stopping:
                 await self._execute_commands()
                 samples = self._inbox.drain(SAMPLES_PER_ROUND)
@@ -244,32 +243,17 @@ class Runtime:
     def _wake_streams(self) -> None:
         self._in_loop(partial(self._notify, "alarm"))
 
-    # ---------------------------------------------------------------- designs
-
-    def _start_design(self, watch: Watch) -> None:
-        """Design in a thread of its own, which must not keep the process from ending."""
-
+    def _hand_over(self, install: Callable[[], None]) -> None:
         def run() -> None:
-            started = time.monotonic()
-            finished: Watcher | None = None
-            problem = ""
-            try:
-                finished = design(watch.site, _said(watch.name))
-            except GridsecError as error:
-                problem = str(error)
-            except Exception as error:  # noqa: BLE001 - shown to the operator as the feeder's problem
-                problem = f"{type(error).__name__}: {error}"
-                _log.exception("design failed", feeder=watch.name)
-            finally:
-                self._in_loop(partial(self._hand_over, partial(_install, watch, finished, problem)))
-            seconds = round(time.monotonic() - started, 3)
-            _log.info("design finished", feeder=watch.name, seconds=seconds, problem=problem or None)
+            install()
+            self._settle()
 
-        threading.Thread(target=run, name=f"gridsec-design-{watch.name}", daemon=True).start()
-
-    def _hand_over(self, command: Callable[[], None]) -> None:
-        self._commands.append((command, asyncio.get_running_loop().create_future()))
+        self._commands.append((run, asyncio.get_running_loop().create_future()))
         self._wake.set()
+
+    def _settle(self) -> None:
+        if all(watch.phase is not Phase.DESIGNING for watch in self._rounds.watches.values()):
+            self._settled()
 
     # ---------------------------------------------------------------- the backend of the API
 
@@ -433,7 +417,8 @@ class Runtime:
             self._rounds.keep_states(at_once=True)
             self._rounds.keeper.store_now()
             self._rounds.store.put_feeder(name, tables)
-            _install(self._rounds.add(site), finished, "")
+            designs.install(self._rounds.add(site), finished, "")
+            self._settle()
 
         await self._command(install)
 
@@ -514,26 +499,3 @@ class Runtime:
             if queue.full():
                 queue.get_nowait()
             queue.put_nowait(kind)
-
-
-def _install(watch: Watch, finished: Watcher | None, problem: str) -> None:
-    if finished is None:
-        watch.fail(problem)
-    else:
-        watch.install(finished)
-        if watch.commissioning.restored:
-            _log.info("commissioning goes on from what was kept", feeder=watch.name)
-        elif watch.commissioning.note:
-            _log.warning("commissioning begins anew", feeder=watch.name, reason=watch.commissioning.note)
-        if watch.suspicions.note:
-            _log.warning("nobody is suspected from before", feeder=watch.name, reason=watch.suspicions.note)
-
-
-def _said(feeder: str) -> Callable[[int, int], None]:
-    """Say how far a design of many parts is, ten times on the way."""
-
-    def progress(done: int, total: int) -> None:
-        if done * 10 // total > (done - 1) * 10 // total:
-            _log.info("designing", feeder=feeder, done=done, total=total)
-
-    return progress

@@ -27,23 +27,8 @@ from service.runtime import Runtime
 from service.store import Store
 from service.watch import Phase, design
 from service.wire import Decoded, Wire
-from tests.service.liars import FEEDER, START, rounds, two_liars, until
+from tests.service.liars import FEEDER, START, rounds, until
 from tests.service.running import Outlet
-
-
-@pytest.fixture(scope="module")
-def site() -> Site:
-    return load(FEEDER)
-
-
-@pytest.fixture(scope="module")
-def attacked(site: Site) -> list[Sample]:
-    return two_liars(site)
-
-
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    return tmp_path / "gridsec.db"
 
 
 def test_a_write_that_fails_in_an_unforeseen_way_is_shown_and_tried_again(

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from feeders.estimators import Watcher
-from feeders.load import Site, load
+from feeders.load import Site
 from gridsec.online import Frame
 from service.alarms import (
     AlarmState,
@@ -31,23 +31,8 @@ from service.rounds import NOT_WATCHED, Rounds, RuntimeConfig
 from service.runtime import Runtime
 from service.store import Store, StoreUnavailable, connect
 from service.watch import Watch, design
-from tests.service.liars import FEEDER, START, rounds, two_liars, until
+from tests.service.liars import FEEDER, START, rounds, until
 from tests.service.running import Outlet
-
-
-@pytest.fixture(scope="module")
-def site() -> Site:
-    return load(FEEDER)
-
-
-@pytest.fixture(scope="module")
-def attacked(site: Site) -> list[Sample]:
-    return two_liars(site)
-
-
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    return tmp_path / "gridsec.db"
 
 
 @pytest.fixture

@@ -1,0 +1,103 @@
+"""Monitors designed while the service runs, and what is done once all of them stand."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import threading
+import weakref
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from feeders.load import Site, from_tables
+from feeders.schema import from_json, to_json
+from service.designs import settle
+from service.rounds import RuntimeConfig
+from service.runtime import Runtime
+from service.store import Store
+from service.watch import Phase, design
+from tests.service.commands import command
+from tests.service.liars import FEEDER
+
+OTHER = "another"
+
+
+class Ring:
+    """Nothing but the collector frees it."""
+
+    def __init__(self) -> None:
+        self.itself = self
+
+
+def called(site: Site, name: str) -> dict[str, Any]:
+    """The tables of a feeder under another name."""
+    tables = to_json(site.tables)
+    return {**tables, "feeder": {**tables["feeder"], "name": name}}
+
+
+def test_what_stays_is_out_of_the_collectors_sight_and_what_is_gone_is_freed() -> None:
+    ring = Ring()
+    there = weakref.ref(ring)
+    try:
+        settle()
+        assert gc.get_freeze_count() > 10_000
+        del ring
+        gc.collect()
+        assert there() is not None
+        settle()
+        assert there() is None
+    finally:
+        gc.unfreeze()
+
+
+def test_settled_is_when_nobody_is_being_designed_any_more(
+    site: Site, path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two feeders at the start, one of which takes longer; then one is put."""
+    other = from_tables(from_json(called(site, OTHER)))
+    goes_on, told = threading.Event(), list[dict[str, str]]()
+
+    def slow(asked: Site, progress: Callable[[int, int], None]) -> Any:
+        if asked.feeder.name == OTHER:
+            goes_on.wait(20.0)
+        return design(asked, progress)
+
+    monkeypatch.setattr("service.designs.design", slow)
+
+    async def scene(store: Store) -> None:
+        runtime = Runtime(RuntimeConfig(), store, [site, other], settled=lambda: told.append(phases()))
+
+        def phases() -> dict[str, str]:
+            return {each["name"]: each["phase"] for each in runtime.feeders()}
+
+        task = asyncio.create_task(runtime.run())
+        while phases()[FEEDER] != Phase.WATCHING:  # noqa: ASYNC110 - the phase is what is tested
+            await asyncio.sleep(0.01)
+        await asyncio.sleep(0.1)
+        assert told == []
+        goes_on.set()
+        while not told:  # noqa: ASYNC110
+            await asyncio.sleep(0.01)
+        assert told == [{FEEDER: Phase.WATCHING, OTHER: Phase.WATCHING}]
+        await runtime.put_feeder("third", called(site, "third"))
+        assert told[1:] == [dict.fromkeys((FEEDER, OTHER, "third"), Phase.WATCHING)]
+        runtime.stop()
+        await task
+
+    with Store(f"sqlite:///{path}") as store:
+        asyncio.run(asyncio.wait_for(scene(store), 30.0))
+
+
+def test_the_service_settles(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    given: dict[str, Any] = {}
+
+    async def serve(*_: object, **named: Any) -> None:
+        given.update(named)
+
+    monkeypatch.setattr("service.app.serve", serve)
+    monkeypatch.setattr("service.logs.set_up", lambda *_: None)
+    assert command("serve")(monkeypatch, capsys, "--feeder", FEEDER)[0] == 0
+    assert given["settled"] is settle
