@@ -72,7 +72,7 @@ def exit_code(error: GridsecError) -> int:
     error
         The error.
     """
-    from feeders.convert_changes import SourceUnreadable
+    from feeders.convert_changes import BusbarUnclear, SourceUnreadable
     from feeders.recording import RecordingInvalid
     from service.app import AddressUnavailable
     from service.bus import BusUnavailable
@@ -84,6 +84,7 @@ def exit_code(error: GridsecError) -> int:
         FeederInvalid: FEEDER,
         NotObservable: FEEDER,
         DesignInfeasible: FEEDER,
+        BusbarUnclear: FEEDER,
         StoreUnavailable: DATABASE,
         AddressUnavailable: ADDRESS,
         BusUnavailable: ADDRESS,

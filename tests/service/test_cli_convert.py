@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import pandapower
 import pytest
 from typer.testing import CliRunner
 
@@ -12,14 +13,16 @@ from feeders.equipment import folder_of
 from feeders.load import load
 from service.cli import app
 from tests.feeders.foreign import opendss, pgm
+from tests.feeders.test_convert_unsupplied import street
+from tests.service.commands import command
 
 run = CliRunner(env={"COLUMNS": "160"}).invoke
 
 
-@pytest.mark.parametrize("command", [["feeders", "convert"], ["convert"]])
-def test_a_network_becomes_a_feeder(command: list[str], tmp_path: Path) -> None:
+@pytest.mark.parametrize("names", [["feeders", "convert"], ["convert"]])
+def test_a_network_becomes_a_feeder(names: list[str], tmp_path: Path) -> None:
     source = pgm(tmp_path / "grid.json", 12, balanced=True)
-    done = run(app, [*command, str(source), str(tmp_path / "out")])
+    done = run(app, [*names, str(source), str(tmp_path / "out")])
     assert done.exit_code == 0, done.output
     for part in ("left out", "above the busbar", "out written", "12 buses", "largest difference"):
         assert part in done.output.replace("\n", " "), part
@@ -86,3 +89,18 @@ def test_an_edited_conversion_is_kept_aside(tmp_path: Path, monkeypatch: pytest.
     assert load(folder).feeder.name == "other"
     assert run(app, ["feeders", "convert", "nowhere.json", "."]).exit_code != 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["grid.json", "out", "out-1", "out-2"]
+
+
+def test_a_network_without_a_clear_busbar_is_refused_until_it_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    net = street(3)
+    net.ext_grid["in_service"] = False
+    source, folder = tmp_path / "net.json", tmp_path / "out"
+    pandapower.to_json(net, str(source))
+    convert = command("feeders", "convert")
+    code, _, told = convert(monkeypatch, capsys, str(source), str(folder))
+    assert (code, folder.exists()) == (3, False)
+    assert "name the busbar with --root" in told
+    assert convert(monkeypatch, capsys, str(source), str(folder), "--root", "b0")[0] == 0
+    assert load(str(folder)).tables.meta.busbar == "b0"
