@@ -65,7 +65,7 @@ def watch(site: Site, watcher: Watcher, scenario: Scenario) -> Seen:
     state, seen = watcher.init(START), Seen()
     for snapshot in snapshots(simulate(site, scenario)):
         state, _, verdict = watcher.step(state, to_frame(site, snapshot))
-        seen.alone |= bool(kinds.suspicious(state.kinds).any())
+        seen.alone |= bool(kinds.repeated(state.kinds).any())
         for j in np.flatnonzero(verdict.suspects).tolist():
             if j not in liars:
                 seen.honest.add(j)
@@ -128,7 +128,7 @@ def cost(name: str, ticks: int = 4200) -> str:
         y = (np.rint(v / shapes.rules.step) * shapes.rules.step) ** 2
         begin = process_time()
         heard = kinds.listen(shapes, state, y, live)
-        kinds.suspicious(heard)
+        kinds.repeated(heard)
         state = kinds.describe(shapes, heard, y, y, nobody, y)
         times.append(process_time() - begin)
     kept = state.memory.blocks

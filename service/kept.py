@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Annotated, Any, Final, TypeVar
+from typing import Annotated, Any, Final, TypeAlias, TypeVar
 
 import msgspec
 import numpy as np
@@ -29,6 +29,7 @@ from service.voltages import Phase, busbar_phases
 FORMAT: Final = 1
 """Version of the text; it changes when its fields do."""
 _Finite = Annotated[float, msgspec.Meta(gt=-1e300, lt=1e300)]
+_Time: TypeAlias = Annotated[float, msgspec.Meta(gt=0.0, lt=1e300)]
 # Of the feeder's file, what says how it is watched and shown, not what it is.
 _BESIDE = ("title", "accept", "busbar_xy", "limits", "monitor")
 
@@ -174,11 +175,14 @@ class Suspect(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         Time scale on which it was caught, s.
     named
         Whether it was named as manipulated.
+    repeats_s
+        Time after which it repeated its readings, s; None if it did not. Older texts lack it.
     """
 
     meter: str
-    scale_s: Annotated[float, msgspec.Meta(gt=0.0, lt=1e300)]
+    scale_s: _Time
     named: bool
+    repeats_s: _Time | None = None
 
 
 class Deviant(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -210,7 +214,7 @@ class OffPhase(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """
 
     phase: Phase | None
-    scale_s: Annotated[float, msgspec.Meta(gt=0.0, lt=1e300)]
+    scale_s: _Time
     named: bool
     off: _Finite
 
@@ -250,10 +254,13 @@ def encode_distrust(site: Site, t: float, distrust: Distrust) -> Kept:
     distrust
         Who.
     """
-    name, scale_s, owners = site.feeder.name, distrust.scale_s, _owners(site)
+    name, owners = site.feeder.name, _owners(site)
+    columns = (distrust.scale_s, distrust.named, distrust.repeats_s)
+    meters = zip(*(column.tolist() for column in columns), strict=True)
     suspects = [
-        Suspect(site.meter_ids[k], float(scale_s[k]), bool(distrust.named[k]))
-        for k in np.flatnonzero(np.isfinite(scale_s)).tolist()
+        Suspect(site.meter_ids[k], scale, named, None if math.isnan(again) else again)
+        for k, (scale, named, again) in enumerate(meters)
+        if math.isfinite(scale)
     ]
     deviants = [Deviant(*owners[k]) for k in np.flatnonzero(distrust.inverters).tolist()]
     each = zip(
@@ -293,6 +300,7 @@ def decode_distrust(site: Site, kept: Kept) -> Distrust:
     phases = [off.get(phase) for phase in busbar_phases(site)]
     return Distrust(
         np.array([math.nan if one is None else one.scale_s for one in found], dtype=np.float64),
+        np.array([one.repeats_s if one and one.repeats_s else math.nan for one in found], dtype=np.float64),
         np.array([one is not None and one.named for one in found], dtype=np.bool_),
         np.array([owner in deviants for owner in owners], dtype=np.bool_),
         np.array([math.nan if one is None else one.scale_s for one in phases], dtype=np.float64),

@@ -18,8 +18,8 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.sequential.busbar import Busbar
 from gridsec.sequential.design import SequentialDesign
-from gridsec.sequential.kinds import suspicious
 from gridsec.sequential.naming import MOST_COUNTED
+from gridsec.sequential.repeats import BLOCKS, ROWS, unnoticed
 from gridsec.sequential.scales import needed
 from gridsec.sequential.state import SequentialState
 
@@ -32,6 +32,9 @@ class Distrust:
     ----------
     scale_s : (p,)
         Time scale on which each distrusted meter was caught, s; NaN for those that are trusted.
+    repeats_s : (p,)
+        Time after which a distrusted meter repeats its readings, s, that from one to the next for a stuck
+        one; NaN for all others.
     named : (p,)
         Meters named as manipulated; all of them are distrusted.
     inverters : (m,)
@@ -45,6 +48,7 @@ class Distrust:
     """
 
     scale_s: Floats
+    repeats_s: Floats
     named: Bools
     inverters: Bools
     busbar_scale_s: Floats = field(default_factory=lambda: np.full(1, np.nan))
@@ -67,6 +71,7 @@ class Distrust:
         """
         return (
             np.array_equal(self.scale_s, other.scale_s, equal_nan=True)
+            and np.array_equal(self.repeats_s, other.repeats_s, equal_nan=True)
             and np.array_equal(self.named, other.named)
             and np.array_equal(self.inverters, other.inverters)
             and np.array_equal(self.busbar_scale_s, other.busbar_scale_s, equal_nan=True)
@@ -81,7 +86,8 @@ class Distrust:
         which : (p,)
             The meters.
         """
-        return replace(self, scale_s=np.where(which, np.nan, self.scale_s), named=self.named & ~which)
+        scale_s, repeats_s = (np.where(which, np.nan, each) for each in (self.scale_s, self.repeats_s))
+        return replace(self, scale_s=scale_s, repeats_s=repeats_s, named=self.named & ~which)
 
 
 def nobody(meters: int, inverters: int, phases: int = 1) -> Distrust:
@@ -93,7 +99,8 @@ def nobody(meters: int, inverters: int, phases: int = 1) -> Distrust:
         p, m and b.
     """
     no, none, here = (np.zeros(count, dtype=np.bool_) for count in (meters, inverters, phases))
-    return Distrust(np.full(meters, np.nan), no, none, np.full(phases, np.nan), here, np.zeros(phases))
+    never = np.full(meters, np.nan)
+    return Distrust(never, never, no, none, np.full(phases, np.nan), here, np.zeros(phases))
 
 
 def distrusted(design: SequentialDesign, state: SequentialState) -> Distrust:
@@ -111,9 +118,11 @@ def distrusted(design: SequentialDesign, state: SequentialState) -> Distrust:
         return nobody(trust.trusted.size, inverters.size, busbar.believed.size)
     scales_s = np.array(design.lengths) * design.step_s
     # Repetition shows on no scale; the longest is what is left to judge such a meter by.
-    scale = np.where(suspicious(state.kinds), len(design.lengths) - 1, trust.scale)
+    repeats = ~trust.trusted & (trust.lag > 0)
+    scale = np.where(repeats, len(design.lengths) - 1, trust.scale)
     return Distrust(
         np.where(trust.trusted, np.nan, scales_s[scale]),
+        np.where(repeats, trust.lag * design.step_s, np.nan),
         trust.named,
         inverters,
         np.where(busbar.believed, np.nan, scales_s[busbar.scale]),
@@ -126,9 +135,9 @@ def restore(design: SequentialDesign, state: SequentialState, before: Distrust) 
     """Go on distrusting who was, from a state that has not seen any frame.
 
     A meter is trusted again as always, but not before it has given as many readings as its scale needs to
-    judge, and the observer has settled; an inverter that is named, as many as the longest scale needs. The
-    busbar's meter is compared with the others as before, by the mean that was known, and has to agree with
-    them for as much longer.
+    judge, and the observer has settled, and one that repeated itself as many as it takes to notice that anew;
+    an inverter that is named, as many as the longest scale needs. The busbar's meter is compared with the
+    others as before, by the mean that was known, and has to agree with them for as much longer.
 
     Parameters
     ----------
@@ -147,6 +156,10 @@ def restore(design: SequentialDesign, state: SequentialState, before: Distrust) 
     )
     still = trust.still.copy()
     still[scale[which], np.flatnonzero(which)] = True
+    repeats = np.isfinite(before.repeats_s)
+    ticks = np.where(repeats, np.rint(before.repeats_s / design.step_s), 0.0)
+    lag = np.where(repeats, np.clip(ticks, 1.0, ROWS * BLOCKS), 0.0).astype(np.intp)
+    owed = np.maximum(np.maximum(need[scale], settling), unnoticed(design.shapes.rules, lag))
     longest = max(int(need[-1]), int(settling.max(initial=0)))
     return replace(
         state,
@@ -157,7 +170,8 @@ def restore(design: SequentialDesign, state: SequentialState, before: Distrust) 
             scale=scale,
             age=np.where(before.named, design.confirmed[scale], which),
             still=still,
-            owed=np.where(which, np.maximum(need[scale], settling), 0),
+            owed=np.where(which, owed, 0),
+            lag=np.where(which, lag, 0),
             named=before.named & which,
             counted=np.where(before.inverters, longest + MOST_COUNTED, 0),
             inverters=before.inverters,

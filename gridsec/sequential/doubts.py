@@ -32,6 +32,8 @@ class Doubts:
         mean of a scale was made with.
     p_calm, q_calm : (s, N)
         For how many ticks a smaller one would have done.
+    p_rest, q_rest : (s, N)
+        The largest that these would have needed.
     busbar : (s, b)
         Whether there was a busbar voltage at all ticks of a scale; b is 3 in three phases, else 1.
     busbar_calm : (s, b)
@@ -49,6 +51,8 @@ class Doubts:
     q: Floats
     p_calm: Ints
     q_calm: Ints
+    p_rest: Floats
+    q_rest: Floats
     busbar: Bools
     busbar_calm: Ints
     priors: tuple[Prior, ...]
@@ -67,7 +71,8 @@ def none(design: SequentialDesign) -> Doubts:
     scales, phases = len(design.lengths), design.hangs_on.shape[1]
     one, never = np.ones((scales, design.customers)), np.zeros((scales, design.customers), dtype=np.intp)
     known, unbroken = np.ones((scales, phases), dtype=np.bool_), np.zeros((scales, phases), dtype=np.intp)
-    return Doubts(one, one, never, never, known, unbroken, (design.prior,) * scales, design.book.std)
+    priors = (design.prior,) * scales
+    return Doubts(one, one, never, never, one, one, known, unbroken, priors, design.book.std)
 
 
 # Frames that claim to know loads so much less well than the design assumes are believed.
@@ -107,8 +112,12 @@ def doubted(
 def _doubts(design: SequentialDesign, before: Doubts, frame: Frame, busbar: Bools | bool) -> Doubts:
     """What this frame does not know; new priors only where that changed."""
     lengths = design.lengths
-    p, p_calm = _factors(frame.p_error, design.doubt.p, before.p, before.p_calm, lengths)
-    q, q_calm = _factors(frame.q_error, design.doubt.q, before.q, before.q_calm, lengths)
+    p, p_calm, p_rest = _factors(
+        frame.p_error, design.doubt.p, (before.p, before.p_calm, before.p_rest), lengths
+    )
+    q, q_calm, q_rest = _factors(
+        frame.q_error, design.doubt.q, (before.q, before.q_calm, before.q_rest), lengths
+    )
     sizes = _claims(np.abs(frame.p), design.options.hidden_power, before.sizes)
     metered, calm = _metered(busbar, before.busbar, before.busbar_calm, lengths)
     if metered is before.busbar and p is before.p and q is before.q:
@@ -118,7 +127,15 @@ def _doubts(design: SequentialDesign, before: Doubts, frame: Frame, busbar: Bool
         if new is not old:
             same &= (new == old).all(axis=1)
     if all_of(same):
-        return replace(before, sizes=sizes, p_calm=p_calm, q_calm=q_calm, busbar_calm=calm)
+        return replace(
+            before,
+            sizes=sizes,
+            p_calm=p_calm,
+            q_calm=q_calm,
+            p_rest=p_rest,
+            q_rest=q_rest,
+            busbar_calm=calm,
+        )
     priors: list[Prior] = []
     for s, known in enumerate(before.priors):
         if same[s]:
@@ -128,7 +145,7 @@ def _doubts(design: SequentialDesign, before: Doubts, frame: Frame, busbar: Bool
         shared = (k for k in range(s) if all(np.array_equal(of[k], of[s]) for of in (p, q, metered)))
         k = next(shared, None)
         priors.append(_prior(design, p[s], q[s], metered[s]) if k is None else priors[k])
-    return Doubts(p, q, p_calm, q_calm, metered, calm, tuple(priors), sizes)
+    return Doubts(p, q, p_calm, q_calm, p_rest, q_rest, metered, calm, tuple(priors), sizes)
 
 
 def _prior(design: SequentialDesign, p: Floats, q: Floats, busbar: Bools) -> Prior:
@@ -172,14 +189,22 @@ def _metered(busbar: Bools | bool, old: Bools, calm: Ints, lengths: tuple[int, .
 
 
 def _factors(
-    error: Floats, std: Floats, old: Floats, calm: Ints, lengths: tuple[int, ...]
-) -> tuple[Floats, Ints]:
-    """`_factor`, but as long as residuals are remembered that were made with a larger one, that one."""
+    error: Floats, std: Floats, before: tuple[Floats, Ints, Floats], lengths: tuple[int, ...]
+) -> tuple[Floats, Ints, Floats]:
+    """`_factor`, but as long as residuals are remembered that were made with a larger one, that one.
+
+    Then the largest of those made since, for as long again: they are remembered still.
+    """
+    old, calm, rest = before
     new = _factor(error, std, old)
     if new is old:
-        return old, calm
-    held = (new < old) & (calm + 1 < np.array(lengths)[:, None])
-    return np.where(held, old, new), np.where(held, calm + 1, 0)
+        return before
+    lower = new < old
+    rest = np.where(lower, np.maximum(rest, new), 1.0)
+    falls = lower & (calm + 1 >= np.array(lengths)[:, None])
+    held = lower & ~falls
+    after = np.where(held, old, np.where(falls, rest, new))
+    return after, np.where(held, calm + 1, 0), np.where(held, rest, 1.0)
 
 
 def _factor(error: Floats, std: Floats, old: Floats) -> Floats:

@@ -14,7 +14,7 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, all_of, any_of
 from gridsec.sequential.bounds import Powers
 from gridsec.sequential.busbar import Doubt, Honest, aligned, opposed, weight
-from gridsec.sequential.conditional import Fit, drop, judge
+from gridsec.sequential.conditional import Fit, Prior, drop, judge
 from gridsec.sequential.decoder import Accused, Evidence
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.explain import Search
@@ -186,16 +186,20 @@ def _without_busbar(
     return replace(found, others=(*found.others, each[best])) if worse <= like else found, None
 
 
-def ended(design: SequentialDesign, trust: Trust, seen: Examined, window: Window) -> Bools:
+def ended(
+    design: SequentialDesign, priors: tuple[Prior, ...], trust: Trust, seen: Examined, window: Window
+) -> Bools:
     """Distrusted meters whose manipulation is over, though long means still contain it.
 
     What a short scale sees of them is honest, and further from what a longer one sees than the short one's
-    noise and the loads' wandering explain.
+    noise and the wandering of loads, and of a busbar that is not read, explain.
 
     Parameters
     ----------
     design
         The design.
+    priors : (s,)
+        What is known on each scale without any meter.
     trust
         From the last tick.
     seen, window
@@ -206,7 +210,7 @@ def ended(design: SequentialDesign, trust: Trust, seen: Examined, window: Window
     if not any_of(suspected):
         return out
     means = window.sums / np.maximum(window.counts, 1)
-    wander = 2.0 * design.prior.variance[design.prior.meters] * design.step_s / design.doubt.time_s
+    at, rate = design.prior.meters, 2.0 * design.step_s / design.doubt.time_s
     for s, short in enumerate(seen.views[:-1]):
         if short is None:
             continue
@@ -214,7 +218,8 @@ def ended(design: SequentialDesign, trust: Trust, seen: Examined, window: Window
         for later in range(s + 1, len(design.lengths)):
             if not any_of(quiet & seen.trust.still[later]):
                 continue
-            variance = design.white / np.maximum(window.counts[s], 1) + wander * design.lengths[later]
+            wander = priors[later].variance[at] * rate * design.lengths[later]
+            variance = design.white / np.maximum(window.counts[s], 1) + wander
             far = np.abs(means[later] - means[s]) > design.sigmas[s] * np.sqrt(variance)
             out |= quiet & seen.trust.still[later] & far
     return out

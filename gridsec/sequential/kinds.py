@@ -181,15 +181,20 @@ def listen(shapes: Shapes, before: Kinds, y: Floats, live: Bools) -> Kinds:
     )
 
 
-def suspicious(kinds: Kinds) -> Bools:
-    """Meters whose readings are evidence by themselves, whatever the others say, (p,).
+def repeated(kinds: Kinds) -> Ints:
+    """Ticks after which readings repeat that are evidence by themselves, whatever the others say, (p,).
 
     Parameters
     ----------
     kinds
         From `listen`.
+
+    Returns
+    -------
+    (p,)
+        1 for a stuck meter, 0 for one that does not repeat itself.
     """
-    return repeats.suspicious(kinds.memory)
+    return repeats.lags(kinds.memory)
 
 
 def describe(  # noqa: PLR0917  # what each meter says, and what the others say of it

@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from gridsec.arrays import Bools, Ints, all_of, any_of
+from gridsec.network import Power
 from gridsec.online import Explanation
 from gridsec.sequential.curves import Curves
 from gridsec.sequential.design import SequentialDesign
@@ -22,8 +23,9 @@ from gridsec.sequential.scales import View
 from gridsec.sequential.search import Found
 from gridsec.sequential.state import Trust
 
-# An accusation of an inverter counts up with every tick that repeats it, and down with every other.
-MOST_COUNTED = 12
+# An accusation of an inverter counts up with every tick that repeats it, and down with every other at which
+# somebody is heard and believed who feels it this much of what those do who feel it most.
+MOST_COUNTED, _FELT = 12, 0.25
 
 
 def name(
@@ -59,7 +61,7 @@ def name(
     need = design.confirmed[trust.scale]
     fresh = ~trusted & ~before.named & trust.bad.any(axis=0) & (age >= need) & _accused(seen, trusted.size)
     named = before.named & (quiet < design.options.release)
-    count, inverters = _inverters(design, before, trust, seen)
+    count, inverters = _inverters(design, before, trust, seen, live)
     new = inverters & ~before.inverters
     rivals: tuple[Explanation, ...] = ()
     if any_of(fresh) or any_of(new):
@@ -74,6 +76,7 @@ def name(
         age=age,
         quiet=quiet,
         owed=owed,
+        lag=np.where(trusted, 0, trust.lag),
         named=named | fresh,
         counted=count,
         inverters=inverters,
@@ -89,24 +92,39 @@ def _accused(seen: Examined, meters: int) -> Bools:
     return out
 
 
-def _inverters(design: SequentialDesign, before: Trust, trust: Trust, seen: Examined) -> tuple[Ints, Bools]:
+def _inverters(
+    design: SequentialDesign, before: Trust, trust: Trust, seen: Examined, live: Bools
+) -> tuple[Ints, Bools]:
     """How long every inverter has been accused, and which are named, (m,) each.
 
-    As with meters, only where the likeliest explanation of this very tick accuses it.
+    As with meters, only where the likeliest explanation of this very tick accuses it; silence clears none.
     """
     accused = [k for k, _ in trust.accused]
     if not accused and not any_of(before.counted):
         return before.counted, before.inverters
     now = inverters_of(design, accused)
+    less = np.where(_felt(design, before.counted > 0, live & trust.trusted), -1, 0)
     # Who was named before the monitor began anew is counted beyond that, down from there.
-    most = np.maximum(MOST_COUNTED, before.counted - 1)
-    count = np.clip(before.counted + np.where(now, 1, -1), 0, most)
+    most = np.maximum(MOST_COUNTED, before.counted + less)
+    count = np.clip(before.counted + np.where(now, 1, less), 0, most)
     need, confirmed = np.full(now.size, MOST_COUNTED), design.confirmed
     for k, s in trust.accused:
         if k >= design.customers:
             need[k - design.customers] = min(confirmed[s], MOST_COUNTED)
     sought = inverters_of(design, [k for found in seen.found.values() for k in found.best.loosened])
     return count, (before.inverters & (count > 0)) | (now & sought & (count >= need))
+
+
+def _felt(design: SequentialDesign, which: Bools, heard: Bools) -> Bools:
+    """Which of some inverters move the voltage of somebody who is heard, (m,)."""
+    if all_of(heard) or not any_of(which):
+        return which
+    out, at = which.copy(), np.flatnonzero(which)
+    own = design.plant.droop.customer[at]
+    effect = np.abs(design.effects.columns(Power.REACTIVE, own)[design.prior.meters])
+    most = effect.max(axis=0, initial=0.0)
+    out[at] = effect[heard].max(axis=0, initial=0.0) >= np.maximum(_FELT * most, np.finfo(np.float64).tiny)
+    return out
 
 
 def inverters_of(design: SequentialDesign, accused: Sequence[int]) -> Bools:

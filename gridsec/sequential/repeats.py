@@ -312,7 +312,38 @@ def suspicious(memory: Memory) -> Bools:
     memory
         From `listen`.
     """
-    return memory.stuck | (memory.lag > 0)
+    return lags(memory) > 0
+
+
+def lags(memory: Memory) -> Ints:
+    """Ticks after which each meter repeats itself beyond chance, (p,): 1 for a stuck one, 0 for the others.
+
+    Parameters
+    ----------
+    memory
+        From `listen`.
+    """
+    return np.where(memory.stuck, 1, memory.lag)
+
+
+def unnoticed(law: Rules, lag: Ints) -> Ints:
+    """For how many readings a meter may repeat itself until that is noticed, from an empty memory, (p,).
+
+    A calm meter takes longer than its data sheet says: twice as long is granted.
+
+    Parameters
+    ----------
+    law
+        When repetition is evidence.
+    lag : (p,)
+        Ticks after which each repeats itself, 1 for a stuck one; 0 for those that do not.
+    """
+    replays, judged = lag > 1, np.maximum(law.surprise, np.finfo(np.float64).tiny)
+    run = np.where(replays, np.maximum(np.ceil(law.replay / judged), SPAN), np.ceil(law.stuck / judged))
+    # What is repeated has to be in a whole block, and these take turns.
+    past = np.where(replays, lag + ROWS + lag // ROWS + 2, 0)
+    most = np.minimum(np.maximum(law.known, past) + 2.0 * run, ROWS * BLOCKS)
+    return np.where(lag > 0, most, 0).astype(np.intp)
 
 
 def past(memory: Memory, meter: int | Ints, start: int, stop: int) -> tuple[Floats, Floats, Floats]:

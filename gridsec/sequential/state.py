@@ -48,6 +48,8 @@ class Trust:
         Evidence enough to go on distrusting a meter.
     owed : (p,)
         Readings that a meter distrusted from before still has to give until its scale can speak for it.
+    lag : (p,)
+        Ticks after which a distrusted meter repeats its readings, 1 for a stuck one; 0 for all others.
     named : (p,)
         Meters named as manipulated.
     accused : tuple of (k, s)
@@ -67,6 +69,7 @@ class Trust:
     bad: Bools
     still: Bools
     owed: Ints
+    lag: Ints
     named: Bools
     accused: tuple[tuple[int, int], ...]
     counted: Ints
@@ -196,6 +199,7 @@ def init(
             none,
             none,
             zeros,
+            zeros,
             no,
             (),
             np.zeros(m, dtype=np.intp),
@@ -242,6 +246,7 @@ def renew(design: SequentialDesign, state: SequentialState, which: Bools) -> Seq
             bad=trust.bad & ~which,
             still=trust.still & ~which,
             owed=np.where(which, 0, trust.owed),
+            lag=np.where(which, 0, trust.lag),
             named=trust.named & ~which,
         ),
     )

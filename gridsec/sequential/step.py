@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, all_of, any_of
+from gridsec.arrays import Bools, Floats, Ints, all_of, any_of
 from gridsec.frames import NO_VOLTAGE, nothing_new
 from gridsec.network import bus_voltages, by_place, model_error_bound
 from gridsec.online import Estimate, Explanation, Frame, Verdict
@@ -22,7 +22,7 @@ from gridsec.sequential.doubts import Doubts, doubted
 from gridsec.sequential.drive import Free, drive
 from gridsec.sequential.examine import Examined, ended, examine
 from gridsec.sequential.heard import Heard, clean, possible
-from gridsec.sequential.kinds import Kinds, describe, listen, suspicious
+from gridsec.sequential.kinds import Kinds, describe, listen, repeated
 from gridsec.sequential.naming import name
 from gridsec.sequential.state import SequentialState, Trust
 from gridsec.sequential.windows import Window, empty, forget, push, shift
@@ -41,7 +41,7 @@ class _Look:
     heard: Heard
     doubts: Doubts
     kinds: Kinds
-    copies: Bools
+    copies: Ints
     x: Floats
     free: Free | None
     lag: Lag
@@ -91,11 +91,14 @@ def _look(design: SequentialDesign, state: SequentialState, frame: Frame) -> _Lo
         fits = tuple(fit if fit is not None and fit.prior is prior else None for fit, prior in pairs)
         state = replace(state, fits=fits)
     kinds = listen(design.shapes, state.kinds, heard.y, heard.live)
-    copies = suspicious(kinds) & (design.decoder is None)
+    copies = repeated(kinds) * (design.decoder is None)
     x, free, lag = _inverters(design, state, frame, heard, doubts.sizes)
     q, v2_bus = _voltages(design, frame, heard, x)
     residual = heard.y - v2_bus[design.prior.meters] - state.learned.bias
-    window = push(_remembered(design, state, frame.t), design.lengths, residual, heard.live)
+    if state.x is not None and frame.t - state.t >= design.lengths[-1] * design.step_s:
+        # After a pause as long as the longest scale loads are others: nothing is remembered.
+        state = replace(state, window=empty(design.lengths, residual.size), fits=(None,) * len(state.fits))
+    window = push(state.window, design.lengths, residual, heard.live)
     swing = _swing(design, v2_bus, heard.v0_squared)
     if state.ticks % _STALE == 0 or swing > max(_GROWN * state.swing, _CALM):
         error = _model_error(design, frame.p, q, heard.v0_squared)
@@ -163,19 +166,12 @@ def _judge(
     seen, now = look.seen, look.now
     if seen.trust.calm and now.trust.calm:
         return seen, now.window, ()
-    over = ended(design, now.trust, seen, now.window)
+    over = ended(design, now.doubts.priors, now.trust, seen, now.window)
     trust, rivals = name(design, now.trust, _acquit(seen, over), look.heard.live, now.curves)
     trust = _distrust(trust, look.copies)
     rivals = rivals or _undecided(design, now.last, before, trust)
     seen = seen if trust is seen.trust else replace(seen, trust=trust)
     return seen, forget(now.window, over), rivals
-
-
-def _remembered(design: SequentialDesign, state: SequentialState, t: float) -> Window:
-    """The residuals so far; none after a pause of the frames as long as the longest scale: loads moved on."""
-    if t - state.t < design.lengths[-1] * design.step_s or state.x is None:
-        return state.window
-    return empty(design.lengths, design.prior.meters.size)
 
 
 def _transient(design: SequentialDesign, age: float) -> Floats:
@@ -224,16 +220,18 @@ def _swing(design: SequentialDesign, v2_bus: Floats, v0_squared: Floats | float)
     return float(np.abs(v2_bus - by_place(design.plant.feeder, v0_squared)).max())
 
 
-def _distrust(trust: Trust, copies: Bools) -> Trust:
+def _distrust(trust: Trust, copies: Ints) -> Trust:
     """Meters that repeat themselves are named, whatever the others say."""
     if not any_of(copies):
         return trust
+    which = copies > 0
     return replace(
         trust,
-        trusted=trust.trusted & ~copies,
-        quiet=np.where(copies, 0, trust.quiet),
-        still=trust.still | copies,
-        named=trust.named | copies,
+        trusted=trust.trusted & ~which,
+        quiet=np.where(which, 0, trust.quiet),
+        still=trust.still | which,
+        lag=np.where(which, copies, trust.lag),
+        named=trust.named | which,
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from feeders.load import Site, from_tables, load
-from gridsec.sequential import Distrust
+from gridsec.sequential import nobody
 from service.kept import (
     FORMAT,
     Kept,
@@ -69,7 +69,13 @@ def test_damaged_or_newer_texts_are_refused_in_words(site: Site) -> None:
 def test_who_is_not_believed_comes_back_by_name(site: Site) -> None:
     p, m = len(site.meter_ids), site.droop.tau.size
     which, inverters = np.arange(p) % 5 == 1, np.arange(m) == m - 1
-    before = Distrust(np.where(which, 1.0 / 3.0, np.nan), which & (np.arange(p) > 5), inverters)
+    before = replace(
+        nobody(p, m),
+        scale_s=np.where(which, 1.0 / 3.0, np.nan),
+        repeats_s=np.where(which & (np.arange(p) > 7), 900.0, np.nan),
+        named=which & (np.arange(p) > 5),
+        inverters=inverters,
+    )
     kept = encode_distrust(site, START, before)
     assert decode_distrust(site, kept).same(before)
     whole = json.loads(kept.text)

@@ -56,7 +56,7 @@ def test_a_scale_speaks_for_a_meter_once_it_has_readings_enough(
     """Readings, not ticks: a meter that was silent at first owes them still."""
     design, street = begun
     which = np.isin(np.arange(P), LIARS)
-    before = Distrust(np.where(which, scale_s, np.nan), which & named, np.zeros(M, dtype=np.bool_))
+    before = replace(nobody(P, M), scale_s=np.where(which, scale_s, np.nan), named=which & named)
     state = restore(design, init(design, street.t), before)
     readings = max(readings, int(state.trust.owed.max()))
     state, silent = watch(street, design, 10, state=state, silent=LIARS)
@@ -137,7 +137,7 @@ def test_a_busbar_that_has_become_honest_is_believed_once_it_has_agreed_long_eno
 def test_a_replaced_meter_owes_nothing(begun: tuple[SequentialDesign, Street]) -> None:
     design, street = begun
     which = np.isin(np.arange(P), LIARS)
-    before = Distrust(np.where(which, 60.0, np.nan), which, np.zeros(M, dtype=np.bool_))
+    before = replace(nobody(P, M), scale_s=np.where(which, 60.0, np.nan), named=which)
     state = renew(design, restore(design, init(design, street.t), before), np.arange(P) == LIARS[0])
     assert distrusted(design, state).same(before.without(np.arange(P) == LIARS[0]))
     assert state.trust.owed[LIARS[0]] == 0
