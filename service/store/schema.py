@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 
 import sqlalchemy as sa
@@ -48,7 +49,10 @@ LAYOUT = sa.Table(
     "history_layout",
     META,
     sa.Column("id", SEQ, primary_key=True, autoincrement=True),
-    sa.Column("meters", sa.Text, nullable=False, unique=True),
+    sa.Column("meters", sa.Text, nullable=False),
+    # No index of PostgreSQL takes a text of more than 2704 bytes.
+    sa.Column("digest", sa.String(64), nullable=False),
+    sa.Index("history_layout_by_digest", "digest", unique=True),
 )
 HISTORY = sa.Table(
     "history",
@@ -113,7 +117,29 @@ def _add_distrust(connection: sa.Connection) -> None:
     DISTRUST.create(connection)
 
 
-MIGRATIONS: tuple[Callable[[sa.Connection], None], ...] = (_add_commissioning, _add_distrust)
+def digest(meters: str) -> str:
+    """Return what a layout is found by.
+
+    Parameters
+    ----------
+    meters
+        Its text, of any length.
+    """
+    return hashlib.sha256(meters.encode()).hexdigest()
+
+
+def _add_digest(connection: sa.Connection) -> None:
+    add = "ALTER TABLE history_layout ADD COLUMN digest VARCHAR(64) NOT NULL DEFAULT ''"
+    connection.exec_driver_sql(add)
+    if connection.dialect.name == "postgresql":
+        # SQLite has no such limit, and drops no constraint without making anew what all history refers to.
+        connection.exec_driver_sql("ALTER TABLE history_layout DROP CONSTRAINT history_layout_meters_key")
+    for number, meters in connection.execute(sa.select(LAYOUT.c.id, LAYOUT.c.meters)).all():
+        connection.execute(LAYOUT.update().where(LAYOUT.c.id == number).values(digest=digest(meters)))
+    connection.exec_driver_sql("CREATE UNIQUE INDEX history_layout_by_digest ON history_layout (digest)")
+
+
+MIGRATIONS: tuple[Callable[[sa.Connection], None], ...] = (_add_commissioning, _add_distrust, _add_digest)
 """Step k leads from schema version k + 1 to k + 2. A new database starts at the newest version."""
 
 

@@ -31,6 +31,7 @@ from service.store.schema import (
     LAYOUT,
     OUTBOX,
     VERSION,
+    digest,
     migrate,
 )
 
@@ -320,10 +321,10 @@ class Store(Reader):
 
     def _layout(self, connection: sa.Connection, report: FeederReport) -> int:
         meters = json.dumps([meter.meter for meter in rows(report)])
-        known = connection.scalar(sa.select(LAYOUT.c.id).where(LAYOUT.c.meters == meters))
+        row = {"meters": meters, "digest": digest(meters)}
+        known = connection.scalar(sa.select(LAYOUT.c.id).where(LAYOUT.c.digest == row["digest"]))
         if known is None:
-            inserted = connection.execute(LAYOUT.insert().values(meters=meters).returning(LAYOUT.c.id))
-            known = inserted.scalar_one()
+            known = connection.execute(LAYOUT.insert().values(row).returning(LAYOUT.c.id)).scalar_one()
         return int(known)
 
 

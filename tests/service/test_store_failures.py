@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import sqlite3
 import subprocess
@@ -9,14 +10,20 @@ import sys
 import textwrap
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
+from random import Random
 
 import pytest
+import sqlalchemy as sa
 
 from service.commissioning import Happened, Step
+from service.history import pack, rows
 from service.kept import Kept, Matter
+from service.report import FeederReport
 from service.store import Store, StoreUnavailable, connect, schema
 from tests.service.databases import Cluster, both
+from tests.service.reports import meter, report
 from tests.service.stored import T0, a_report, an_alarm, raised
 
 
@@ -181,12 +188,28 @@ def test_what_was_learned_is_kept_as_it_is(store: Store) -> None:
     assert store.commission("town") == other
 
 
+OLD_LAYOUT = sa.Table(
+    "history_layout",
+    sa.MetaData(),
+    sa.Column("id", schema.SEQ, primary_key=True, autoincrement=True),
+    sa.Column("meters", sa.Text, nullable=False, unique=True),
+)
+"""As it was until version 3."""
+
+
+def put_back(connection: sa.Connection, version: int, *later: sa.Table) -> None:
+    """Make a database without history one of an earlier version, which did not have the later tables."""
+    for table in (schema.HISTORY, schema.LAYOUT, *later):
+        table.drop(connection)
+    for table in (OLD_LAYOUT, schema.HISTORY):
+        table.create(connection)
+    connection.execute(schema.VERSION.update().values(version=version))
+
+
 @both
 def test_a_database_from_before_commissioning_was_kept_is_brought_forward(url: str) -> None:
     with Store(url) as old, old._write() as connection:
-        for table in (schema.COMMISSION, schema.COMMISSION_EVENT, schema.DISTRUST):
-            table.drop(connection)
-        connection.execute(schema.VERSION.update().values(version=1))
+        put_back(connection, 1, schema.COMMISSION, schema.COMMISSION_EVENT, schema.DISTRUST)
     with Store(url) as new:
         new.commit(kept=[Kept("village", T0, "{}")])
         assert new.commission("village") == Kept("village", T0, "{}")
@@ -197,12 +220,48 @@ def test_a_database_from_before_suspicions_were_kept_is_brought_forward(url: str
     learned, suspected = Kept("village", T0, "{}"), Kept("village", T0, "[]", Matter.DISTRUST)
     with Store(url) as old, old._write() as connection:
         old._put_kept(connection, learned)
-        schema.DISTRUST.drop(connection)
-        connection.execute(schema.VERSION.update().values(version=2))
+        put_back(connection, 2, schema.DISTRUST)
     with Store(url) as new:
         assert new.distrust("village") is None
         new.commit(kept=[suspected])
         assert (new.commission("village"), new.distrust("village")) == (learned, suspected)
+
+
+def of_random_ids(t: float, count: int) -> FeederReport:
+    """Meters whose ids no compression makes shorter."""
+    random = Random(1)
+    meters = tuple(meter(f"{random.getrandbits(128):032x}") for _ in range(count))
+    return replace(report(*meters), t=t)
+
+
+@both
+def test_a_feeder_of_many_meters_costs_no_alarm(store: Store) -> None:
+    """An index of PostgreSQL takes no text of more than 2704 bytes."""
+    assert store.commit([raised(an_alarm())], reports=[of_random_ids(T0, 400)]) == (1,)
+    store.commit(reports=[of_random_ids(T0 + 600, 400), of_random_ids(T0 + 1200, 401)])
+    assert [tick["seen"] for tick in store.history("village")] == [400, 400, 401]
+    with store._read() as connection:
+        assert connection.scalar(sa.select(sa.func.count()).select_from(schema.LAYOUT)) == 2
+
+
+@both
+def test_a_database_whose_layouts_had_a_length_is_brought_forward(url: str) -> None:
+    reports = [a_report(T0), a_report(T0 + 600, count=4)]
+    with Store(url) as old, old._write() as connection:
+        put_back(connection, 3)
+        for number, each in enumerate(reports, 1):
+            meters = json.dumps([one.meter for one in rows(each)])
+            connection.execute(OLD_LAYOUT.insert().values(meters=meters))
+            row = {"feeder": "village", "t": each.t, "verdict": "clean", "cause": "agreement"}
+            connection.execute(schema.HISTORY.insert().values(**row, layout=number, data=pack(rows(each))))
+    with Store(url) as new:
+        new.commit(reports=[replace(each, t=each.t + 6000) for each in reports])
+        new.commit([raised(an_alarm())], reports=[of_random_ids(T0 + 9000, 400)])
+        assert new.alarm(an_alarm().id) == an_alarm()
+        assert [tick["seen"] for tick in new.history("village")] == [2, 3, 2, 3, 400]
+        with new._read() as connection:
+            found = connection.execute(sa.select(schema.HISTORY.c.layout).order_by(schema.HISTORY.c.t))
+            assert [number for (number,) in found] == [1, 2, 1, 2, 3]
 
 
 @both
@@ -221,7 +280,7 @@ def test_older_schemas_are_brought_forward_and_newer_ones_refused(
         with Store(url) as two:
             assert two.alarm(an_alarm().id) == an_alarm()
     monkeypatch.setattr(schema, "MIGRATIONS", known)
-    with pytest.raises(StoreUnavailable, match=r"version 4.* too old"):
+    with pytest.raises(StoreUnavailable, match=r"version 5.* too old"):
         Store(url)
 
 
