@@ -367,15 +367,15 @@ def acknowledge(
     raise AlarmUnknown(alarm_id)
 
 
-def close(book: AlarmBook, t: float, why: str) -> tuple[Transition, ...]:
-    """Return the transitions that clear every alarm of a feeder that is watched no more.
+def close(alarms: Iterable[Alarm], t: float, why: str) -> tuple[Transition, ...]:
+    """Return the transitions that clear alarms that nobody would clear any more.
 
     Parameters
     ----------
-    book, t, why
-        Its alarms, when (Unix s), and why, for the event.
+    alarms, t, why
+        The alarms, of which those that stand are cleared; when (Unix s), and why, for the event.
     """
-    cleared = (replace(alarm, state=AlarmState.CLEARED, t_cleared=t) for alarm in book.active)
+    cleared = (replace(alarm, state=AlarmState.CLEARED, t_cleared=t) for alarm in alarms if alarm.active)
     return tuple(Transition(alarm, Change.CLEARED, t, None, why) for alarm in cleared)
 
 
@@ -392,10 +392,12 @@ def restore(feeder: str, alarms: Iterable[Alarm]) -> AlarmBook:
         Name.
     alarms
         Its active alarms and those that cleared within the memory of the rules, in any order. Of several
-        with the same kind and subject the latest counts.
+        with the same kind and subject one counts: an active one before those that have cleared, then the one
+        that was raised last.
     """
     entries: dict[Key, Entry] = {}
-    for alarm in sorted(alarms, key=lambda alarm: alarm.id):
+    # Ids follow a clock that may have been set back since, and then say nothing about which one stands.
+    for alarm in sorted(alarms, key=lambda alarm: (alarm.active, alarm.t_raised, alarm.id)):
         if alarm.feeder != feeder:
             raise ValueError(f"an alarm of {alarm.feeder!r} in the book of {feeder!r}")
         t = alarm.t_raised if alarm.t_cleared is None else alarm.t_cleared

@@ -38,6 +38,7 @@ from service.watch import TickResult, Watch, align_rules, known_of
 from service.wire import Decoded, Wire
 
 NOT_WATCHED = "the feeder is not watched any more"
+TOLD_TWICE = "another alarm tells the same"
 
 _log = structlog.get_logger("gridsec.runtime")
 
@@ -129,7 +130,11 @@ class Rounds:
         rules = align_rules(site, config.clock, max_skew_s=config.max_skew_s, grace_s=config.grace_s)
         commissioning = Commissioning(site, self.store.commission(name))
         suspicions = Suspicions(site, self.store.distrust(name))
-        watch = Watch(site, rules, restore(name, stored), commissioning, suspicions)
+        book = restore(name, stored)
+        watch = Watch(site, rules, book, commissioning, suspicions)
+        held = {alarm.id for alarm in book.alarms}
+        twice = [alarm for alarm in stored if alarm.id not in held]
+        self.keeper.waiting.add(transitions=close(twice, self._wall(), TOLD_TWICE))
         self.watches = {**self.watches, name: watch}
         self.unloaded.pop(name, None)
         self._learn()
@@ -151,9 +156,9 @@ class Rounds:
         watch = self.watches.get(name)
         if watch is None and name not in self.unloaded:
             raise FeederUnknown(name)
-        book = restore(name, self.store.active(name)) if watch is None else watch.book
-        t = self._wall() if book.t is None else book.t
-        self.keeper.store_now(close(book, t, NOT_WATCHED), without=name)
+        standing = self.store.active(name) if watch is None else watch.book.active
+        t = self._wall() if watch is None or watch.book.t is None else watch.book.t
+        self.keeper.store_now(close(standing, t, NOT_WATCHED), without=name)
         self.unloaded.pop(name, None)
         self.watches = {other: kept for other, kept in self.watches.items() if other != name}
         self._learn()
@@ -172,9 +177,8 @@ class Rounds:
         """
         ours, t = self.watches.keys() | self.unloaded.keys() | self.store.feeders().keys(), self._wall()
         standing = self.store.active()
-        for name in sorted({alarm.feeder for alarm in standing} - ours):
-            gone = restore(name, [alarm for alarm in standing if alarm.feeder == name])
-            self.keeper.waiting.add(transitions=close(gone, t, NOT_WATCHED))
+        left_out = [alarm for alarm in standing if alarm.feeder not in ours]
+        self.keeper.waiting.add(transitions=close(left_out, t, NOT_WATCHED))
         if self.keeper.publisher is not None:
             for alarm in standing:
                 if alarm.feeder in ours:

@@ -391,6 +391,17 @@ def test_restore_takes_the_latest_of_a_kind() -> None:
     assert restore(FEEDER, [later, first]).alarms == (later,)
 
 
+def test_restore_takes_what_stands_before_what_began_later_and_has_cleared() -> None:
+    """A clock that was ahead and has been set right: what began before that has the later times."""
+    _, stands = raised()
+    ahead = replace(stands, id="Z" * 26, t_raised=T0 + 3600)
+    cleared = replace(ahead, state=AlarmState.CLEARED, t_cleared=T0 + 3700)
+    for order in ([stands, cleared], [cleared, stands]):
+        assert restore(FEEDER, order).alarms == (stands,)
+    again = replace(stands, id="0" * 26, t_raised=T0 + 60)
+    assert restore(FEEDER, [again, stands, cleared]).alarms == (again,)
+
+
 # ------------------------------------------------------------------------- ids
 
 

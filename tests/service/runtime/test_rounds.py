@@ -33,6 +33,7 @@ from service.store import Store, StoreUnavailable, connect
 from service.watch import Watch, design
 from tests.service.liars import FEEDER, START, rounds, until
 from tests.service.running import Outlet
+from tests.service.stored import an_alarm
 
 
 @pytest.fixture
@@ -340,6 +341,32 @@ def test_alarms_of_a_feeder_that_was_left_out_are_cleared_at_the_start(
         number = store.last_event
         rounds(store, site)
         assert store.last_event == number
+
+
+def test_of_two_alarms_that_tell_the_same_none_stands_for_ever(site: Site, path: Path) -> None:
+    """Another version left them so: one is in the feeder's book; the other goes, or both with the feeder."""
+    one = an_alarm(feeder=FEEDER, meter="m01")
+    both = (one, replace(one, id="Z" * 26), replace(one, id="1" * 26, t_raised=one.t_raised + 1))
+
+    def after(name: str, run: Callable[[Store], None]) -> list[str]:
+        with Store(f"sqlite:///{path}-{name}") as store:
+            store.commit([Transition(each, Change.RAISED, START) for each in both])
+            run(store)
+            return [each.id for each in store.active()]
+
+    def watched(store: Store) -> None:
+        rounds(store, site)
+
+    def unloaded(store: Store) -> None:
+        why = {FEEDER: "of another version"}
+        live = Rounds(RuntimeConfig(), store, [], wall=lambda: START, stored=lambda: None, unloaded=why)
+        live.remove(FEEDER)
+
+    def left_out(store: Store) -> None:
+        Rounds(RuntimeConfig(), store, [], wall=lambda: START, stored=lambda: None).begin()
+
+    assert after("watched", watched) == ["1" * 26]
+    assert after("unloaded", unloaded) == after("left-out", left_out) == []
 
 
 def test_an_idle_service_notices_that_the_database_is_back(
