@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import gc
+import multiprocessing
 import threading
 import time
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import structlog
 
 from feeders.estimators import Watcher
-from gridsec.errors import GridsecError
+from feeders.load import Site, from_tables
+from feeders.schema import from_json
+from gridsec.errors import FeederInvalid, GridsecError
 from service.watch import Watch, design
 
 _log = structlog.get_logger("gridsec.runtime")
@@ -31,20 +37,72 @@ def begin(watch: Watch, hand_over: Callable[[Callable[[], None]], None]) -> None
     def run() -> None:
         started = time.monotonic()
         finished: Watcher | None = None
+        defect: Exception | None = None
         problem = ""
         try:
             finished = design(watch.site, _progress(watch.name))
         except GridsecError as error:
             problem = str(error)
         except Exception as error:  # noqa: BLE001 - shown to the operator as the feeder's problem
-            problem = f"{type(error).__name__}: {error}"
-            _log.exception("design failed", feeder=watch.name)
-        finally:
-            hand_over(partial(install, watch, finished, problem))
+            problem, defect = f"{type(error).__name__}: {error}", error
         seconds = round(time.monotonic() - started, 3)
-        _log.info("design finished", feeder=watch.name, seconds=seconds, problem=problem or None)
 
-    threading.Thread(target=run, name=f"gridsec-design-{watch.name}", daemon=True).start()
+        def end() -> None:
+            if defect is not None:
+                _log.error("design failed", feeder=watch.name, exc_info=defect)
+            _log.info("design finished", feeder=watch.name, seconds=seconds, problem=problem or None)
+            install(watch, finished, problem)
+
+        hand_over(end)
+
+    _apart(watch.name, run)
+
+
+def prepare(name: str, tables: dict[str, Any]) -> asyncio.Future[tuple[Site, Watcher]]:
+    """Load and design a feeder as `begin` does; called from the event loop.
+
+    Parameters
+    ----------
+    name, tables
+        Its name, and JSON of the columns of its files.
+
+    Returns
+    -------
+    asyncio.Future
+        The feeder and its design, or FeederInvalid, NotObservable or DesignInfeasible. Who does not want to
+        wait any more ends it in another way; the thread then works for nobody.
+    """
+    loop = asyncio.get_running_loop()
+    answer: asyncio.Future[tuple[Site, Watcher]] = loop.create_future()
+
+    def work() -> tuple[Site, Watcher]:
+        parsed = from_json(tables)
+        if parsed.meta.name != name:
+            raise FeederInvalid([f"feeder: name {parsed.meta.name!r} does not fit the address {name!r}"])
+        site = from_tables(parsed)
+        return site, design(site, _progress(name))
+
+    def run() -> None:
+        tell: Callable[[], None]
+        try:
+            tell = partial(answer.set_result, work())
+        except Exception as error:  # noqa: BLE001 - raised where the answer is awaited
+            tell = partial(answer.set_exception, error)
+        with contextlib.suppress(RuntimeError):  # the loop has ended
+            loop.call_soon_threadsafe(lambda: None if answer.done() else tell())
+
+    _apart(name, run)
+    return answer
+
+
+def abandon() -> None:
+    """End the processes of designs that are under way, since Python would wait for them at its end."""
+    for process in multiprocessing.active_children():
+        process.kill()
+
+
+def _apart(name: str, run: Callable[[], None]) -> None:
+    threading.Thread(target=run, name=f"gridsec-design-{name}", daemon=True).start()
 
 
 def install(watch: Watch, finished: Watcher | None, problem: str) -> None:

@@ -16,9 +16,8 @@ from functools import partial
 from typing import Any, TypeVar
 
 from feeders.estimators import Watcher
-from feeders.load import Site, from_tables
-from feeders.schema import from_json
-from gridsec.errors import FeederInvalid, GridsecError
+from feeders.load import Site
+from gridsec.errors import GridsecError
 from service import describe, designs
 from service.align import Clock
 from service.bus import Sample
@@ -29,11 +28,12 @@ from service.keeper import Done, Publisher, at_once
 from service.report import FeederReport
 from service.rounds import Rounds, RuntimeConfig
 from service.store import Store, StoreUnavailable
-from service.watch import Phase, design
+from service.watch import Phase
 
 SAMPLES_PER_ROUND = 512
 IDLE_S = 1.0
 STUCK_S = 30.0
+STOPPING = "the service is stopping"
 
 T = TypeVar("T")
 
@@ -78,15 +78,18 @@ class Runtime:
             store,
             sites,
             wall=wall,
-            stored=self._wake_streams,
+            stored=lambda: self._in_loop(partial(self._notify, "alarm")),
             apart=at_once if waits else self._write_apart,
             unloaded=unloaded,
         )
         self._given = frozenset(self._rounds.watches) if given is None else frozenset(given)
         self._inbox = Inbox(
-            self._wake_from_thread, max_samples=config.max_samples, lossless=config.clock is Clock.EVENTS
+            lambda: self._in_loop(self._wake.set),
+            max_samples=config.max_samples,
+            lossless=config.clock is Clock.EVENTS,
         )
         self._commands: deque[tuple[Callable[[], Any], asyncio.Future[Any]]] = deque()
+        self._prepared: set[asyncio.Future[tuple[Site, Watcher]]] = set()
         self._subscribers: set[asyncio.Queue[str]] = set()
         self._outcomes: deque[Callable[[], None]] = deque()
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="gridsec-round")
@@ -153,6 +156,9 @@ class Runtime:
         """End `run` and every subscription soon; called from the event loop."""
         self._stopping = True
         self._inbox.close()
+        for prepared in self._prepared:
+            if not prepared.done():
+                prepared.set_exception(StoreUnavailable(STOPPING))
         self._wake.set()
         self._notify("stop")
 
@@ -224,24 +230,21 @@ class Runtime:
 
     async def _command(self, run: Callable[[], T]) -> T:
         """Have something executed between two rounds."""
-        if self._stopping:
-            raise StoreUnavailable("the service is stopping")
+        self._go_on()
         answer: asyncio.Future[T] = asyncio.get_running_loop().create_future()
         self._commands.append((run, answer))
         self._wake.set()
         return await answer
+
+    def _go_on(self) -> None:
+        if self._stopping:
+            raise StoreUnavailable(STOPPING)
 
     def _in_loop(self, run: Callable[[], object]) -> None:
         """Call something in the event loop, from any thread; not at all once the loop has ended."""
         if self._loop is not None:
             with contextlib.suppress(RuntimeError):
                 self._loop.call_soon_threadsafe(run)
-
-    def _wake_from_thread(self) -> None:
-        self._in_loop(self._wake.set)
-
-    def _wake_streams(self) -> None:
-        self._in_loop(partial(self._notify, "alarm"))
 
     def _hand_over(self, install: Callable[[], None]) -> None:
         def run() -> None:
@@ -401,16 +404,12 @@ class Runtime:
         FeederInvalid, NotObservable, DesignInfeasible, TooManyFeeders, StoreUnavailable
             If it cannot be taken over; the feeder stays as it was.
         """
+        self._go_on()
         self._make_room(name)
-
-        def prepare() -> tuple[Site, Watcher]:
-            parsed = from_json(tables)
-            if parsed.meta.name != name:
-                raise FeederInvalid([f"feeder: name {parsed.meta.name!r} does not fit the address {name!r}"])
-            site = from_tables(parsed)
-            return site, design(site)
-
-        site, finished = await asyncio.to_thread(prepare)
+        prepared = designs.prepare(name, tables)
+        self._prepared.add(prepared)
+        prepared.add_done_callback(self._prepared.discard)
+        site, finished = await prepared
 
         def install() -> None:
             self._make_room(name)

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import multiprocessing
+import signal
 import threading
+import time
 import weakref
 from collections.abc import Callable
 from pathlib import Path
@@ -14,10 +17,10 @@ import pytest
 
 from feeders.load import Site, from_tables
 from feeders.schema import from_json, to_json
-from service.designs import settle
+from service.designs import abandon, settle
 from service.rounds import RuntimeConfig
 from service.runtime import Runtime
-from service.store import Store
+from service.store import Store, StoreUnavailable
 from service.watch import Phase, design
 from tests.service.commands import command
 from tests.service.liars import FEEDER
@@ -89,6 +92,47 @@ def test_settled_is_when_nobody_is_being_designed_any_more(
 
     with Store(f"sqlite:///{path}") as store:
         asyncio.run(asyncio.wait_for(scene(store), 30.0))
+
+
+def test_stopping_waits_for_no_feeder_that_is_being_put(
+    site: Site, path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun, goes_on = threading.Event(), threading.Event()
+
+    def slow(asked: Site, progress: Callable[[int, int], None]) -> Any:
+        if asked.feeder.name == OTHER:
+            begun.set()
+            goes_on.wait(20.0)
+        return design(asked, progress)
+
+    monkeypatch.setattr("service.designs.design", slow)
+
+    async def scene(store: Store) -> None:
+        runtime = Runtime(RuntimeConfig(), store, [site])
+        task = asyncio.create_task(runtime.run())
+        put = asyncio.create_task(runtime.put_feeder(OTHER, called(site, OTHER)))
+        while not begun.is_set():  # noqa: ASYNC110
+            await asyncio.sleep(0.01)
+        runtime.stop()
+        for answer in (put, runtime.put_feeder("third", called(site, "third"))):
+            with pytest.raises(StoreUnavailable, match="stopping"):
+                await answer
+        await task
+        assert store.feeders() == {}
+
+    with Store(f"sqlite:///{path}") as store:
+        started = time.monotonic()
+        asyncio.run(asyncio.wait_for(scene(store), 15.0))
+        assert time.monotonic() - started < 10.0
+    goes_on.set()
+
+
+def test_processes_of_a_design_are_not_waited_for_at_the_end() -> None:
+    worker = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(60.0,))
+    worker.start()
+    abandon()
+    worker.join(10.0)
+    assert worker.exitcode == -signal.SIGKILL
 
 
 def test_the_service_settles(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
