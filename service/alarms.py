@@ -252,7 +252,8 @@ def _settle(
 
 
 def _remembered(alarm: Alarm, rules: AlarmRules, t: float) -> bool:
-    return alarm.t_cleared is not None and t - alarm.t_cleared <= rules.memory_s
+    # Of a time ahead, after the clock was set back or a recording began again, no more is remembered.
+    return alarm.t_cleared is not None and abs(t - alarm.t_cleared) <= rules.memory_s
 
 
 def _raise(old: Alarm | None, condition: Condition, rules: AlarmRules, onset: float, t: float) -> Alarm:

@@ -203,6 +203,14 @@ def test_a_clock_set_back_holds() -> None:
     assert [item.t for item in happened] == [T0 - 3599]
 
 
+@pytest.mark.parametrize(("back_s", "count"), [(40.0, 2), (3600.0, 1)])
+def test_what_cleared_at_a_time_far_ahead_is_not_remembered(back_s: float, count: int) -> None:
+    book, happened = run(at_1_hz("PPP" + 6 * "A"))
+    assert times(happened) == [(2.0, Change.RAISED), (8.0, Change.CLEARED)]
+    _, (again,) = run([(T0 - back_s + k, "P") for k in range(4)], book=book)
+    assert again.alarm.count == count
+
+
 def test_conditions_of_another_feeder_are_refused() -> None:
     with pytest.raises(ValueError, match="village"):
         advance(AlarmBook("town"), RULES, tick("P"), T0)

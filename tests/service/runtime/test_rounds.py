@@ -369,6 +369,19 @@ def test_of_two_alarms_that_tell_the_same_none_stands_for_ever(site: Site, path:
     assert after("unloaded", unloaded) == after("left-out", left_out) == []
 
 
+def test_what_cleared_lately_is_remembered_by_the_readings_clock(
+    site: Site, attacked: list[Sample], path: Path
+) -> None:
+    """However long ago that is for the wall clock."""
+    with Store(f"sqlite:///{path}") as store:
+        rounds(store, site).round(attacked)
+        before = store.alarms()[0]
+        config = RuntimeConfig(clock=Clock.EVENTS)
+        live = Rounds(config, store, [site], wall=lambda: START + 1e8, stored=lambda: None)
+        assert {alarm.state for alarm in before} == {AlarmState.CLEARED}
+        assert sorted(live.watches[FEEDER].book.alarms, key=lambda alarm: alarm.id) == before[::-1]
+
+
 def test_an_idle_service_notices_that_the_database_is_back(
     site: Site,
     attacked: list[Sample],
