@@ -14,7 +14,7 @@ References
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import log
 
 import numpy as np
@@ -42,6 +42,9 @@ class Droop:
         First-order time constant, s.
     vbar
         Reference voltage, pu; `z = vbar^2 - v^2`.
+    rating : (m,), or one number for all
+        The most that an inverter can inject when it does not follow its curve: its rated apparent power, pu
+        of the feeder's base; infinite where it is not told.
     slope : (m,)
         Derived. Largest slope of K, the d of chong2020 (18) as corrected.
     limit : (m,)
@@ -58,6 +61,7 @@ class Droop:
     q: Floats
     tau: Floats
     vbar: float = 1.0
+    rating: Floats = field(default_factory=lambda: np.array(np.inf))
     slope: Floats = field(init=False, repr=False)
     limit: Floats = field(init=False, repr=False)
     # Ramp k of z is slope[k] * (clip(z, low[k], high[k]) - low_or_high[k]); see `_ramps`.
@@ -68,6 +72,8 @@ class Droop:
         object.__setattr__(self, "customer", frozen_ints(self.customer))
         for name in ("v", "q", "tau"):
             object.__setattr__(self, name, frozen(getattr(self, name)))
+        rating = np.asarray(self.rating, dtype=np.float64)
+        object.__setattr__(self, "rating", frozen(rating if rating.ndim else np.full(self.tau.shape, rating)))
         problems = _problems(self)
         if problems:
             raise FeederInvalid(problems)
@@ -146,7 +152,7 @@ class Droop:
         """
         # What was derived and found right is so for some of the inverters too.
         out: Droop = object.__new__(Droop)
-        own = {name: getattr(self, name)[rows] for name in ("v", "q", "tau", "slope", "limit")}
+        own = {name: getattr(self, name)[rows] for name in ("v", "q", "tau", "rating", "slope", "limit")}
         ramps = tuple(ramp.take(rows) for ramp in self._ramps)
         object.__setattr__(out, "customer", frozen_ints(self.customer[rows]))
         for name, values in own.items():
@@ -213,13 +219,14 @@ def _problems(droop: Droop) -> list[str]:
         ("v", droop.v.shape, (count, 4)),
         ("q", droop.q.shape, (count, 4)),
         ("tau", droop.tau.shape, (count,)),
+        ("rating", droop.rating.shape, (count,)),
     )
     out = [f"droop: {what} has shape {has}; expected {wants}" for what, has, wants in shapes if has != wants]
     if out:
         return out
     if not (np.isfinite(droop.vbar) and droop.vbar > 0):
         out.append(f"droop: vbar is {droop.vbar}; it must be a positive number")
-    for wrong, text in _row_problems(droop.v, droop.q, droop.tau):
+    for wrong, text in _row_problems(droop):
         out.extend(
             f"inverter {i}: {text}; v {droop.v[i].tolist()}, q {droop.q[i].tolist()}, tau {droop.tau[i]} s"
             for i in np.flatnonzero(wrong)
@@ -229,8 +236,10 @@ def _problems(droop: Droop) -> list[str]:
     return out
 
 
-def _row_problems(v: Floats, q: Floats, tau: Floats) -> tuple[tuple[Bools, str], ...]:
-    """Which inverters' breakpoints or time constants are wrong, and why."""
+def _row_problems(droop: Droop) -> tuple[tuple[Bools, str], ...]:
+    """Which inverters' breakpoints, time constants or ratings are wrong, and why."""
+    v, q, tau = droop.v, droop.q, droop.tau
+    most = np.abs(q).max(axis=1, initial=0.0)
     finite = np.all(np.isfinite(v), axis=1) & np.all(np.isfinite(q), axis=1)
     # Infinite entries are named as such, and not again for what their differences are.
     steps = np.diff(np.where(finite[:, None], v, 1.0), axis=1)
@@ -241,6 +250,7 @@ def _row_problems(v: Floats, q: Floats, tau: Floats) -> tuple[tuple[Bools, str],
         (np.any(falls > 0, axis=1), "reactive power must not increase with the voltage"),
         (np.any((steps == 0) & (falls < 0), axis=1), "reactive power jumps where two voltages are equal"),
         (~(np.isfinite(tau) & (tau > 0)), "time constant must be positive"),
+        (finite & ~(droop.rating >= most), "the curve asks for more than the rating"),
     )
 
 
@@ -385,12 +395,13 @@ def fleet(
     if tau is not None:
         given = np.asarray(tau, dtype=np.float64)
         own = np.where(np.isnan(given), own, given)
-    droop = Droop(index, v, q * (rated / base_kva)[:, None], own, vbar)
+    rating = rated / base_kva
+    droop = Droop(index, v, q * rating[:, None], own, vbar, rating)
     if capability == "fixed":
         return droop
     if capability != "circular" or p_gen is None:
         raise FeederInvalid([f"capability {capability!r} must be 'fixed', or 'circular' together with p_gen"])
-    headroom = (rated / base_kva) ** 2 - np.asarray(p_gen, dtype=np.float64) ** 2
+    headroom = rating**2 - np.asarray(p_gen, dtype=np.float64) ** 2
     if not np.all(headroom >= 0):
         raise FeederInvalid(
             [f"inverter {i} generates above its rating" for i in np.flatnonzero(~(headroom >= 0))]
@@ -415,7 +426,7 @@ def capped(droop: Droop, limit: Floats) -> Droop:
         kept = q[:, outer] - q[:, inner]
         share = np.divide(kept, rise, out=np.ones_like(rise), where=rise != 0)
         v[:, outer] = droop.v[:, inner] + share * (droop.v[:, outer] - droop.v[:, inner])
-    return Droop(droop.customer, v, q, droop.tau, droop.vbar)
+    return replace(droop, v=v, q=q)
 
 
 def voltage_curve(droop: Droop, v: Floats) -> Floats:

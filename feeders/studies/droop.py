@@ -257,8 +257,7 @@ def _preset(study: _Study, name: str) -> dict[str, Any]:
 
 
 def _time_constant(study: _Study, times: float) -> dict[str, Any]:
-    slow = study.fleet
-    fleet = Droop(slow.customer, slow.v, slow.q, times * slow.tau, slow.vbar)
+    fleet = replace(study.fleet, tau=times * study.fleet.tau)
     return {"tau_factor": times, "tau_s": float(np.median(fleet.tau)), **_compared(study, fleet)}
 
 

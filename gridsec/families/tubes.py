@@ -123,7 +123,7 @@ class Doubt:
     meters, inverters
         How many of each at once.
     reach : (m,)
-        Largest injection that an inverter can be made to have, pu.
+        Largest injection that an inverter can be made to have: its rating, pu.
     coupling : (m, m)
         2X between the inverters' customers.
     """

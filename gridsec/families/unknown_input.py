@@ -2,9 +2,9 @@
 
 A candidate is a pair (suspected meters, suspected inverters) of bounded size. Its unknown-input observer
 rests on neither: honest inverters follow their curves (`gridsec.families.tubes`), what the suspected ones
-inject is an unknown input that the trusted readings reveal through 2X, and what is left over must be
-possible for honest readings (`gridsec.families.pairs`). Thresholds are worst cases of everything that is
-not known, so that honest readings never contradict the pair that is true. Hence:
+inject is an unknown input, up to their rating, that the trusted readings reveal through 2X, and what is left
+over must be possible for honest readings (`gridsec.families.pairs`). Thresholds are worst cases of everything
+that is not known, so that honest readings never contradict the pair that is true. Hence:
 
 1. The pair that is true is never refuted, as long as no more meters and inverters are attacked than assumed.
 2. Who is in every pair that is not refuted is attacked: *named*.
@@ -41,9 +41,6 @@ from gridsec.plant import Options, Plant, check_plant, setting
 
 __all__ = ["UnknownInputDesign", "UnknownInputState", "design", "init", "step"]
 
-REACH = 2.0
-"""Largest injection of an attacked inverter in parts of the largest that its curve asks for."""
-
 
 def design(
     plant: Plant,
@@ -73,10 +70,13 @@ def design(
     DesignInfeasible
         If there are too many pairs.
     ValueError
-        As `plant.check_plant`, or if `max_inverters` is negative.
+        As `plant.check_plant`, or if `max_inverters` is negative, or if inverters have no rating: how far an
+        attacked one can go is what decides whether it can be the explanation.
     """
     p, m = plant.meters.size, plant.droop.tau.size
     more = [f"max_inverters is {max_inverters}; it cannot be negative"] if not max_inverters >= 0 else []
+    untold = np.flatnonzero(~np.isfinite(plant.droop.rating)).tolist()
+    more += [f"inverters {untold} have no rating; `Droop.rating` tells it"] if untold else []
     check_plant(plant, max_attacked=max_attacked, step_s=step_s, more=more)
     if p <= 2 * max_attacked:
         why = f"{p} meters of which {max_attacked} may lie: more than {2 * max_attacked} are needed"
@@ -88,7 +88,7 @@ def design(
     gain = 2.0 * made.model.X[:, own]
     most = min(max_inverters, m)
     found, missing = pairs(gain[plant.meters], max_attacked, most)
-    doubt = Doubt(max_attacked, most, frozen(REACH * plant.droop.limit), frozen(gain[own]))
+    doubt = Doubt(max_attacked, most, plant.droop.rating, frozen(gain[own]))
     return UnknownInputDesign(made, most, found, found.within(), missing, doubt, frozen(gain))
 
 

@@ -180,7 +180,7 @@ def steepened(droop: Droop, times: float) -> Droop:
     v[:, 0] = inner[:, 0] - (v[:, 1] - v[:, 0]) / times
     v[:, 3] = inner[:, 1] + (v[:, 3] - v[:, 2]) / times
     v[:, 1:3] = inner
-    return Droop(droop.customer, v, droop.q, droop.tau, droop.vbar)
+    return replace(droop, v=v)
 
 
 def enlarged(droop: Droop, times: float) -> Droop:
@@ -193,7 +193,9 @@ def enlarged(droop: Droop, times: float) -> Droop:
     times
         Factor, not negative.
     """
-    return Droop(droop.customer, droop.v, times * droop.q, droop.tau, droop.vbar)
+    # What nobody told stays untold, also of inverters of no size.
+    rating = np.multiply(times, droop.rating, out=droop.rating.copy(), where=np.isfinite(droop.rating))
+    return replace(droop, q=times * droop.q, rating=rating)
 
 
 # --- certificates ---------------------------------------------------------------------------------------

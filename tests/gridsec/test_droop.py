@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import hypothesis.strategies as st
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from hypothesis import assume, given
 
 from gridsec.droop import PRESETS, Droop, capped, curve_gap, fleet, preset, voltage_curve
 from gridsec.errors import FeederInvalid
+from gridsec.studies.droop_stability import enlarged, steepened
 
 seeds = st.integers(0, 100_000)
 
@@ -164,6 +167,18 @@ def test_circular_capability() -> None:
     assert np.array_equal(droop.q[1], fixed.q[1])
 
 
+def test_ratings_stay_with_their_inverters_whatever_caps_the_curve() -> None:
+    droop = fleet(np.array([0, 3]), "ieee1547-b", np.array([5.0, 20.0]), 100.0)
+    assert droop.rating.tolist() == [0.05, 0.2]
+    assert droop.take(np.array([1, 1, 0])).rating.tolist() == [0.2, 0.2, 0.05]
+    assert capped(droop, np.array([0.01, 0.0])).rating.tolist() == [0.05, 0.2]
+    assert enlarged(droop, 3.0).rating == pytest.approx([0.15, 0.6])
+    assert steepened(droop, 2.0).rating.tolist() == [0.05, 0.2]
+    untold = Droop(droop.customer, droop.v, droop.q, droop.tau)
+    assert untold.rating.tolist() == enlarged(untold, 0.0).rating.tolist() == [np.inf, np.inf]
+    assert replace(untold, rating=np.array(0.3)).rating.tolist() == [0.3, 0.3]
+
+
 # name, voltages, injections, time constant; from the tables that droop.py cites.
 TABLE = [
     ("ieee1547-a", [0.90, 1.00, 1.00, 1.10], [0.25, 0, 0, -0.25], 4.3429),
@@ -223,6 +238,9 @@ def test_no_inverters_at_all() -> None:
         ({"tau": [np.inf]}, "time constant"),
         ({"tau": [1.0, 1.0]}, "tau has shape"),
         ({"vbar": 0.0}, "vbar"),
+        ({"rating": [0.09]}, "asks for more than the rating"),
+        ({"rating": [np.nan]}, "asks for more than the rating"),
+        ({"rating": [0.2, 0.2]}, "rating has shape"),
         ({"customer": [-1]}, "customer"),
     ],
 )

@@ -129,6 +129,18 @@ def test_only_an_inverter_whose_meter_might_as_well_lie_is_ambiguous() -> None:
     assert sum(e.probability for e in last.explanations) == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize("part", [-1.0, 1.0])
+def test_an_inverter_may_inject_all_that_it_is_rated_for(part: float) -> None:
+    """Its curve asks for 0.436 of its 23 kVA; the rest is no proof that its meter lies."""
+    site = village()
+    assert (site.droop.rating[2], site.droop.limit[2]) == pytest.approx((0.23, 0.436 * 0.23))
+    answers = watch(site, inverter=(2, 23.0 * part), seconds=ON + 10.0)
+    assert all(named(verdict) == ([], []) for _, verdict in answers)
+    last = answers[-1][1]
+    assert (last.decision, last.cause) == (Decision.UNDECIDED, Cause.AMBIGUOUS)
+    assert any(e.inverters[2] and not e.meters.any() for e in last.explanations)
+
+
 def test_only_an_inverter_is_named_where_no_meter_can_be_the_explanation() -> None:
     """M = 0: meters are beyond doubt, and what its own one reports is proof."""
     site = village()
@@ -245,6 +257,9 @@ def test_designs_that_cannot_be() -> None:
         unknown_input.design(street, max_attacked=5, step_s=1.0)
     with pytest.raises(ValueError, match="step_s"):
         unknown_input.design(street, max_attacked=1, step_s=0.0)
+    untold = replace(street, droop=replace(street.droop, rating=np.array(np.inf)))
+    with pytest.raises(ValueError, match=r"inverters .* no rating"):
+        unknown_input.design(untold, max_attacked=1, step_s=1.0)
     with pytest.raises(DesignInfeasible, match="cannot be tried"):
         watcher(village("kerber-vorstadtnetz"))
 
