@@ -338,7 +338,7 @@ FAMILIES: Final = Families(
             unknown_input.init,
             unknown_input.step,
             lambda d: int(d.observers),
-            lambda d: f"intervals of honest inverters; {len(d.missing)} pairs have no observer",
+            lambda d: f"intervals of honest inverters; {len(d.missing)} pairs need reported q",
         ),
     )
 )

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gridsec.arrays import Bools, Floats
-from gridsec.families.pairs import Believed, LeftOut, Pairs, Relation, Trial, believe, try_pair
+from gridsec.families.pairs import Believed, Pairs, Relation, Trial, Unseen, believe, try_pair
 from gridsec.families.tubes import Doubt, Seen, Tube, Tubes, advance
 from gridsec.feeder import Feeder
 from gridsec.frames import NO_VOLTAGE, Inputs, Past, busbar_errors, clean
@@ -32,7 +32,7 @@ class UnknownInputDesign:
     within : (c, c)
         Whether the first of two candidates suspects nobody whom the second does not.
     missing
-        Pairs without an unknown-input observer, by the rank of what voltages say.
+        Pairs whose inverters voltages alone do not tell apart; they are tried as well.
     doubt
         How many may be attacked, and how far.
     gain : (N, m)
@@ -43,7 +43,7 @@ class UnknownInputDesign:
     max_inverters: int
     pairs: Pairs
     within: Bools
-    missing: tuple[LeftOut, ...]
+    missing: tuple[Unseen, ...]
     doubt: Doubt
     gain: Floats
 

@@ -54,8 +54,8 @@ class Pairs:
 
 
 @dataclass(frozen=True, slots=True)
-class LeftOut:
-    """A pair that has no unknown-input observer.
+class Unseen:
+    """A pair that has no unknown-input observer by voltages alone.
 
     Attributes
     ----------
@@ -70,10 +70,11 @@ class LeftOut:
     rank: int
 
 
-def pairs(gain: Floats, most_meters: int, most_inverters: int) -> tuple[Pairs, tuple[LeftOut, ...]]:
-    """All pairs that have an unknown-input observer, and those that have none.
+def pairs(gain: Floats, most_meters: int, most_inverters: int) -> tuple[Pairs, tuple[Unseen, ...]]:
+    """All pairs, and those of them whose inverters voltages alone do not tell apart.
 
-    What a pair without one could explain, a smaller pair explains as well: its columns span no more.
+    These are tried like all others: reported reactive powers may tell them apart, and two inverters together
+    reach farther than either.
 
     Parameters
     ----------
@@ -101,11 +102,10 @@ def pairs(gain: Floats, most_meters: int, most_inverters: int) -> tuple[Pairs, t
     for meters in _subsets(p, most_meters):
         rest = np.delete(gain, list(meters), axis=0)
         for inverters in _subsets(m, most_inverters):
+            found.append((meters, inverters))
             rank = _rank(rest[:, list(inverters)], float(np.abs(gain).max(initial=0.0)))
             if rank < len(inverters):
-                missing.append(LeftOut(meters, inverters, rank))
-            else:
-                found.append((meters, inverters))
+                missing.append(Unseen(meters, inverters, rank))
     found.sort(key=lambda pair: len(pair[0]) + len(pair[1]))
     marks = np.zeros((len(found), p + m), dtype=np.bool_)
     for row, (meters, inverters) in zip(marks, found, strict=True):
@@ -294,8 +294,16 @@ def try_pair(believed: Believed, inverters: Bools, room: Floats) -> Trial:
 _ROUNDING = 1e-6
 
 
+# Inverters whose columns differ by less, as a part of their squared lengths, are one and the same.
+_ALIKE = 1e-10
+
+
 def _pseudo_inverse(G: Floats) -> Floats:
-    """Of a symmetric positive semidefinite matrix, most often of one entry."""
-    if G.size <= 1:
-        return np.divide(1.0, G, out=np.zeros_like(G), where=G > 0.0)
-    return np.asarray(np.linalg.pinv(G, hermitian=True))
+    """F with G F G = G, any of which decouples; G is positive semidefinite, most often of one entry."""
+    size = np.sqrt(np.diagonal(G))
+    unit = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
+    # What reactive powers say of one inverter may be orders sharper than what voltages say of the next.
+    scale = np.multiply.outer(unit, unit)
+    if size.size <= 1:
+        return scale
+    return np.asarray(scale * np.linalg.pinv(scale * G, rcond=_ALIKE, hermitian=True))

@@ -19,7 +19,7 @@ from scipy.optimize import linprog
 
 from feeders.estimators import choose
 from feeders.estimators import design as watcher
-from feeders.load import Site, load, plant, to_frame
+from feeders.load import Site, from_tables, load, plant, to_frame
 from feeders.meters import Channel, MeterErrors, Silence
 from feeders.scenario import START, Scenario, simulate, snapshots
 from gridsec.attack import Bias, InverterAttack
@@ -129,16 +129,26 @@ def test_only_an_inverter_whose_meter_might_as_well_lie_is_ambiguous() -> None:
     assert sum(e.probability for e in last.explanations) == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize("part", [-1.0, 1.0])
-def test_an_inverter_may_inject_all_that_it_is_rated_for(part: float) -> None:
-    """Its curve asks for 0.436 of its 23 kVA; the rest is no proof that its meter lies."""
-    site = village()
-    assert (site.droop.rating[2], site.droop.limit[2]) == pytest.approx((0.23, 0.436 * 0.23))
-    answers = watch(site, inverter=(2, 23.0 * part), seconds=ON + 10.0)
+@pytest.mark.parametrize(
+    ("name", "inverter", "kvar"),
+    [
+        ("simbench-lv-rural1", 2, -23.0),
+        ("simbench-lv-rural1", 2, 23.0),
+        ("cigre-lv", 0, 95.0),  # at the busbar: no voltage shows it
+        ("cigre-lv", 0, -95.0),
+    ],
+)
+def test_an_inverter_may_inject_all_that_it_is_rated_for(name: str, inverter: int, kvar: float) -> None:
+    """Its curve asks for 0.44 of it at most; the rest is no proof that its meter lies."""
+    site = village(name)
+    rating = site.droop.rating[inverter]
+    assert rating * site.feeder.base_kva == pytest.approx(abs(kvar))
+    assert site.droop.limit[inverter] <= 0.44 * rating
+    answers = watch(site, inverter=(inverter, kvar), seconds=ON + 10.0)
     assert all(named(verdict) == ([], []) for _, verdict in answers)
     last = answers[-1][1]
     assert (last.decision, last.cause) == (Decision.UNDECIDED, Cause.AMBIGUOUS)
-    assert any(e.inverters[2] and not e.meters.any() for e in last.explanations)
+    assert any(e.inverters[inverter] and not e.meters.any() for e in last.explanations)
 
 
 def test_only_an_inverter_is_named_where_no_meter_can_be_the_explanation() -> None:
@@ -239,16 +249,34 @@ def test_a_quarter_of_an_hour_is_an_interval_like_any_other() -> None:
     assert all(named(v) == ([4], []) for _, v in answers[2:])
 
 
-def test_members_without_an_observer_are_left_out_by_rank() -> None:
-    """CIGRE's first inverter sits at the busbar: no meter sees it, whoever is trusted."""
+def test_members_that_voltages_do_not_show_are_known_by_rank_and_tried_all_the_same() -> None:
+    """CIGRE's first inverter sits at the busbar: no voltage shows it, whoever is trusted."""
     made = watcher(village("cigre-lv")).design
     assert len(made.missing) == 7  # with nobody and with each of six meters suspected
     assert {out.inverters for out in made.missing} == {(0,)}
-    assert not made.pairs.inverters[:, 0].any()
+    assert made.observers == 7 * 7
+    assert made.pairs.inverters[:, 0].sum() == 7
     gain = made.gain[made.setting.plant.meters]
     for out in made.missing:
         kept = np.delete(gain, out.meters, axis=0)[:, out.inverters]
         assert np.linalg.matrix_rank(kept) == out.rank == 0
+
+
+def test_two_inverters_at_one_bus_are_named_by_what_their_meters_report() -> None:
+    """All voltages see the sum of both alone."""
+    tables = load("simbench-lv-rural1").tables
+    rows = list(tables.customers)
+    rows[4] = replace(rows[4], bus=rows[1].bus)
+    site = from_tables(replace(tables, customers=tuple(rows)))
+    made = unknown_input.design(plant(site), max_attacked=0, max_inverters=2, step_s=1.0)
+    assert [(out.meters, out.inverters) for out in made.missing] == [((), (1, 3))]
+    wrong = InverterAttack(np.array([1, 3]), np.array([-0.04, -0.04]), START + 5.0, START + 99.0)
+    scenario = Scenario(seed=5, duration_s=12.0, errors=REPORTING, inverter_attacks=(wrong,))
+    state = unknown_input.init(made, START)
+    for snapshot in snapshots(simulate(site, scenario)):
+        state, _, verdict = unknown_input.step(made, state, to_frame(site, snapshot))
+    assert (verdict.decision, named(verdict)) == (Decision.ATTACKED, ([], [1, 3]))
+    assert verdict.inverter_attack[[1, 3]] == pytest.approx([-0.04, -0.04], abs=0.02)
 
 
 def test_designs_that_cannot_be() -> None:
@@ -306,26 +334,33 @@ def test_no_test_refutes_what_a_linear_program_can_explain(seed: int) -> None:
     rng = default_rng(seed)
     R, m, p = 7, 3, 5
     C, E = rng.normal(size=(R, m)), np.hstack([rng.normal(size=(R, 4)), np.eye(R)])
+    # Inverters that all rows see alike, that none sees, or that differ in the last rows or by rounding alone.
+    alike = int(rng.integers(5))
+    if alike:
+        C[:, 1] = (0.0, 2.0, 1.0 / 3.0, -1.0)[alike - 1] * C[:, 0]
+        C[p:, 1] += (alike == 2) * rng.normal(size=R - p)
+        C[:, 1] *= 1.0 + (alike == 3) * 1e-15 * rng.normal(size=R)
     h = rng.uniform(0.05, 0.3, E.shape[1])
     meter = np.array([0, 1, 2, 3, 4, 1, 3])
     wrong = np.zeros(m)
-    wrong[0] = rng.choice([0.0, 1.0, 5.0])
+    wrong[:2] = rng.choice([0.0, 1.0, 5.0]), rng.choice([0.0, 0.0, 2.0])
     r = C @ wrong + E @ (h * rng.uniform(-1.0, 1.0, h.size))
     r[meter == 2] += rng.choice([0.0, 2.0])
     relation = Relation(r, C, E, h, meter, np.arange(R) < p)
     room = np.full(m, 3.0)
     for suspect in (None, 0, 2):
-        for inverter in (None, 0, 1):
-            meters, inverters = np.arange(p) == suspect, np.arange(m) == inverter
+        for some in ([], [0], [1], [0, 1]):
+            meters, inverters = np.arange(p) == suspect, np.isin(np.arange(m), some)
             keep = ~meters[meter]
-            box = [(-3.0, 3.0) if i == inverter else (0.0, 0.0) for i in range(m)] + [(-1.0, 1.0)] * h.size
+            box = [(-3.0, 3.0) if on else (0.0, 0.0) for on in inverters] + [(-1.0, 1.0)] * h.size
             possible = linprog(
                 np.zeros(m + h.size), A_eq=np.hstack([C, E * h])[keep], b_eq=r[keep], bounds=box
             ).success
             trial = try_pair(believe(relation, meters), inverters, room)
             assert trial.fits or not possible
-            if inverter == 0 and suspect == 2:
-                assert abs(trial.attack[0] - wrong[0]) <= trial.attack_error[0] * (1.0 + 1e-9)
+            if suspect == 2 and inverters[0] and (inverters[1] or not wrong[1]):
+                off = np.abs(trial.attack - wrong)[inverters]
+                assert (off <= trial.attack_error[inverters] * (1.0 + 1e-9)).all()
 
 
 def test_pairs_begin_with_nobody_and_know_who_is_within_whom() -> None:
