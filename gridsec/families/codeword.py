@@ -191,18 +191,15 @@ def code_word(  # noqa: PLR0917  # as _conclude
     where = plant.meters[at]
     driven = inputs.live[errors.meter_of] if at.size else np.zeros(m, dtype=np.bool_)
     inverters = np.flatnonzero(driven & (errors.meter_of >= 0))
-    net = np.flatnonzero(inputs.live & np.isfinite(frame.q_net + frame.q_net_error)[plant.meters])
-    of_x = np.eye(m, scale.size)
-    total = np.zeros((n, scale.size))
-    total[own, np.arange(m)] = 1.0
-    total[:, m + n : m + 2 * n] = np.eye(n)
-    from_model = np.bincount(own, weights=parts.x, minlength=n) + frame.q
-    rows = np.vstack([voltage[where], of_x[inverters], total[plant.meters[net]]])
+    # What an inverter injects is not its meter's word.
+    net = np.flatnonzero(_told(setting, frame, inputs) & ~np.isin(plant.meters, own))
+    of_x, of_q = np.eye(m, scale.size), np.eye(n, scale.size, k=m + n)
+    rows = np.vstack([voltage[where], of_x[inverters], of_q[plant.meters[net]]])
     value = np.concatenate(
         [
             inputs.y[at] - model.v2[where],
             (parts.driven - parts.x)[inverters],
-            (frame.q_net - from_model)[plant.meters[net]],
+            (frame.q_net - frame.q)[plant.meters[net]],
         ]
     )
     unit = np.concatenate(
@@ -217,6 +214,28 @@ def code_word(  # noqa: PLR0917  # as _conclude
     reading = np.arange(block.size) < at.size
     B = rows * scale / unit[:, None]
     return CodeWord(B, value / unit, block, unit, scale, reading, voltage * scale, rest_)
+
+
+def _told(setting: Setting, frame: Frame, inputs: Inputs) -> Bools:
+    """Whose net reactive power is reported, with a known error; (p,)."""
+    return np.asarray(inputs.live & np.isfinite(frame.q_net + frame.q_net_error)[setting.plant.meters])
+
+
+def disputed(setting: Setting, parts: Parts, frame: Frame, inputs: Inputs) -> Bools:
+    """Meters that report a reactive power which their inverters, on their curves, cannot have; (p,).
+
+    Either lies, the meter or its inverter, and nothing here can tell which.
+
+    Parameters
+    ----------
+    setting, parts, frame, inputs
+        As in `code_word`.
+    """
+    droop, n = setting.plant.droop, frame.q.size
+    honest = droop.per_customer(parts.x, n) + frame.q
+    most = droop.per_customer(parts.bound.free, n) + frame.q_error + frame.q_net_error + _SMALLEST
+    off = np.isin(np.arange(n), droop.customer) & (np.abs(frame.q_net - honest) > most)
+    return np.asarray(_told(setting, frame, inputs) & off[setting.plant.meters])
 
 
 def _split(setting: Setting, frame: Frame, inputs: Inputs, alone: Uncertainty) -> tuple[Floats, Floats]:

@@ -6,7 +6,8 @@ that belongs to meter j is
 - ``x_i`` of the inverter that it sits at: a scalar observer that its own reading drives,
   ``tau x_hat_i' = -x_hat_i + K_i(vbar^2 - v_j^2)``, whose honest error is bounded by its reading's;
 - the reading, one linear combination of all injections and loads;
-- its customer's net reactive power, where it reports that.
+- its customer's net reactive power, where it reports that and there is no inverter: what an inverter injects
+  is not its meter's word. Where both cannot be honest, nothing is CLEAN, but neither is named for it.
 
 Everything else of x fades without it (section 4.2.1, the detectable part): an observer that hears no meter
 at all, the same for everybody and out of every liar's reach. Likewise the loads and the busbar voltage are
@@ -48,7 +49,7 @@ from gridsec.decode.boxes import Fits, fits
 from gridsec.decode.stacks import MOST_SUBSETS
 from gridsec.detect import Uncertainty
 from gridsec.errors import DesignInfeasible, NotObservable
-from gridsec.families.codeword import CodeWord, Parts, code_word, constants, observe, start
+from gridsec.families.codeword import CodeWord, Parts, code_word, constants, disputed, observe, start
 from gridsec.frames import Inputs, Past, Reconstruction, clean, known, nothing_new
 from gridsec.judge import Situation, Tally, count, decide
 from gridsec.lure import close_loop
@@ -272,6 +273,10 @@ def _conclude(  # noqa: PLR0917  # the chain's values, in the order in which the
     if hopeless and decision is Decision.ATTACKED:
         decision, cause = Decision.UNDECIDED, Cause.TOO_MANY_SUSPECTS
         reason = f"No {live.size - most} meters agree with each other: more lie than the {most} allowed for."
+    torn = disputed(setting, after.parts, frame, inputs)
+    if decision is Decision.CLEAN and torn.any():
+        decision, cause = Decision.UNDECIDED, Cause.AMBIGUOUS
+        reason = _either([plant.feeder.customers[c] for c in plant.meters[torn]])
     estimate = replace(estimate, trusted=estimate.trusted & ~tally.named)
     attack = np.where(tally.named & live, inputs.y - estimate.v2[plant.meters], 0.0)
     verdict = Verdict(
@@ -285,6 +290,13 @@ def _conclude(  # noqa: PLR0917  # the chain's values, in the order in which the
         explanations=_explanations(found) if contradicted.any() else (),
     )
     return replace(after, tally=tally, last=(estimate, verdict)), estimate, verdict
+
+
+def _either(names: list[str]) -> str:
+    who = ", ".join(names[:_SHOWN]) + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")
+    return (
+        f"{who}: the reactive power reported is off the inverter's curve; either of the two is manipulated."
+    )
 
 
 def _choose(found: Fits, word: CodeWord, named: Bools) -> int:

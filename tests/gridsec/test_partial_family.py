@@ -15,6 +15,7 @@ from feeders.estimators import FAMILIES, choose, design
 from feeders.load import load, plant, to_frame
 from feeders.scenario import START, Scenario, random_attacks, simulate, snapshots
 from gridsec import detect
+from gridsec.arrays import Ints
 from gridsec.errors import DesignInfeasible, NotObservable
 from gridsec.families import codeword, partial
 from gridsec.families.partial import PartialDesign, PartialState
@@ -258,10 +259,12 @@ class TestBadFrames:
         np.testing.assert_array_equal(base.v2, other.v2)
         assert verdict.decision is Decision.CLEAN
 
-    def test_a_wrong_reactive_power_names_its_meter(self) -> None:
-        """Everything that a meter says belongs to its block."""
+    @pytest.mark.parametrize("inverters", [np.arange(6), np.arange(9)])
+    def test_a_wrong_reactive_power_names_its_meter_unless_an_inverter_may_inject_it(
+        self, inverters: Ints
+    ) -> None:
         rng = np.random.default_rng(14)
-        street_plant = make_plant(rng)
+        street_plant = make_plant(rng, inverters=inverters)
         street = Street(street_plant, rng, metered_q=np.arange(9))
         made = made_for(street_plant)
         state, _ = watch(street, made, 10)
@@ -270,7 +273,14 @@ class TestBadFrames:
             return replace(frame, q_net=frame.q_net + np.where(np.arange(9) == 6, 0.3, 0.0))
 
         _, answers = watch(street, made, 3, state=state, lies={6: 0.0}, change=lie)
-        assert np.flatnonzero(answers[-1][1].suspects).tolist() == [6]
+        last = answers[-1][1]
+        if 6 in inverters:
+            assert not last.suspects.any()
+            assert (last.decision, last.cause) == (Decision.UNDECIDED, Cause.AMBIGUOUS)
+            assert last.reason.startswith("c6: the reactive power reported is off the inverter's curve")
+        else:
+            assert np.flatnonzero(last.suspects).tolist() == [6]
+            assert last.decision is Decision.ATTACKED
 
     def test_a_silent_meter_has_exactly_no_influence(self) -> None:
         street, made, state = self.settled()
@@ -325,7 +335,7 @@ class TestParts:
     def test_the_code_word_of_honest_meters_is_inside_its_box(self) -> None:
         """s = B xi + v with |xi| <= 1 and |v| <= 1, from the street's own truth."""
         rng = np.random.default_rng(10)
-        street_plant = make_plant(rng, drop=0.03)
+        street_plant = make_plant(rng, drop=0.03, inverters=np.arange(0, 9, 2))
         street = Street(street_plant, rng, extreme=True, metered_q=np.arange(9))
         made = made_for(street_plant)
         state, _ = watch(street, made, 10)
@@ -339,7 +349,8 @@ class TestParts:
         error = [street.x - parts.x, street.p - frame.p, true_q - frame.q, [street.v0**2 - frame.v0_squared]]
         xi = np.concatenate(error) / word.scale
         assert np.abs(xi).max() <= 1.0
-        assert word.s.size == 27
+        assert word.s.size == 9 + 5 + 4  # voltages, inverters, reactive powers of customers without one
+        assert not codeword.disputed(made.setting, parts, frame, inputs).any()
         assert np.abs(word.s - word.B @ xi).max() <= 1.0 + 1e-9  # metered q sits at the very end
         assert (np.abs(street.truth() - model.v2 - word.voltage @ xi) <= word.rest).all()
 
