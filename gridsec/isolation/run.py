@@ -181,9 +181,12 @@ def step(
     sensors_now = support(sensor_attack, sensor_threshold)
     inputs, sensors = state.inputs | inputs_now, state.sensors | sensors_now
     excess = pi if design.measure == "bounds" else contradiction(design, family)
+    told = np.isfinite(excess)
     evidence = _Evidence(
         torn=torn,
-        contradicted=bool(np.any(np.isfinite(excess) & (excess > 1.0))),
+        contradicted=bool(np.any(told & (excess > 1.0))),
+        # At the first tick no observer has used a reading yet, whatever the caller knew before.
+        confirmed=state.x is not None and bool(np.any(told)),
         settled=bool(np.all(bound < plant.span)),
         silent=~heard,
     )
@@ -237,6 +240,8 @@ class _Evidence:
         Whether the large observers' intervals do not intersect.
     contradicted
         Whether some observer differs from its company by more than both bounds allow.
+    confirmed
+        Whether some observer has used readings, and its company has as well.
     settled
         Whether the estimate's bound says more than what is known anyway.
     silent : (p,)
@@ -245,6 +250,7 @@ class _Evidence:
 
     torn: bool
     contradicted: bool
+    confirmed: bool
     settled: bool
     silent: Bools
 
@@ -274,6 +280,10 @@ def _quiet(evidence: _Evidence) -> tuple[Decision, Cause, str]:
         reason = "observers contradict each other, and nobody can be named"
         reason += f"; sensors {silent} are silent" if silent else ""
         return Decision.UNDECIDED, Cause.AMBIGUOUS, reason
+    if not evidence.confirmed:
+        reason = "no observer and its company have heard all their sensors at two ticks in a row"
+        reason += f"; sensors {silent} are silent" if silent else ""
+        return Decision.UNDECIDED, Cause.SETTLING, reason
     if not evidence.settled:
         reason = "the estimate's error bound is not below what is known anyway"
         return Decision.UNDECIDED, Cause.SETTLING, reason

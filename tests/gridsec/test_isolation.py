@@ -30,9 +30,9 @@ from gridsec.isolation import (
     step,
     support,
 )
-from gridsec.lmi.sampled import advance
+from gridsec.lmi.sampled import DiscreteLure, advance
 from gridsec.lure import close_loop, known_input
-from gridsec.observers.unknown_input import UnknownInputPlant, inverters, obstruction
+from gridsec.observers.unknown_input import UnknownInputPlant, exact, inverters, obstruction
 from gridsec.online import Cause, Decision
 from gridsec.papers import yang2021, yang2021_feeder
 
@@ -214,6 +214,24 @@ def test_no_attack_is_clean_and_first_answers_are_not() -> None:
     assert not answers[-1].inputs.any()
     assert np.all(np.isnan(answers[0].input_attack))
     assert np.all(np.isinf(answers[0].input_threshold))
+    assert (answers[0].decision, answers[0].cause) == (Decision.UNDECIDED, Cause.SETTLING)
+
+
+@pytest.mark.parametrize("heard", [[], [0], [0, 1]])
+@pytest.mark.parametrize("radius", [1e-3, 6.0])
+def test_a_narrow_start_is_no_evidence(heard: list[int], radius: float) -> None:
+    """Who hears nobody, or fewer than can contradict each other, calls nothing clean at any tick."""
+    system = DiscreteLure.of(
+        [[0.2, 0.5], [0.2, 0.3]], [[1, 1], [1, 2], [3, 2], [4, 1]], G=np.eye(2), H=np.eye(2), B=np.eye(2),
+        phi=lambda z: 0.5 * np.sin(z), lower=-0.5, upper=0.5,
+    )  # fmt: skip
+    made = isolation.design(exact(system, inputs=np.eye(2)), max_inputs=2, max_sensors=1)
+    start = init(made, 0.0, radius=np.full(2, radius))
+    for seen, last in ((np.isin(np.arange(4), heard), Decision.UNDECIDED), (ALL4, Decision.CLEAN)):
+        state = start
+        for k in range(3):
+            state, answer = step(made, state, np.zeros(4), np.zeros(2), seen)
+            assert answer.decision is (last if k else Decision.UNDECIDED)
 
 
 def test_more_attacks_than_assumed_are_noticed() -> None:
