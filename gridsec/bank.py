@@ -199,7 +199,7 @@ def init(bank: Bank, y: Floats, u: Floats, seen: Bools, *, net: Floats | None = 
     bank
         The design.
     y : (p,)
-        Readings as `z = vbar^2 - v^2`, pu; anything where not seen.
+        Readings as `z = vbar^2 - v^2`, pu; anything where not seen. One that is no finite number is not seen.
     u : (l,)
         Known input w, pu.
     seen : (p,)
@@ -207,6 +207,7 @@ def init(bank: Bank, y: Floats, u: Floats, seen: Bools, *, net: Floats | None = 
     net : (p,), optional
         As in `step`.
     """
+    seen = np.asarray(seen & np.isfinite(y))
     if bank.gains is not None:
         state = stacked.start(bank.lure, bank.gains, bank.policy)
         return stacked.settle(bank.lure, bank.gains, state, y=y, u=u, seen=seen, policy=bank.policy)
@@ -233,7 +234,7 @@ def step(  # noqa: PLR0917  # design and state, then the four inputs that every 
     bank, state
         Design and state.
     y : (p,)
-        Readings as `z = vbar^2 - v^2`, pu; anything where not seen.
+        Readings as `z = vbar^2 - v^2`, pu; anything where not seen. One that is no finite number is not seen.
     u : (l,)
         Known input w, pu.
     seen : (p,)
@@ -250,6 +251,7 @@ def step(  # noqa: PLR0917  # design and state, then the four inputs that every 
     """
     # Equal steps that differ by rounding share their coefficients.
     h = round(h, 6)
+    seen = np.asarray(seen & np.isfinite(y))
     if isinstance(state, StackedState):
         gains = _gains(bank)
         return stacked.advance(bank.lure, gains, state, y=y, u=u, seen=seen, h=h, policy=bank.policy)

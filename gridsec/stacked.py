@@ -209,7 +209,7 @@ def _newton(
         width = _QUOTIENT * np.maximum(1.0, np.abs(z))
         slope = (lure.phi(z + width) - lure.phi(z - width)) / (2.0 * width)
         jacobian = (A + (lure.G * slope[:, None, :]) @ H) / scale[:, None]
-        step = -np.linalg.solve(jacobian, rest[..., None])[..., 0]
+        step = -_solve(jacobian, rest)
         length = rough.astype(np.float64)
         norm = np.linalg.norm(rest, axis=1)
         for _ in range(_HALVINGS):
@@ -220,6 +220,15 @@ def _newton(
             length = np.where(worse, 0.5 * length, length)
         x = x + length[:, None] * step
     return x
+
+
+def _solve(matrices: Floats, rest: Floats) -> Floats:
+    """`matrices[o]^-1 rest[o]` for every observer o, by least squares if one of them has no inverse."""
+    try:
+        return np.asarray(np.linalg.solve(matrices, rest[..., None])[..., 0])
+    except np.linalg.LinAlgError:
+        # An observer that hears too little of an integrator may rest anywhere, or nowhere.
+        return _times(np.asarray(np.linalg.pinv(matrices), dtype=np.float64), rest)
 
 
 def _times(matrices: Floats, x: Floats) -> Floats:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from gridsec.lure import Lure, advance
 from gridsec.observers import high_gain
 from gridsec.observers.high_gain import groups, nearest
 from gridsec.online import Cause, Decision
+from gridsec.stacked import StackedState
 from tests.gridsec.observers.bent import bent, truth
 
 A, C = [[0, 1], [0, -1]], [[1, 0], [1, 0], [1, 0], [1, 1], [1, 1]]
@@ -147,3 +149,48 @@ def test_a_sensor_that_nothing_has_tested_is_not_called_clean() -> None:
     # Nothing else is heard: what is heard is tested.
     state, answer = high_gain.step(made, state, y[-1], u[-1:], np.array([False, True, True]), 0.02)
     assert answer.decision is Decision.CLEAN
+
+
+@lru_cache
+def small_bank(*, integrator: bool) -> bank.Bank:
+    H, phi = ([[0, 1]], np.tanh) if integrator else ([[1, 0]], curve)
+    own = Lure.of(A, C, G=[[0], [-1]], H=H, B=[[0], [1]], phi=phi, slope=1 if integrator else 2)
+    options = options_for(own, rate=0.2, noise=0.1, load=np.zeros(1), weight=np.eye(2))
+    return bank.design(own, 1, gains=bank.lmi_gains(own, 1, options))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_reading_that_is_no_number_is_none(value: float) -> None:
+    made, u = small_bank(integrator=False), np.ones(1)
+    y = made.lure.C @ np.array([1.0, 0.0])
+    told, unseen = np.where(np.arange(5) == 1, value, y), np.arange(5) != 1
+    one, other = bank.init(made, told, u, ALL), bank.init(made, y, u, unseen)
+    for _ in range(3):
+        assert isinstance(one, StackedState)
+        assert isinstance(other, StackedState)
+        np.testing.assert_array_equal(one.x, other.x)
+        np.testing.assert_array_equal(one.seen, unseen)
+        one, other = (
+            bank.step(made, state, read, u, seen, h=0.01)
+            for state, read, seen in ((one, told, ALL), (other, y, unseen))
+        )
+    estimate, trusted = bank.believe(made, one)
+    assert np.isfinite(estimate).all()
+    assert not trusted[1]
+
+
+@pytest.mark.parametrize("heard", [[], [0], [0, 1]])
+def test_a_bank_starts_where_an_integrator_is_not_heard(heard: list[int]) -> None:
+    """Sets that hear nobody have no equilibrium; all others are in theirs."""
+    made, u, seen = small_bank(integrator=True), np.ones(1), np.isin(np.arange(5), heard)
+    own, gains = made.lure, made.gains
+    assert gains is not None
+    y = own.C @ np.array([1.0, 0.2])
+    state = bank.init(made, y, u, seen)
+    assert isinstance(state, StackedState)
+    assert np.isfinite(state.x).all()
+    for x, L, K, mask in zip(state.x, gains.L, gains.K, made.masks, strict=True):
+        e = np.where(seen, y - own.C @ x, 0.0)
+        rest = own.A @ x + own.G @ np.tanh(own.H @ x + K @ e) + own.B @ u + L @ e
+        if (mask & seen).any():
+            assert np.abs(rest).max() <= 1e-6 * max(1.0, np.abs(L).max())
