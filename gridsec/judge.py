@@ -68,7 +68,7 @@ class Situation:
     live, suspected, named : (p,)
         Who reports, who was above the threshold lately, who is named.
     wide : (p,)
-        Whose threshold is too wide for an answer.
+        Whose threshold is too wide for an answer, or is none.
     valid, settled, busbar
         Whether the design holds, the initial state is forgotten, and the busbar voltage is known.
     """

@@ -278,7 +278,7 @@ def _conclude(  # noqa: PLR0917  # the chain's three values, then what this step
             live=live,
             suspected=tally.above > 0,
             named=tally.named,
-            wide=live & (view.threshold > options.widest),
+            wide=live & ~(view.threshold <= options.widest),
             valid=state.valid,
             settled=view.settled,
             busbar=inputs.busbar,

@@ -200,11 +200,15 @@ def interval_bounds(
     Returns
     -------
     (N,), (N,)
-        How far the correction moves, and what its first step leaves of the AC power flow, pu.
+        How far the correction moves, and what its first step leaves of the AC power flow, pu; infinite where
+        there is no bound, as with a busbar voltage that is none.
     """
-    if isinstance(feeder, Meshed):
-        return mesh.interval_bounds(feeder, p, q, v0_squared, p_error=p_error, q_error=q_error)
-    return places.interval_bounds(feeder, p, q, v0_squared, p_error=p_error, q_error=q_error)
+    with np.errstate(all="ignore"):  # what is no number gets no finite bound, and no complaint
+        if isinstance(feeder, Meshed):
+            moved, rest = mesh.interval_bounds(feeder, p, q, v0_squared, p_error=p_error, q_error=q_error)
+        else:
+            moved, rest = places.interval_bounds(feeder, p, q, v0_squared, p_error=p_error, q_error=q_error)
+    return np.where(np.isnan(moved), np.inf, moved), np.where(np.isnan(rest), np.inf, rest)
 
 
 def columns(feeder: Network, power: Power, customers: Ints) -> Floats:

@@ -103,7 +103,7 @@ def answer(
             live=live,
             suspected=np.zeros(live.size, dtype=np.bool_),
             named=meters,
-            wide=live & (found.threshold > now.options.widest),
+            wide=live & ~(found.threshold <= now.options.widest),
             valid=True,
             settled=bool(memory <= now.options.settled),
             busbar=tick.inputs.busbar,

@@ -264,7 +264,7 @@ def _conclude(  # noqa: PLR0917  # the chain's values, in the order in which the
             live=live,
             suspected=(tally.above > 0) | doubtful,
             named=tally.named,
-            wide=live & (threshold > options.widest),
+            wide=live & ~(threshold <= options.widest),
             valid=after.valid,
             settled=after.settled,
             busbar=inputs.busbar,

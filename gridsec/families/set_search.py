@@ -184,7 +184,7 @@ def _verdict(  # noqa: PLR0917  # everything one tick brought
             live=live,
             suspected=(tally.above > 0) | dropped,
             named=tally.named,
-            wide=live & (view.threshold > design.setting.options.widest),
+            wide=live & ~(view.threshold <= design.setting.options.widest),
             valid=True,
             settled=view.settled and not switched,
             busbar=inputs.busbar,

@@ -89,7 +89,7 @@ def conclude(
             live=live,
             suspected=~trust.trusted | beyond,
             named=trust.named,
-            wide=live & (threshold > design.options.widest),
+            wide=live & ~(threshold <= design.options.widest),
             valid=True,
             settled=settled,
             busbar=True,
