@@ -4,20 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar
+
+import numpy as np
 
 from feeders.convert_changes import BusbarUnclear, Change
 from feeders.convert_graph import fused_with
 from feeders.schema import LineRow
+from gridsec.arrays import Phasors
 from gridsec.droop import preset
 from gridsec.errors import FeederInvalid, GridsecError
+from gridsec.phases import ROTATION
 
 if TYPE_CHECKING:
     from feeders.convert_network import Network
 
-__all__ = ["below_source", "busbar_of", "chosen", "named_bus", "one_busbar", "opened_rows"]
+__all__ = ["angles_of", "below_source", "busbar_of", "chosen", "named_bus", "one_busbar", "opened_rows"]
 
 Busbar = TypeVar("Busbar")
+
+TURNED: Final = 1.0
+"""Degrees up to which the angles between a busbar's phases may be others than those of a feeder."""
 
 
 def chosen(network: Network, find: Callable[[], Busbar], opened: Sequence[str], droop: str | None) -> Busbar:
@@ -149,6 +156,43 @@ def below_source(network: Network) -> str | None:
     """
     way = _way_down(network, network.lines) if len(network.sources) == 1 else []
     return way[-1] if len(way) > 1 and _has_lines(way[-1], network.lines) else None
+
+
+def angles_of(volts: Phasors, busbar: str, changes: list[Change]) -> Phasors:
+    """Return the busbar's voltages as the feeder can have them.
+
+    The busbar's meter reads magnitudes; simulations and monitors take angles of 0, -120 and 120 degrees.
+
+    Parameters
+    ----------
+    volts : (3,)
+        The source's, V; NaN where a phase is absent.
+    busbar
+        The bus.
+    changes
+        Takes a row where phases are turned otherwise against each other.
+
+    Returns
+    -------
+    (3,)
+        The same, turned where they have to be.
+    """
+    there = np.isfinite(volts)
+    if not there.any():
+        return volts
+    first = volts[there][0]
+    of_feeder = ROTATION / ROTATION[there][0]
+    if np.ptp(np.angle((volts / first / of_feeder)[there], deg=True)) <= TURNED:
+        return volts
+    theirs, ours = (_degrees(each[there]) for each in (volts / first, of_feeder))
+    effect = f"{ours} degrees, in the source {theirs}; the check shows what that does"
+    changes.append(Change(f"bus {busbar}", "angles between its phases", "approximated", effect))
+    return np.asarray(np.abs(volts) * of_feeder)
+
+
+def _degrees(phasors: Phasors) -> str:
+    angles = np.round(np.angle(phasors, deg=True), 1) + 0.0
+    return " and ".join(", ".join(f"{angle:g}" for angle in angles).rsplit(", ", 1))
 
 
 def one_busbar(buses: Collection[str], rows: Iterable[LineRow]) -> bool:

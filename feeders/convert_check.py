@@ -40,7 +40,7 @@ class SourceState:
     power_kva
         Net import P + jQ of each customer, kVA; the others draw nothing.
     busbar_volt : (3,)
-        Voltages of the busbar, phase to neutral, V.
+        Voltages of the busbar, phase to neutral, V; NaN where a phase is absent.
     volts
         Voltage magnitudes (3,) of each bus, V, all loads of constant power; NaN where a phase is absent.
     as_found
@@ -132,13 +132,14 @@ def compare(state: SourceState, tables: FeederTables) -> SourceCheck:
         If there is no bus where both have a voltage.
     """
     power = np.array([state.power_kva.get(row.customer, 0.0) for row in tables.customers])
-    size = np.abs(state.busbar_volt)
+    v0 = np.nan_to_num(np.asarray(state.busbar_volt, dtype=np.complex128))
+    size = np.abs(v0)
     phases = tables.in_phases or bool(np.ptp(size) > UNIFORM * size[0]) or not _uniform(state)
     if phases:
         unbalanced, _ = spanned(tables)
-        v0 = np.asarray(state.busbar_volt, dtype=np.complex128)
         _, volts = UnbalancedPowerFlow(unbalanced).solve(power.real, power.imag, v0)
         index, level = unbalanced.bus_of_file, unbalanced.nominal_volt
+        volts[index[tables.meta.busbar], size == 0] = np.nan
     else:
         site = from_tables(tables)
         _, single_phase = PowerFlow(site).solve(power.real, power.imag, float(size[0]))

@@ -15,7 +15,7 @@ import numpy as np
 
 from feeders.check import loops
 from feeders.columns import SUSPICIONS
-from feeders.convert_busbar import busbar_of, chosen, named_bus, opened_rows
+from feeders.convert_busbar import angles_of, busbar_of, chosen, named_bus, opened_rows
 from feeders.convert_changes import WHOLE, Change
 from feeders.convert_check import SourceState
 from feeders.convert_customers import USUAL_POWER_FACTOR, base_kva, with_meters
@@ -234,8 +234,14 @@ def finished(network: Network, part: Part, tables: FeederTables, power: Mapping[
         If values are doubtful, and no power flow of the source speaks for them.
     """
     unchecked = "" if network.volts else network.unsolved
-    if network.volts and not np.isfinite(network.volts[part.busbar]).all():
+    given = network.volts.get(part.busbar, np.full(3, np.nan + 0j))
+    of_rows = (*(row.phases for row in tables.customers), *(row.phases for row in tables.lines))
+    if (
+        network.volts
+        and not np.isfinite(given[["abc".index(phase) for phase in set("".join(of_rows))]]).all()
+    ):
         unchecked = f"the source's power flow has no voltage at the busbar {part.busbar!r}"
+    given = angles_of(given, part.busbar, part.changes)
     accepted = accepting(tables, part.changes, unchecked)
     changes = tuple(dict.fromkeys(part.changes))
     if unchecked:
@@ -243,7 +249,7 @@ def finished(network: Network, part: Part, tables: FeederTables, power: Mapping[
     state = SourceState(
         tool=network.tool,
         power_kva=power,
-        busbar_volt=network.volts[part.busbar],
+        busbar_volt=given,
         volts={bus: np.abs(network.volts[bus]) for bus in part.inside if bus in network.volts},
         as_found={bus: np.abs(network.as_found[bus]) for bus in part.inside if bus in network.as_found},
     )
