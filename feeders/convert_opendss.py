@@ -425,11 +425,11 @@ def _shunt(dss: Any, each: Element, network: Network) -> None:
         effect = f"{-kvar:.4g} kvar" if each.closed else "switched off in the source"
         network.of_bus.append((bus, Change(label, WHOLE, "left out", effect)))
         return
-    here = sorted(
-        (k for k, node in enumerate(each.nodes[0]) if 1 <= node <= PHASES), key=lambda k: each.nodes[0][k]
-    )
-    block = _yprim(dss, each)[np.ix_(here, here)].imag
-    phases = "".join("abc"[each.nodes[0][k] - 1] for k in here)
+    # Both terminals may be at phases of the bus: what is between phases is where their conductors meet.
+    meet = np.equal.outer(np.arange(1, PHASES + 1), np.concatenate(each.nodes)).astype(np.float64)
+    here = np.flatnonzero(meet.any(axis=1))
+    block = (meet @ _yprim(dss, each).imag @ meet.T)[np.ix_(here, here)]
+    phases = "".join("abc"[k] for k in here)
     effect = f"{kvar:.4g} kvar as the charging of a line to nowhere"
     network.of_bus.append((bus, Change(label, "connection", "changed", effect)))
     network.lines.append(capacitor(f"capacitor.{each.name}", bus, block, phases))

@@ -166,6 +166,8 @@ new line.lower bus1=B3 bus2=B6 phases=3 r1=0.5 x1=0.2 r0=1 x0=0.5 c1=40 c0=15 le
 new capacitor.star bus1=B3.2.1 phases=2 kv=0.231 kvar=4
 new capacitor.delta bus1=B4 phases=3 kv=0.4 kvar=10 conn=delta
 new capacitor.across bus1=B5.3.2 phases=1 kv=0.4 kvar=3 conn=delta
+new capacitor.ends bus1=B5.3 bus2=B5.2 phases=1 kv=0.4 kvar=1
+new capacitor.round bus1=B4.1.2.3 bus2=B4.2.3.1 phases=3 kv=0.6928203 kvar=3
 new load.mill bus1=B6 phases=3 kv=0.4 kw=8 pf=0.95 vminpu=0.5
 new load.home bus1=B5.3 phases=1 kv=0.231 kw=6 pf=0.95 vminpu=0.5
 new load.hut bus1=B5.1 phases=1 kv=0.231 kw=3 pf=0.9
@@ -186,8 +188,9 @@ new load.shed bus1=B3.2 phases=1 kv=0.231 kw=5 pf=1
     assert rows["lower"].r0_ohm == pytest.approx(0.3)
     assert rows["lower"].b_ab_us == pytest.approx(-2e-3 * np.pi * 60 * 25 * 0.3 / 3)
     assert (rows["capacitor.star"].phases, rows["capacitor.star"].b_ab_us) == ("ab", None)
-    across = rows["capacitor.across"]
-    assert (across.phases, across.b_bc_us) == ("bc", pytest.approx(-3e9 / 400.0**2))
+    for across, kvar in ((rows["capacitor.across"], 3), (rows["capacitor.ends"], 1)):
+        assert (across.phases, across.b_bc_us) == ("bc", pytest.approx(-1e9 * kvar / 400.0**2))
+    assert rows["capacitor.round"].b_ab_us == pytest.approx(-1e9 / 400.0**2)
     assert examine(tmp_path / "x").problems == ()
 
 
