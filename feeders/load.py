@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from feeders.columns import CUSTOMER_COLUMNS, parse
 from feeders.equipment import (
     LoadModel,
     accuracy,
@@ -25,7 +26,7 @@ from feeders.equipment import (
     positions,
 )
 from feeders.forecast import Forecast, forecast
-from feeders.load_phases import spanned
+from feeders.load_phases import spanned, unsupported
 from feeders.schema import CustomerRow, FeederTables, validate
 from feeders.taps import Referred, refer
 from feeders.topology import Edge, Tree, tree
@@ -211,7 +212,12 @@ def from_tables(tables: FeederTables) -> Site:
         If the tables are not valid, or need what the model cannot do yet.
     """
     if tables.in_phases:
-        return _in_phases(one_phase_each(tables))
+        try:
+            return _in_phases(one_phase_each(tables))
+        except FeederInvalid as error:
+            # Rows and ids are those of the files, not of the channels.
+            problems = validate(tables) or _channels(tables) or unsupported(tables) or error.problems
+            raise FeederInvalid(problems) from error
     problems = validate(tables) or _unsupported(tables)
     if problems:
         raise FeederInvalid(problems)
@@ -276,6 +282,27 @@ def _parts(row: CustomerRow) -> list[CustomerRow]:
         )
         for phase in PHASES
     ]
+
+
+def _channels(tables: FeederTables) -> list[str]:
+    """Ids that customers or meters of three phases give to their phases and that cannot be."""
+    problems = []
+    for column in (column for column in CUSTOMER_COLUMNS if column.name in {"customer", "meter"}):
+        first: dict[str, str] = {}
+        for number, row in enumerate(tables.customers, start=1):
+            where = f"customers, row {number} ({row.customer})"
+            ids = [getattr(part, column.name) for part in (_parts(row) if row.phases == "abc" else [row])]
+            wrong = [problem for problem in (parse(column, own)[1] for own in ids) if problem]
+            wrong += [
+                f"{own!r} is already the id of {first[own]}; every id must be unique, as those of the phases "
+                "of whoever has three"
+                for own in ids
+                if own in first
+            ]
+            if wrong:
+                problems.append(f"{where}, column {column.name}: {wrong[0]}")
+            first.update({own: where for own in ids if own})
+    return problems
 
 
 def _in_phases(tables: FeederTables) -> Site:

@@ -150,7 +150,7 @@ def spanned(tables: FeederTables) -> tuple[ThreePhaseSite, Ties]:
     FeederInvalid
         If the tables are not valid, or no tree does.
     """
-    problems = validate(tables) or _unsupported(tables)
+    problems = validate(tables) or unsupported(tables)
     if problems:
         raise FeederInvalid(problems)
     meta = tables.meta
@@ -259,9 +259,22 @@ def _fuses(line: LineRow) -> bool:
     return line.r_ohm == line.x_ohm == 0.0
 
 
-def _unsupported(tables: FeederTables) -> tuple[str, ...]:
-    """What the format can say and the three-phase model cannot do, or needs and does not find."""
-    problems = []
+def _why(tables: FeederTables) -> str:
+    """The first that makes it a feeder in three phases, as the end of a sentence."""
+    who = [f"customer {row.customer!r}" for row in tables.customers if row.phases != "abc"]
+    who += [f"line {row.line!r}" for row in tables.lines if row.closed and row.in_phases]
+    return f" ({who[0]} makes the feeder one in three phases)" if who else ""
+
+
+def unsupported(tables: FeederTables) -> tuple[str, ...]:
+    """Return what the format can say and the three-phase model cannot do, or needs and does not find.
+
+    Parameters
+    ----------
+    tables
+        Valid tables.
+    """
+    problems, why = [], _why(tables)
     closed = [line for line in tables.lines if line.closed]
     for line in closed:
         where = f"lines, line {line.line!r}"
@@ -279,6 +292,7 @@ def _unsupported(tables: FeederTables) -> tuple[str, ...]:
             missing = "r0_ohm" if line.r0_ohm is None else "x0_ohm"
             problems.append(
                 f"{where}, column {missing}: is missing; several phases need the zero sequence or a matrix"
+                + why
             )
     if all(map(_fuses, closed)):
         problems.append("lines: no closed line has an impedance; there is nothing to watch below the busbar")

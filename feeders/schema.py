@@ -197,8 +197,9 @@ class FeederTables:
 
     @property
     def in_phases(self) -> bool:
-        """Whether it is one in three phases."""
-        return any(row.phases != "abc" for row in self.customers) or any(row.in_phases for row in self.lines)
+        """Whether it is one in three phases: what is open carries nothing, and makes it none."""
+        lines = any(row.in_phases for row in self.lines if row.closed)
+        return lines or any(row.phases != "abc" for row in self.customers)
 
 
 @dataclass(frozen=True, slots=True)
