@@ -85,12 +85,20 @@ def calibrate(
 
 
 def _tell(found: Calibrate) -> None:
+    from feeders.studies.calibrate_tables import UNREAD
+
     console.out.print(
         escape(
             f"{found.feeder}: {found.frames} moments in {found.span_h:.4g} h; any proposal would be "
             f"wrong with probability {found.risk:g} at most"
         )
     )
+    if found.unread:
+        count, phases = int((found.meters["verdict"] == UNREAD).sum()), " and ".join(found.unread)
+        console.out.print(
+            f"left out: {count} of {len(found.meters)} meters, as the busbar's readings have no voltage of "
+            f"phase {phases} (column v_phases)"
+        )
     if found.proposals.empty:
         console.out.print("nothing to propose")
     else:

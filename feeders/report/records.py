@@ -73,8 +73,15 @@ def calibrate(site: Site, found: Calibrate) -> Section:
             f"{found.frames} moments over {number(found.span_h, 1)} h were compared; if the files are right, "
             f"there is any proposal with a probability of {100.0 * found.risk:g} %.",
             "Nothing was changed in the files.",
+            *_left_out(found),
         ),
     )
+
+
+def _left_out(found: Calibrate) -> list[str]:
+    if not found.unread:
+        return []
+    return [f"The busbar has no voltages of phase {listed(found.unread)}: the meters on it were left out."]
 
 
 def _said(found: Calibrate) -> Finding:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -21,7 +21,7 @@ from feeders.equipment import digest, find
 from feeders.schema import write
 from feeders.studies import calibrate_tables
 from feeders.studies.calibrate_corrections import Correction, Kind, apply, as_filed, left
-from feeders.studies.calibrate_readings import Frames, frames
+from feeders.studies.calibrate_readings import Frames, blind, frames
 from feeders.studies.calibrate_search import (
     LENGTH_SPREAD,
     SHORTEST,
@@ -88,6 +88,8 @@ class Calibrate:
         log-likelihood), `confidence`, `verdict`, `alternatives`.
     corrections
         The proposals that are sure, in the words of the files.
+    unread
+        Phases of which the busbar has no voltage: the meters on them are left out.
     """
 
     feeder: str
@@ -102,6 +104,7 @@ class Calibrate:
     errors: pd.DataFrame
     proposals: pd.DataFrame
     corrections: tuple[Correction, ...]
+    unread: str = ""
 
     @property
     def tables(self) -> dict[str, pd.DataFrame]:
@@ -197,8 +200,10 @@ def calibrate(
     def fitted(state: State) -> Round:
         return prepare(state, given, tolerance=tolerance, errors=True)
 
+    unread = given.unread if site.tables.in_phases else ""
+    files = State(site.tables, (*exclude, *blind(site, unread)), unread=unread)
     with Journal(journal, subject) as kept:
-        now, verdict, found = _searched(State(site.tables, tuple(exclude)), fitted, weighed, risk, kept)
+        now, verdict, found = _searched(files, fitted, weighed, risk, kept)
     lines, ids = calibrate_tables.lines(now, tolerance, kinds)
     wrongs = [_read(row["correction"]) for row in found]
     rows, sure = calibrate_tables.final(found, wrongs, lines, ids)
@@ -215,6 +220,7 @@ def calibrate(
         errors=calibrate_tables.errors(now),
         proposals=rows,
         corrections=sure,
+        unread=unread,
     )
 
 
@@ -258,7 +264,7 @@ def _searched(
         wrong = _read(row["correction"])
         if wrong.kind is Kind.METER:
             # What its readings may have been taken for until now is forgotten: all begins again without it.
-            state = State(files.tables, (*state.excluded, *wrong.names))
+            state = replace(files, excluded=(*state.excluded, *wrong.names))
             found = [*(each for each in found if each["correction"]["kind"] == Kind.METER), row]
         elif any(state.after(wrong).same(before) for before in been):
             # The readings speak for each of two places once the other one is taken for right.
@@ -324,6 +330,9 @@ def _best(now: Round, said: Verdict, risk: float, files: FeederTables) -> dict[s
     shift = g / (h + LENGTH_SPREAD**-2) if guess.kind is Kind.LENGTH else 0.0
     wrong = correction(now, guess, max(1.0 + shift, SHORTEST))
     others = [correction(now, said.guesses[k]) for k in said.kept[1:]]
+    if wrong.kind is Kind.PHASE:
+        # It may as well be on one of which there is no voltage to compare with.
+        others += [replace(wrong, phases=phase) for phase in now.state.unread]
     return {
         "correction": asdict(wrong),
         "estimate": g / h if h > 0.0 else 0.0,

@@ -346,7 +346,10 @@ def series(net: Network, given: Frames, drawn: Powers, excluded: Collection[str]
     order = [given.meter_ids.index(name) for name in site.meter_ids]
     v = given.v_volt[:, order] / net.places.unit
     seen = np.isfinite(v) & ~np.isin(site.meter_ids, list(excluded))
-    busbar = given.v0_phases if isinstance(net.feeder, ThreePhaseFeeder) else given.v0_volt
+    busbar = given.v0_volt
+    if isinstance(net.feeder, ThreePhaseFeeder):
+        # Nobody looks at phases that are not read, and what they do to others is of second order.
+        busbar = np.where(np.isfinite(given.v0_phases), given.v0_phases, busbar[:, None])
     U, drop = _voltages(net, drawn.p, drawn.q, busbar / site.feeder.base_volt)
     bus, phase = net.place.T
     return Series(

@@ -21,14 +21,15 @@ from pandas.api.types import (
 from feeders.meters import BUSBAR
 from feeders.recording import REQUIRED, RecordingInvalid, read_recording
 from feeders.scenario import LATEST_S
-from gridsec.arrays import Floats, Ints
+from gridsec.arrays import Bools, Floats, Ints
+from gridsec.phases import PHASES
 
 if TYPE_CHECKING:
     from feeders.load import Site
     from feeders.load_phases import ThreePhaseSite
     from feeders.recording import Recording
 
-__all__ = ["Frames", "frames", "open_readings"]
+__all__ = ["Frames", "blind", "frames", "open_readings"]
 
 MOST_FRAMES: Final = 720
 """More frames than these are averaged."""
@@ -50,6 +51,9 @@ _KILOVOLT: Final = (0.5e-3, 2e-3)
 
 _EXPECTED: Final = {"t": "expected Unix time in seconds"}
 
+OFTEN: Final = 0.5
+"""A phase of the busbar with voltages in fewer of the frames than this part is not read."""
+
 FEWEST_SPANS: Final = 6.0
 """The recording is at least so many correlation times of the loads' errors long."""
 
@@ -69,7 +73,7 @@ class Frames:
     v0_volt : (T,)
         The busbar's.
     v0_phases : (T, 3)
-        Those of its phases; the mean of them where a frame has no more.
+        Those of its phases; NaN in all frames for one that is not read.
     count : (T, p + 1)
         Readings of each mean, the busbar's last.
     step_s
@@ -85,6 +89,12 @@ class Frames:
     v0_phases: Floats
     count: Floats
     step_s: float
+
+    @property
+    def unread(self) -> str:
+        """Phases of which the busbar has no voltage."""
+        missing = ~np.isfinite(self.v0_phases).all(axis=0)
+        return "".join(PHASES[k] for k in np.flatnonzero(missing))
 
 
 def open_readings(path: Path | str) -> pd.DataFrame | Recording:
@@ -127,7 +137,7 @@ def frames(
     RecordingInvalid
         If columns are missing or hold no numbers, times are not Unix seconds, voltages and powers are hardly
         in V from phase to neutral, kW and kvar, meters are unknown, the recording is another feeder's, the
-        busbar has no reading, or there are too few.
+        busbar has no reading, in three phases none of the phases of any meter, or there are too few.
     """
     given = open_readings(readings) if isinstance(readings, (Path, str)) else readings
     if not isinstance(given, pd.DataFrame):
@@ -153,7 +163,27 @@ def frames(
         problems += _wrong_units(site, numbers, meter, exclude)
     if problems:
         raise RecordingInvalid(f"readings: {'; '.join(problems)}")
-    return _binned(site, given, numbers, np.asarray(column, dtype=np.intp))
+    found = _binned(site, given, numbers, np.asarray(column, dtype=np.intp))
+    if site.tables.in_phases and len(blind(site, found.unread)) == len(site.meter_ids):
+        raise RecordingInvalid(
+            f"readings: the busbar has no voltages of phase {' and '.join(found.unread)}, and without them "
+            "no meter can be compared; expected v_phases, as [230.1, 230.4, 229.9]"
+        )
+    return found
+
+
+def blind(site: Site | ThreePhaseSite, unread: str) -> tuple[str, ...]:
+    """Return the meters on phases of which the busbar has no voltage: how far they are off cannot be told.
+
+    Parameters
+    ----------
+    site
+        A feeder in three phases.
+    unread
+        The phases.
+    """
+    rows = [site.tables.customers[k] for k in site.meters]
+    return tuple(row.meter for row in rows if set(row.phases) & set(unread))
 
 
 def _numbers(column: pd.Series, problems: list[str]) -> Floats | None:
@@ -258,7 +288,9 @@ def _binned(
     for name in ("v_volt", "p_kw", "q_kvar"):
         values[name] = _means(cell, numbers.get(name, np.full(t.size, np.nan)), size)
     v, count = values["v_volt"]
+    phases = _phases(given, number, size[0])
     there = (np.isfinite(v[:, :-1]).mean(axis=1) >= 0.3) & np.isfinite(v[:, -1])
+    there &= _complete(phases, there) | (not site.tables.in_phases)
     T = int(there.sum())
     span, wanted = T * step * together, max(FEWEST_FRAMES * step * together, FEWEST_SPANS * tau)
     if T < FEWEST_FRAMES or span < wanted:
@@ -266,7 +298,6 @@ def _binned(
             f"too little data: {T} frames over {span / 3600:.3g} h; at least {FEWEST_FRAMES} frames over "
             f"{wanted / 3600:.3g} h are needed, and days tell more than hours"
         )
-    phases = _phases(given, number, size[0])
     middle = first + (used * together + 0.5 * (together - 1)) * step
     return Frames(
         meter_ids=site.meter_ids,
@@ -275,7 +306,7 @@ def _binned(
         p_kw=values["p_kw"][0][there, :-1],
         q_kvar=values["q_kvar"][0][there, :-1],
         v0_volt=v[there, -1],
-        v0_phases=np.where(np.isfinite(phases), phases, v[:, -1:])[there],
+        v0_phases=phases[there],
         count=np.maximum(count[there], 1.0),
         step_s=step * together,
     )
@@ -295,6 +326,16 @@ def _phases(given: pd.DataFrame, number: Ints, ticks: int) -> Floats:
         raise RecordingInvalid("readings: v_phases are three voltages, as [230.1, 230.4, 229.9]") from error
     cell = (number[there, None] * 3 + np.arange(3)).ravel()
     return _means(cell, told.ravel(), (ticks, 3))[0]
+
+
+def _complete(phases: Floats, there: Bools) -> Bools:
+    """Frames (T,) with voltages of all phases that are read; the others' are forgotten.
+
+    In a frame without one of them its meters would be compared with another voltage than their own.
+    """
+    read = np.isfinite(phases[there]).sum(axis=0) >= max(1.0, OFTEN * there.sum())
+    phases[:, ~read] = np.nan
+    return np.asarray(np.isfinite(phases[:, read]).all(axis=1))
 
 
 def _step(t: Floats, column: Ints) -> float:

@@ -91,11 +91,14 @@ class State:
         Meters whose errors change, or that the caller does not trust.
     lengths
         Factor on each line that was found to be of another length, by its id.
+    unread
+        Phases of which the busbar has no voltage; the meters on them are among the excluded ones.
     """
 
     tables: FeederTables
     excluded: tuple[str, ...] = ()
     lengths: dict[str, float] = field(default_factory=dict)
+    unread: str = ""
 
     def same(self, other: State) -> bool:
         """Whether both say the same."""
@@ -296,7 +299,12 @@ def _chunks(now: Round, kinds: Collection[Kind]) -> Iterator[Chunk]:
     """Guesses of like kind, and how their effects are made; (T, p, H)."""
     net, series = now.net, now.series
     trusted = np.flatnonzero(series.seen.any(axis=0)).tolist()
-    moves = {Kind.BUS: _buses, Kind.PHASE: _phases, Kind.SWAP: _swaps}
+    read = [phase for phase in PHASES if phase not in now.state.unread]
+    moves: dict[Kind, Callable[[Network, list[int]], list[Guess]]] = {
+        Kind.BUS: _buses,
+        Kind.PHASE: partial(_phases, read=read),
+        Kind.SWAP: _swaps,
+    }
     guesses = [guess for kind, made in moves.items() if kind in kinds for guess in made(net, trusted)]
     for first in range(0, len(guesses), _CHUNK):
         some = guesses[first : first + _CHUNK]
@@ -329,18 +337,19 @@ def _buses(net: Network, trusted: list[int]) -> list[Guess]:
     return out
 
 
-def _phases(net: Network, trusted: list[int]) -> list[Guess]:
+def _phases(net: Network, trusted: list[int], read: Collection[str]) -> list[Guess]:
     out = []
     if isinstance(net.feeder, ThreePhaseFeeder):
         for j in trusted:
             customer = int(net.site.meters[j])
             bus, phases = int(net.feeder.bus[customer]), net.site.tables.customers[customer].phases
             if len(phases) == 1:
-                others = [phase for phase in PHASES if phase != phases and net.reaches(bus, phase)]
+                others = [phase for phase in read if phase != phases and net.reaches(bus, phase)]
                 out += [Guess(Kind.PHASE, customer, bus, phase) for phase in others]
         for k, lateral in enumerate(net.laterals):
             seen = np.intersect1d(net.site.meters[trusted], lateral.customers).tolist()
-            out += [Guess(Kind.PHASE, seen[0], k, phase, lateral=True) for phase in lateral.others if seen]
+            others = [phase for phase in lateral.others if phase in read and seen]
+            out += [Guess(Kind.PHASE, seen[0], k, phase, lateral=True) for phase in others]
     return out
 
 

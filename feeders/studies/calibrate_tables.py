@@ -10,6 +10,7 @@ import pandas as pd
 from scipy.stats import norm
 
 from feeders.studies.calibrate_corrections import PLACES, Correction, Kind
+from feeders.studies.calibrate_readings import blind
 from feeders.studies.calibrate_search import LENGTH_SPREAD, SHORTEST, concerned
 from gridsec.studies.calibrate import explain
 from gridsec.studies.calibrate_model import lengthened
@@ -23,6 +24,7 @@ __all__ = ["customers", "errors", "final", "lines", "loads", "meters", "present"
 
 AS_FILED, PROPOSED, UNTOLD, EXCLUDED = "as in the files", "proposed", "cannot be told", "excluded"
 UNASKED: Final = "not looked for"
+UNREAD: Final = "phase not read"
 
 WIDE: Final = 1.96
 """Half-width of intervals, in standard errors: 95 %."""
@@ -52,7 +54,11 @@ def meters(now: Round, risk: float) -> pd.DataFrame:
     limit = 100.0 * site.accuracy.class_fraction
     sure = norm.isf(risk / (2.0 * max(at.size, 1)))
 
+    unread = blind(site, now.state.unread)
+
     def verdict(j: int) -> str:
+        if site.meter_ids[j] in unread:
+            return UNREAD
         if site.meter_ids[j] in now.state.excluded:
             return EXCLUDED
         if not count[j] or std[j] > VAGUE * prior[j]:
@@ -215,6 +221,7 @@ def customers(
     """Place of every customer, and which others the readings do not rule out."""
     net, right = now.net, _as_filed(now.state.tables, kinds)
     moved = {name for wrong in wrongs if wrong.kind in (*PLACES, Kind.SWAP) for name in wrong.names}
+    excluded = {*now.state.excluded}.difference(blind(net.site, now.state.unread))
     open_from = -float(np.log(1.0 / risk))
     others: dict[int, list[tuple[float, str]]] = {}
     for guess, factor in zip(said.guesses, said.found.log_factor, strict=True):
@@ -237,7 +244,7 @@ def customers(
                 "alternative": ranked[0][1] if ranked else "",
                 "log_factor": ranked[0][0] if ranked else np.nan,
                 "open": _some(possible),
-                "verdict": EXCLUDED if row.meter in now.state.excluded else verdict,
+                "verdict": EXCLUDED if row.meter in excluded else verdict,
             }
         )
     return pd.DataFrame(out)

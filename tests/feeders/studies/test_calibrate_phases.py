@@ -16,7 +16,7 @@ from feeders.schema import CustomerRow, FeederMeta, FeederTables, LineRow, valid
 from feeders.studies.calibrate import Calibrate, calibrate
 from feeders.studies.calibrate_corrections import Correction, Kind, apply, as_filed, left
 from feeders.studies.calibrate_feeder import network, powers, series
-from feeders.studies.calibrate_readings import Frames
+from feeders.studies.calibrate_readings import Frames, frames
 from tests.feeders.studies.calibrate_cases import three_phase_readings
 
 
@@ -52,6 +52,24 @@ def days() -> pd.DataFrame:
     return three_phase_readings(three_phase(street()), seed=3, ticks=96, dt_s=900.0, hidden_kw=0.1)
 
 
+@cache
+def apart() -> pd.DataFrame:
+    """A day on the street whose busbar has phases 0.6 % above and below."""
+    return three_phase_readings(
+        three_phase(street()), seed=3, ticks=96, dt_s=900.0, hidden_kw=0.1, apart=0.006
+    )
+
+
+def without(readings: pd.DataFrame, phase: int, part: float = 1.0) -> pd.DataFrame:
+    """Readings whose busbar has, in the first part of all of them, no voltage of one phase."""
+    first = np.arange(len(readings)) < part * len(readings)
+    cells = [
+        row and [None if k == phase and gone else v for k, v in enumerate(row)]
+        for row, gone in zip(readings["v_phases"], first, strict=True)
+    ]
+    return readings.assign(v_phases=cells)
+
+
 def told(found: Calibrate) -> list[list[str]]:
     """The proposals in short."""
     return found.proposals[["kind", "what", "now", "proposed", "verdict"]].to_numpy().tolist()
@@ -66,6 +84,33 @@ def corrected(tables: FeederTables, found: Calibrate) -> FeederTables:
 
 def test_nothing_is_said_of_right_phases() -> None:
     assert calibrate(three_phase(street()), days()).proposals.empty
+
+
+def test_meters_on_a_phase_that_the_busbar_does_not_read_are_left_out_and_accused_of_nothing() -> None:
+    tables = street()
+    found = calibrate(three_phase(tables), without(apart(), 0))
+    assert found.proposals.empty
+    on_a = {row.meter for row in tables.customers if row.phases == "a"}
+    verdicts = found.meters.set_index("meter")["verdict"]
+    assert found.unread == "a"
+    assert set(verdicts.index[verdicts == "phase not read"]) == on_a
+    assert set(verdicts.drop(list(on_a))) <= {"within error", "biased"}
+    places = found.customers.set_index("meter")["verdict"]
+    assert set(places.loc[list(on_a)]) == {"cannot be told"}
+
+
+def test_moments_without_one_of_the_phases_are_left_out() -> None:
+    whole, some = (frames(three_phase(street()), each) for each in (apart(), without(apart(), 2, 0.25)))
+    assert (some.unread, some.t.size) == ("", whole.t.size - 24)
+    np.testing.assert_array_equal(some.v0_phases, whole.v0_phases[24:])
+    assert frames(three_phase(street()), without(apart(), 2, 0.75)).unread == "c"
+
+
+def test_a_wrong_phase_is_not_written_where_another_one_is_not_read() -> None:
+    found = calibrate(three_phase(on(street(), {"s5": "c"})), without(apart(), 0))
+    assert told(found) == [["phase", "l-s5 with c-s5", "c", "b", "cannot be told"]]
+    assert found.proposals["alternatives"].tolist() == ["l-s5 with c-s5 on a"]
+    assert found.corrections == ()
 
 
 @pytest.mark.parametrize(("bus", "said"), [("s1", "a"), ("s5", "c")])
