@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -18,6 +18,7 @@ from pandas.api.types import (
     is_string_dtype,
 )
 
+from feeders.load import one_phase_each
 from feeders.meters import BUSBAR
 from feeders.recording import REQUIRED, RecordingInvalid, read_recording
 from feeders.scenario import LATEST_S
@@ -75,7 +76,7 @@ class Frames:
     v0_phases : (T, 3)
         Those of its phases; NaN in all frames for one that is not read.
     count : (T, p + 1)
-        Readings of each mean, the busbar's last.
+        Readings of each mean, the busbar's last; of a meter of three channels those of all.
     step_s
         Interval between readings, s.
     """
@@ -123,6 +124,10 @@ def frames(
 ) -> Frames:
     """Put readings into frames.
 
+    In three phases a meter of a customer of all of them may be read as a whole, or as its three channels
+    (`feeders.load.one_phase_each`): its voltage is then their mean, and its powers are their sums, each where
+    all three are there.
+
     Parameters
     ----------
     site
@@ -136,8 +141,9 @@ def frames(
     ------
     RecordingInvalid
         If columns are missing or hold no numbers, times are not Unix seconds, voltages and powers are hardly
-        in V from phase to neutral, kW and kvar, meters are unknown, the recording is another feeder's, the
-        busbar has no reading, in three phases none of the phases of any meter, or there are too few.
+        in V from phase to neutral, kW and kvar, meters are unknown or are read both as a whole and by
+        channels, the recording is another feeder's, the busbar has no reading, in three phases none of the
+        phases of any meter, or there are too few.
     """
     given = open_readings(readings) if isinstance(readings, (Path, str)) else readings
     if not isinstance(given, pd.DataFrame):
@@ -151,7 +157,8 @@ def frames(
     if "t" in numbers:
         problems += _wrong_times(numbers["t"])
     meter = given["meter"].astype("string").fillna(BUSBAR) if "meter" in given else pd.Series(dtype="string")
-    known = {name: k for k, name in enumerate((*site.meter_ids, BUSBAR))}
+    channels = _channels(site)
+    known = {name: k for k, name in enumerate((*site.meter_ids, BUSBAR, *channels))}
     column = meter.map(known)
     unknown = sorted(set(meter[column.isna()]))
     if unknown:
@@ -160,10 +167,14 @@ def frames(
     if "meter" in given and not (column == len(site.meter_ids)).any():
         problems.append("none of the busbar (an empty meter); nothing to compare with")
     if "meter" in given:
-        problems += _wrong_units(site, numbers, meter, exclude)
+        problems += _twice(meter, channels)
+        problems += _wrong_units(
+            site, numbers, meter.mask(meter.isin(channels), meter.map(channels)), exclude
+        )
     if problems:
         raise RecordingInvalid(f"readings: {'; '.join(problems)}")
-    found = _binned(site, given, numbers, np.asarray(column, dtype=np.intp))
+    whole = [site.meter_ids.index(name) for name in dict.fromkeys(channels.values())]
+    found = _binned(site, given, numbers, np.asarray(column, dtype=np.intp), whole)
     if site.tables.in_phases and len(blind(site, found.unread)) == len(site.meter_ids):
         raise RecordingInvalid(
             f"readings: the busbar has no voltages of phase {' and '.join(found.unread)}, and without them "
@@ -184,6 +195,26 @@ def blind(site: Site | ThreePhaseSite, unread: str) -> tuple[str, ...]:
     """
     rows = [site.tables.customers[k] for k in site.meters]
     return tuple(row.meter for row in rows if set(row.phases) & set(unread))
+
+
+def _channels(site: Site | ThreePhaseSite) -> dict[str, str]:
+    """Meter of each channel of those that customers of three phases have in a feeder of one phase each."""
+    if not site.tables.in_phases:
+        return {}
+    rows = [site.tables.customers[k] for k in site.meters]
+    return {
+        part.meter: row.meter
+        for row in rows
+        if row.phases == "abc"
+        for part in one_phase_each(replace(site.tables, customers=(row,))).customers
+    }
+
+
+def _twice(meter: pd.Series, channels: Mapping[str, str]) -> list[str]:
+    """Meters that are read as a whole and by channels."""
+    names = set(meter)
+    both = sorted(names & {whole for channel, whole in channels.items() if channel in names})
+    return [f"there are both {one} and channels of it, as {one}-a; expected one of both" for one in both]
 
 
 def _numbers(column: pd.Series, problems: list[str]) -> Floats | None:
@@ -270,10 +301,14 @@ def _rows(which: Ints) -> str:
 
 
 def _binned(
-    site: Site | ThreePhaseSite, given: pd.DataFrame, numbers: dict[str, Floats], column: Ints
+    site: Site | ThreePhaseSite,
+    given: pd.DataFrame,
+    numbers: dict[str, Floats],
+    column: Ints,
+    whole: list[int],
 ) -> Frames:
     t = numbers["t"]
-    width, step = len(site.meter_ids) + 1, _step(t, column)
+    width, step = len(site.meter_ids) + 1 + 3 * len(whole), _step(t, column)
     first = float(t.min())
     # Clocks are off by a little: frames are centred on the first tick.
     number = np.floor((t - first) / step + 0.5).astype(np.intp)
@@ -286,7 +321,8 @@ def _binned(
     cell = number * width + column
     values = {}
     for name in ("v_volt", "p_kw", "q_kvar"):
-        values[name] = _means(cell, numbers.get(name, np.full(t.size, np.nan)), size)
+        means = _means(cell, numbers.get(name, np.full(t.size, np.nan)), size)
+        values[name] = _joined(*means, whole, 1.0 / 3.0 if name == "v_volt" else 1.0)
     v, count = values["v_volt"]
     phases = _phases(given, number, size[0])
     there = (np.isfinite(v[:, :-1]).mean(axis=1) >= 0.3) & np.isfinite(v[:, -1])
@@ -326,6 +362,23 @@ def _phases(given: pd.DataFrame, number: Ints, ticks: int) -> Floats:
         raise RecordingInvalid("readings: v_phases are three voltages, as [230.1, 230.4, 229.9]") from error
     cell = (number[there, None] * 3 + np.arange(3)).ravel()
     return _means(cell, told.ravel(), (ticks, 3))[0]
+
+
+def _joined(mean: Floats, count: Floats, whole: list[int], share: float) -> tuple[Floats, Floats]:
+    """Means and counts (T, p + 1) from those of the channels behind them: `share` of the channels' sum.
+
+    With n_f readings of independent channels the variance of their mean is that of ``9 / sum(1 / n_f)``
+    readings of one.
+    """
+    width = mean.shape[1] - 3 * len(whole)
+    three, n = (x[:, width:].reshape(len(x), -1, 3) for x in (mean, count))
+    mean, count = mean[:, :width].copy(), count[:, :width].copy()
+    together = share * three.sum(axis=2)
+    by_channel = np.isfinite(together)
+    mean[:, whole] = np.where(by_channel, together, mean[:, whole])
+    with np.errstate(divide="ignore"):
+        count[:, whole] = np.where(by_channel, 9.0 / (1.0 / n).sum(axis=2), count[:, whole])
+    return mean, count
 
 
 def _complete(phases: Floats, there: Bools) -> Bools:

@@ -5,13 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
+from feeders.load import from_tables
 from feeders.load_phases import series_of, three_phase
+from feeders.meters import MeterErrors
 from feeders.powerflow_unbalanced import UnbalancedPowerFlow
+from feeders.recording import RecordingInvalid, record
+from feeders.scenario import Scenario
 from feeders.schema import CustomerRow, FeederMeta, FeederTables, LineRow, validate
 from feeders.studies.calibrate import Calibrate, calibrate
 from feeders.studies.calibrate_corrections import Correction, Kind, apply, as_filed, left
@@ -111,6 +116,29 @@ def test_a_wrong_phase_is_not_written_where_another_one_is_not_read() -> None:
     assert told(found) == [["phase", "l-s5 with c-s5", "c", "b", "cannot be told"]]
     assert found.proposals["alternatives"].tolist() == ["l-s5 with c-s5 on a"]
     assert found.corrections == ()
+
+
+def test_channels_of_a_meter_of_three_phases_are_read_as_the_meter(tmp_path: Path) -> None:
+    """What `record` writes of a feeder with a customer of three phases is what `calibrate` takes."""
+    tables = street()
+    rows = (replace(row, bus="n3", phases="abc") if row.bus == "s3" else row for row in tables.customers)
+    tables = replace(tables, customers=tuple(rows))
+    day = Scenario(seed=1, duration_s=86400.0, dt_s=900.0, profile_s=0.0, errors=MeterErrors(report_q=True))
+    recording = record(from_tables(tables), day, tmp_path / "day.parquet")
+    table = recording.frame().assign(meter=lambda read: read["meter"].astype(str))
+    own = table[table["meter"].str.startswith("m-s3-")].pivot_table(index="t", columns="meter")
+    found = frames(three_phase(tables), recording)
+    j = found.meter_ids.index("m-s3")
+    np.testing.assert_allclose(found.v_volt[:, j], own["v_volt"].mean(axis=1))
+    np.testing.assert_allclose(found.p_kw[:, j], own["p_kw"].sum(axis=1))
+    np.testing.assert_allclose(found.q_kvar[:, j], own["q_kvar"].sum(axis=1))
+    assert set(found.count[:, j]) == {3.0}
+    gone = (table["meter"] == "m-s3-b") & (table["t"] == table["t"].min())
+    assert np.flatnonzero(np.isnan(frames(three_phase(tables), table[~gone]).v_volt[:, j])).tolist() == [0]
+    assert calibrate(three_phase(tables), recording).proposals.empty
+    for both in (table.replace({"meter": {"m-s3-b": "m-s3"}}), table.replace({"meter": {"m-s1": "m-s3-d"}})):
+        with pytest.raises(RecordingInvalid, match=r"both m-s3 and channels of it|does not have: m-s3-d"):
+            frames(three_phase(tables), both)
 
 
 @pytest.mark.parametrize(("bus", "said"), [("s1", "a"), ("s5", "c")])
