@@ -25,7 +25,7 @@ from feeders.equipment import (
 )
 from feeders.matrices import cells_of, series_ohm, shunt_us
 from feeders.schema import FeederTables, LineRow, validate
-from feeders.taps import Referred, refer
+from feeders.taps import Referred, of_customers, refer
 from feeders.topology import Edge, Tree, tree
 from gridsec.accuracy import MeterAccuracy
 from gridsec.arrays import Floats, Ints, Phasors, frozen
@@ -80,8 +80,7 @@ class ThreePhaseSite:
     @property
     def customer_volt(self) -> Floats:
         """1 pu at each customer, V, (N,): the mean of its phases."""
-        base, connected = self.base_volt[self.feeder.bus], self.feeder.connected
-        return np.asarray((base * connected).sum(axis=1) / connected.sum(axis=1))
+        return of_customers(self.base_volt[self.feeder.bus], self.feeder.connected)
 
     @property
     def customer_nominal(self) -> Floats:

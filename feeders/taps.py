@@ -19,7 +19,7 @@ import numpy as np
 from feeders.levels import nominal_volts
 from feeders.schema import FeederTables, LineRow
 from feeders.topology import Tree
-from gridsec.arrays import Floats
+from gridsec.arrays import Bools, Floats
 from gridsec.errors import FeederInvalid
 
 
@@ -42,7 +42,7 @@ class Referred:
     tie : (t, 3)
         The same of each tie.
     customer, customer_nominal : (N,)
-        Voltage base of every customer, in the first of its phases, and its nominal voltage, V.
+        Voltage base of every customer, the mean of its phases, and its nominal voltage, V.
     """
 
     lines: list[LineRow]
@@ -79,15 +79,30 @@ def refer(tables: FeederTables, closed: Sequence[LineRow], found: Tree) -> Refer
     if problems:
         raise FeederInvalid(problems)
     at = np.array([found.group[row.bus] for row in tables.customers], dtype=np.intp)
-    phase = np.array(["abc".index(row.phases[0]) for row in tables.customers], dtype=np.intp)
+    there = [[phase in row.phases for phase in "abc"] for row in tables.customers]
 
     def own(rows: Sequence[LineRow]) -> Floats:
         return nominal[[found.group[line.to_bus] for line in rows], None]
 
     base = bus * nominal[:, None]
-    return Referred(
-        lines, ties, nominal, base, branch * own(lines), tie * own(ties), base[at, phase], nominal[at]
-    )
+    customer = of_customers(base[at], np.array(there, dtype=np.bool_).reshape(-1, 3))
+    return Referred(lines, ties, nominal, base, branch * own(lines), tie * own(ties), customer, nominal[at])
+
+
+def of_customers(base: Floats, connected: Bools) -> Floats:
+    """Return what 1 pu of each customer is, V, (N,): the mean of its phases, which is what its meter reads.
+
+    Parameters
+    ----------
+    base : (N, 3)
+        Voltage bases of the phases of their buses, V.
+    connected : (N, 3)
+        Which phases they have.
+    """
+    first = np.take_along_axis(base, connected.argmax(axis=1)[:, None], axis=1)
+    # Where all are the same the mean is, to the last bit.
+    apart = np.where(connected, base - first, 0.0).sum(axis=1) / connected.sum(axis=1)
+    return np.asarray(first[:, 0] + apart)
 
 
 def _factors(lines: Sequence[LineRow], found: Tree) -> tuple[Floats, Floats]:

@@ -174,6 +174,23 @@ def test_inverters_follow_the_standards_curve_in_true_volts() -> None:
         np.testing.assert_allclose(at, np.array(preset(row.droop).q) * row.inverter_kva / 100.0, atol=1e-12)
 
 
+@pytest.mark.parametrize("own", [OWN, {"tap_a": 1.03, "tap_b": 1.0, "tap_c": 0.95}])
+def test_a_customer_of_three_phases_is_in_the_mean_of_its_phases(own: dict[str, float]) -> None:
+    """Curve and accuracy in the volts that its meter reads, whichever phase is the first."""
+    tables = villages.tables()
+    lines = [replace(line, r0_ohm=3 * line.r_ohm, x0_ohm=4 * line.x_ohm) for line in tables.lines]
+    lines = [replace(line, **own) if line.line == "l2" else line for line in lines]  # type: ignore[arg-type]
+    site = three_phase(replace(tables, lines=tuple(lines)))
+    base = site.customer_volt
+    behind = np.array([230.0 / tap for tap in own.values()]).mean()
+    assert set(np.round(base / behind, 12)) == {1.0, round(230.0 / behind, 12)}
+    np.testing.assert_allclose(site.accuracy.resolution * base[site.meters], 0.1, rtol=1e-14)
+    np.testing.assert_allclose(site.accuracy.jitter * base[site.meters], 0.0005 * 230.0, rtol=1e-14)
+    for k, customer in enumerate(site.droop.customer):
+        curve = preset(site.tables.customers[customer].droop)
+        np.testing.assert_allclose(site.droop.v[k] * base[customer], np.array(curve.v) * 230.0, rtol=1e-14)
+
+
 def test_the_trace_of_a_load_that_is_not_there_is_in_volts() -> None:
     tables = villages.village_without_inverters().tables
     site, customers = from_tables(tapped(tables, TAPS)), len(tables.customers)
