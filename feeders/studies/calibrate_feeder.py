@@ -422,7 +422,7 @@ def doubts(net: Network, drawn: Powers, tolerance: float, free: Collection[int],
     half = 0.5 * (model.tan_max - model.tan_min)
     root = np.sqrt(3.0)
     return Doubts(
-        bias=site.accuracy.class_fraction / root,
+        bias=np.hypot(site.accuracy.class_fraction, site.accuracy.busbar_class) / root,
         p_gain=np.where(without, 0.0, model.p_fraction / root),
         q_gain=np.where(unmetered, 0.0, model.q_fraction / root),
         tan=np.where(unmetered, half / root, 0.0),

@@ -51,7 +51,8 @@ def meters(now: Round, risk: float) -> pd.DataFrame:
     at, site = now.given.where["bias"], now.net.site
     bias, std, prior = 100.0 * now.fit.estimate[at], 100.0 * now.fit.std[at], 100.0 * now.given.spread[at]
     count = now.series.seen.sum(axis=0)
-    limit = 100.0 * site.accuracy.class_fraction
+    # A bias is told relative to the busbar's meter, which may be off the other way.
+    limit = 100.0 * (site.accuracy.class_fraction + site.accuracy.busbar_class)
     sure = norm.isf(risk / (2.0 * max(at.size, 1)))
 
     unread = blind(site, now.state.unread)

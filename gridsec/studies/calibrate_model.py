@@ -187,7 +187,7 @@ class Doubts:
     Attributes
     ----------
     bias : (p,)
-        Relative fixed error of each meter, 1.
+        Fixed error of each meter, relative to the busbar's, 1.
     p_gain, q_gain : (N,)
         Relative error of the power registers, 1.
     tan : (N,)

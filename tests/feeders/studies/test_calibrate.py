@@ -99,6 +99,34 @@ def test_biases_of_the_size_of_the_class_are_found(tmp_path: Path) -> None:
     assert (rows.drop(["m02", "m05"])["verdict"] == "within error").all()
 
 
+@pytest.mark.parametrize(("bias", "verdict"), [(0.0049, "biased"), (0.0075, "outside its class")])
+def test_the_class_of_the_busbars_meter_counts(bias: float, verdict: str, tmp_path: Path) -> None:
+    """Classes 0.5 and 0.1; the busbar's meter is off by nearly its class the other way."""
+    given = scenario(3)
+    lie = Bias(np.array([1]), START, np.inf, np.array([bias]))
+    exact = replace(given, errors=replace(given.errors, bias=0.0), attacks=(lie,))
+    readings = recorded(tmp_path, exact).frame()
+    readings.loc[readings["meter"] == "", "v_volt"] *= 1.0 - 0.0009
+    rows = calibrate(CIGRE, readings, kinds=[Kind.METER]).meters.set_index("meter")
+    assert rows.loc["m02", "bias_percent"] == pytest.approx(100.0 * bias + 0.09, abs=0.06)
+    assert rows.loc["m02", "verdict"] == verdict
+    assert "outside its class" not in set(rows.drop("m02")["verdict"])
+
+
+def test_the_error_of_a_coarse_busbars_meter_excludes_nobody(tmp_path: Path) -> None:
+    """Meters of class 0.2, and a busbar's of class 1 that is off by 0.9 %: all are apart from it."""
+    meta = replace(
+        TABLES.meta, busbar_class_percent=1.0, meters=replace(TABLES.meta.meters, class_percent=0.2)
+    )
+    given = scenario(3)
+    exact = replace(given, errors=replace(given.errors, bias=0.0))
+    readings = recorded(tmp_path, exact).frame()
+    readings.loc[readings["meter"] == "", "v_volt"] *= 1.0 + 0.009
+    found = calibrate(site(replace(TABLES, meta=meta)), readings)
+    assert found.proposals.empty
+    assert set(found.meters["verdict"]) == {"biased"}
+
+
 def test_lines_in_series_cannot_be_told_apart_and_are_not_corrected(tmp_path: Path) -> None:
     found = calibrate(site(shortened(TABLES, "Line R1-R2", 1.4)), recorded(tmp_path, scenario(1)))
     assert found.proposals["verdict"].tolist() == ["cannot be told"]
