@@ -79,13 +79,13 @@ def refer(tables: FeederTables, closed: Sequence[LineRow], found: Tree) -> Refer
     if problems:
         raise FeederInvalid(problems)
     at = np.array([found.group[row.bus] for row in tables.customers], dtype=np.intp)
-    there = [[phase in row.phases for phase in "abc"] for row in tables.customers]
+    own_phases = [[phase in row.phases for phase in "abc"] for row in tables.customers]
 
     def own(rows: Sequence[LineRow]) -> Floats:
         return nominal[[found.group[line.to_bus] for line in rows], None]
 
     base = bus * nominal[:, None]
-    customer = of_customers(base[at], np.array(there, dtype=np.bool_).reshape(-1, 3))
+    customer = of_customers(base[at], np.array(own_phases, dtype=np.bool_).reshape(-1, 3))
     return Referred(lines, ties, nominal, base, branch * own(lines), tie * own(ties), customer, nominal[at])
 
 
