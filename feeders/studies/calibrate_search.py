@@ -246,14 +246,16 @@ def compare(
     """
     guesses: list[Guess] = []
     parts: list[Evidence] = []
-    chunks = list(_chunks(now, kinds))
+    # Of some kinds there may be none: phases on a balanced feeder, meters if all are excluded.
+    chunks = [chunk for chunk in _chunks(now, kinds) if chunk[0]]
     for k, (some, make, spread) in enumerate(chunks):
         tell(k, len(chunks))
         z = now.whiten(make())
         parts.append(evidence(now.fit, z.reshape(-1, len(some)), np.full(len(some), spread)))
         guesses.extend(some)
     tell(len(chunks), len(chunks))
-    g, h, factor = (np.concatenate([getattr(part, n) for part in parts]) for n in ("g", "h", "log_factor"))
+    names = ("g", "h", "log_factor")
+    g, h, factor = (np.concatenate([np.empty(0), *(getattr(part, n) for part in parts)]) for n in names)
     kind = np.array([list(Kind).index(guess.kind) for guess in guesses], dtype=np.intp)
     exact = factor.copy()
     for k in _close(now, guesses, factor):
@@ -267,6 +269,8 @@ _MOVES: Final = (Kind.BUS, Kind.PHASE, Kind.SWAP)
 
 def _close(now: Round, guesses: list[Guess], factor: Floats) -> list[int]:
     """Moves that the linear flow makes likely, and before a meter is excluded its customer's likeliest."""
+    if not guesses:
+        return []
     order = np.argsort(-factor).tolist()
     moves = [k for k in order if guesses[k].kind in _MOVES]
     likely = [k for k in moves[:_REFIT] if factor[k] > 0.0]

@@ -133,7 +133,8 @@ class Weighed:
     confidence : (H,)
         Probability of each, if some error and none are as likely before any reading.
     any
-        Mean of the Bayes factors, logarithm: above ``log(1 / risk)`` there is an error.
+        Mean of the Bayes factors, logarithm: above ``log(1 / risk)`` there is an error; without any
+        hypothesis minus infinity.
     kept : (k,)
         The best hypotheses, best first, that share all but `risk` of the probability.
     """
@@ -157,7 +158,7 @@ def weigh(log_factor: Floats, kind: Ints, risk: float) -> Weighed:
     """
     _, where, count = np.unique(kind, return_inverse=True, return_counts=True)
     log_share = log_factor - np.log(count.size * count[where])
-    total = float(logsumexp(log_share))
+    total = float(logsumexp(log_share)) if log_share.size else -np.inf
     order = np.argsort(-log_share, kind="stable")
     among = np.cumsum(np.exp(log_share[order] - total))
     kept = order[: int(np.searchsorted(among, 1.0 - risk)) + 1]

@@ -237,6 +237,15 @@ def test_phases_of_the_busbar_that_are_apart_are_no_errors_of_meters(tmp_path: P
         calibrate(given, readings)
 
 
+def test_where_there_is_nothing_to_look_for_nothing_is_found(tmp_path: Path) -> None:
+    readings = recorded(tmp_path, scenario(1, ticks=96))
+    assert calibrate(CIGRE, readings, kinds=[Kind.PHASE]).proposals.empty
+    for kinds in (tuple(Kind), [Kind.METER], [Kind.BUS]):
+        found = calibrate(CIGRE, readings, exclude=CIGRE.meter_ids, kinds=kinds)
+        assert found.proposals.empty
+        assert set(found.meters["verdict"]) == {"excluded"}
+
+
 def test_an_interrupted_study_goes_on_and_another_ones_journal_is_refused(tmp_path: Path) -> None:
     readings = recorded(tmp_path, scenario(1))
     wrong = site(moved(TABLES, "Load R15", "Bus R17"))
