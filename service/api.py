@@ -193,9 +193,7 @@ def get_feeder(
 ) -> Any:
     """A feeder: its tree, and the columns of its files."""
     fields = _detail(backend, feeder)
-    text = json.dumps(fields, sort_keys=True, default=str)
-    tag = f'"{hashlib.sha256(text.encode()).hexdigest()[:32]}"'
-    return _unchanged(response, tag, if_none_match) or fields
+    return _unchanged(response, f'"{fields["revision"]}"', if_none_match) or fields
 
 
 @_feeders.put("/{feeder}", response_model=models.FeederDetail, dependencies=[Depends(_json_only)])

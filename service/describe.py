@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+from collections.abc import Mapping
 from typing import Any
 
 from feeders.load import Site
@@ -29,19 +32,33 @@ def summary(site: Site) -> dict[str, Any]:
     }
 
 
-def detail(site: Site) -> dict[str, Any]:
-    """Return everything about a feeder: limits, tree with positions, tables.
+def revision(fields: Mapping[str, Any]) -> str:
+    """Return a digest of what is told of a feeder: the same as long as all of it is.
+
+    Parameters
+    ----------
+    fields
+        What is told, as JSON.
+    """
+    return hashlib.sha256(json.dumps(fields, sort_keys=True, default=str).encode()).hexdigest()[:32]
+
+
+def detail(site: Site, patience_s: float) -> dict[str, Any]:
+    """Return everything about a feeder: limits, tree with positions, tables, and the `revision` of all that.
 
     Parameters
     ----------
     site
         The feeder.
+    patience_s
+        From which age its states are stale, s.
     """
     meta = site.tables.meta
     tree = site.spanning
     xy = site.xy
-    return {
+    fields = {
         **summary(site),
+        "patience_s": patience_s,
         "v_nominal_volt": meta.voltage_volt,
         "v_min_volt": meta.limits.v_min_pu * meta.voltage_volt,
         "v_max_volt": meta.limits.v_max_pu * meta.voltage_volt,
@@ -63,3 +80,4 @@ def detail(site: Site) -> dict[str, Any]:
         },
         "tables": to_json(site.tables),
     }
+    return {**fields, "revision": revision(fields)}

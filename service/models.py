@@ -138,6 +138,7 @@ class State(BaseModel):
     """A feeder at its latest tick."""
 
     feeder: str
+    revision: str = Field(default="", description="That of the feeder that it is about.")
     t: float = Field(description="Unix time of the tick, s.")
     age_s: float = Field(description="How old it was when this was sent, by the service's clock, s.")
     verdict: Decision
@@ -276,6 +277,7 @@ class FeederDetail(BaseModel):
     v_max_volt: float
     tick_s: float = 1.0
     patience_s: Number = Field(default=None, description="A state that is older is stale, s.")
+    revision: str = Field(description="Digest of all the rest; a state with another one is not about this.")
     layout: Layout
     tables: dict[str, Any]
 

@@ -201,6 +201,8 @@ class FeederReport:
         In three phases, the voltage of each phase of every bus, V; None for one that it does not have.
     busbar
         The busbar's own meter.
+    revision
+        Of which tables, limits and times of the feeder this is, see `describe.revision`.
     """
 
     feeder: str
@@ -219,6 +221,7 @@ class FeederReport:
     explanations: tuple[ExplanationReport, ...] = ()
     bus_phases: tuple[tuple[float | None, ...], ...] = ()
     busbar: BusbarReport = UNKNOWN_BUSBAR
+    revision: str = ""
 
     @property
     def suspects(self) -> tuple[str, ...]:
@@ -430,6 +433,7 @@ def to_json(report: FeederReport) -> dict[str, Any]:
     """
     return {
         "feeder": report.feeder,
+        "revision": report.revision,
         "t": report.t,
         "verdict": str(report.verdict),
         "reason": report.reason,

@@ -292,7 +292,7 @@ class Runtime:
             Its name.
         """
         watch = self._rounds.watches.get(name)
-        return None if watch is None else {**describe.detail(watch.site), "patience_s": watch.patience_s}
+        return None if watch is None else describe.detail(watch.site, watch.patience_s)
 
     def known(self, name: str) -> bool:
         """Whether a feeder is watched.

@@ -9,13 +9,15 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
+from functools import cached_property
 from typing import Any
 
 from feeders import estimators
 from feeders.load import Site, to_frame
 from gridsec.online import Cause
+from service import describe
 from service.alarms import AlarmBook, AlarmRules, Transition, acknowledge, advance
 from service.align import Aligner, AlignRules, Clock, Outcome, Tick, rules
 from service.commissioning import Commissioning
@@ -163,6 +165,12 @@ class Watch:
         rules = self.aligner.rules
         return max(PATIENCE_MIN_S, 3.0 * rules.tick_s + rules.grace_s)
 
+    @cached_property
+    def revision(self) -> str:
+        """What its reports carry, so that nobody reads them with the meters of other tables."""
+        revision: str = describe.detail(self.site, self.patience_s)["revision"]
+        return revision
+
     def install(self, finished: estimators.Watcher) -> None:
         """Begin to watch with a finished design.
 
@@ -266,14 +274,14 @@ class Watch:
         """Judge a tick; a defect costs the answer to it, and no alarm of the ticks before."""
         for _ in range(2):  # watched, and given up
             try:
-                report = self._judge(tick)
+                report = replace(self._judge(tick), revision=self.revision)
                 book, transitions = advance(self.book, self._alarm_rules, conditions(report), report.t)
             except Exception as error:  # noqa: BLE001 - whatever it is, ticks before and after have their answers
                 self.break_down(error)
             else:
                 self.report, self.book = report, book
                 return TickResult(report, transitions)
-        self.report = self._judge(tick)
+        self.report = replace(self._judge(tick), revision=self.revision)
         return TickResult(self.report, ())
 
     def _judge(self, tick: Tick) -> FeederReport:

@@ -108,6 +108,10 @@ function listen(name) {
 
 function take(report) {
   if (report.feeder !== page.feeder?.name) return;
+  if (report.revision !== page.feeder.revision) {
+    show(report.feeder); // Its meters may belong to others than those that are drawn.
+    return;
+  }
   // By the service's clock; a state that comes again does not grow younger on the way.
   const made = performance.now() - 1000 * report.age_s;
   const again = page.report?.t === report.t;

@@ -10,6 +10,7 @@ import tempfile
 import threading
 import time
 from collections.abc import AsyncGenerator, Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from gridsec.online import Cause, Decision
 from service.alarms import AlarmBook, AlarmRules, AlarmUnknown, acknowledge, advance, conditions, to_json
 from service.api import create_api
 from service.commissioning import Happened, Step
+from service.describe import revision
 from service.errors import FeederFixed, FeederUnknown, TooManyFeeders
 from service.report import FeederReport, MeterReport
 from service.store import Store
@@ -53,7 +55,7 @@ class Village:
         self.meters = [c["meter"] for c in self.customers]
 
     def detail(self) -> dict[str, Any]:
-        return {
+        fields = {
             "name": self.name,
             "title": f"{self.name.capitalize()}, {len(self.customers)} customers",
             "v_nominal_volt": NOMINAL,
@@ -64,6 +66,7 @@ class Village:
             "layout": {"buses": self.buses, "parent": self.parent, "xy": None, "customers": self.customers},
             "tables": {"meta": {"name": self.name}, "lines": [], "customers": []},
         }
+        return {**fields, "revision": revision(fields)}
 
     def report(
         self,
@@ -149,6 +152,7 @@ class SmallService:
         self.lock = threading.Lock()
 
     def tick(self, report: FeederReport) -> None:
+        report = replace(report, revision=self.villages[report.feeder].detail()["revision"])
         with self.lock:
             book, transitions = advance(self.books[report.feeder], self.rules, conditions(report), report.t)
             self.store.commit(transitions, reports=[report])

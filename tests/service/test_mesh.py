@@ -28,7 +28,7 @@ def scenario() -> Scenario:
 
 def test_the_layout_is_a_tree_and_its_ties() -> None:
     site = baran_wu()
-    found = FeederDetail.model_validate(detail(site)).layout
+    found = FeederDetail.model_validate(detail(site, 5.0)).layout
     assert len(found.ties) == 5
     lines = {frozenset((row.from_bus, row.to_bus)) for row in site.tables.lines}
     drawn = [(k, above) for k, above in enumerate(found.parent) if above is not None] + found.ties

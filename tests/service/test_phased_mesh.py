@@ -39,7 +39,7 @@ def test_the_folder_is_checked_and_shown(tmp_path: Path) -> None:
 def test_the_layout_is_a_tree_and_its_tie() -> None:
     site = european()
     assert isinstance(site.feeder, PhasedMesh)
-    found = FeederDetail.model_validate(detail(site)).layout
+    found = FeederDetail.model_validate(detail(site, 5.0)).layout
     assert [{found.buses[one], found.buses[other]} for one, other in found.ties] == [{"681", "906"}]
     assert len(found.buses) == len(found.parent) == 906
     assert {customer.phase for customer in found.customers} == {"a", "b", "c"}

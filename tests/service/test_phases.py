@@ -87,7 +87,7 @@ def test_phases_do_not_matter_to_a_balanced_feeder() -> None:
 
 
 def test_the_layout_is_that_of_the_buses(site: Site) -> None:
-    found = FeederDetail.model_validate(detail(site))
+    found = FeederDetail.model_validate(detail(site, 5.0))
     assert len(found.layout.buses) == len(site.tree.buses) == 906
     assert {customer.phase for customer in found.layout.customers} == {"a", "b", "c"}
     assert all(customer.bus in found.layout.buses for customer in found.layout.customers)
@@ -136,7 +136,7 @@ def test_the_service_names_the_liars_with_their_phases(
 
 def test_a_balanced_feeder_says_nothing_of_phases() -> None:
     village = load("kerber-landnetz")
-    assert all(customer["phase"] is None for customer in detail(village)["layout"]["customers"])
+    assert all(customer["phase"] is None for customer in detail(village, 5.0)["layout"]["customers"])
     assert from_tables(village.tables).digest == village.digest
     (sample,) = simulate(village, Scenario(duration_s=1.0))
     assert all(b"phases" not in payload_of(reading) for reading in sample.readings)

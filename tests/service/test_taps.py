@@ -72,5 +72,5 @@ def test_the_liars_behind_a_tap_are_named_in_volts(name: str, tmp_path: Path) ->
 
 def test_the_layout_has_one_nominal_voltage() -> None:
     site = tapped("kerber-landnetz")
-    told = FeederDetail.model_validate(detail(site))
+    told = FeederDetail.model_validate(detail(site, 5.0))
     assert told.v_nominal_volt == site.tables.meta.voltage_volt

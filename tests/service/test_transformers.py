@@ -95,12 +95,12 @@ def _limits_are_those_of_the_level(site: Site, report: FeederReport) -> None:
 
 def test_the_layout_says_the_nominal_voltage_of_every_bus() -> None:
     site = from_tables(stations.tables())
-    told = FeederDetail.model_validate(detail(site))
+    told = FeederDetail.model_validate(detail(site, 5.0))
     assert told.v_nominal_volt == MV
     assert told.layout.v_nominal_volt == [stations_volt(bus) for bus in told.layout.buses]
-    phases = FeederDetail.model_validate(detail(from_tables(stations.in_phases())))
+    phases = FeederDetail.model_validate(detail(from_tables(stations.in_phases()), 5.0))
     assert phases.layout.v_nominal_volt == told.layout.v_nominal_volt
-    assert detail(site)["tables"] == to_json(site.tables)
+    assert detail(site, 5.0)["tables"] == to_json(site.tables)
 
 
 def test_a_reading_is_absurd_by_its_own_level() -> None:

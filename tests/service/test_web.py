@@ -31,7 +31,7 @@ def real(village: type, of: FeederSite) -> Any:
     """A village with the tree of a real feeder."""
     made = village(of.feeder.name, 0)
     made.detail = lambda: known
-    known = {**detail(of), "patience_s": 5.0}
+    known = detail(of, 5.0)
     layout = known["layout"]
     made.buses, made.parent, made.customers = layout["buses"], layout["parent"], layout["customers"]
     made.meters = [c["meter"] for c in made.customers]
@@ -339,7 +339,7 @@ def test_146_customers_can_be_told_apart(
 
 def test_real_feeders_are_drawn_without_crossings(site: Site) -> None:
     page = site.open()
-    layouts = [detail(load(name))["layout"] for name in names()]
+    layouts = [detail(load(name), 5.0)["layout"] for name in names()]
     draw = random.Random(7)
     for size in (1, 2, 5, 30, 80):
         parent = [None, *(draw.randrange(max(0, k - 6), k) for k in range(1, size))]
@@ -387,7 +387,7 @@ def test_the_map_shows_real_places(site_of: Callable[..., Site], village: type) 
         "all => all.map(e => [e.ariaLabel.split(':')[0], e.transform.baseVal[0].matrix])"
         ".map(([name, m]) => [name, m.e, m.f])"
     )
-    layout = detail(load("simbench-lv-rural1"))["layout"]
+    layout = detail(load("simbench-lv-rural1"), 5.0)["layout"]
     xy = dict(zip(layout["buses"], layout["xy"], strict=True))
     bus = {known["customer"]: known["bus"] for known in layout["customers"]}
     x, y = np.array([[x, y] for _, x, y in seen]).T

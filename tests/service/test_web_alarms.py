@@ -321,6 +321,21 @@ def test_a_lost_connection_is_said_and_healed(site: Site) -> None:
     expect(page.locator(".alarm")).to_have_count(0)
 
 
+def test_meters_that_changed_places_accuse_their_new_customers_on_an_open_page(site: Site) -> None:
+    site.tick(T0, lies={"H3": 9.0})
+    page = site.open()
+    suspect = page.locator('#diagram .customer[data-status="suspect"]')
+    expect(suspect).to_have_attribute("aria-label", re.compile("^H3: suspect"))
+    meters = [c["meter"] for c in site.village.customers]
+    meters[3], meters[9] = meters[9], meters[3]
+    pairs = zip(site.village.customers, meters, strict=True)
+    site.village.customers = [{**c, "meter": meter} for c, meter in pairs]
+    site.tick(T0 + 1, lies={"H3": 9.0})
+    expect(suspect).to_have_attribute("aria-label", re.compile("^H9: suspect"))
+    expect(suspect).to_have_count(1)
+    expect(page.locator("#link")).to_have_text("live")
+
+
 def test_a_state_that_is_old_when_it_comes_is_not_live(site: Site) -> None:
     """It counts from its tick by the service's clock, and does not grow younger when it comes again."""
     site.tick(T0)
