@@ -29,7 +29,8 @@ class Pace:
     speed
         Virtual seconds per second; 1 is real time, infinity as fast as it goes.
     ahead
-        In step with the service: at most so many ticks ahead of its published estimates. None: not in step.
+        In step with the service: at most so many ticks ahead of its published estimates (the feeder's ticks,
+        or the meters' readings where these are rarer). None: not in step.
     """
 
     speed: float = 1.0
@@ -108,7 +109,7 @@ def play(
         If zenoh is closed.
     """
     name = site.feeder.name
-    steps = _Steps(meters, name, pace.ahead, scenario.dt_s) if pace.ahead is not None else None
+    steps = _Steps(meters, site, pace.ahead, scenario.dt_s) if pace.ahead is not None else None
     begin = clock()
     waiting: list[tuple[float, int, Reading]] = []
     number = count()
@@ -132,14 +133,21 @@ def play(
 
 
 class _Steps:
-    """Keeps a simulation in step with the published estimates of a feeder."""
+    """Keeps a simulation in step with the published estimates of a feeder.
 
-    def __init__(self, meters: Meters, feeder: str, ahead: int, dt_s: float) -> None:
+    Readings every d seconds, the last of them at t, let the service publish the latest tick that is not after
+    t; of ticks every s seconds that is one of less than s ago. So it can always be waited for until t minus
+    the published time is less than a max(d, s), for any d, s, beginning, and a >= 1.
+    """
+
+    def __init__(self, meters: Meters, site: Site, ahead: int, dt_s: float) -> None:
+        tick_s = site.tables.meta.monitor.tick_s
         self._meters = meters
-        self._ahead_s = (ahead - 0.5) * dt_s
+        # Sums of many steps are not exact: what is a thousandth short of the next step has reached it.
+        self._ahead_s = ahead * max(dt_s, tick_s) - 1e-3 * min(dt_s, tick_s)
         self._reached: float | None = None
         self._first: float | None = None
-        meters.watch(feeder)
+        meters.watch(site.feeder.name)
 
     def wait(self, t: float, clock: Callable[[], float], sleep: Callable[[float], None]) -> None:
         """Wait until the estimates have come near to t."""
