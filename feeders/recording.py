@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from feeders.meters import BUSBAR
@@ -55,6 +56,8 @@ PHASES: Final = pa.field("v_phases", pa.list_(pa.float64()))
 """Voltages of the busbar's phases, a column of recordings of feeders in three phases."""
 
 REQUIRED: Final = ("meter", "t", "v_volt")
+REGISTERS: Final = ("seq", "p_kw", "q_kvar")
+"""Columns in which NaN says, as null does, that nothing was reported: tables of floats have nothing else."""
 
 
 class RecordingInvalid(GridsecError):
@@ -208,20 +211,21 @@ def read_recording(path: Path | str) -> Recording:
     """Open a recording, ours or a foreign one.
 
     A foreign file needs the columns `meter`, `t` and `v_volt`. Without `arrival` readings arrive at their own
-    time; `seq`, `p_kw` and `q_kvar` may be absent.
+    time; `seq`, `p_kw` and `q_kvar` may be absent, and null or NaN where they are not reported.
 
     Raises
     ------
     RecordingInvalid
-        When the file is not Parquet, lacks a column or has one of another type, or has a newer format.
+        When the file is not Parquet, lacks a column or has one of another type, has numbers of readings that
+        are not whole, or has a newer format.
     """
     path = Path(path)
     try:
         with pq.ParquetFile(path) as file:
             schema, count = file.schema_arrow, file.metadata.num_rows
+            problems = [*_wrong_columns(schema), *_wrong_numbers(file)]
     except (OSError, pa.ArrowException) as error:
         raise RecordingInvalid(f"{path}: no recording: {error}") from error
-    problems = _wrong_columns(schema)
     if problems:
         raise RecordingInvalid(f"{path}: {'; '.join(problems)}")
     if KEY not in (schema.metadata or {}):
@@ -277,6 +281,22 @@ def _wrong_columns(schema: Any) -> list[str]:
 
 
 _TIMES: Final = ("t", "arrival")
+
+
+def _wrong_numbers(file: Any) -> list[str]:
+    """What is wrong with the numbers of readings, which tables write as floats where one is missing."""
+    if "seq" not in file.schema_arrow.names or not _is_floating(file.schema_arrow.field("seq").type):
+        return []
+    for batch in file.iter_batches(columns=["seq"]):
+        try:
+            _column(batch, "seq")
+        except pa.ArrowInvalid as error:
+            return [f"column seq has numbers that are not whole: {error}"]
+    return []
+
+
+def _is_floating(kind: Any) -> bool:
+    return bool(pa.types.is_floating(kind.value_type if pa.types.is_dictionary(kind) else kind))
 
 
 def _is_number(kind: Any) -> bool:
@@ -402,7 +422,7 @@ def _matrix(column: Any) -> Any:
 def _readings(batch: Any) -> Iterator[Reading]:
     size = batch.num_rows
     there = {
-        name: batch.column(name).to_pylist()
+        name: _column(batch, name).to_pylist()
         for name in batch.schema.names
         if name in (*READINGS.names, PHASES.name)
     }
@@ -419,3 +439,13 @@ def _readings(batch: Any) -> Iterator[Reading]:
         strict=True,
     ):
         yield Reading(meter, t, seq, arrival, v_volt, p_kw, q_kvar, phases and tuple(phases))
+
+
+def _column(batch: Any, name: str) -> Any:
+    """A column as its readings have it: nothing for NaN in `REGISTERS`, and whole numbers as such."""
+    column = batch.column(name)
+    if name not in REGISTERS or not _is_floating(column.type):
+        return column
+    numbers = pc.cast(column, pa.float64())
+    known = pc.if_else(pc.is_nan(numbers), pa.scalar(None, pa.float64()), numbers)
+    return pc.cast(known, pa.int64()) if name == "seq" else known

@@ -31,6 +31,7 @@ from service.places import Unusable, see
 if TYPE_CHECKING:
     from feeders.campaign import Kind
     from feeders.load import Site
+    from feeders.recording import Recording
     from feeders.scenario import Scenario
     from gridsec.attack import Attack, InverterAttack
 
@@ -412,13 +413,39 @@ def replay(
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object per alarm transition.")] = False,
 ) -> None:
     """Run a recording through the same chain as the live service, and show what it would have said."""
-    from feeders.load import load
-    from feeders.recording import RecordingInvalid, read_recording
+    from feeders.recording import read_recording
     from service.alarms import to_json
     from service.replay import Tally
     from service.replay import replay as run
 
     recording = read_recording(file)
+    site = _site_of(recording, feeder)
+    tally = Tally()
+    began: float | None = None
+    for result in run(site, recording.readings(), tally):
+        began = result.report.t if began is None else began
+        for transition in result.transitions:
+            alarm = transition.alarm
+            if as_json:
+                record = {"t": transition.t, "change": str(transition.change), "alarm": to_json(alarm)}
+                print(json.dumps(record))
+            else:
+                about = escape(f"{alarm.kind} {alarm.meter or alarm.feeder}: {alarm.reason}")
+                console.out.print(f"{transition.t - began:10.1f} s  {transition.change:<12} {about}")
+    summary = console.err if as_json else console.out
+    summary.print(f"ticks:    {_counts(tally.ticks)}")
+    summary.print(f"readings: {_counts(tally.readings)}, never arrived {tally.lost}")
+    if not tally.judged:
+        complain("no tick was judged, which is no answer: whether anybody lied is not known")
+        raise typer.Exit(FAILED)
+
+
+def _site_of(recording: Recording, feeder: str | None) -> Site:
+    """The feeder that is given, or that of the recording; said if it is not quite the same."""
+    from feeders.load import load
+    from feeders.recording import RecordingInvalid
+
+    file = recording.path
     name = feeder or recording.feeder
     if name is None:
         raise typer.BadParameter("the file does not say which feeder it belongs to", param_hint="--feeder")
@@ -433,21 +460,7 @@ def replay(
         raise RecordingInvalid(f"{file}: recorded on {recording.feeder}, not on {site.feeder.name}")
     if recording.digest not in {None, site.digest}:
         console.err.print(f"[yellow]{escape(name)} has changed since this was recorded.[/]")
-    tally = Tally()
-    began: float | None = None
-    for result in run(site, recording.readings(), tally):
-        began = result.report.t if began is None else began
-        for transition in result.transitions:
-            alarm = transition.alarm
-            if as_json:
-                record = {"t": transition.t, "change": str(transition.change), "alarm": to_json(alarm)}
-                print(json.dumps(record))
-            else:
-                about = escape(f"{alarm.kind} {alarm.meter or alarm.feeder}: {alarm.reason}")
-                console.out.print(f"{transition.t - began:10.1f} s  {transition.change:<12} {about}")
-    if not as_json:
-        console.out.print(f"ticks:    {_counts(tally.ticks)}")
-        console.out.print(f"readings: {_counts(tally.readings)}, never arrived {tally.lost}")
+    return site
 
 
 def _counts(counts: dict[str, int]) -> str:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from feeders.load import Site
 from feeders.meters import BUSBAR
 from feeders.scenario import Reading as Recorded
+from gridsec.online import Decision
 from service.alarms import AlarmBook
 from service.align import Clock, Outcome
 from service.commissioning import Commissioning
@@ -25,6 +26,11 @@ class Tally:
     readings: Counter[str] = field(default_factory=Counter)
     ticks: Counter[str] = field(default_factory=Counter)
     lost: int = 0
+
+    @property
+    def judged(self) -> int:
+        """Number of ticks at which the monitor could tell whether anybody lies."""
+        return self.ticks.total() - self.ticks[Decision.UNDECIDED]
 
 
 def replay(

@@ -243,3 +243,28 @@ def test_a_scenario_in_which_nothing_arrives(tmp_path: Path) -> None:
     assert recording.count == 0
     assert list(recording.readings()) == []
     assert recording.truth().t.size == 3
+
+
+def foreign(path: Path, **columns: list[float | None]) -> Path:
+    """A file of two readings with more columns, NaN and null as they are given."""
+    about = {"meter": ["m1", "m2"], "t": [1.0, 2.0], "v_volt": [230.0, 231.0]}
+    pq.write_table(pa.table({**about, **columns}), path)
+    return path
+
+
+def test_numbers_of_readings_may_be_floats_and_nan_is_nothing(tmp_path: Path) -> None:
+    columns = {"seq": [7.0, np.nan], "p_kw": [np.nan, 1.5], "q_kvar": [None, np.nan]}
+    first, second = read_recording(foreign(tmp_path / "a.parquet", **columns)).readings()
+    assert (first.seq, type(first.seq), first.p_kw, first.q_kvar) == (7, int, None, None)
+    assert (second.seq, second.p_kw, second.q_kvar) == (None, 1.5, None)
+    # As pandas writes a column of whole numbers in which one is missing.
+    frame = pd.DataFrame({"meter": ["m1", "m2"], "t": [1, 2], "v_volt": [230, 231], "seq": [None, 2**40]})
+    frame.to_parquet(tmp_path / "b.parquet")
+    assert [r.seq for r in read_recording(tmp_path / "b.parquet").readings()] == [None, 2**40]
+
+
+def test_numbers_of_readings_that_are_not_whole_are_named_with_everything_else(tmp_path: Path) -> None:
+    wrong = r"column p_kw is of type bool.*; column seq has numbers that are not whole"
+    for seq in (1.5, np.inf, 1e30):
+        with pytest.raises(RecordingInvalid, match=wrong):
+            read_recording(foreign(tmp_path / "a.parquet", seq=[1.0, seq], p_kw=[True, False]))

@@ -1,0 +1,65 @@
+"""`gridsec replay`: a recording without an answer says so, and what was live is replayed."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+import pytest
+
+from feeders.campaign import random_attacks
+from feeders.load import load
+from feeders.recording import record
+from feeders.scenario import Scenario
+from tests.service.commands import command, plain
+
+FEEDER = "simbench-lv-rural1"
+START = 1_795_212_000.0
+Replay = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def replay(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Replay:
+    return lambda *arguments: command("replay")(monkeypatch, capsys, *map(str, arguments))
+
+
+@pytest.fixture(scope="module")
+def day(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of 40 s in which two meters lie for 20 of them."""
+    path, site = tmp_path_factory.mktemp("recorded") / "day.parquet", load(FEEDER)
+    attacks = random_attacks(site, 2, "bias", 2, 0.03, t_on=START + 10, t_off=START + 30)
+    return record(site, Scenario(seed=5, start=START, duration_s=40.0, attacks=attacks), path).path
+
+
+def changed(day: Path, path: Path, name: str, column: pa.ChunkedArray | None) -> Path:
+    """The recording as another program would have written it: one column is another, or is not there."""
+    table = pq.read_table(day).replace_schema_metadata(None)
+    k = table.schema.get_field_index(name)
+    pq.write_table(table.remove_column(k) if column is None else table.set_column(k, name, column), path)
+    return path
+
+
+def test_numbers_of_readings_as_floats_change_nothing(day: Path, tmp_path: Path, replay: Replay) -> None:
+    seq = pq.read_table(day, columns=["seq"]).column("seq")
+    floats = changed(day, tmp_path / "floats.parquet", "seq", pc.cast(seq, pa.float64()))
+    code, told, tally = replay(day, "--json")
+    assert (code, [json.loads(line)["change"] for line in told.splitlines()].count("raised")) == (0, 2)
+    assert "ticks: attacked" in plain(tally)
+    assert replay(floats, "--feeder", FEEDER, "--json") == (code, told, tally)
+
+
+@pytest.mark.parametrize("options", [(), ("--json",)])
+def test_no_answer_does_not_look_like_no_attack(
+    day: Path, tmp_path: Path, replay: Replay, options: tuple[str, ...]
+) -> None:
+    absurd = changed(
+        day, tmp_path / "absurd.parquet", "v_volt", pa.chunked_array([[1e6] * pq.read_table(day).num_rows])
+    )
+    code, told, said = replay(absurd, "--feeder", FEEDER, *options)
+    assert code == 1
+    assert "no tick was judged" in plain(said)
+    assert "readings: value 560" in plain(said if options else told)
