@@ -110,6 +110,8 @@ class Recording:
         What was simulated; None for a foreign file.
     versions
         Versions of the packages that made it.
+    timed
+        Whether it says when its readings arrived.
     """
 
     path: Path
@@ -118,6 +120,7 @@ class Recording:
     digest: str | None
     scenario: Scenario | None
     versions: dict[str, str]
+    timed: bool = False
 
     def readings(self) -> Iterator[Reading]:
         """All readings in the order of the file, which is that of arrival."""
@@ -228,14 +231,15 @@ def read_recording(path: Path | str) -> Recording:
         raise RecordingInvalid(f"{path}: no recording: {error}") from error
     if problems:
         raise RecordingInvalid(f"{path}: {'; '.join(problems)}")
+    timed = "arrival" in schema.names and not pa.types.is_null(schema.field("arrival").type)
     if KEY not in (schema.metadata or {}):
-        return Recording(path, count, None, None, None, {})
+        return Recording(path, count, None, None, None, {}, timed)
     try:
         about = json.loads(schema.metadata[KEY])
         if about["format"] != FORMAT:
             raise RecordingInvalid(f"{path}: format {about['format']}; this program reads format {FORMAT}")
         scenario = scenario_from_json(about["scenario"])
-        return Recording(path, count, about["feeder"], about["digest"], scenario, about["versions"])
+        return Recording(path, count, about["feeder"], about["digest"], scenario, about["versions"], timed)
     except (ValueError, KeyError, TypeError) as error:
         raise RecordingInvalid(f"{path}: its metadata cannot be read: {error!r}") from error
 

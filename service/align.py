@@ -384,14 +384,15 @@ class Aligner:
             yield tick
 
     def flush(self) -> Iterator[Tick]:
-        """Let go every tick that the readings have reached, without grace: nothing more will come."""
+        """Let go every tick that the time has reached, without grace: nothing more will come."""
         if self._now is None and self._claims:
             self._now = self._claims[len(self._claims) // 2]
             self._sweep(self._now)
-        if self._now is None:
+        now = self.now(self._latest)
+        if now is None or now == -math.inf:
             return
-        yield from self.due(self._now)
-        while self._time(self._number()) <= self._now:
+        yield from self.due(now)
+        while self._time(self._number()) <= now:
             tick = self._tick(self._time(self._number()))
             self._turn_to(self._number() + 1)
             yield tick

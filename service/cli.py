@@ -410,19 +410,32 @@ def replay(
     feeder: Annotated[
         str | None, typer.Option(help="Folder or name. [default: the one it was recorded on]")
     ] = None,
+    clock: Annotated[
+        str,
+        typer.Option(
+            help="events: the readings tell the time; wall: the time of their arrival, as it was live."
+        ),
+    ] = "events",
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object per alarm transition.")] = False,
 ) -> None:
     """Run a recording through the same chain as the live service, and show what it would have said."""
-    from feeders.recording import read_recording
+    from feeders.recording import RecordingInvalid, read_recording
     from service.alarms import to_json
+    from service.align import Clock
     from service.replay import Tally
     from service.replay import replay as run
 
+    if clock not in set(Clock):
+        raise typer.BadParameter(f"{clock!r}; expected one of {', '.join(Clock)}", param_hint="--clock")
     recording = read_recording(file)
+    if clock == Clock.WALL and not recording.timed:
+        raise RecordingInvalid(
+            f"{file}: no column arrival, so it does not say what was live with --clock wall"
+        )
     site = _site_of(recording, feeder)
     tally = Tally()
     began: float | None = None
-    for result in run(site, recording.readings(), tally):
+    for result in run(site, recording.readings(), tally, clock=Clock(clock)):
         began = result.report.t if began is None else began
         for transition in result.transitions:
             alarm = transition.alarm

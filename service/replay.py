@@ -1,4 +1,4 @@
-"""A recording through the same chain as in the live service, in its own time and as fast as it goes."""
+"""A recording through the same chain as in the live service, in its own time or in that of its arrival."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from service.alarms import AlarmBook
 from service.align import Clock, Outcome
 from service.commissioning import Commissioning
 from service.kept import Kept
-from service.reading import Findings, Known, Reading, judge, to_reading
+from service.reading import T_MAX, T_MIN, BadReason, Findings, Known, Reading, judge, to_reading
 from service.suspicions import Suspicions
 from service.watch import TickResult, Watch, align_rules, design, known_of
 
@@ -38,6 +38,7 @@ def replay(
     recorded: Iterable[Recorded],
     tally: Tally,
     *,
+    clock: Clock = Clock.EVENTS,
     grace_s: float | None = None,
     kept: Kept | None = None,
     distrust: Kept | None = None,
@@ -52,6 +53,8 @@ def replay(
         Readings in the order of their arrival.
     tally
         Filled on the way.
+    clock
+        Who says what time it is: the readings, or, as it was live, the wall clock by which they arrived.
     grace_s
         As in `align.rules`.
     kept
@@ -64,17 +67,19 @@ def replay(
     NotObservable, DesignInfeasible
         If the feeder cannot be watched.
     """
-    rules = align_rules(site, Clock.EVENTS, grace_s=grace_s)
+    rules = align_rules(site, clock, grace_s=grace_s)
     book = AlarmBook(site.feeder.name)
     watch = Watch(site, rules, book, Commissioning(site, kept), Suspicions(site, distrust))
     watch.install(design(site))
     known = known_of(site)
-    for reading in (_checked(watch.name, known, one, tally) for one in recorded):
+    for one in recorded:
+        reading = _checked(watch.name, known, one, tally, clock)
         if reading is not None:
-            # The arrival times of the recording do not matter: its readings tell the time.
-            outcome, results = watch.take(reading, 0.0)
+            # Where the readings tell the time, nothing else needs to, and a file need not say more.
+            now = one.arrival if clock is Clock.WALL else 0.0
+            outcome, results = watch.take(reading, now)
             tally.readings[outcome] += 1
-            yield from _counted(watch, results, tally)
+            yield from _counted(watch, [*results, *watch.due(now)], tally)
             refused = len(watch.aligner.refused())
             tally.readings[Outcome.ACCEPTED] -= refused
             tally.readings[Outcome.CLOCK_OFF] += refused
@@ -89,8 +94,11 @@ def _counted(watch: Watch, results: list[TickResult], tally: Tally) -> list[Tick
     return results
 
 
-def _checked(feeder: str, known: Known, recorded: Recorded, tally: Tally) -> Reading | None:
+def _checked(feeder: str, known: Known, recorded: Recorded, tally: Tally, clock: Clock) -> Reading | None:
     """Return a recorded reading as it would have come off the wire, or None (counted) if it is a bad one."""
+    if clock is Clock.WALL and not _is_time(recorded.arrival):
+        tally.readings[BadReason.VALUE] += 1
+        return None
     if recorded.meter != BUSBAR and recorded.meter not in known.meters:
         tally.readings["unknown-meter"] += 1
         return None
@@ -107,3 +115,7 @@ def _checked(feeder: str, known: Known, recorded: Recorded, tally: Tally) -> Rea
         tally.readings[found.reason] += 1
         return None
     return to_reading(feeder, None if recorded.meter == BUSBAR else recorded.meter, found)
+
+
+def _is_time(t: float | None) -> bool:
+    return t is not None and T_MIN <= t <= T_MAX

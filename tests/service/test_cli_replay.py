@@ -63,3 +63,11 @@ def test_no_answer_does_not_look_like_no_attack(
     assert code == 1
     assert "no tick was judged" in plain(said)
     assert "readings: value 560" in plain(said if options else told)
+
+
+def test_the_clock_of_arrival_needs_its_column(day: Path, tmp_path: Path, replay: Replay) -> None:
+    assert replay(day, "--clock", "wall")[0] == 0
+    code, told, said = replay(changed(day, tmp_path / "bare.parquet", "arrival", None), "--clock", "wall")
+    assert (code, told) == (6, "")
+    assert "no column arrival" in plain(said)
+    assert replay(day, "--clock", "sun")[0] == 2

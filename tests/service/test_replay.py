@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import random
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -70,6 +71,48 @@ def test_the_live_rounds_and_a_replay_agree_to_the_last_bit(
     assert tally.readings["duplicate"] > 0
     assert tally.readings["late"] > 0
     assert sum(tally.ticks.values()) == len(replayed)
+
+
+def test_what_was_live_by_the_wall_clock_is_replayed_by_the_time_of_arrival(
+    site: Site, scenario: Scenario, tmp_path: Path
+) -> None:
+    """Grace is by the wall clock: who comes after it is late live, and in time where the readings tell it."""
+    path = record(site, replace(scenario, duration_s=40.0), tmp_path / "day.parquet").path
+    readings = list(read_recording(path).readings())
+    clock, outlet, chance = [readings[0].arrival], Outlet(), random.Random(3)
+    with Store(f"sqlite:///{tmp_path / 'gridsec.db'}") as store:
+        live = Rounds(RuntimeConfig(), store, [site], wall=lambda: clock[0], stored=lambda: None)
+        live.watches[FEEDER].install(design(site))
+        live.keeper.publisher = outlet
+        while readings:
+            clock[0] += chance.expovariate(2.0)  # rounds come when they come: between readings, or after many
+            ready = [r for r in readings if r.arrival <= clock[0]]
+            readings = readings[len(ready) :]
+            live.round(
+                [Sample(f"gridsec/{key_of(FEEDER, r.meter)}", payload_of(r), "", r.arrival, 1) for r in ready]
+            )
+        clock[0] += 1.0
+        live.round([])
+    told = {}
+    for by in Clock:
+        run = replay(site, read_recording(path).readings(), Tally(), clock=by)
+        told[by] = [json.loads(json.dumps(to_json(one.report))) for one in run]
+    count = len(told[Clock.WALL])
+    assert len(outlet.estimates) >= count >= 39
+    assert told[Clock.WALL] == outlet.estimates[:count]
+    assert told[Clock.EVENTS] != told[Clock.WALL][: len(told[Clock.EVENTS])]
+
+
+@pytest.mark.parametrize("arrival", [None, float("nan"), 5.0])
+def test_readings_that_do_not_say_when_they_arrived_were_not_live(
+    site: Site, scenario: Scenario, arrival: Any
+) -> None:
+    good = list(by_arrival(simulate(site, replace(scenario, duration_s=3.0, channel=Channel(), attacks=()))))
+    bad = [replace(one, arrival=arrival) for one in good[:5]]
+    for clock, refused in ((Clock.WALL, 5), (Clock.EVENTS, 0)):
+        tally = Tally()
+        assert len(list(replay(site, [*bad, *good[5:]], tally, clock=clock))) == 3
+        assert (tally.readings["value"], tally.readings["accepted"]) == (refused, len(good) - refused)
 
 
 def forecasting(site: Site) -> Site:
