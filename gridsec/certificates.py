@@ -24,7 +24,8 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, frozen
 from gridsec.droop import Droop
 from gridsec.errors import DesignInfeasible
-from gridsec.lure import Lure, Readout
+from gridsec.lure import Lure
+from gridsec.lure_form import Readout
 
 # Shares of 1 / slope on the diagonal of P that `reactance` tries, see Theorem 1.
 SHARES = (0.01, 0.03, 0.1, 0.3, 0.6, 1.0)

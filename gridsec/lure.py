@@ -13,17 +13,17 @@ References
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import expm
 
-from gridsec.arrays import Floats, Ints, exponential_integrals, frozen, perron_bound
+from gridsec.arrays import Floats, Ints, exponential_integrals, perron_bound
 from gridsec.droop import Droop
 from gridsec.errors import FeederInvalid, refuse
 from gridsec.feeder import LinDistFlow
+from gridsec.lure_form import as_floats, freeze, input_matrices, without_lower
 from gridsec.network import Network, Power, columns
 from gridsec.newton import Nonlinearity, settle
 from gridsec.phases import CustomerFlow, ThreePhaseFeeder, lindist3flow, per_customer
@@ -47,6 +47,11 @@ class Lure:
         Upper bound of the slope of each entry of phi; the lower bound is 0.
     phi
         The nonlinearity, (…, m) -> (…, m), entry by entry. For a feeder: its `Droop`.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit, an entry is not finite, or a slope is negative; names every problem.
     """
 
     A: Floats
@@ -60,16 +65,9 @@ class Lure:
     phi: Nonlinearity
 
     def __post_init__(self) -> None:
-        for name in ("A", "G", "H", "F", "B", "C", "D", "slope"):
-            object.__setattr__(self, name, frozen(getattr(self, name)))
-        n, m, inputs, p = self.A.shape[0], self.slope.size, self.F.shape[-1], self.C.shape[0]
-        wanted: dict[str, tuple[int, ...]] = {"A": (n, n), "G": (n, m), "H": (m, n), "F": (m, inputs)}
-        wanted |= {"B": (n, inputs), "C": (p, n), "D": (p, inputs), "slope": (m,)}
-        wrong = [
-            f"{name} has shape {getattr(self, name).shape}; expected {shape}"
-            for name, shape in wanted.items()
-            if getattr(self, name).shape != shape
-        ]
+        wrong = freeze(self, "slope")
+        if np.any(self.slope < 0.0):
+            wrong.append("an upper slope is below its lower one, which is 0 unless `Lure.of` is told another")
         refuse(wrong)
 
     @classmethod
@@ -82,6 +80,7 @@ class Lure:
         H: ArrayLike,
         phi: Nonlinearity,
         slope: ArrayLike,
+        lower: ArrayLike = 0.0,
         F: ArrayLike | None = None,
         B: ArrayLike | None = None,
         D: ArrayLike | None = None,
@@ -92,53 +91,26 @@ class Lure:
         ----------
         A, C, G, H, phi, F, B, D
             As in the class. Without any of F, B and D there are no inputs, l = 0.
-        slope
-            Likewise; one number for all entries of phi.
+        slope, lower
+            Bounds of the slopes of each entry of phi, or one number for all. Where `lower` is not 0, it moves
+            into the linear part: A, B, `slope` and phi of what is returned are those of `without_lower`.
 
         Raises
         ------
         ValueError
-            If shapes do not fit; names every problem.
+            If shapes do not fit, an entry is not finite, or a lower slope exceeds its upper one; names
+            every problem.
+
+        References
+        ----------
+        chong2020 (9), (10).
         """
-        a, c, g, h = as_floats(A, C, G, H)
+        a, c, g, h, high, low = as_floats(A, C, G, H, slope, lower)
         f, b, d = input_matrices((len(h), len(a), len(c)), F, B, D)
-        return cls(a, g, h, f, b, c, d, np.broadcast_to(as_floats(slope)[0], len(h)), phi)
-
-
-class Readout(Protocol):
-    """What `z = H x + F u` and `y = C x + D u` are read from: a `Lure`, or a system in discrete time."""
-
-    @property
-    def H(self) -> Floats: ...  # noqa: D102, N802
-    @property
-    def F(self) -> Floats: ...  # noqa: D102, N802
-    @property
-    def C(self) -> Floats: ...  # noqa: D102, N802
-    @property
-    def D(self) -> Floats: ...  # noqa: D102, N802
-
-
-def as_floats(*given: ArrayLike) -> tuple[Floats, ...]:
-    """Nested lists as arrays of floats."""
-    return tuple(np.asarray(one, dtype=np.float64) for one in given)
-
-
-def input_matrices(
-    heights: tuple[int, int, int], F: ArrayLike | None, B: ArrayLike | None, D: ArrayLike | None
-) -> tuple[Floats, ...]:
-    """F, B and D as arrays, zero where they are not given; all of them decide on l.
-
-    Parameters
-    ----------
-    heights
-        Their rows: the numbers of nonlinearities, states and meters.
-    F, B, D
-        Matrices or nested lists, or None.
-    """
-    found = [None if one is None else np.asarray(one, dtype=np.float64) for one in (F, B, D)]
-    inputs = max((one.shape[-1] for one in found if one is not None and one.ndim), default=0)
-    rows = zip(found, heights, strict=True)
-    return tuple(np.zeros((count, inputs)) if one is None else one for one, count in rows)
+        high, low = (np.broadcast_to(bound, len(h)) for bound in (high, low))
+        given = cls(a, g, h, f, b, c, d, high - low, phi)
+        moved_a, moved_b, bent = without_lower(given, low)
+        return replace(given, A=moved_a, B=moved_b, phi=bent)
 
 
 def close_loop(feeder: Network | ThreePhaseFeeder, droop: Droop, meters: Ints) -> Lure:

@@ -11,15 +11,16 @@ yang2019 (1), (2), with the known vector rho written as B u; docs/theory-discret
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import expm
 
-from gridsec.arrays import Floats, exponential_integrals, frozen, spectral_radius
+from gridsec.arrays import Floats, exponential_integrals, spectral_radius
 from gridsec.errors import refuse
-from gridsec.lure import Lure, as_floats, input_matrices
+from gridsec.lure import Lure
+from gridsec.lure_form import as_floats, freeze, input_matrices, without_lower
 from gridsec.newton import Nonlinearity
 
 
@@ -43,6 +44,12 @@ class DiscreteLure:
         The nonlinearity, (…, m) -> (…, m), entry by entry.
     h
         Time from one step to the next, s.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit, an entry is not finite, a lower slope exceeds its upper one, or h is not
+        positive; names every problem.
     """
 
     A: Floats
@@ -58,20 +65,8 @@ class DiscreteLure:
     h: float = 1.0
 
     def __post_init__(self) -> None:
-        names = ("A", "G", "H", "F", "B", "C", "D", "lower", "upper")
-        for name in names:
-            object.__setattr__(self, name, frozen(getattr(self, name)))
-        n, m, inputs, p = self.A.shape[0], self.lower.size, self.F.shape[-1], self.C.shape[0]
-        wanted: dict[str, tuple[int, ...]] = {"A": (n, n), "G": (n, m), "H": (m, n), "F": (m, inputs)}
-        wanted |= {"B": (n, inputs), "C": (p, n), "D": (p, inputs), "lower": (m,), "upper": (m,)}
-        wrong = [
-            f"{name} has shape {getattr(self, name).shape}; expected {shape}"
-            for name, shape in wanted.items()
-            if getattr(self, name).shape != shape
-        ]
-        if not all(np.isfinite(getattr(self, name)).all() for name in names):
-            wrong.append("every entry must be finite")
-        if not wrong and np.any(self.lower > self.upper):
+        wrong = freeze(self, "lower", "upper")
+        if self.lower.shape == self.upper.shape and np.any(self.lower > self.upper):
             wrong.append("a lower slope exceeds its upper slope")
         if not (np.isfinite(self.h) and self.h > 0.0):
             wrong.append(f"h is {self.h}; the time between steps must be positive")
@@ -105,7 +100,7 @@ class DiscreteLure:
         Raises
         ------
         ValueError
-            If shapes do not fit; names every problem.
+            As in the class.
         """
         a, c, g, hh, low, high = as_floats(A, C, G, H, lower, upper)
         f, b, d = input_matrices((len(hh), len(a), len(c)), F, B, D)
@@ -119,31 +114,15 @@ class DiscreteLure:
 
 
 def shift(system: DiscreteLure) -> DiscreteLure:
-    """Loop transform: the same system with slopes in [0, upper - lower].
-
-    `phi(z) = lower z + phi~(z)` moves the lower slope into the linear part:
-    `A~ = A + G diag(lower) H`, `B~ = B + G diag(lower) F`. Trajectories do not change.
+    """The same system with slopes in [0, upper - lower]: `gridsec.lure_form.without_lower`.
 
     Parameters
     ----------
     system
         Any.
     """
-    lower = system.lower
-    pushed = system.G * lower
-    return DiscreteLure(
-        A=system.A + pushed @ system.H,
-        G=system.G,
-        H=system.H,
-        F=system.F,
-        B=system.B + pushed @ system.F,
-        C=system.C,
-        D=system.D,
-        lower=np.zeros(lower.shape),
-        upper=system.slope,
-        phi=lambda z: np.asarray(system.phi(z) - lower * z),
-        h=system.h,
-    )
+    A, B, phi = without_lower(system, system.lower)
+    return replace(system, A=A, B=B, lower=np.zeros(system.lower.shape), upper=system.slope, phi=phi)
 
 
 def advance(system: DiscreteLure, x: Floats, u: Floats) -> Floats:

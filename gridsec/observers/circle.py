@@ -25,7 +25,8 @@ from gridsec.certificates import Certificate, certify, error_bound, feeds
 from gridsec.errors import DesignInfeasible
 from gridsec.gains import CircleGains, CircleOptions, margin, sensitivity, state_bound
 from gridsec.lmi import circle, contraction
-from gridsec.lure import POLICY, Lure, Readout, StepPolicy, advance
+from gridsec.lure import POLICY, Lure, StepPolicy, advance
+from gridsec.lure_form import Readout
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from gridsec import bank
-from gridsec.errors import NotObservable
-from gridsec.lmi import circle, options_for
+from gridsec.errors import DesignInfeasible, NotObservable
+from gridsec.gains import CircleGains
+from gridsec.lmi import circle, options_for, prove
 from gridsec.lmi.sampled import DiscreteLure
 from gridsec.lmi.sampled import advance as advance_discrete
 from gridsec.lure import Lure, advance
+from gridsec.observers import circle as observer
 from gridsec.observers import high_gain
 from gridsec.observers.high_gain import groups, nearest
 from gridsec.online import Cause, Decision
@@ -66,6 +68,57 @@ def test_what_does_not_fit_is_refused_by_name() -> None:
         Lure.of(A, C, G=[[1]], H=[[1, 0]], B=[[1]], phi=curve, slope=2)
     with pytest.raises(ValueError, match="D has shape"):
         DiscreteLure.of(A, C, G=[[0], [1]], H=[[1, 0]], D=[[1]], phi=curve, lower=0, upper=2)
+
+
+def test_a_slope_that_no_proof_can_use_is_refused_with_every_other_problem() -> None:
+    def own(slope: Any, **more: Any) -> Lure:
+        return Lure.of(-np.eye(2), np.eye(2), G=np.eye(2), H=np.eye(2), phi=np.tanh, slope=slope, **more)
+
+    with pytest.raises(ValueError, match="below its lower one"):
+        own([-3.0, 0.5])
+    with pytest.raises(ValueError, match="below its lower one"):
+        own([1.0, 0.5], lower=[0.0, 0.6])
+    with pytest.raises(ValueError, match="finite"):
+        own([np.nan, 0.5])
+    with pytest.raises(ValueError, match=r"B has shape.*finite.*below"):
+        own([np.inf, -1.0], B=[[1.0]])
+    with pytest.raises(ValueError, match=r"A has shape \(2,\); expected 2 axes"):
+        Lure.of([1.0, 2.0], np.eye(2), G=np.eye(2), H=np.eye(2), phi=np.tanh, slope=1.0)
+
+
+def test_falling_curves_are_those_of_the_system_transformed_by_hand() -> None:
+    """`x' = -2 x + sin(x + u)` is `x' = -3 x - u + (z + sin z)`, z = x + u, with slopes in [0, 2]."""
+    found = Lure.of([[-2]], [[1]], G=[[1]], H=[[1]], F=[[1]], phi=np.sin, slope=1, lower=-1)
+    hand = Lure.of([[-3]], [[1]], G=[[1]], H=[[1]], F=[[1]], B=[[-1]], phi=curve, slope=2)
+    for name in ("A", "B", "G", "H", "F", "C", "D", "slope"):
+        assert np.array_equal(getattr(found, name), getattr(hand, name)), name
+    z = np.linspace(-9, 9, 50)[:, None]
+    assert np.allclose(found.phi(z), hand.phi(z), rtol=0, atol=1e-14)
+
+
+def test_a_certificate_of_a_falling_curve_is_kept_where_its_error_grows() -> None:
+    """At rest at pi the curve falls with slope -1: the error obeys the proof, or there is none."""
+
+    def own(rate: float, **more: Any) -> Lure:
+        return Lure.of([[-rate]], [[1]], G=[[-1]], H=[[1]], B=[[1]], phi=np.sin, slope=1, **more)
+
+    def proof(lure: Lure) -> CircleGains:
+        options = options_for(lure, rate=0.2, noise=1.0, load=np.zeros(1), weight=np.eye(1))
+        return prove(lure, [0], np.array([[0.01]]), np.zeros((1, 1)), options)
+
+    with pytest.raises(DesignInfeasible):
+        proof(own(0.5, lower=-1))  # -0.5 - 0.01 + 1 > 0: it does grow
+    lure = own(1.5, lower=-1)
+    made, u, x = proof(lure), np.array([1.5 * np.pi]), np.array([np.pi])
+    design = observer.design(lure, np.ones(1, dtype=bool), gains=made)
+    state = observer.init(design, 0.0, x + 1e-3)
+    first = float(observer.error_norm(design, x - state.x))
+    for _ in range(100):
+        state = observer.step(design, state, x, u, np.ones(1, dtype=bool), 0.05)
+    left = float(observer.error_norm(design, x - state.x))
+    truth = np.exp(-(1.5 - 1 + 0.01) * 5)  # linearised where both are
+    assert left / first == pytest.approx(truth, rel=1e-2)
+    assert left <= first * np.exp(-5 * design.rate)
 
 
 def test_gains_of_a_bank_are_those_of_its_single_observers() -> None:

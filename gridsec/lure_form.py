@@ -1,0 +1,134 @@
+"""What systems in Lur'e form have in common, in continuous and in discrete time.
+
+    x' or x+ = A x + G phi(H x + F u) + B u,     y = C x + D u
+
+References
+----------
+chong2020 (9), (10); yang2019 (1), (2).
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gridsec.arrays import Floats, frozen
+from gridsec.newton import Nonlinearity
+
+_MATRICES = ("A", "G", "H", "F", "B", "C", "D")
+
+
+class Readout(Protocol):
+    """What `z = H x + F u` and `y = C x + D u` are read from: a system in either time."""
+
+    @property
+    def H(self) -> Floats: ...  # noqa: D102, N802
+    @property
+    def F(self) -> Floats: ...  # noqa: D102, N802
+    @property
+    def C(self) -> Floats: ...  # noqa: D102, N802
+    @property
+    def D(self) -> Floats: ...  # noqa: D102, N802
+
+
+class Form(Readout, Protocol):
+    """A whole system in Lur'e form, in either time."""
+
+    @property
+    def A(self) -> Floats: ...  # noqa: D102, N802
+    @property
+    def G(self) -> Floats: ...  # noqa: D102, N802
+    @property
+    def B(self) -> Floats: ...  # noqa: D102, N802
+    @property
+    def phi(self) -> Nonlinearity: ...  # noqa: D102
+
+
+def as_floats(*given: ArrayLike) -> tuple[Floats, ...]:
+    """Nested lists as arrays of floats."""
+    return tuple(np.asarray(one, dtype=np.float64) for one in given)
+
+
+def input_matrices(
+    heights: tuple[int, int, int], F: ArrayLike | None, B: ArrayLike | None, D: ArrayLike | None
+) -> tuple[Floats, ...]:
+    """F, B and D as arrays, zero where they are not given; all of them decide on l.
+
+    Parameters
+    ----------
+    heights
+        Their rows: the numbers of nonlinearities, states and meters.
+    F, B, D
+        Matrices or nested lists, or None.
+    """
+    found = [None if one is None else np.asarray(one, dtype=np.float64) for one in (F, B, D)]
+    inputs = max((one.shape[-1] for one in found if one is not None and one.ndim), default=0)
+    rows = zip(found, heights, strict=True)
+    return tuple(np.zeros((count, inputs)) if one is None else one for one, count in rows)
+
+
+def freeze(system: object, *slopes: str) -> list[str]:
+    """Freeze the arrays of a system that is being made, and return what is wrong with them.
+
+    Parameters
+    ----------
+    system
+        With the seven matrices and the bounds of the slopes as attributes.
+    slopes
+        Names of these bounds, (m,).
+
+    Returns
+    -------
+    list of str
+        One clause for every shape that does not fit, and one if an entry is not finite.
+    """
+    given: dict[str, Floats] = {name: frozen(getattr(system, name)) for name in (*_MATRICES, *slopes)}
+    for name, array in given.items():
+        object.__setattr__(system, name, array)
+    if wrong := [
+        f"{name} has shape {array.shape}; expected {count} axes"
+        for name, array in given.items()
+        if array.ndim != (count := 1 if name in slopes else 2)
+    ]:
+        return wrong
+    n, m, inputs, p = len(given["A"]), given[slopes[0]].size, given["F"].shape[1], len(given["C"])
+    wanted = {"A": (n, n), "G": (n, m), "H": (m, n), "F": (m, inputs), "B": (n, inputs), "C": (p, n)}
+    wanted |= {"D": (p, inputs)}
+    wrong = [
+        f"{name} has shape {given[name].shape}; expected {shape}"
+        for name, shape in (wanted | dict.fromkeys(slopes, (m,))).items()
+        if given[name].shape != shape
+    ]
+    if not all(np.isfinite(array).all() for array in given.values()):
+        wrong.append("every entry must be finite")
+    return wrong
+
+
+def without_lower(system: Form, lower: Floats) -> tuple[Floats, Floats, Nonlinearity]:
+    """Loop transform: the lower slopes of phi move into the linear part.
+
+    `phi(z) = lower z + phi~(z)`, where the slopes of phi~ lie in [0, upper - lower], and
+    `A~ = A + G diag(lower) H`, `B~ = B + G diag(lower) F`. Trajectories do not change.
+
+    Parameters
+    ----------
+    system
+        With slopes of phi from `lower` on.
+    lower : (m,)
+        The lower slopes.
+
+    Returns
+    -------
+    A~, B~, phi~
+        Of the same system; phi itself where there is nothing to move.
+    """
+    if not np.any(lower):
+        return system.A, system.B, system.phi
+    phi, pushed = system.phi, system.G * lower
+    return (
+        system.A + pushed @ system.H,
+        system.B + pushed @ system.F,
+        lambda z: np.asarray(phi(z) - lower * z),
+    )
