@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from feeders.campaign import NoSuchAttack, coordinated, fake_load, present_loads
-from feeders.choices import choice
 from feeders.variation import Stream, generator
 from gridsec.arrays import Floats, Ints
 from gridsec.attack import Attack, Bias, Coordinated, Drift, InverterAttack, Replay, Scaling, Stuck
+from gridsec.choices import choice
 
 if TYPE_CHECKING:
     from feeders.load import Site

@@ -15,7 +15,7 @@ from typing import Final
 
 import numpy as np
 
-from feeders.choices import choice
+from gridsec.choices import choice
 from gridsec.online import Floats
 
 ENVELOPES = "envelopes.csv"

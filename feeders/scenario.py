@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from feeders.campaign import random_attacks
-from feeders.choices import choice
 from feeders.load import Snapshot
 from feeders.meters import BUSBAR, Channel, Delivery, MeterErrors, Meters, Registers
 from feeders.plain import own_numbers
@@ -25,6 +24,7 @@ from feeders.truth import Block, net_reactive, truth
 from feeders.variation import Variation
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.attack import Attack, InverterAttack, Reports, apply_all, manipulated, reach
+from gridsec.choices import choice
 from gridsec.errors import refuse
 from gridsec.network import busbar_places
 

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from feeders.choices import choice
 from feeders.lies import Lie, Trick, manipulations
 from feeders.load import Site, from_tables, to_frame
 from feeders.meters import MeterErrors
@@ -25,6 +24,7 @@ from feeders.scenario import START, SUNNY_NOON_S, Sample, Scenario, simulate, sn
 from feeders.variation import Customers, Variation
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.attack import Coordinated, active
+from gridsec.choices import choice
 from gridsec.online import Decision, Frame, Verdict
 
 if TYPE_CHECKING:

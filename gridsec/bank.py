@@ -19,7 +19,8 @@ import numpy as np
 
 from gridsec import slot_steps, slots, stacked
 from gridsec.arrays import Bools, Floats, Ints
-from gridsec.errors import DesignInfeasible
+from gridsec.choices import no_choice
+from gridsec.errors import DesignInfeasible, refuse
 from gridsec.gains import CircleOptions
 from gridsec.gains import stacked as in_one
 from gridsec.lmi.circle_criterion import solve_many
@@ -122,6 +123,8 @@ def design(
     DesignInfeasible
         If there would be too many observers, or if an observer listens to none of its meters: the
         degenerate gains L = K = 0 satisfy every convergence condition here and detect nothing.
+    ValueError
+        If M is negative, or `gains` is another text: `lmi_gains` makes gains by matrix inequality.
 
     References
     ----------
@@ -132,6 +135,7 @@ def design(
     masks = sets.masks()
     sizes = masks.sum(axis=1)
     if isinstance(gains, str):
+        refuse(no_choice("gains", ("direct",), gains))
         lay = slots.layout(lure, reactive)
         base = slots.make_plan(lay, sets, np.ones(p, dtype=np.bool_))
         return Bank(lure, sets, masks, sizes, True, None, lay, base, policy)

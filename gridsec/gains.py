@@ -41,6 +41,11 @@ class CircleOptions:
         Q, what an error costs: e^T Q e.
     floor
         Smallest gain, 0 … 1, from a trusted meter to the curve of an inverter that it sits at.
+
+    Raises
+    ------
+    ValueError
+        If a number is none, negative or out of its range, or no meter has noise; names every problem.
     """
 
     rate: float
@@ -70,9 +75,9 @@ class CircleOptions:
             )
             if bad
         ]
-        refuse(problems)
         if not np.any(self.noise > 0.0):
-            raise ValueError("at least one meter must have a noise scale above zero")
+            problems.append("at least one meter must have a noise scale above zero")
+        refuse(problems)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -150,6 +155,11 @@ def options_for(
         Q; by default H^T H, the squared error of z at the inverters.
     floor
         Smallest gain from a trusted meter to the curve at the same place.
+
+    Raises
+    ------
+    ValueError
+        As `CircleOptions`, or if shapes do not fit the plant.
     """
     load = np.asarray(load, dtype=np.float64)
     options = CircleOptions(

@@ -78,7 +78,7 @@ def design(
     DesignInfeasible
         If no certificate holds, the bank would be too large, or the gains detect nothing.
     ValueError
-        As `plant.check_plant`.
+        As `plant.check_plant`; or if `gains` is another text.
 
     References
     ----------

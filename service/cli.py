@@ -232,12 +232,12 @@ def simulate(
 
     Faster than real time needs a service with `--clock events`.
     """
-    from feeders.choices import no_choice
     from feeders.load import load
     from feeders.meters import Channel, MeterErrors
     from feeders.recording import record, truth_path
     from feeders.scenario import Scenario, Season
     from feeders.scenario import check as see_attacks
+    from gridsec.choices import no_choice
 
     site = load(feeder)
     length = duration or math.inf

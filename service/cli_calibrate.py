@@ -50,11 +50,11 @@ def calibrate(
 
     Only what is sure gets into the copy that `--write` makes; the feeder itself is never touched.
     """
-    from feeders.choices import no_choice
     from feeders.studies.calibrate import calibrate as study
     from feeders.studies.calibrate import wrong_numbers
     from feeders.studies.calibrate_corrections import Kind
     from feeders.studies.calibrate_feeder import site_of
+    from gridsec.choices import no_choice
 
     refuse_options(
         [*no_choice("--look-for", Kind, *(look_for or ())), *wrong_numbers(risk, tolerance)],

@@ -262,7 +262,7 @@ def _each(
     option: str, known: type[Choice], chosen: list[str] | None, problems: list[str]
 ) -> tuple[Choice, ...] | None:
     """What was chosen; None: nothing, or what is wrong is among the problems."""
-    from feeders.choices import no_choice
+    from gridsec.choices import no_choice
 
     wrong = no_choice(option, known, *(chosen or ()))
     problems += wrong

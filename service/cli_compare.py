@@ -63,12 +63,12 @@ def compare(
     The truth is full AC power flow; what the estimators know of loads and meters is as uncertain as it is
     stated to be. Estimators that cannot watch the feeder are listed with the reason.
     """
-    from feeders.choices import no_choice
     from feeders.comparison import CASES, Plan, markdown, splice, write_csv
     from feeders.estimators import FAMILIES
     from feeders.files import replace_file
     from feeders.load import load
     from feeders.trials import LoadError, Meters
+    from gridsec.choices import no_choice
 
     families, cases = tuple(FAMILIES), tuple(each.name for each in CASES)
     refuse_options(

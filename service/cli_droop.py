@@ -98,9 +98,9 @@ def droop(
     out: Out = None,
 ) -> None:
     """Is the volt/VAR fleet stable, with what margins; does it keep the band; how much more is hosted."""
-    from feeders.choices import no_choice
     from feeders.studies.droop import DroopOptions
     from feeders.studies.droop_fleets import NOTHING, NoInverters, Who
+    from gridsec.choices import no_choice
     from gridsec.droop import PRESETS
 
     fleets = hosting_preset or ["none", "ieee1547-b"]

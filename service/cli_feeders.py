@@ -126,10 +126,10 @@ def feeders_design(
     ] = None,
 ) -> None:
     """Design a feeder's estimator ahead of time; designs that take long are kept for the next start."""
-    from feeders.choices import no_choice
     from feeders.columns import ESTIMATORS
     from feeders.estimators import choose, design
     from feeders.load import load
+    from gridsec.choices import no_choice
 
     problems = no_choice("--estimator", ESTIMATORS, *([estimator] if estimator else []))
     if max_attacked is not None and max_attacked < 0:

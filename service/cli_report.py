@@ -80,9 +80,9 @@ def report(
 
     Interrupted, the same command goes on where it was. What a study cannot answer, the report says.
     """
-    from feeders.choices import no_choice
     from feeders.columns import ESTIMATORS
     from feeders.studies.protect import check as see_question
+    from gridsec.choices import no_choice
     from gridsec.droop import PRESETS
     from service.study_report import STUDIES, Asked, misplaced
 
@@ -177,7 +177,7 @@ def _studies(
     text: str | None, known: tuple[str, ...], *, recorded: bool, problems: list[str]
 ) -> tuple[str, ...]:
     """Names of studies, each once; calibration only where there are readings."""
-    from feeders.choices import no_choice
+    from gridsec.choices import no_choice
 
     if text is None:
         return tuple(name for name in known if recorded or name != "calibrate")

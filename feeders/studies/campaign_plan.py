@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from feeders.choices import choice, each_choice
 from feeders.columns import ESTIMATORS
 from feeders.lies import Trick
 from feeders.load import from_tables
@@ -26,6 +25,7 @@ from feeders.profiles import Season, library
 from feeders.trials import LoadError, Meters, Trial
 from feeders.variation import Variation
 from gridsec.arrays import Ints
+from gridsec.choices import choice, each_choice
 from gridsec.errors import refuse
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from feeders.choices import choice, no_choice
 from gridsec.arrays import Bools, Floats, Ints, unit_rows
+from gridsec.choices import choice, no_choice
 from gridsec.errors import refuse
 from gridsec.lure import close_loop
 from gridsec.studies.patterns import Patterns, patterns, unknown_pair, unknown_voltages

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from feeders.choices import choice
 from feeders.doubts import unread
 from feeders.forecast import always
 from feeders.load import Snapshot, to_frame
 from feeders.studies.hidden import Curves, customer_indices
 from gridsec.accuracy import busbar_error, reading_error
 from gridsec.arrays import Floats
+from gridsec.choices import choice
 from gridsec.network import Power, between
 from gridsec.online import Frame
 from gridsec.studies.false_powers import FalsePowers

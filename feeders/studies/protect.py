@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from feeders.choices import choice, no_choice
 from feeders.studies.hidden import Attack, Curves, knowledge, meter_mask, see_names
 from feeders.studies.journal import Journal, Where
 from feeders.studies.operating import SHARE, box, false_powers, squared, volts_of_lie
 from gridsec.arrays import Bools, Ints
+from gridsec.choices import choice, no_choice
 from gridsec.errors import DesignInfeasible, refuse
 from gridsec.studies.false_powers import FalsePowers, largest_of
 from gridsec.studies.lies import Box, largest_lie

@@ -15,16 +15,17 @@ lee2018, section 2.2.3.2.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.special import chdtri
 
 from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints
+from gridsec.choices import no_choice
 from gridsec.decode.chisquare import log_density, log_tail
 from gridsec.decode.stacks import MOST_SUBSETS, Stack, subsets
-from gridsec.errors import DesignInfeasible, NotObservable
+from gridsec.errors import DesignInfeasible, NotObservable, refuse
 
 Rule = Literal["density", "tail"]
 
@@ -281,10 +282,16 @@ def choose(hypotheses: Hypotheses, z: Floats, *, rule: Rule, freedom: Ints | Non
     freedom : (S,)
         Degrees of freedom to use instead of the right ones; for comparisons with the paper's.
 
+    Raises
+    ------
+    ValueError
+        If there is no such rule.
+
     References
     ----------
     lee2018, Algorithm 2.3 and (2.2.21), with the degrees of freedom corrected.
     """
+    refuse(no_choice("rule", get_args(Rule), rule))
     S, width, N = hypotheses.standardise.shape
     flat = np.asarray(z, dtype=np.float64) @ hypotheses.standardise.reshape(S * width, N).T
     g = np.square(flat).reshape(*flat.shape[:-1], S, width).sum(axis=-1)

@@ -10,12 +10,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints
-from gridsec.errors import DesignInfeasible, NotObservable
+from gridsec.choices import no_choice
+from gridsec.errors import DesignInfeasible, NotObservable, refuse
 from gridsec.lmi.unknown_input import Multiplier
 from gridsec.observers.unknown_input import Missing, Pair, UnknownInputDesign, UnknownInputPlant
 from gridsec.observers.unknown_input import design as design_family
@@ -90,7 +91,11 @@ def members(inputs: int, sensors: int, max_inputs: int, max_sensors: int) -> tup
     ------
     NotObservable
         Unless p > 2 q_2 and (except for the complete bank) r > 2 q_1, yang2021 (4), (19), (20).
+    ValueError
+        If a count is negative.
     """
+    counts = {"max_inputs": max_inputs, "max_sensors": max_sensors}
+    refuse(f"{name} is {count}; it cannot be negative" for name, count in counts.items() if count < 0)
     if sensors <= 2 * max_sensors:
         why = f"{sensors} sensors of which {max_sensors} may lie: more than {2 * max_sensors} are needed"
         raise NotObservable(range(sensors), sensors, why + " (yang2021, Assumptions 2 and 3)")
@@ -137,7 +142,10 @@ def design(
         If there are too few sensors or inputs for the counts.
     DesignInfeasible
         If no member exists at all.
+    ValueError
+        If a count is negative, no rate is given, or there is no such measure or multiplier.
     """
+    refuse(no_choice("measure", get_args(Measure), measure))
     r, p = plant.inputs.shape[1], plant.noise.size
     wide, narrow = members(r, p, max_inputs, max_sensors)
     # With nothing to tolerate both banks are the same: one observer, compared with itself.

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from gridsec.arrays import Floats, Ints, frozen, frozen_ints
-from gridsec.errors import DesignInfeasible
+from gridsec.errors import DesignInfeasible, refuse
 from gridsec.gains import negativity
 from gridsec.lmi.discrete_bounds import (
     DirectProof,
@@ -56,6 +56,12 @@ class DiscreteOptions:
         What else is unknown.
     weight : (n, n)
         Q > 0: the bound minimised is the one on `e^T Q e`.
+
+    Raises
+    ------
+    ValueError
+        If a candidate is not inside (0, 1), a scale of noise not positive, or the weight not positive
+        definite; names every problem.
     """
 
     decays: tuple[float, ...]
@@ -66,12 +72,14 @@ class DiscreteOptions:
     def __post_init__(self) -> None:
         object.__setattr__(self, "noise", frozen(self.noise))
         object.__setattr__(self, "weight", frozen(self.weight))
-        if not self.decays or not all(0.0 < decay < 1.0 for decay in self.decays):
-            raise ValueError("decays must lie between 0 and 1, and there must be one")
-        if self.noise.ndim != 1 or not (np.isfinite(self.noise).all() and np.all(self.noise > 0.0)):
-            raise ValueError("noise must be finite and positive, of shape (p,)")
-        if negativity(-self.weight) <= 0.0:
-            raise ValueError("the weight must be positive definite")
+        decays = bool(self.decays) and all(0.0 < decay < 1.0 for decay in self.decays)
+        noise = self.noise.ndim == 1 and np.isfinite(self.noise).all() and bool(np.all(self.noise > 0.0))
+        held = {
+            "decays must lie between 0 and 1, and there must be one": decays,
+            "noise must be finite and positive, of shape (p,)": noise,
+            "the weight must be positive definite": negativity(-self.weight) > 0.0,
+        }
+        refuse(text for text, holds in held.items() if not holds)
 
 
 def discrete_options(
@@ -96,8 +104,13 @@ def discrete_options(
         Nothing by default. A plant that settles by itself needs it, or the best design is blind.
     weight : (n, n)
         Identity by default.
+
+    Raises
+    ------
+    ValueError
+        As `DiscreteOptions`.
     """
-    several = (float(decays),) if isinstance(decays, int | float) else tuple(float(d) for d in decays)
+    several = tuple(float(decay) for decay in np.atleast_1d(np.asarray(decays, dtype=np.float64)))
     return DiscreteOptions(
         decays=several,
         noise=np.array(np.broadcast_to(np.asarray(noise, dtype=np.float64), (len(system.C),))),

@@ -22,11 +22,12 @@ in docs/theory-unknown-input.md.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from gridsec.arrays import Floats, frozen
+from gridsec.choices import no_choice
 from gridsec.errors import DesignInfeasible, refuse
 from gridsec.lmi.solver import cvxpy_late, solver_warnings_as_status
 
@@ -194,9 +195,15 @@ class UnknownInputTemplate:
     multiplier
         "diagonal": every nonlinearity has a bound of its own. "scalar": one bound of their norm, the
         Lipschitz condition (34) of yang2021; it proves less.
+
+    Raises
+    ------
+    ValueError
+        If there is no such multiplier.
     """
 
     def __init__(self, states: int, sensors: int, bounds: int, multiplier: Multiplier) -> None:
+        refuse(no_choice("multiplier", get_args(Multiplier), multiplier))
         cp = cvxpy_late()
         n, k, m = states, sensors, bounds
         self.shape = (n, k, m)

@@ -22,7 +22,8 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, frozen
 from gridsec.certificates import Certificate, certify, error_bound, feeds
-from gridsec.errors import DesignInfeasible
+from gridsec.choices import no_choice
+from gridsec.errors import DesignInfeasible, refuse
 from gridsec.gains import CircleGains, CircleOptions, margin, sensitivity, state_bound
 from gridsec.lmi import circle, contraction
 from gridsec.lure import POLICY, Lure, StepPolicy, advance
@@ -127,12 +128,14 @@ def design(
     DesignInfeasible
         If there is no certificate, or if the design listens to no meter.
     ValueError
-        If `trusted` has the wrong length, or contradicts the given design.
+        If `trusted` has the wrong length, or contradicts the given design, or `gains` is another text.
     """
     trusted = np.asarray(trusted, dtype=np.bool_)
     if trusted.shape != (len(lure.C),):
         raise ValueError(f"trusted has shape {trusted.shape}; the plant has {len(lure.C)} meters")
-    if isinstance(gains, str) and gains == "direct":
+    if isinstance(gains, str):
+        refuse(no_choice("gains", ("direct", "lmi"), gains))
+    if gains == "direct":
         return _direct(lure, trusted, options)
     meters = np.flatnonzero(trusted)
     if isinstance(gains, CircleGains):

@@ -22,6 +22,7 @@ from typing import Literal
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, frozen
+from gridsec.choices import no_choice
 from gridsec.errors import DesignInfeasible, refuse
 from gridsec.lmi.discrete import DiscreteOptions, discrete_circle
 from gridsec.lmi.discrete_bounds import (
@@ -116,12 +117,14 @@ def design(
     DesignInfeasible
         If there is no proof, or the given one does not hold here.
     ValueError
-        If `trusted` has the wrong length, or contradicts the given design.
+        If `trusted` has the wrong length, or contradicts the given design, or `gains` is another text.
     """
     trusted = np.array(trusted, dtype=np.bool_)
     trusted.flags.writeable = False
     if trusted.shape != (len(system.C),):
         raise ValueError(f"trusted has shape {trusted.shape}; the plant has {len(system.C)} meters")
+    if isinstance(gains, str):
+        refuse(no_choice("gains", ("lmi",), gains))
     if isinstance(gains, DirectProof):
         return _direct(system, trusted, gains)
     meters = np.flatnonzero(trusted)

@@ -21,7 +21,8 @@ from typing import Literal
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, frozen, spectral_radius
-from gridsec.errors import DesignInfeasible
+from gridsec.choices import no_choice
+from gridsec.errors import DesignInfeasible, refuse
 from gridsec.observers.parts import Part, Stack, decompose, heard, riccati, stack
 
 LONGEST = 1 << 17
@@ -211,6 +212,9 @@ def design(
     DesignInfeasible
         If some F_i = S_i - L_i t_i is not Schur stable, or so slow that errors may not have halved for
         good after `LONGEST` steps.
+    ValueError
+        If shapes do not fit, a bound is negative or no number, or `gains` is another text, or "riccati"
+        without noise.
 
     References
     ----------
@@ -223,6 +227,7 @@ def design(
     if not (bounds.process >= 0.0 and np.all(noise >= 0.0)):
         raise ValueError("bounds of disturbance and noise must be numbers and cannot be negative")
     if isinstance(gains, str):
+        refuse(no_choice("gains", ("riccati",), gains))
         weight = bounds.process**2 * E @ E.T
         if np.any(noise == 0.0):
             raise ValueError('gains="riccati" needs positive bounds of the noise; give the gains otherwise')

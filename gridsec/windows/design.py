@@ -9,10 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, frozen
+from gridsec.choices import no_choice
 from gridsec.errors import refuse
 from gridsec.lmi.discrete import DiscreteOptions, discrete_circles
 from gridsec.lmi.discrete_bounds import DirectProof
@@ -115,6 +117,8 @@ def bank(
         Unless p > 2q.
     DesignInfeasible
         If there would be too many, or if an observer cannot be designed.
+    ValueError
+        If `max_attacked` is below 1, or not exactly one of `options` and `proof` is given.
     """
     if max_attacked < 1:
         raise ValueError("max_attacked must be at least 1: without liars there is nothing to isolate")
@@ -170,7 +174,8 @@ def design(
     Raises
     ------
     ValueError
-        With every number that is not finite or negative, or if the observers are not those of a bank.
+        With every number that is not finite or negative, or if the rule is unknown or the observers are not
+        those of a bank.
 
     References
     ----------
@@ -183,7 +188,8 @@ def design(
         raise ValueError(f"no bank for {p} meters and {max_attacked} liars, in the order of `bank_masks`")
     gamma = np.array([one.noise_gain for one in observers]) if gains is None else np.asarray(gains)
     sizes = {"noise": noise, "start": start, "epsilon": epsilon, "unknown": unknown}
-    refuse(_problems(sizes, gamma, len(observers), length))
+    problems = _problems(sizes, gamma, len(observers), length)
+    refuse((*problems, *no_choice("rule", get_args(Rule), rule)))
     level = epsilon + gamma * noise
     if unknown > 0.0:
         level = level + np.array([one.unknown_gain for one in observers]) * unknown

@@ -8,11 +8,13 @@ yang2019, Algorithms 1 and 2; docs/theory-discrete.md, section 3.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
 from gridsec.arrays import Bools, Floats
+from gridsec.choices import no_choice
+from gridsec.errors import refuse
 
 Rule = Literal["majority", "survivors"]
 
@@ -115,10 +117,16 @@ def isolation(pi_sets: Floats, thresholds: Floats, masks: Bools, length: int, ru
     rule
         Which of the two.
 
+    Raises
+    ------
+    ValueError
+        If it is neither.
+
     References
     ----------
     yang2019, Algorithm 2; docs/errata/yang2019.md for why there are two.
     """
+    refuse(no_choice("rule", get_args(Rule), rule))
     count = pi_sets.shape[-2] // length
     shape = (*pi_sets.shape[:-2], count, length, pi_sets.shape[-1])
     windowed = np.asarray(pi_sets[..., : count * length, :].reshape(shape))

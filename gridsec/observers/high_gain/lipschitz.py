@@ -178,13 +178,13 @@ def kappa_detect(factor: float, lowest: float) -> float:
     factor
         Lip^(id - Phi Psi), or the largest one over the sets for kappa^{n,c}.
     lowest
-        Smallest Lip_(Phi_J) over the sets J that can be free of attacks.
+        Smallest Lip_(Phi_J) over the sets J that can be free of attacks; 0: nothing is bounded.
 
     References
     ----------
     kim2018, Theorems 1 and 2; lee2018, before Theorem 5.4.1 and before Theorem 5.4.3.
     """
-    return (factor + 1.0) / lowest
+    return (factor + 1.0) / lowest if lowest != 0.0 else np.inf
 
 
 def kappa_error(factor: float, lowest: float, steepest: float) -> float:
@@ -201,4 +201,4 @@ def kappa_error(factor: float, lowest: float, steepest: float) -> float:
     ----------
     lee2018, before Theorem 5.4.1; its part (ii).
     """
-    return (factor + 1.0) * (1.0 + steepest / lowest)
+    return (factor + 1.0) * (1.0 + steepest / lowest) if lowest != 0.0 else np.inf

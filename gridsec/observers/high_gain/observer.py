@@ -12,12 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, frozen
-from gridsec.errors import DesignInfeasible, NotObservable
+from gridsec.arrays import Bools, Floats, frozen, not_negative
+from gridsec.choices import no_choice
+from gridsec.errors import DesignInfeasible, NotObservable, refuse
 from gridsec.observers.high_gain.constants import (
     Decay,
     decay_componentwise,
@@ -29,7 +30,7 @@ from gridsec.observers.high_gain.field import Field, Transition, advance, field,
 from gridsec.observers.high_gain.form import System, slopes
 from gridsec.observers.high_gain.inverse import Inverse, check, corners_and_interior, nearest
 from gridsec.observers.high_gain.lipschitz import kappa_detect, upper_proven
-from gridsec.observers.high_gain.outcome import Outcome, verdict
+from gridsec.observers.high_gain.outcome import Outcome, Search, verdict
 from gridsec.observers.high_gain.redundancy import groups
 
 _DECAYS = {"componentwise": decay_componentwise, "kim2018": decay_kim, "lee2018": decay_lee}
@@ -83,7 +84,7 @@ class HighGainDesign:
     limit: Floats
     lowest: float
     steep: Floats
-    search: Literal["all", "one"]
+    search: Search
     K: Floats
     field: Field
     move: Transition
@@ -131,7 +132,7 @@ def design(
     whole: Inverse | None = None,
     decay: Literal["componentwise", "kim2018", "lee2018"] | Sequence[Decay] = "componentwise",
     lowest: float = np.nan,
-    search: Literal["all", "one"] = "all",
+    search: Search = "all",
     reset: bool = True,
     substeps: int = 1,
     tolerance: float = 1e-6,
@@ -160,7 +161,8 @@ def design(
     decay
         Which derivation of eta, epsilon and rate; or these constants, one for each sensor.
     lowest
-        Lower bound on Lip_(Phi_J) for every set J of p - 2q sensors.
+        Lower bound on Lip_(Phi_J) for every set J of p - 2q sensors, at least 0; NaN: unknown. At 0 or
+        without it no bound of the estimate's error is known.
     search
         See `HighGainDesign`.
     reset
@@ -176,12 +178,15 @@ def design(
         If p <= 2q, or the sets are not all sets of p - q sensors.
     DesignInfeasible
         If theta is too small for Lemma 1, or a left inverse is none.
+    ValueError
+        If `noise` or `lowest` is negative, or there is no such `decay` or `search`.
     """
     p, m = len(system.partials), system.partials[0].inputs
     if not p > 2 * max_attacked >= 0:
         raise NotObservable(range(p), p, f"{p} sensors, {max_attacked} attacked: more than twice are needed")
+    refuse(_problems(lowest, search, decay))
     thetas = np.broadcast_to(np.asarray(theta, dtype=np.float64), (p,))
-    noises = np.broadcast_to(np.asarray(noise, dtype=np.float64), (p,))
+    noises = np.broadcast_to(not_negative("noise", noise), (p,))
     decays = _constants(system, thetas, noises, decay)
     inverses, whole = _inverses(system, inverses, whole, decays, max_attacked)
     low, high = (np.broadcast_to(np.asarray(end, dtype=np.float64), (m,)) for end in (u_low, u_high))
@@ -209,6 +214,15 @@ def design(
         move=transition(system, K, step_s / substeps),
         substeps=substeps,
     )
+
+
+def _problems(lowest: float, search: str, decay: str | Sequence[Decay]) -> list[str]:
+    wrong = no_choice("search", get_args(Search), search)
+    wrong += no_choice("decay", _DECAYS, decay) if isinstance(decay, str) else []
+    return [
+        *wrong,
+        *([f"lowest is {lowest}; a lower bound of gains is not negative"] if lowest < 0.0 else []),
+    ]
 
 
 def _inverses(
@@ -482,4 +496,5 @@ def _unhealthy(design: HighGainDesign, z: Floats, x: Floats, delta: Floats, boun
         return np.zeros(len(delta), dtype=np.bool_)
     off = np.zeros(z.shape)
     off[design.system.mask] = z[design.system.mask] - design.system.phi(x)
-    return np.asarray(np.max(np.abs(off), axis=1) > delta + design.steep * bound)
+    with np.errstate(invalid="ignore"):  # a bound that is infinite, of a sensor that is constant
+        return np.asarray(np.max(np.abs(off), axis=1) > delta + design.steep * bound)

@@ -13,6 +13,8 @@ from typing import Literal
 from gridsec.arrays import Bools, Floats
 from gridsec.online import Cause, Decision
 
+Search = Literal["all", "one"]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outcome:
@@ -67,7 +69,7 @@ def verdict(
     alarm: bool,
     settled: bool,
     untested: int,
-    search: Literal["all", "one"],
+    search: Search,
 ) -> tuple[Decision, Cause, str]:
     """Decision, its cause, and one sentence.
 

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, frozen
-from gridsec.errors import DesignInfeasible
+from gridsec.errors import DesignInfeasible, refuse
 from gridsec.lmi.unknown_input import ErrorSystem, Multiplier, UnknownInputGains, UnknownInputTemplate
 from gridsec.observers.unknown_input.plant import (
     Missing,
@@ -137,7 +137,10 @@ def design(
     ------
     DesignInfeasible
         If none of the observers exists.
+    ValueError
+        If no rate is given, or there is no such multiplier.
     """
+    refuse([] if len(rates) else ["rates are empty; at least one contraction has to be tried"])
     templates: dict[tuple[int, int], UnknownInputTemplate] = {}
     made: list[tuple[Pair, ErrorSystem, UnknownInputGains]] = []
     missing: list[Missing] = []

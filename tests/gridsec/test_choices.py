@@ -1,0 +1,121 @@
+"""Choices and numbers of designs: what means nothing is refused, and never means something else."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gridsec import bank, isolation, windows
+from gridsec.decode import Stack, gaussian
+from gridsec.index import asymptotic_index, dynamic_index, redundant_detectable, redundant_observable
+from gridsec.lmi.discrete import discrete_options
+from gridsec.lmi.sampled import DiscreteLure
+from gridsec.observers import circle, circle_discrete, high_gain, luenberger
+from gridsec.observers.unknown_input import exact
+from tests.gridsec.observers.bent import estimator
+from tests.gridsec.plants import street
+
+C = np.array([[1.0, 0], [0, 1], [1, 1], [1, -1], [1, 2]])
+A = np.array([[1.0, 0.1], [0, 0.9]])
+ALL = np.ones(3, dtype=np.bool_)
+
+
+def feeder() -> Any:
+    return street([0, 1, 2], [1, 2, 3], [0, 1, 2], [0, 1, 2]).lure
+
+
+def discrete() -> DiscreteLure:
+    return DiscreteLure.of(
+        [[0.2, 0.5], [0.2, 0.3]], [[1, 1], [1, 2], [3, 2]], G=np.eye(2), H=np.eye(2), B=np.eye(2),
+        phi=lambda z: 0.5 * np.sin(z), lower=-0.5, upper=0.5,
+    )  # fmt: skip
+
+
+def isolating(**more: Any) -> Any:
+    given = {"max_inputs": 2, "max_sensors": 1} | more
+    return isolation.design(exact(discrete(), inputs=np.eye(2)), **given)
+
+
+def partial(**more: Any) -> Any:
+    bounds = luenberger.Bounds(process=1e-3, noise=np.full(5, 0.01), E=np.eye(2))
+    return luenberger.design(A, np.zeros((2, 1)), C, bounds, slowest=0.0, tol=1e-9, **more)
+
+
+def chosen(rule: Any) -> Any:
+    prepared = gaussian.design_hypotheses(Stack.of_rows(C), np.eye(5), q=1)
+    return gaussian.choose(prepared, np.arange(5.0), rule=rule)
+
+
+def windowed(rule: Any) -> Any:
+    return windows.isolation(np.ones((4, 3)), np.ones(3), ~np.eye(3, dtype=bool), 4, rule)
+
+
+WRONG: dict[str, tuple[str, Callable[[], Any]]] = {
+    "bank": ("gains is 'lmi'.*direct", lambda: bank.design(feeder(), 1, gains="lmi")),  # type: ignore[arg-type]
+    "circle": ("gains is 'riccati'", lambda: circle.design(feeder(), ALL, gains="riccati")),  # type: ignore[arg-type]
+    "circle_discrete": (
+        "gains is 'direct'",
+        lambda: circle_discrete.design(discrete(), ALL, gains="direct"),  # type: ignore[arg-type]
+    ),
+    "windows": ("rule is 'survivor'", lambda: windowed("survivor")),
+    "gaussian": ("rule is 'desity'", lambda: chosen("desity")),
+    "luenberger": ("gains is 'kalman'", lambda: partial(gains="kalman")),
+    "discrete": (
+        "decays must.*noise must",
+        lambda: discrete_options(discrete(), decays=(1.5, -1), noise=-1.0),
+    ),
+    "measure": ("measure is 'distances'", lambda: isolating(measure="distances")),
+    "multiplier": ("multiplier is 'diag'", lambda: isolating(multiplier="diag")),
+    "rates": ("rates are empty", lambda: isolating(rates=())),
+    "sensors": ("max_sensors is -1", lambda: isolating(max_sensors=-1)),
+    "both counts": ("max_inputs is -1.*max_sensors is -2", lambda: isolating(max_inputs=-1, max_sensors=-2)),
+    "search": ("search is 'single'", lambda: estimator(search="single")),
+    "decay": ("decay is 'kim'.*componentwise", lambda: estimator(decay="kim")),
+    "lowest": ("lowest is -1", lambda: estimator(lowest=-1.0)),
+    "noise": ("noise is -0.001", lambda: estimator(noise=-1e-3)),
+    "noise that is no number": ("noise is nan", lambda: estimator(noise=np.nan)),
+    "dynamic": ("by is 'ranks'", lambda: dynamic_index(A, C, tol=1e-9, by="ranks")),  # type: ignore[arg-type]
+    "asymptotic": (
+        "by is 'ranks'",
+        lambda: asymptotic_index(A, C, discrete=True, tol=1e-9, by="ranks"),  # type: ignore[arg-type]
+    ),
+    "observable": (
+        "by is 'ranks'",
+        lambda: redundant_observable(A, C, 1, tol=1e-9, by="ranks"),  # type: ignore[arg-type]
+    ),
+    "detectable": (
+        "by is 'ranks'",
+        lambda: redundant_detectable(A, C, 1, discrete=True, tol=1e-9, by="ranks"),  # type: ignore[arg-type]
+    ),
+}
+
+
+@pytest.mark.parametrize(("words", "made"), WRONG.values(), ids=WRONG)
+def test_what_means_nothing_is_refused(words: str, made: Callable[[], Any]) -> None:
+    with pytest.raises(ValueError, match=words):
+        made()
+
+
+def test_what_means_something_is_taken() -> None:
+    assert isolating(measure="distance", multiplier="scalar").measure == "distance"
+    assert chosen("density").hypothesis == chosen("tail").hypothesis
+    assert windowed("survivors").decided.all()
+    assert windowed("majority").decided.all()
+    assert len(partial(gains="riccati").envelopes) == 5
+    asked = discrete_options(discrete(), decays=np.float32(0.5), noise=0.1)  # type: ignore[arg-type]
+    assert asked.decays == (0.5,)
+
+
+def test_without_a_lower_bound_of_the_gains_no_bound_of_the_error_is_claimed() -> None:
+    """A gain of 0 bounds nothing: the same answers as with a positive one, without the certificate."""
+    for lowest in (0.0, 1.0):
+        design = estimator(lowest=lowest)
+        state = high_gain.init(design, 0.0)
+        for _ in range(300):
+            state, answer = high_gain.step(design, state, np.zeros(3), np.zeros(1), ALL, 0.02)
+        assert (answer.bound == np.inf) == (lowest == 0.0)
+        assert not answer.suspects.any()
+        assert answer.decision == "clean"
