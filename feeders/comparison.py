@@ -2,7 +2,7 @@
 
 Every family of `feeders.estimators.FAMILIES` watches the same frames: full AC power flow as truth, meters as
 accurate as the feeder's files say, loads known up to a stated error. A family that cannot be designed for the
-feeder keeps its rows, with the reason in them.
+feeder, or that fails while it watches, keeps its rows, with the reason in them.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from feeders.studies.journal import Journal, Where
 from feeders.trials import LoadError, Meters, Outcome, Trial, frames, judge
 from feeders.variation import Variation
 from gridsec.arrays import Floats
-from gridsec.errors import DesignInfeasible, GridsecError, NotObservable
+from gridsec.choices import no_choice
+from gridsec.errors import DesignInfeasible, GridsecError, NotObservable, refuse
 
 if TYPE_CHECKING:
     from feeders.load import Site
@@ -138,6 +139,11 @@ class Plan:
         Names; all by default.
     workers
         Processes for designs by matrix inequality.
+
+    Raises
+    ------
+    ValueError
+        If there is no such family or case, or no run; names every problem.
     """
 
     max_attacked: int = 2
@@ -151,6 +157,16 @@ class Plan:
     families: tuple[str, ...] = tuple(FAMILIES)
     cases: tuple[str, ...] = tuple(case.name for case in CASES)
     workers: int = 1
+
+    def __post_init__(self) -> None:
+        """Refuse what would compare nothing."""
+        refuse(
+            [
+                *no_choice("family", FAMILIES, *self.families),
+                *no_choice("case", (case.name for case in CASES), *self.cases),
+                *([] if self.seeds >= 1 else [f"seeds is {self.seeds}; at least one run is needed"]),
+            ]
+        )
 
     def trial(self, site: Site, case: Case, seed: int) -> Trial:
         """One run."""
@@ -282,21 +298,30 @@ def _design(site: Site, name: str, plan: Plan, tell: Callable[[str], None]) -> W
 
 def _case(site: Site, case: Case, plan: Plan, watchers: dict[str, Watcher | str]) -> list[Row]:
     outcomes: dict[str, list[Outcome]] = {name: [] for name in watchers}
+    reasons = {name: watcher for name, watcher in watchers.items() if isinstance(watcher, str)}
     try:
         for seed in range(plan.seeds):
             trial = plan.trial(site, case, seed)
             played = list(frames(trial))
             for name, watcher in watchers.items():
-                if isinstance(watcher, Watcher):
+                if name in reasons or isinstance(watcher, str):
+                    continue
+                try:
                     outcomes[name].append(judge(watcher, trial, played=played))
+                except Exception as failure:  # noqa: BLE001  # the code of others may do anything
+                    reasons[name] = _failed(failure)
     except NoSuchAttack as error:
         return [Row(name, case.name, str(error)) for name in watchers]
     return [
-        Row(name, case.name, watcher)
-        if isinstance(watcher, str)
+        Row(name, case.name, reasons[name])
+        if isinstance(watcher, str) or name in reasons
         else _row(name, case.name, watcher.observers, outcomes[name])
         for name, watcher in watchers.items()
     ]
+
+
+def _failed(failure: Exception) -> str:
+    return "it failed while it watched: " + " ".join(f"{type(failure).__name__}: {failure}".split())
 
 
 def _row(family: str, case: str, observers: int, outcomes: Sequence[Outcome]) -> Row:

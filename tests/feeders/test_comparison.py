@@ -8,6 +8,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -89,6 +90,31 @@ def test_a_lie_that_cannot_be_told_is_a_reason_too() -> None:
     plan = replace(SHORT, max_attacked=2, seeds=1, cases=("bias",), families=("sequential",))
     (row,) = compare(without_meters(load(FEEDER), 1), plan)
     assert "lie" in row.reason
+
+
+def test_a_family_that_fails_while_it_watches_leaves_the_others_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The other's row is the one that it has without it."""
+    plan = replace(SHORT, seeds=1, duration_s=20.0, cases=("clean",))
+    site, made, ticks = load("cigre-lv"), FAMILIES["exact-bank"], iter(range(10))
+
+    def step(prepared: Any, state: Any, frame: Any) -> Any:
+        if next(ticks) == 9:
+            raise ZeroDivisionError("a defect\nof the other package")
+        return made.step(prepared, state, frame)
+
+    (alone,) = compare(site, replace(plan, families=("sequential",)))
+    monkeypatch.setitem(FAMILIES._known, "exact-bank", replace(made, step=step))
+    row, broken = compare(site, plan)
+    assert broken.reason == "it failed while it watched: ZeroDivisionError: a defect of the other package"
+    assert (broken.case, broken.observers) == ("clean", 0)
+    assert replace(row, step_ms=0.0, step_ms_95=0.0) == replace(alone, step_ms=0.0, step_ms_95=0.0)
+
+
+def test_a_plan_that_compares_nothing_is_refused_with_all_that_is_wrong() -> None:
+    with pytest.raises(ValueError, match=r"family is 'bank'.*case is 'biass'.*seeds is 0"):
+        Plan(families=("sequential", "bank"), cases=("biass",), seeds=0)
 
 
 def test_cases_lie_as_they_say() -> None:
