@@ -214,7 +214,7 @@ class InverterAttack:
 
     References
     ----------
-    yang2021 (2): the attack signal a_u on the inputs.
+    yang2021 (1): the attack signal a_u on the inputs.
     """
 
     inverters: Ints

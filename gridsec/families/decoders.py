@@ -6,7 +6,7 @@ nobody attacks); e are the meters' honest errors; a is the attack, in as few ent
 
 References
 ----------
-lee2018, chapters 2, 4 and 5; kim2018; yang2021; docs/theory-snapshot.md.
+lee2018, chapter 2; docs/theory-snapshot.md.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def pursue(evidence: Evidence) -> tuple[Accused, ...]:
 
     References
     ----------
-    lee2018 (2.2.7); Theorem 2.1.1 for when it is exact.
+    lee2018 (2.1.4); Theorem 2.1.1 for when it is exact.
     """
     at, F, y = _stack(evidence)
     attack = np.sqrt(evidence.whole.noise[at]) * basis_pursuit(F, y)[: at.size]

@@ -25,7 +25,7 @@ Metered net reactive power is not used: a dropped meter's would have to be forgo
 
 References
 ----------
-kim2018, section IV; lee2018, section 5.3; docs/theory-high-gain.md.
+kim2018, section III.D, Theorem 2; lee2018, section 5.4, Theorem 5.4.3; docs/theory-high-gain.md.
 """
 
 from __future__ import annotations

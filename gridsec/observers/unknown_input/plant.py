@@ -174,7 +174,7 @@ class Missing:
     pair
         (J_u, J_s).
     reason
-        "rank": the sensors do not see every unknown input. "zero": a zero on or outside the unit circle.
+        "rank": the sensors do not see every unknown input. "zero": a zero outside the unit circle.
         Either proves that no observer whatsoever does what (3) or (21) of yang2021 ask for. "design":
         no gain was found; others may exist.
     rank
