@@ -91,6 +91,11 @@ class Channel:
         Each meter's clock is off by a constant, uniform within plus or minus this, s.
     silences
         Intervals in which a meter says nothing. Its sequence numbers count on.
+
+    Raises
+    ------
+    ValueError
+        If a probability is outside [0, 1], or a time negative or not finite.
     """
 
     loss: float = 0.0
@@ -171,6 +176,11 @@ class Meters:
     p_gain, q_gain : (p,)
         Fixed relative errors of the power registers, 1: the truth is the reading times 1 + gain, because
         data sheets state the error as a fraction of the reading.
+
+    Raises
+    ------
+    ValueError
+        If a meter is silent that there is not.
     """
 
     def __init__(self, site: Site, errors: MeterErrors, channel: Channel, seed: int) -> None:

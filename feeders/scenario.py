@@ -89,6 +89,11 @@ class Scenario:
     busbar_attacks
         How the busbar's meter lies, applied in this order; none may look back. Their meters are its phases, 0
         to 2, or 0 on a balanced feeder.
+
+    Raises
+    ------
+    ValueError
+        If there is no such season, or a number cannot be meant.
     """
 
     seed: int = 0

@@ -110,6 +110,11 @@ class Drift(_Attack):
         Signed speed, pu/s.
     limit : (k,)
         Largest displacement, pu, >= 0.
+
+    Raises
+    ------
+    ValueError
+        If meters, times or numbers do not fit, or a limit is negative.
     """
 
     rate: Floats
@@ -135,6 +140,11 @@ class Replay(_Attack):
     ----------
     delay_s
         How far back the played stretch lies, s, > 0.
+
+    Raises
+    ------
+    ValueError
+        If meters or times do not fit, or the delay is not positive.
     """
 
     delay_s: float
@@ -157,6 +167,11 @@ class Random(_Attack):
         How long one draw stays, s, > 0.
     seed
         Chooses the draws.
+
+    Raises
+    ------
+    ValueError
+        If meters, times or numbers do not fit, or not 0 <= low <= high, or `hold_s` is not positive.
     """
 
     low: Floats
@@ -211,6 +226,11 @@ class InverterAttack:
         What each injects in addition, pu.
     t_on, t_off
         While t_on <= t < t_off, Unix s.
+
+    Raises
+    ------
+    ValueError
+        If inverters or times do not fit, or q is not one finite number for each.
 
     References
     ----------
@@ -338,7 +358,13 @@ def load_pattern(R: Floats, X: Floats, target: int, ratio: float, v: Floats) -> 
 
 
 def most_affected(pattern: Floats, count: int) -> Ints:
-    """The `count` entries of largest magnitude, in ascending order of index; ties go to the lower index."""
+    """The `count` entries of largest magnitude, in ascending order of index; ties go to the lower index.
+
+    Raises
+    ------
+    ValueError
+        If there are fewer entries than that, or none is asked for.
+    """
     if not 0 < count <= pattern.size:
         raise ValueError(f"cannot choose {count} of {pattern.size} meters")
     order = np.argsort(-np.abs(pattern), kind="stable")

@@ -125,6 +125,8 @@ def design(
         degenerate gains L = K = 0 satisfy every convergence condition here and detect nothing.
     ValueError
         If M is negative, or `gains` is another text: `lmi_gains` makes gains by matrix inequality.
+    TypeError, ValueError
+        With `direct`, if the plant is not the loop of a feeder, from `close_loop`.
 
     References
     ----------

@@ -303,6 +303,11 @@ def loss_correction(
     (…, b + 1)
         Additive correction of `v^2`, pu; 0 at the busbar.
 
+    Raises
+    ------
+    ValueError
+        If `steps` is below 1.
+
     References
     ----------
     Baran and Wu 1989, the DistFlow equations. Derivation: docs/theory-model.md.

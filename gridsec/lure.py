@@ -302,6 +302,11 @@ def transition(lure: Lure, h: float, policy: StepPolicy = POLICY) -> Transition:
     policy
         How to divide it.
 
+    Raises
+    ------
+    ValueError
+        If h is negative or not finite.
+
     References
     ----------
     M. Hochbruck, A. Ostermann, "Exponential integrators", Acta Numerica 19, 2010, sections 2.1, 2.3.

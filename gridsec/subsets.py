@@ -85,6 +85,8 @@ def subsets(meters: int, max_attacked: int, *, most: int) -> Subsets:
         Unless p > 2M.
     DesignInfeasible
         If the banks would hold more than `most` observers.
+    ValueError
+        If M is negative.
 
     References
     ----------

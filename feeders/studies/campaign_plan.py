@@ -92,6 +92,11 @@ class Kind:
         How many lie; empty: as the plan says.
     promise
         What is to become of such lies, if anything is promised.
+
+    Raises
+    ------
+    ValueError
+        If there is no such trick or no size, the name is taken, or volts are given for no bias.
     """
 
     name: str
@@ -207,6 +212,12 @@ class Plan:
         Other settings of the feeder's `[monitor]`, by name.
     meters, load_error, variation, report_q
         As in `feeders.trials.Trial`; no `load_error`: as the feeder's files say.
+
+    Raises
+    ------
+    ValueError
+        If there is no such place, season, design or kind of meters, or numbers cannot be meant; these are
+        named at once.
     """
 
     scenes: int = 10

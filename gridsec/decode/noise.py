@@ -153,6 +153,8 @@ def correction_constants(
         If Phi is not q-error correctable.
     DesignInfeasible
         If there are more than `most` subsets.
+    ValueError
+        Unless q <= r <= 2 q.
 
     References
     ----------

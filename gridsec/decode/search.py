@@ -103,6 +103,8 @@ def design(
         If Phi is not q-error correctable; names sensors whose loss shows it.
     DesignInfeasible
         If there would be more than `most` candidates.
+    ValueError
+        Unless 0 <= q <= r <= 2 q.
     """
     q = max_attacked
     r = cheapest(stack.count, q) if left_out is None else left_out

@@ -39,6 +39,11 @@ class Stack:
         Rows of each block; they sum to N.
     membership : (N, p)
         1 where a row belongs to a block, else 0. Derived.
+
+    Raises
+    ------
+    ValueError
+        If heights are negative, or do not sum to the rows of the matrix.
     """
 
     matrix: Floats
@@ -181,7 +186,13 @@ def error_correctable(stack: Stack, q: int, *, tol: float) -> bool:
 
 
 def require(stack: Stack, lost: int, tol: float, purpose: str) -> None:
-    """Raise NotObservable unless x stays determined after the loss of any `lost` blocks."""
+    """Raise NotObservable unless x stays determined after the loss of any `lost` blocks.
+
+    Raises
+    ------
+    NotObservable
+        If it is not; names the sensors whose loss shows it.
+    """
     found = cospark(stack, tol=tol, below=lost + 1)
     if found.count > lost:
         return

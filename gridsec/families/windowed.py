@@ -28,14 +28,16 @@ yang2019, Algorithms 1 and 2, (8), (10), (17), (19); docs/theory-discrete.md, se
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import get_args
 
 import numpy as np
 
 from gridsec import bank as banks
 from gridsec import monitor
 from gridsec.arrays import Bools, Floats
+from gridsec.choices import no_choice
 from gridsec.detect import ErrorBound
-from gridsec.errors import DesignInfeasible
+from gridsec.errors import DesignInfeasible, refuse
 from gridsec.online import Cause, Decision, Estimate, Frame, Verdict
 from gridsec.plant import MonitorDesign, MonitorState, Plant
 from gridsec.slots import SlotState
@@ -144,13 +146,15 @@ def design(
     DesignInfeasible
         If no certificate holds, the bank would be too large, there is no droop inverter whose injection
         could be estimated, or nobody may lie.
+    ValueError
+        If a window would be empty, or there is no such rule.
     """
     if not plant.droop.tau.size:
         raise DesignInfeasible("windows of consistency", "no droop inverter whose injection is estimated")
     if max_attacked < 1:
         raise DesignInfeasible("windows of consistency", "without a possible liar nothing is isolated")
-    if length < 1:
-        raise ValueError("a window has at least one reading")
+    wrong = ["a window has at least one reading"] if length < 1 else []
+    refuse((*wrong, *no_choice("rule", get_args(Rule), rule)))
     return WindowedDesign(monitor.design(plant, max_attacked=max_attacked, step_s=step_s), length, rule)
 
 

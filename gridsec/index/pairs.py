@@ -164,6 +164,11 @@ def dynamic_index(A: Floats, C: Floats, *, tol: float, by: By = "eigenvectors") 
     by
         "eigenvectors": over every eigenspace, (3.2.4). "rank": over all states, (3.2.3).
 
+    Raises
+    ------
+    ValueError
+        If `by` is another text.
+
     References
     ----------
     lee2018 (3.2.3), Proposition 3.2.2.
@@ -196,6 +201,11 @@ def asymptotic_index(A: Floats, C: Floats, *, discrete: bool, tol: float, by: By
     -------
     Index
         Infinite for a stable A.
+
+    Raises
+    ------
+    ValueError
+        If `by` is another text.
 
     References
     ----------
@@ -241,6 +251,11 @@ def redundant_observable(A: Floats, C: Floats, q: int, *, tol: float, by: By = "
     by
         "eigenvectors": `|C v|_0 > q` for every eigenvector. "rank": all C(p, q) stacked matrices.
 
+    Raises
+    ------
+    ValueError
+        If `by` is another text.
+
     References
     ----------
     lee2018, Definition 3.1.1, Propositions 3.1.1 (iii) and 3.1.2 (ii).
@@ -263,6 +278,11 @@ def redundant_detectable(
         As in `redundant_observable`.
     discrete
         As in `asymptotic_index`.
+
+    Raises
+    ------
+    ValueError
+        If `by` is another text.
 
     References
     ----------

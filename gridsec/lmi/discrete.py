@@ -158,6 +158,11 @@ def discrete_circles(
         As there.
     subsets
         Sets of trusted meters.
+
+    Raises
+    ------
+    DesignInfeasible
+        If there is no such observer for one of the sets, or it ignores its meters.
     """
     templates: dict[int, _Template] = {}
     made = []

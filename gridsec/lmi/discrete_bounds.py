@@ -31,6 +31,11 @@ class Uncertainty:
     argument : (m, r)
     output : (p, r)
         Scaled so that the entries of delta are about one.
+
+    Raises
+    ------
+    ValueError
+        If the numbers of columns differ.
     """
 
     state: Floats

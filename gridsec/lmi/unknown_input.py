@@ -60,6 +60,11 @@ class ErrorSystem:
         How errors of size one enter that no gain weighs: next readings, drift of the plant.
     N : (k,)
         Size of the error of each sensor's reading, positive.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit, an error scale is not positive, or a half-width negative.
     """
 
     M: Floats
@@ -254,6 +259,8 @@ class UnknownInputTemplate:
         ------
         DesignInfeasible
             If the inequality has no solution, or does not survive being rebuilt.
+        ValueError
+            If the rate is not inside (0, 1).
         """
         if not 0.0 < rate < 1.0:
             raise ValueError(f"the rate is {rate:g}; it is a contraction per step, between 0 and 1")

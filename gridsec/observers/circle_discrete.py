@@ -269,6 +269,11 @@ def settling_steps(design: DiscreteDesign, *, start: float, epsilon: float) -> i
         Bound on |e(0)|; 0: it starts in the true state.
     epsilon
         What may be left of it.
+
+    Raises
+    ------
+    ValueError
+        If `epsilon` is not positive and not everything is known at the start.
     """
     if design.growth * start <= epsilon:
         return 0
@@ -304,6 +309,11 @@ def stack(designs: Sequence[DiscreteDesign]) -> Stack:
     ----------
     designs
         At least one; all of the same plant.
+
+    Raises
+    ------
+    ValueError
+        If the observers belong to different plants.
     """
     if any(one.system is not designs[0].system for one in designs):
         raise ValueError("the observers belong to different plants")

@@ -154,6 +154,8 @@ def riccati_gain(part: Part, process: Floats, noise: float, *, rate: float) -> F
     DesignInfeasible
         If there is no such gain: the process weight leaves a mode on or outside the circle of radius
         `rate` without disturbance.
+    ValueError
+        If `rate` is not in (0, 1].
 
     References
     ----------
@@ -314,6 +316,8 @@ def geometric(part: Part, gain: Floats, process: float, noise: float, E: Floats,
     ------
     DesignInfeasible
         If beta is so close to the spectral radius that the constants cannot be found in `LONGEST` steps.
+    ValueError
+        If beta is not between the spectral radius of F and 1.
 
     References
     ----------

@@ -78,6 +78,11 @@ def decompose(A: Floats, C: Floats, *, slowest: float, tol: float) -> tuple[Part
     -------
     p times Part
 
+    Raises
+    ------
+    ValueError
+        If `slowest` is not in [0, 1].
+
     References
     ----------
     lee2018, section 4.2.1.

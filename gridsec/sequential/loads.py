@@ -45,6 +45,11 @@ class LoadDoubt:
     together : (N,) or one for all
         Share of both variances, 0 to 1, that goes up and down with that of all others: powers that nobody
         meters are low together by night, the active and the reactive one alike.
+
+    Raises
+    ------
+    ValueError
+        If a number is none, negative, or a share outside [0, 1]; names every problem.
     """
 
     p: Floats

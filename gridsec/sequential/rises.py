@@ -58,6 +58,11 @@ class Lies:
         What the second liar, and each further one, costs more where they read off by the same amount.
     story
         What liars cost who tell of one customer's load, beside the choice of the customer.
+
+    Raises
+    ------
+    ValueError
+        If `size`, `amplitude` or `differ` is not positive.
     """
 
     size: float = 0.2

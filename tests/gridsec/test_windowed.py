@@ -255,6 +255,8 @@ def test_what_cannot_be_designed() -> None:
         windowed.design(plant, max_attacked=0, step_s=1.0)
     with pytest.raises(DesignInfeasible, match="inverter"):
         windowed.design(make_plant(rng, inverters=np.array([], np.intp)), max_attacked=1, step_s=1.0)
+    with pytest.raises(ValueError, match="rule is 'vote'"):
+        windowed.design(plant, max_attacked=1, step_s=1.0, rule="vote")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="window"):
         windowed.design(plant, max_attacked=1, step_s=1.0, length=0)
     assert windowed.design(plant, max_attacked=2, step_s=1.0).observers == 1 + 36 + 126

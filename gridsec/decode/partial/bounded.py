@@ -135,6 +135,8 @@ def design(
     NotObservable
         Unless the pair is 2q-redundant detectable (lee2018, Proposition 4.3.1), as far as the parts of the
         observers go.
+    ValueError
+        If `scale` is not one positive number for each sensor, or r is not from q to 2 q.
     """
     blocks = observers.stack.blocks
     size = np.ones(len(blocks)) if scale is None else np.asarray(scale, dtype=np.float64)

@@ -176,6 +176,8 @@ def design(
         sensors has redundancy of its own.
     DesignInfeasible
         If there are more than `most` sets.
+    ValueError
+        If `max_attacked` is below 1, or `false_alarm` not inside (0, 1).
     """
     if max_attacked < 1 or not 0.0 < false_alarm < 1.0:
         raise ValueError(f"max_attacked is {max_attacked} (>= 1), false_alarm {false_alarm} (in (0, 1))")

@@ -185,6 +185,13 @@ class System:
         The states stay in the box `|x_k| <= x_bound_k`.
     partials
         The sensors' observable parts.
+
+    Raises
+    ------
+    NotObservable
+        If there is no sensor.
+    ValueError
+        If sensors differ in their numbers of inputs.
     """
 
     x_bound: Floats

@@ -45,6 +45,12 @@ class UnknownInputPlant:
         E: what the plant may do besides its model, with |d_i| <= 1.
     span : (n,)
         Largest |x_i| there can be, infinite if there is none. Nothing else is known at the start.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit, the columns of `inputs` are dependent, or `noise` or `span` cannot be meant;
+        names every problem.
     """
 
     system: DiscreteLure
@@ -139,6 +145,11 @@ def inverters(
         Inverters that report their reactive injection.
     report_error : (k,)
         Largest error of each report, pu.
+
+    Raises
+    ------
+    ValueError
+        As `UnknownInputPlant`; or if not every report has its error.
     """
     system = sample(lure, h)
     n, inputs = system.B.shape
@@ -244,6 +255,11 @@ def worst_zero(plant: UnknownInputPlant, pair: Pair) -> float:
         The plant.
     pair
         (J_u, J_s), with `C_Js b_Ju` square and regular.
+
+    Raises
+    ------
+    DesignInfeasible
+        If there are too many nonlinearities to visit all corners.
     """
     system, sensors = plant.system, list(pair[1])
     blind, _ = projection(plant, pair)
