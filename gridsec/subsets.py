@@ -7,6 +7,7 @@ sets and all their comparisons plain tables, computed once.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import combinations
 from math import comb
@@ -114,6 +115,35 @@ def subsets(meters: int, max_attacked: int, *, most: int) -> Subsets:
     parent = np.stack([_rank(out_small[:, pick], meters) for pick in choices])
     pairs = np.argsort(parent, axis=None, kind="stable").reshape(out_large.shape[0], -1)
     return Subsets(meters, max_attacked, out_large, out_small, choices, parent, pairs)
+
+
+def most_attacked(meters: int, works: Callable[[Ints], bool]) -> int:
+    """Largest M such that every set of at least p - 2M > 0 meters works: the q of the papers.
+
+    They are tried, the largest first, until one does not. Where a set works if the pair (A, C_J) is
+    observable, `index.dynamic_index(A, C).correctable` says the same without trying.
+
+    Parameters
+    ----------
+    meters
+        p, number of meters.
+    works
+        Whether the meters J, ascending, are enough: there is an observer for them, or it can be designed.
+
+    Returns
+    -------
+    int
+        M; -1 if not even all meters are enough.
+
+    References
+    ----------
+    yang2019, before (3); yang2021, before (4); chong2020, Theorem 1 (ii) and Corollary 1.
+    """
+    everybody = np.arange(meters)
+    lost = 0
+    while lost < meters and all(works(np.delete(everybody, out)) for out in _combinations(meters, lost)):
+        lost += 1
+    return (lost - 1) // 2
 
 
 def _combinations(n: int, k: int) -> Ints:

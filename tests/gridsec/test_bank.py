@@ -13,7 +13,9 @@ from scipy.integrate import solve_ivp
 from gridsec import bank as banks
 from gridsec.droop import Droop
 from gridsec.errors import DesignInfeasible, NotObservable
+from gridsec.index import dynamic_index
 from gridsec.lure import StepPolicy, close_loop
+from gridsec.subsets import most_attacked
 from tests.gridsec.small_banks import CASES, loop_step, mixed_fleet, ordered, plant, readings, states, tree
 
 
@@ -37,6 +39,29 @@ class TestSubsets:
         with pytest.raises(NotObservable, match="Theorem 1") as caught:
             banks.subsets(p, M, most=10**6)
         assert caught.value.rank == p
+
+    @pytest.mark.parametrize("seed", range(8))
+    def test_the_most_liars_that_a_plant_withstands(self, seed: int) -> None:
+        """Oracles: the definition, set by set, and the security index of linear plants."""
+        rng = np.random.default_rng(seed)
+        A = np.diag([0.5, 0.5, -0.3]) + np.diag([float(rng.integers(2)), 0.0], 1)
+        C = rng.integers(-1, 2, (6, 3)).astype(float)
+
+        def seen(J: tuple[int, ...]) -> bool:
+            rows = C[list(J)]
+            return bool(np.linalg.matrix_rank(np.vstack([rows, rows @ A, rows @ A @ A])) == 3)
+
+        def holds(M: int) -> bool:
+            return all(seen(J) for size in range(6 - 2 * M, 7) for J in combinations(range(6), size))
+
+        found = most_attacked(6, lambda J: seen(tuple(J)))
+        assert found == max((M for M in range(3) if holds(M)), default=-1)
+        assert found == min(dynamic_index(A, C, tol=1e-9).correctable, 2)
+
+    def test_all_but_the_last_meter_may_be_lost_and_none(self) -> None:
+        assert [most_attacked(p, lambda J: J.size > 0) for p in (0, 1, 2, 3, 7)] == [-1, 0, 0, 1, 3]
+        assert most_attacked(5, lambda J: J.size > 5) == -1
+        assert most_attacked(5, lambda J: 4 in J) == 0
 
     def test_too_many_observers(self) -> None:
         with pytest.raises(DesignInfeasible, match=f"{comb(146, 2) + comb(146, 4)} observers"):
