@@ -105,7 +105,9 @@ def busbar_of(network: Network, rows: list[LineRow], root: str | None) -> str:
     Raises
     ------
     GridsecError
-        If there is no such bus, or more than one that could be meant.
+        If there is no such bus.
+    BusbarUnclear
+        If none was asked for, and it is not clear which one is meant.
     """
     if root is not None:
         return named_bus(network, root)

@@ -159,6 +159,11 @@ def envelope(p: Floats, q: Floats) -> Envelope:
     ----------
     p, q : (T,)
         Active and reactive power, fractions of their nominal values.
+
+    Raises
+    ------
+    GridsecError
+        If there is none.
     """
     points = np.column_stack([p, q])
     try:

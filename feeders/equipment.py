@@ -100,7 +100,13 @@ def folder_of(path_or_name: Path | str) -> Path | None:
 
 
 def find(path_or_name: Path | str) -> FeederTables:
-    """Read the tables of a feeder's folder, or of a feeder that comes with the project; raises as `load`."""
+    """Read the tables of a feeder's folder, or of a feeder that comes with the project.
+
+    Raises
+    ------
+    FeederInvalid
+        As `load`.
+    """
     folder = folder_of(path_or_name)
     if folder is not None:
         return read(folder)

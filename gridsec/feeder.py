@@ -351,6 +351,11 @@ def corrected(
     -------
     (…, b + 1), (…, N)
         Additive correction of `v^2`, and a bound on what it leaves after its first step, pu.
+
+    Raises
+    ------
+    ValueError
+        If `steps` is below 1.
     """
     if steps < 1:
         raise ValueError(f"steps is {steps}; it must be at least 1")

@@ -151,6 +151,11 @@ def discrete_matrix(system: DiscreteLure, J: Ints | Sequence[int], gains: Discre
     gains
         The design.
 
+    Raises
+    ------
+    ValueError
+        If `J` is no subset of the design's meters.
+
     References
     ----------
     docs/theory-discrete.md, Theorem 1.

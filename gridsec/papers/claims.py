@@ -59,6 +59,11 @@ class Line:
         Its points; NaN in `y` interrupts it.
     style
         "points" has markers only, "steps" holds each value until the next point.
+
+    Raises
+    ------
+    ValueError
+        If x and y differ in their shapes.
     """
 
     label: str

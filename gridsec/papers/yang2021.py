@@ -40,6 +40,11 @@ def plant(example: int, *, corrected: bool = False) -> UnknownInputPlant:
         1 (also of Example 3) or 2 (also of Example 4).
     corrected
         With the one entry of C changed that makes all members of the bank exist.
+
+    Raises
+    ------
+    ValueError
+        If there is no such example.
     """
     if example == 1:
         A, B = np.array([[0.2, 0.5], [0.2, 0.7]]), np.eye(2)

@@ -235,7 +235,13 @@ class Problem:
 
     @cached_property
     def felt(self) -> Floats:
-        """How much those feel each customer's load who feel it most; see `FalsePowers`."""
+        """How much those feel each customer's load who feel it most; see `FalsePowers`.
+
+        Raises
+        ------
+        ValueError
+            If there are no false powers.
+        """
         if self.false is None:
             raise ValueError("there are no false powers")
         return strongest(self.false.R) if self.false.felt is None else self.false.felt

@@ -52,6 +52,11 @@ class Update:
         Sampling interval h, s; 0: continuous filters.
     dead
         Dead time d, whole intervals.
+
+    Raises
+    ------
+    ValueError
+        If the interval or the dead time is negative or none, or a continuous filter has a dead time.
     """
 
     interval_s: float = 1.0

@@ -40,6 +40,11 @@ class Box:
         Customer of each meter.
     reading : (p,)
         e: largest error of an honest squared reading, pu; positive.
+
+    Raises
+    ------
+    ValueError
+        If numbers of meters differ, an effect is not finite, or an error of a reading not positive.
     """
 
     effect: Floats

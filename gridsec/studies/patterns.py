@@ -189,6 +189,8 @@ def fewest_meters(
     ------
     DesignInfeasible
         After `most` nodes.
+    ValueError
+        If a meter must lie that is honest or silent.
     """
     p = given.seen[0].shape[0] if given.seen else 0
     none = np.zeros(p, dtype=np.bool_)
