@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from functools import cached_property
 
 import numpy as np
 
@@ -34,7 +35,7 @@ from gridsec.sequential.conditional import invert
 from gridsec.sequential.design import SequentialDesign
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Learned:
     """What is known of the meters' fixed errors. p meters.
 
@@ -58,6 +59,17 @@ class Learned:
     allowed: Floats
     at: Floats
     hidden: Floats
+
+    @cached_property
+    def late(self) -> Floats | None:
+        """Variance that `hidden` of the others adds to what they say of each meter not learned, squared pu^2.
+
+        (p,), the largest of them, and zero at learned meters; None where nobody or everybody is learned.
+        """
+        unknown = np.isnan(self.at)
+        if all_of(unknown) or not any_of(unknown):
+            return None
+        return np.where(unknown, self.hidden.max(), 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -374,6 +386,7 @@ def _problems(design: SequentialDesign, arrays: Mapping[str, Floats]) -> list[st
         "variance is not within that of the class": (arrays["variance"] >= 0)
         & (arrays["variance"] <= design.fixed * _ROUNDED),
         "allowed is not within the class": (arrays["allowed"] >= 0) & (arrays["allowed"] <= widest),
+        "hidden is no variance": (arrays["hidden"] >= 0) & np.isfinite(arrays["hidden"]),
         "at is no time": np.isnan(at) | np.isfinite(at),
         "since is no time": np.isnan(since) | np.isfinite(since),
         "neither learned nor being learned": (np.isfinite(at) ^ np.isfinite(since)) | (idle & np.isnan(at)),

@@ -347,9 +347,9 @@ def _best(design: SequentialDesign, state: SequentialState) -> tuple[int, float]
 
 def _hidden(state: SequentialState, prior_: Prior) -> Floats:
     """What learning could not tell from errors of the loads that last, at every bus, (n,)."""
-    hidden = state.learned.hidden
+    hidden, late = state.learned.hidden, state.learned.late
     out = np.full(prior_.variance.size, hidden.max(initial=0.0))
-    out[prior_.meters] = hidden
+    out[prior_.meters] = hidden if late is None else np.maximum(hidden, late)
     return np.asarray(np.minimum(out, prior_.variance))
 
 

@@ -130,15 +130,15 @@ class Scales:
         return replace(self.design.book, std=self.doubts.sizes)
 
     def __getitem__(self, s: int) -> Scale:
-        design, counts = self.design, self.window.counts[s]
+        design, counts, learned = self.design, self.window.counts[s], self.learned
         need = needed(design, s)
         return Scale(
             prior=self.doubts.priors[s],
-            noise=design.white / need + self.learned.variance,
+            noise=design.white / need + learned.variance,
             m=self.window.sums[s] / np.maximum(counts, 1),
             enough=counts >= need,
             limits=Limits(
-                design.sigmas[s], self.model, self.learned.allowed, self.learned.variance, design.most
+                design.sigmas[s], self.model, learned.allowed, learned.variance, design.most, learned.late
             ),
         )
 

@@ -50,6 +50,8 @@ class Limits:
         Variance within the meters' noise that `allowed` stands for.
     most
         How many liars can be told apart; None: however many.
+    late : (p,)
+        Variance of offsets beside that by which they are judged, squared pu^2; None for none.
     """
 
     sigmas: float
@@ -57,6 +59,7 @@ class Limits:
     allowed: Floats
     certain: Floats
     most: int | None = None
+    late: Floats | None = None
 
     @property
     def penalty(self) -> float:
@@ -73,6 +76,8 @@ class Limits:
         part
             Of `sigmas`, how many count.
         """
+        if self.late is not None:
+            std = np.sqrt(std * std + self.late)
         rest, sigmas = np.sqrt(np.maximum(std * std - self.certain, 0.0)), part * self.sigmas
         within = np.minimum(sigmas * std, self.allowed + sigmas * rest)
         return np.asarray(self.model + within)

@@ -11,9 +11,11 @@ from hypothesis import strategies as st
 from scipy.integrate import dblquad
 
 from gridsec import sequential
-from gridsec.arrays import Bools
+from gridsec.arrays import Bools, Floats
+from gridsec.online import Frame
 from gridsec.sequential import Commission, SequentialDesign, SequentialOptions
 from gridsec.sequential.commission import (
+    Learned,
     Learning,
     _share,
     begin,
@@ -26,7 +28,11 @@ from gridsec.sequential.commission import (
     ripe,
     to_arrays,
 )
+from gridsec.sequential.conditional import fit
+from gridsec.sequential.doubts import none as no_doubts
 from gridsec.sequential.loads import LoadDoubt
+from gridsec.sequential.scales import Scales, view_of
+from gridsec.sequential.windows import empty
 from tests.gridsec.sequential.test_monitor import prepare, watch
 from tests.gridsec.street import Street, make_plant
 
@@ -120,6 +126,66 @@ def test_what_is_left_of_lasting_errors_is_in_the_standard_deviation(lasting: fl
     assert (nothing(design).hidden == 0.0).all()
 
 
+def lasting_errors() -> tuple[SequentialDesign, Learned, Floats]:
+    """A feeder where meter 2 was not heard while the others were learned, all errors of loads lasting.
+
+    With what was learned from means of zero, and the map from lasting errors (P), own ones (P) and noise (P)
+    to the residuals of all meters afterwards, all in standard deviations: biases are linear in the means.
+    """
+    plant = make_plant(np.random.default_rng(3), customers=P, inverters=np.zeros(0, dtype=np.intp))
+    doubt = LoadDoubt(np.full(P, 0.006), np.full(P, 0.002), 600.0, lasting=1.0)
+    options = SequentialOptions(commission_s=3600.0, scales_s=(0.0, 60.0))
+    design = sequential.design(plant, doubt=doubt, step_s=1.0, options=options)
+    others, count = np.flatnonzero(~one(2)), np.where(one(2), 0, 3600)
+    gathered = Learning(np.zeros(P), count, count.astype(np.float64), np.zeros(P))
+    known = conclude(design, nothing(design), gathered, ~one(2), 3600.0).learned
+    S, B = design.prior.between, np.diag(design.fixed)
+    means = np.hstack([np.linalg.cholesky(S), np.sqrt(B), np.zeros((P, P))])
+    part, bias = np.ix_(others, others), np.zeros_like(means)
+    bias[others] = B[part] @ np.linalg.solve((S + B + np.diag(design.white / 3600))[part], means[others])
+    residuals = means - bias
+    residuals[:, 2 * P :] = np.diag(np.sqrt(design.white))
+    return design, known, residuals
+
+
+def test_a_meter_not_learned_among_learned_ones_is_known_as_well_as_is_said() -> None:
+    """What the monitor says of a voltage whose meter is silent, against draws of all errors."""
+    design, known, residuals = lasting_errors()
+    rng, none, root = np.random.default_rng(8), np.zeros(P), np.linalg.cholesky(design.prior.between)
+    seen, state = ~one(2), sequential.init(design, 0.0, known, None)
+    off = []
+    for _ in range(300):
+        drawn = rng.normal(size=3 * P)
+        y = np.where(seen, 1.0 + residuals @ drawn, np.nan)
+        frame = Frame(1.0, y, seen, 1.0, none, none, none, none, np.full(P, np.nan), none)
+        estimate = sequential.step(design, state, frame)[1]
+        off.append((estimate.v2 - 1.0 - root @ drawn[:P]) / estimate.std)
+    size = np.sqrt(np.mean(np.square(off), axis=0))
+    assert (size < 1.1).all()
+
+
+def test_an_honest_meter_not_learned_is_within_its_limit_as_seldom_as_is_said() -> None:
+    """Judged by learned ones, whose remaining errors are not independent: against the dense covariance."""
+    design, known, residuals = lasting_errors()
+    window = empty(design.lengths, P)
+    scale = Scales(design, no_doubts(design), window, known, np.zeros(P))[-1]
+    view = view_of(design, scale, fit(scale.prior, scale.noise, np.ones(P, dtype=np.bool_)))
+    Q = np.linalg.inv(scale.prior.between + np.diag(scale.noise))
+    offset = Q[2] @ np.hstack([residuals[:, : 2 * P], np.diag(np.sqrt(design.white / 60))]) / Q[2, 2]
+    own = np.arange(3 * P) == P + 2
+    chance, rest = (design.sigmas[-1] * np.linalg.norm(part) for part in (offset, offset[~own]))
+    assert view.limit[2] >= min(chance, known.allowed[2] + rest)
+
+
+def test_where_nobody_or_everybody_is_learned_limits_are_as_they_were() -> None:
+    design, rng = prepared(), np.random.default_rng(5)
+    assert nothing(design).late is None
+    assert learned(design, rng).learned.late is None
+    late = renew(design, learned(design, rng), one(2), 9.0).learned.late
+    assert late is not None
+    assert (late > 0.0).tolist() == one(2).tolist()
+
+
 def test_a_silent_meter_is_waited_for_and_holds_up_nobody() -> None:
     design = prepared()
     use = ~one(4)
@@ -188,6 +254,8 @@ class TestArrays:
             ("variance", np.nan, "variance is not within"),
             ("variance", -1.0, "variance is not within"),
             ("allowed", 1.0, "allowed is not within the class"),
+            ("hidden", np.nan, "hidden is no variance"),
+            ("hidden", -1.0, "hidden is no variance"),
             ("at", np.inf, "at is no time"),
             ("since", 5.0, "neither learned nor being learned"),
             ("total", np.nan, "total is no number"),
