@@ -20,11 +20,9 @@ from gridsec.arrays import Floats
 from gridsec.certificates import certify
 from gridsec.errors import FeederInvalid
 from gridsec.families import decoders, partial, set_search, ticks, unknown_input, windowed
-from gridsec.frames import usual
 from gridsec.gains import CircleOptions, options_for
 from gridsec.lure import Lure, close_loop
 from gridsec.network import linear
-from gridsec.online import Estimate, Frame, Verdict
 from gridsec.sequential.decoder import Decoder
 
 __all__ = [
@@ -94,13 +92,6 @@ def _sequential(site: Site, _: Job) -> sequential.SequentialDesign:
         alarms_per_year=settings.alarms_per_year, commission_s=settings.commission_s
     )
     return sequential.design(plant(site), doubt=load_doubt(site), step_s=settings.tick_s, options=options)
-
-
-def _sequential_step(
-    design: sequential.SequentialDesign, state: sequential.SequentialState, frame: Frame
-) -> tuple[sequential.SequentialState, Estimate, Verdict]:
-    """Its step takes deviations from the intervals, as those of what is uniform in them."""
-    return sequential.step(design, state, usual(frame))
 
 
 def _direct_bank(site: Site, _: Job) -> monitor.MonitorDesign:
@@ -241,7 +232,7 @@ def _ticks(name: str, summary: str, decoder: Decoder) -> Family:
         )
 
     return Family(
-        name, summary, make, sequential.init, _sequential_step, lambda d: int(d.observers), _certificate
+        name, summary, make, sequential.init, sequential.step, lambda d: int(d.observers), _certificate
     )
 
 
@@ -281,7 +272,7 @@ FAMILIES: Final = Families(
             "one switched observer, correlated loads, evidence on several time scales",
             _sequential,
             sequential.init,
-            _sequential_step,
+            sequential.step,
             lambda d: int(d.observers),
             _certificate,
             lambda d: int(d.most),

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of
+from gridsec.frames import usual
 from gridsec.online import Frame
 from gridsec.sequential.conditional import Prior
 from gridsec.sequential.design import SequentialDesign
@@ -111,7 +112,8 @@ def doubted(
 
 def _doubts(design: SequentialDesign, before: Doubts, frame: Frame, busbar: Bools | bool) -> Doubts:
     """What this frame does not know; new priors only where that changed."""
-    lengths = design.lengths
+    # The design has standard deviations, and so have frames that tell them apart from their intervals.
+    frame, lengths = usual(frame), design.lengths
     p, p_calm, p_rest = _factors(
         frame.p_error, design.doubt.p, (before.p, before.p_calm, before.p_rest), lengths
     )

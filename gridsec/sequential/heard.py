@@ -60,7 +60,13 @@ def possible(design: SequentialDesign, frame: Frame) -> Frame:
     q, q_error = _possible(frame.q, frame.q_error, design.most_q)
     if p is frame.p and q is frame.q and p_error is frame.p_error and q_error is frame.q_error:
         return frame
-    return replace(frame, p=p, p_error=p_error, q=q, q_error=q_error)
+    p_std, q_std = _sure(frame.p_std, p == frame.p), _sure(frame.q_std, q == frame.q)
+    return replace(frame, p=p, p_error=p_error, q=q, q_error=q_error, p_std=p_std, q_std=q_std)
+
+
+def _sure(std: Floats | None, same: Bools) -> Floats | None:
+    """Standard deviations, but of powers that cannot be."""
+    return None if std is None else np.where(same, std, np.nan)
 
 
 def _possible(power: Floats, error: Floats, most: Floats) -> tuple[Floats, Floats]:

@@ -26,6 +26,7 @@ from gridsec.arrays import Floats
 from gridsec.frames import usual
 from gridsec.sequential import SequentialDesign, SequentialState
 from tests.feeders.unmetered import CIGRE, unmetered, without
+from tests.gridsec.street import ac_voltages
 
 MONDAYS = {
     season: datetime(*day, tzinfo=UTC).timestamp()
@@ -274,6 +275,28 @@ def test_a_told_deviation_is_believed_although_the_interval_is_wide() -> None:
         state, _, _ = watcher.step(state, to_frame(site, snapshot))
         assert isinstance(state, SequentialState)
         assert state.doubts.priors[-1] is watcher.design.prior
+
+
+def test_the_bound_holds_whatever_is_forecast() -> None:
+    """At 3 o'clock those whom nobody reads draw all that they may: within the frame's interval."""
+    watcher, at, base = design(FORECAST), CIGRE.meters, CIGRE.feeder.base_volt
+    start, none = START + 10_800.0, np.full(at.size, np.nan)
+    state = watcher.init(start)
+    for t in start + 60.0 * np.arange(6):
+        p = to_frame(FORECAST, Snapshot(t, none, none, none, np.nan)).p
+        p[at] = -0.2 * CIGRE.loads.load_peak[at]
+        p[NOBODY] = -CIGRE.loads.load_peak[NOBODY]
+        net = 0.4 * p
+        assert isinstance(state, SequentialState)
+        if state.x is not None:
+            net += CIGRE.droop.per_customer(state.x, p.size)
+        v = ac_voltages(CIGRE.feeder, p + 1j * net, 1.0)[CIGRE.feeder.bus]
+        said = Snapshot(t, (v * CIGRE.customer_volt)[at], -p[at] * CIGRE.feeder.base_kva, none, base)
+        frame = to_frame(FORECAST, said)
+        assert (np.abs(p - frame.p) <= frame.p_error + 1e-9).all()
+        assert (np.abs(0.4 * p - frame.q) <= frame.q_error + 1e-9).all()
+        state, estimate, _ = watcher.step(state, frame)
+        assert (np.abs(estimate.v2 - v**2) <= estimate.bound).all()
 
 
 @pytest.mark.parametrize("estimator", [SEQUENTIAL, "weighted-least-squares", "exact-bank"])
