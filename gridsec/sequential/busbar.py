@@ -118,7 +118,11 @@ def opposed(design: SequentialDesign, doubt: Doubt, now: Fit, judged: Judged) ->
     chance = doubt.sigmas * np.sqrt(form)
     if all_of(along <= chance):
         return []
-    return np.flatnonzero(doubt.metered & (along > chance + doubt.model.max() * form)).tolist()
+    # The model may be off by that at all meters, in the direction that says most: more than form where
+    # weights differ in sign.
+    at, Q = now.trusting()
+    reach = np.abs(Q @ design.hangs_on[at]).sum(axis=0)
+    return np.flatnonzero(doubt.metered & (along > chance + doubt.model.max() * reach)).tolist()
 
 
 def weight(design: SequentialDesign, now: Fit) -> Floats:

@@ -87,6 +87,16 @@ class TestOneMore:
             judged = judge(now, self.m + 1.001 * at * shift)
             assert opposed(self.design, Doubt(limit, nothing + 1e-3, metered=True), now, judged) == []
 
+    def test_the_model_may_be_off_in_the_direction_that_says_most(self) -> None:
+        """Weights differ in sign where meters are good; a model that is off with them is no busbar that lies."""
+        now = fit(self.design.prior, self.design.white, np.ones(CUSTOMERS, dtype=np.bool_))
+        weights, off = now.Q.sum(axis=0), 1e-3
+        assert (weights < 0.0).any()
+        shift = 0.999 * self.design.sigmas[0] / np.sqrt(weights.sum())
+        judged = judge(now, shift + off * np.sign(weights))
+        doubt = Doubt(self.design.sigmas[0], np.full(CUSTOMERS, off), np.ones(1, dtype=np.bool_))
+        assert opposed(self.design, doubt, now, judged) == []
+
     def test_nobody_trusted_contradicts_nobody(self) -> None:
         nobody = np.zeros(CUSTOMERS, dtype=np.bool_)
         now = fit(self.design.prior, self.noise, nobody)
