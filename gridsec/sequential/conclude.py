@@ -162,6 +162,9 @@ def _estimate(
     v2_bus = tick.v2_bus + w
     first = busbar_places(plant.feeder)
     v2_bus[first] = np.where(heard.busbar, heard.v0_squared, v2_bus[first])
+    # That is a reading, however well the others know the voltage.
+    variance = variance.copy()
+    variance[first] = np.maximum(variance[first], np.where(heard.busbar, design.busbar**2, 0.0))
     trusted = state.trust.trusted & heard.live
     grounds = Grounds(
         plant=plant,

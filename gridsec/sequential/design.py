@@ -108,10 +108,11 @@ class SequentialOptions:
             ("release", self.release >= 1, "must be at least 1"),
             ("suspect", 0.0 < self.suspect < 1.0, "must be between 0 and 1"),
             ("lower", 0.0 < self.lower <= 1.0, "must be above 0 and up to 1"),
+            ("hidden_power", 0.0 < self.hidden_power < np.inf, positive),
             ("like", 1.0 <= self.like < np.inf, "must be at least 1 and finite"),
             *(
                 (name, 0.0 <= getattr(self, name) < np.inf, zero)
-                for name in ("hidden_power", "hidden_charge", "commission_s", "stability")
+                for name in ("hidden_charge", "commission_s", "stability")
             ),
         ]
         refuse(

@@ -24,6 +24,8 @@ from gridsec.sequential.conditional import Prior
 
 UNMETERED = 0.1
 """Standard deviation of a squared busbar voltage that nobody reads, squared pu."""
+LONGEST_S = 1e12
+"""Longest correlation time of errors of powers, s: nothing learned would be left of those of longer ones."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,8 +68,9 @@ class LoadDoubt:
             for name in ("p", "q")
             if not (np.isfinite(getattr(self, name)).all() and (getattr(self, name) >= 0).all())
         ]
-        if not self.time_s > 0:
-            problems.append(f"time_s is {self.time_s}; it must be positive")
+        if not 0 < self.time_s <= LONGEST_S:
+            most = f"at most {LONGEST_S:g}; what never changes is `lasting`"
+            problems.append(f"time_s is {self.time_s}; it must be positive and {most}")
         problems += [
             f"{name} is {getattr(self, name)}; it must be from 0 to 1"
             for name in ("common_p", "common_q", "lasting", "together")

@@ -76,7 +76,7 @@ def test_options_that_would_name_everybody_or_nobody_are_refused() -> None:
 def test_options_of_the_sequential_monitor_are_checked_alike() -> None:
     wrong = {
         "alarms_per_year": 0.0, "scales_s": (np.nan,), "enough": 0.0, "focus": np.nan, "several": -1,
-        "release": 0, "suspect": 1.0, "lower": np.nan, "like": 0.5, "hidden_power": -1.0,
+        "release": 0, "suspect": 1.0, "lower": np.nan, "like": 0.5, "hidden_power": 0.0,
         "hidden_charge": np.nan, "commission_s": np.nan, "stability": -0.1, "widest": np.nan,
         "v2_limits": (np.nan, 1.0), "settled": np.nan,
     }  # fmt: skip

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gridsec import sequential
-from gridsec.online import Cause, Decision, Explanation
+from gridsec.online import Cause, Decision, Explanation, Frame
 from gridsec.plant import Plant
 from gridsec.sequential import LoadDoubt, SequentialDesign, SequentialOptions
 from gridsec.sequential.words import ways
@@ -39,6 +39,27 @@ def test_every_explanation_is_told_as_what_it_is(design: SequentialDesign) -> No
     )
     assert "c11" not in ways(design, (way(tuple(range(12))), way()))
     assert "or 3 more; each of these" in ways(design, (way((1,)),) * 8)
+
+
+def test_a_customer_on_the_busbar_is_known_as_well_as_its_meter_reads() -> None:
+    """A busbar's meter of class 0.5 among twelve exact ones: what is reported there is that reading."""
+    plant = make_plant(
+        np.random.default_rng(1), customers=12, drop=0.03, inverters=np.zeros(0, dtype=np.intp)
+    )
+    bus, rng, none = np.arange(12), np.random.default_rng(2), np.zeros(12)
+    plant = replace(
+        plant,
+        feeder=replace(plant.feeder, bus=bus),
+        accuracy=replace(plant.accuracy, busbar_class=0.005),
+    )
+    made, off = prepare(plant), []
+    for _ in range(60):
+        v0_squared = (1.0 + 0.005 * rng.uniform(-1.0, 1.0)) ** 2
+        y, seen = np.ones(12), np.ones(12, dtype=np.bool_)
+        frame = Frame(1.0, y, seen, v0_squared, none, none, none, none, np.full(12, np.nan), none)
+        estimate = sequential.step(made, sequential.init(made, 0.0), frame)[1]
+        off.append((estimate.v2 - 1.0) / estimate.std)
+    assert (np.sqrt(np.mean(np.square(off), axis=0)) < 1.1).all()
 
 
 def twins() -> Plant:

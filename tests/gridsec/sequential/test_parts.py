@@ -73,6 +73,9 @@ class TestLoads:
     def test_every_problem_is_named(self) -> None:
         with pytest.raises(ValueError, match=r"p must be.*q must be.*time_s.*common_p.*common_q"):
             LoadDoubt(np.array([-1.0]), np.array([np.nan]), 0.0, common_p=2.0, common_q=-1.0)
+        for time_s in (np.inf, np.nan, 1e200):
+            with pytest.raises(ValueError, match=r"time_s is .*; it must be positive and at most"):
+                LoadDoubt(np.ones(1), np.ones(1), time_s)
 
     def test_inverters_follow_their_meters_errors_up_to_saturation(self) -> None:
         droop = fleet(np.array([0, 2, 2]), ["ieee1547-b"] * 3, np.array([5.0, 5.0, 8.0]), 100.0)
