@@ -126,7 +126,7 @@ class Rounds:
             The feeder.
         """
         config, name = self.config, site.feeder.name
-        # Where the readings tell the time, it may be long ago for the wall clock; `advance` forgets what is too old.
+        # Where the readings tell the time, that may be long ago; `advance` forgets what is too old.
         latest = min([self._wall(), *(tick["t"] for tick in self.store.history(name, limit=1))])
         stored = self.store.active(name, cleared_since=latest - AlarmRules().memory_s)
         rules = align_rules(site, config.clock, max_skew_s=config.max_skew_s, grace_s=config.grace_s)
