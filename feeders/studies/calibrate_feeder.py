@@ -457,13 +457,17 @@ def field(net: Network, drawn: Powers) -> Field:
 
 
 def meter_noise(net: Network, given: Frames) -> tuple[Floats, Floats]:
-    """Variances of the readings' own noise (T, p), and of the busbar's (T,), squared pu^2."""
+    """Variances of the readings' own noise (T, p), squared pu^2, and what the busbar's does, (T, p, F).
+
+    Each phase of the busbar is metered apart, and a place has the error of its own phase.
+    """
     site, accuracy = net.site, net.site.accuracy
     order = [given.meter_ids.index(name) for name in site.meter_ids]
     own = 4.0 * (accuracy.jitter**2 + accuracy.resolution**2 / 12.0)
     busbar = 4.0 * (accuracy.busbar_jitter**2 + accuracy.busbar_resolution**2 / 12.0)
     count = np.maximum(given.count[:, order], 1.0)
-    return own / count, busbar / np.maximum(given.count[:, -1], 1.0)
+    std = np.sqrt(busbar / np.maximum(given.count[:, -1], 1.0))
+    return own / count, std[:, None, None] * net.places.of_phases
 
 
 def gaps(net: Network, drawn: Powers) -> list[Floats]:

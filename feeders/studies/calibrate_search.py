@@ -185,13 +185,12 @@ def prepare(state: State, frames: Frames, *, tolerance: float, errors: bool = Fa
     rest = series.residual(net.places)
     size = _typical(net)
     noise = LoadErrors(size, size, net.site.tables.meta.load.correlation_s, 1.0, np.full(4, np.nan))
+    shared = np.einsum("tjf,tkf->jk", common, common) / len(common)
     guess, left = noise, rest
     for turn in range(_NOISE_ROUNDS):
         last = errors and turn == _NOISE_ROUNDS - 1
         products = increments(series.t, series.seen, left)
-        noise = learn(
-            products, own, white.mean(axis=0), float(common.mean()), guess, errors=last, start=noise
-        )
+        noise = learn(products, own, white.mean(axis=0), shared, guess, errors=last, start=noise)
         S = noise.covariance(own)
         whiten = whitening(
             series.t,

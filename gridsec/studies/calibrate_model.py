@@ -76,6 +76,12 @@ class Places:
         return np.asarray(own * (own.sum(axis=1) / self.unit**2)[:, None])
 
     @property
+    def of_phases(self) -> Floats:
+        """What a squared voltage of each phase everywhere is at the meters, (p, F)."""
+        W = self.read(self.weight[self.meters])
+        return np.stack([W[:, self.phase == f].sum(axis=1) for f in range(self.phase.max() + 1)], axis=1)
+
+    @property
     def at_meters(self) -> tuple[Floats, Floats]:
         """Sensitivities of the meters to the customers' powers, (p, N) each."""
         W = self.read(self.weight[self.meters])

@@ -2,8 +2,9 @@
 
 The powers of N customers err by independent Ornstein-Uhlenbeck processes of correlation time tau. At the
 p meters that is a field of covariance ``S exp(-abs(dt) / tau)``, ``S = k_p S_p + k_q S_q + S_0``; meters add
-white noise, the busbar's the same to all. A Kalman filter over the few modes of S that stand out of the
-meters' noise whitens readings and regressors alike, readings that are missing left out exactly.
+white noise, that of the busbar the same to all on its phase. A Kalman filter over the few modes of S that
+stand out of the meters' noise whitens readings and regressors alike, readings that are missing left out
+exactly.
 
 References
 ----------
@@ -139,8 +140,9 @@ def whitening(
         Its correlation time, s.
     white : (T, p)
         Variance of each reading's own noise.
-    common : (T,)
-        Variance of what all readings of a frame have in common: the busbar's noise.
+    common : (T, p, f)
+        What readings of a frame have in common, one column each, in standard deviations: the noise of the
+        busbar's f voltages.
     gaps : T times (p, g)
         What unknown powers of single frames do, one column each, in standard deviations.
     """
@@ -148,11 +150,11 @@ def whitening(
     p, m = L.shape
     decay = np.append(np.exp(-np.diff(t) / time_s), 0.0)
     inverse, gain = np.zeros((t.size, p, p)), np.zeros((t.size, m, p))
-    P, log_det, ones = np.eye(m), 0.0, np.ones((p, 1))
+    P, log_det = np.eye(m), 0.0
     for k in range(t.size):
         rows = np.flatnonzero(seen[k])
         if rows.size:
-            own, extra = L[rows], np.hstack([np.sqrt(common[k]) * ones, gaps[k]])[rows]
+            own, extra = L[rows], np.hstack([common[k], gaps[k]])[rows]
             cross = P @ own.T
             covariance = own @ cross + extra @ extra.T
             covariance[np.diag_indices_from(covariance)] += white[k, rows]
@@ -227,7 +229,7 @@ def learn(
     given: Increments,
     field: Field,
     white: Floats,
-    common: float,
+    common: Floats,
     guess: LoadErrors,
     *,
     errors: bool = True,
@@ -246,8 +248,8 @@ def learn(
         What unit errors do.
     white : (p,)
         Variance of the meters' noise as promised, squared pu^2.
-    common
-        The same of the busbar's.
+    common : (p, p)
+        Covariance of what the busbar's noise does at the meters, squared pu^2.
     guess
         The middle of the prior.
     errors
@@ -300,7 +302,7 @@ class _Composite:
     dt: Floats
     field: Field
     white: Floats
-    common: float
+    common: Floats
     base: Floats
 
     def value(self, x: Floats, mean: Floats, count: Floats) -> tuple[float, Floats]:

@@ -104,6 +104,22 @@ def test_meters_on_a_phase_that_the_busbar_does_not_read_are_left_out_and_accuse
     assert set(places.loc[list(on_a)]) == {"cannot be told"}
 
 
+def test_the_noise_of_the_busbars_phases_is_learned_as_that_of_three_meters(tmp_path: Path) -> None:
+    """Coarse meters of known powers: what is left is their noise, the busbar's of each phase included."""
+    meta = street().meta
+    meta = replace(meta, busbar_jitter_percent=0.1, meters=replace(meta.meters, jitter_percent=0.02))
+    tables = replace(street(), meta=meta)
+    day = Scenario(
+        seed=1, duration_s=2 * 86400.0, dt_s=900.0, profile_s=0.0, errors=MeterErrors(report_q=True)
+    )
+    found = calibrate(
+        three_phase(tables), record(from_tables(tables), day, tmp_path / "day.parquet"), kinds=[Kind.LENGTH]
+    )
+    white = found.errors.set_index("quantity").loc["noise of meters"]
+    assert white["low"] < 1.0 < white["high"]
+    assert white["estimate"] == pytest.approx(1.0, abs=0.15)
+
+
 def test_moments_without_one_of_the_phases_are_left_out() -> None:
     whole, some = (frames(three_phase(street()), each) for each in (apart(), without(apart(), 2, 0.25)))
     assert (some.unread, some.t.size) == ("", whole.t.size - 24)

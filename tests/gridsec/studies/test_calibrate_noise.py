@@ -33,7 +33,7 @@ def scene(
     seen = rng.random((7, P)) > 0.25
     seen[3] = False
     white = rng.uniform(1e-8, 4e-8, (7, P))
-    common = rng.uniform(1e-8, 4e-8, 7)
+    common = rng.uniform(1e-4, 2e-4, (7, P, 2))
     gaps = [np.empty((P, 0))] * 7
     gaps[2] = 1e-3 * rng.standard_normal((P, 2))
     made = whitening(t, seen, S, time_s=300.0, white=white, common=common, gaps=gaps)
@@ -46,7 +46,7 @@ def test_whitened_columns_have_the_inner_products_of_the_dense_covariance(seed: 
     dense = np.kron(np.exp(-np.abs(np.subtract.outer(t, t)) / 300.0), S)
     for k in range(t.size):
         some = slice(k * P, (k + 1) * P)
-        dense[some, some] += np.diag(white[k]) + common[k] + gaps[k] @ gaps[k].T
+        dense[some, some] += np.diag(white[k]) + common[k] @ common[k].T + gaps[k] @ gaps[k].T
     rows = seen.ravel()
     columns = np.random.default_rng(9).standard_normal((t.size, P, 3)) * seen[:, :, None]
     flat, whitened = columns.reshape(-1, 3)[rows], made(columns).reshape(-1, 3)
@@ -85,7 +85,7 @@ def test_sizes_and_correlation_time_are_learned_and_their_errors_cover() -> None
     z = []
     for seed in range(12):
         t, seen, residual = drawn(seed, true, given, white)
-        found = learn(increments(t, seen, residual), given, white, 0.0, guess)
+        found = learn(increments(t, seen, residual), given, white, np.zeros((P, P)), guess)
         ratios = (found.p / true.p, found.q / true.q, found.time_s / true.time_s, found.white / true.white)
         z.append(np.log(ratios) / found.std)
         assert abs(np.log(found.p / true.p)) < 0.2
@@ -96,7 +96,7 @@ def test_what_cannot_be_seen_stays_as_uncertain_as_before() -> None:
     given, white = field(np.random.default_rng(0)), np.full(P, 1.0)
     t, seen, residual = drawn(3, LoadErrors(0.1, 0.05, 600.0, 1.0, np.zeros(4)), given, white)
     guess = LoadErrors(0.03, 0.03, 300.0, 1.0, np.zeros(4))
-    found = learn(increments(t, seen, residual), given, white, 0.0, guess)
+    found = learn(increments(t, seen, residual), given, white, np.zeros((P, P)), guess)
     assert found.std[0] > 2.0
     assert found.std[2] > 1.5
     assert found.white == pytest.approx(1.0, abs=0.05)
