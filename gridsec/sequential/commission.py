@@ -259,10 +259,11 @@ def conclude(
     hidden[heard] = _hidden(design, heard, K)
     bias[heard] += B * (K @ (gathered.total[heard] / n))
     left = np.maximum(B - B * B * K.diagonal(), 0.0)
-    aging = design.options.stability * design.allowed[heard]
-    # A uniform error of half-width a has the variance a^2 / 3.
-    variance[heard] = np.minimum(left + aging**2 / 3.0, B)
-    allowed[heard] = np.minimum(aging + 3.0 * np.sqrt(left), design.allowed[heard])
+    rounded = design.rounded[heard]
+    aging = design.options.stability * (design.allowed[heard] - rounded)
+    # A uniform error of half-width a has the variance a^2 / 3; what rounding adds goes with the voltage.
+    variance[heard] = np.minimum(left + aging**2 / 3.0 + 0.5 * rounded**2, B)
+    allowed[heard] = np.minimum(aging + 3.0 * np.sqrt(left) + rounded, design.allowed[heard])
     learned = Learned(
         # No honest meter leaves its class, so nothing beyond it is learned as an error.
         bias=np.where(done, np.clip(bias, -design.allowed, design.allowed), known.bias),

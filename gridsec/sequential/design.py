@@ -13,7 +13,7 @@ import numpy as np
 from scipy.linalg import lapack
 from scipy.special import ndtri
 
-from gridsec.accuracy import ToldError, busbar_error
+from gridsec.accuracy import ToldError, busbar_error, steady_rounding
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.certificates import Certificate, certify, verify
 from gridsec.detect import curve_mismatch
@@ -158,7 +158,9 @@ class SequentialDesign:
     white, fixed : (p,)
         Variance of a squared reading from tick to tick, and of its unknown fixed part, squared pu^2.
     allowed : (p,)
-        Largest fixed part by the accuracy class, squared pu.
+        Largest fixed part by the accuracy class, `rounded` included, squared pu.
+    rounded : (p,)
+        Largest error of rounding that stays as long as the voltage does, squared pu; nobody can learn it.
     hangs_on : (p, b)
         1 where a meter hangs on a phase of the busbar, else 0; b is 1 on a balanced feeder.
     reach : (p,)
@@ -204,6 +206,7 @@ class SequentialDesign:
     white: Floats
     fixed: Floats
     allowed: Floats
+    rounded: Floats
     hangs_on: Floats
     reach: Floats
     meter_of: Ints
@@ -277,7 +280,8 @@ def design(
     lengths = _lengths(options.scales_s, step_s)
     accuracy, slope = plant.accuracy, 2.0 * _HIGH * plant.droop.vbar
     white = np.maximum(slope**2 * (accuracy.jitter**2 + accuracy.resolution**2 / 12.0), _WHITE)
-    fixed = slope**2 * accuracy.class_fraction**2 / 3.0
+    rounded = slope * steady_rounding(accuracy)
+    fixed = slope**2 * accuracy.class_fraction**2 / 3.0 + 0.5 * rounded**2
     known = prior(plant.feeder, plant.feeder.bus[meters], doubt, busbar=busbar, inverters=injections)
     suspect = -float(ndtri(0.5 * options.suspect / meters.size))
     sigmas = tuple(_sigmas(options.alarms_per_year, plant, n, step_s, lengths) for n in lengths)
@@ -297,7 +301,8 @@ def design(
         suspect=suspect,
         white=white,
         fixed=fixed,
-        allowed=slope * accuracy.class_fraction,
+        allowed=slope * accuracy.class_fraction + rounded,
+        rounded=rounded,
         hangs_on=hangs_on(plant.feeder)[meters],
         reach=np.abs(lure.C) @ (2.0 * plant.droop.limit),
         meter_of=_meter_of(plant),

@@ -7,8 +7,10 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from gridsec import monitor, sequential
+from gridsec.accuracy import steady_rounding
 from gridsec.families import partial, set_search, unknown_input
 from gridsec.plant import Options, Plant
 from gridsec.sequential import LoadDoubt, SequentialOptions
@@ -107,3 +109,19 @@ def test_an_accuracy_names_all_its_problems_and_is_read_only() -> None:
     assert made.class_fraction.tolist() == [0.005, 0.005]
     with pytest.raises(ValueError, match="read-only"):
         made.jitter[0] = 1.0
+
+
+def test_rounding_that_jitter_does_not_average_away_is_bounded() -> None:
+    """Against the mean of a register, by the probability of each of its numbers."""
+    steps = np.array([1.0 / 230.0, 0.1 / 230.0, 0.0, 0.01])
+    for part in (1e-6, 0.02, 0.1, 0.2, 0.3, 0.5, 1.0):
+        found = steady_rounding(replace(accuracy(4), resolution=steps, jitter=part * steps))
+        v, numbers = np.linspace(-0.5, 0.5, 201)[1:-1, None], np.arange(-9, 10)
+        upper, lower = (ndtr((numbers + end - v) / part) for end in (0.5, -0.5))
+        off = ((upper - lower) @ numbers)[:, None] - v
+        largest, variance = np.abs(off).max(), np.mean(off**2)
+        assert (found >= 0.999 * largest * steps).all()
+        assert (found <= 1.5 * largest * steps + 1e-15).all()
+        assert (0.5 * found**2 >= 0.99 * variance * steps**2).all()
+    # A register of 0.1 V with 0.05 % of jitter has none.
+    assert (steady_rounding(accuracy(4)) < 1e-12).all()

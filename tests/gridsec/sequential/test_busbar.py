@@ -88,7 +88,7 @@ class TestOneMore:
             assert opposed(self.design, Doubt(limit, nothing + 1e-3, metered=True), now, judged) == []
 
     def test_the_model_may_be_off_in_the_direction_that_says_most(self) -> None:
-        """Weights differ in sign where meters are good; a model that is off with them is no busbar that lies."""
+        """Weights of good meters differ in sign; a model that is off with them is no busbar that lies."""
         now = fit(self.design.prior, self.design.white, np.ones(CUSTOMERS, dtype=np.bool_))
         weights, off = now.Q.sum(axis=0), 1e-3
         assert (weights < 0.0).any()

@@ -34,7 +34,7 @@ from gridsec.sequential.loads import LoadDoubt
 from gridsec.sequential.scales import Scales, view_of
 from gridsec.sequential.windows import empty
 from tests.gridsec.sequential.test_monitor import prepare, watch
-from tests.gridsec.street import Street, make_plant
+from tests.gridsec.street import BASE_VOLT, JITTER, Street, make_plant
 
 P = 6
 
@@ -184,6 +184,27 @@ def test_where_nobody_or_everybody_is_learned_limits_are_as_they_were() -> None:
     late = renew(design, learned(design, rng), one(2), 9.0).learned.late
     assert late is not None
     assert (late > 0.0).tolist() == one(2).tolist()
+
+
+def test_honest_meters_with_coarse_registers_are_not_suspected_once_learned() -> None:
+    """Of 2 V: while voltages stand still rounding is off by about the same all the time, up or down."""
+    plant = make_plant(np.random.default_rng(3), customers=P, inverters=np.zeros(0, dtype=np.intp))
+    plant = replace(plant, accuracy=replace(plant.accuracy, resolution=np.full(P, 2.0 / BASE_VOLT)))
+    options = SequentialOptions(commission_s=3600.0)
+    doubt = LoadDoubt(np.full(P, 1e-4), np.full(P, 1e-4), 600.0)
+    design = sequential.design(plant, doubt=doubt, step_s=1.0, options=options)
+    every, none, rng = np.ones(P, dtype=np.bool_), np.zeros(P), np.random.default_rng(6)
+    gathered = Learning(none, np.full(P, 3600), np.full(P, 3600.0), none)
+    known = conclude(design, nothing(design), gathered, every, 0.0).learned
+    state = sequential.init(design, 0.0, known, None)
+    # The truth is 230 V everywhere, and by their own errors one meter is rounded up and the others are down.
+    off = np.where(one(4), 0.8, -0.8) / BASE_VOLT
+    for t in range(1, 65):
+        shown = 1.0 + off + JITTER * rng.normal(size=P)
+        frame = Frame(float(t), shown**2, every, 1.0, none, none, none, none, np.full(P, np.nan), none)
+        state, _, verdict = sequential.step(design, state, frame)
+        assert not verdict.suspects.any()
+        assert state.trust.trusted.all()
 
 
 def test_a_silent_meter_is_waited_for_and_holds_up_nobody() -> None:
