@@ -21,7 +21,6 @@ from gridsec.errors import FeederInvalid, GridsecError
 from service.align import Clock
 from service.api import create_api
 from service.bus import BusConfig
-from service.designs import abandon
 from service.ingest import Bus
 from service.rounds import RuntimeConfig
 from service.runtime import Runtime
@@ -75,7 +74,6 @@ async def serve(
         for name, site in load_sites(settings.feeders).items()
     }
     with ExitStack() as stack:
-        stack.callback(abandon)
         store = stack.enter_context(Store(settings.database))
         given = tuple(sites)
         stored, unloaded = _stored(sites, store)

@@ -87,7 +87,7 @@ def serve(
 
     from service import logs
     from service.app import serve as run
-    from service.designs import settle
+    from service.designs import abandon, settle
     from service.settings import settings, strangers
 
     chosen = settings(
@@ -121,7 +121,10 @@ def serve(
         if until_eof:
             _stop_at_eof(asyncio.get_running_loop(), running.stop)
 
-    asyncio.run(run(chosen, announce=announce, settled=settle))
+    try:
+        asyncio.run(run(chosen, announce=announce, settled=settle))
+    finally:
+        abandon()
 
 
 def _stop_at_eof(loop: asyncio.AbstractEventLoop, stop: Callable[[], None]) -> None:

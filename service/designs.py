@@ -96,7 +96,7 @@ def prepare(name: str, tables: dict[str, Any]) -> asyncio.Future[tuple[Site, Wat
 
 
 def abandon() -> None:
-    """End the processes of designs that are under way, since Python would wait for them at its end."""
+    """End all processes that this one has begun: Python would wait at its end for designs under way."""
     for process in multiprocessing.active_children():
         process.kill()
 

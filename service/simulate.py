@@ -16,7 +16,8 @@ from feeders.meters import BUSBAR
 from feeders.scenario import Reading, Sample, Scenario, simulate
 from service.ingest import Meters
 
-WAIT_S = 5.0
+# Beside much other work a service may pause for seconds.
+WAIT_S = 20.0
 _POLL_S = 0.0005
 
 

@@ -141,7 +141,7 @@ def test_a_busbar_that_is_not_clear(
     pandapower.to_json(net, str(tmp_path / "net.json"))
     words = ("detectable", str(tmp_path / "net.json"), "--out", str(tmp_path / "out"))
     code, _, told = run(monkeypatch, capsys, *words)
-    assert code == 1
+    assert code == 3
     assert "the busbar is not clear, candidates:" in plain(told)
     assert "--root BUS" in told
     assert not (tmp_path / "out").exists()

@@ -56,6 +56,7 @@ def coupled(
         q=rating * like.droop.q,
         tau=like.droop.tau,
         vbar=like.droop.vbar,
+        rating=rating * like.droop.rating,
     )
     return Plant(PhasedFeeder(tree), droop, like.meters, like.accuracy, loss_correction)
 

@@ -135,8 +135,11 @@ def test_processes_of_a_design_are_not_waited_for_at_the_end() -> None:
     assert worker.exitcode == -signal.SIGKILL
 
 
-def test_the_service_settles(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_service_settles_and_abandons(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     given: dict[str, Any] = {}
+    monkeypatch.setattr("service.designs.abandon", lambda: given.update(abandoned=True))
 
     async def serve(*_: object, **named: Any) -> None:
         given.update(named)
@@ -144,4 +147,4 @@ def test_the_service_settles(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
     monkeypatch.setattr("service.app.serve", serve)
     monkeypatch.setattr("service.logs.set_up", lambda *_: None)
     assert command("serve")(monkeypatch, capsys, "--feeder", FEEDER)[0] == 0
-    assert given["settled"] is settle
+    assert (given["settled"], given["abandoned"]) == (settle, True)
