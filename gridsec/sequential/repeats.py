@@ -304,17 +304,6 @@ def _kept(meters: int) -> int:
     return int(min(BLOCKS, max(1, MOST_BYTES // (BYTES * ROWS * max(meters, 1)))))
 
 
-def suspicious(memory: Memory) -> Bools:
-    """Meters that repeat themselves beyond chance, (p,).
-
-    Parameters
-    ----------
-    memory
-        From `listen`.
-    """
-    return lags(memory) > 0
-
-
 def lags(memory: Memory) -> Ints:
     """Ticks after which each meter repeats itself beyond chance, (p,): 1 for a stuck one, 0 for the others.
 

@@ -71,7 +71,7 @@ class TestRules:
         rule = law(0.0)
         assert rule.surprise[0] == 0.0
         still = np.ones((2000, 1))
-        assert not any(repeats.suspicious(memory).any() for memory in play(rule, still))
+        assert not any(repeats.lags(memory).any() for memory in play(rule, still))
 
     def test_a_run_is_evidence_exactly_from_the_surprise_on(self) -> None:
         rule, rng = law(), np.random.default_rng(1)
@@ -188,7 +188,7 @@ class TestMemory:
         for k in range(2200, 2600):
             v[k, 1] = v[k - lag, 1]
         states = play(law(meters=3), v)
-        found = [k for k, memory in enumerate(states) if repeats.suspicious(memory)[1]]
+        found = [k for k, memory in enumerate(states) if repeats.lags(memory)[1]]
         assert found
         assert 2200 + SPAN - 1 <= found[0] <= 2200 + SPAN + BLOCKS + ROWS
         assert found == list(range(found[0], 2600))
@@ -209,7 +209,7 @@ class TestMemory:
         for y in (-1.0, 0.0, 1e300, 1.0):
             memory = repeats.listen(rule, memory, np.full(3, y), np.ones(3, dtype=np.bool_))
             memory = repeats.keep(memory, np.ones(3), np.zeros(3))
-        assert not repeats.suspicious(memory).any()
+        assert not repeats.lags(memory).any()
 
 
 class TestHonestMeters:
@@ -222,7 +222,7 @@ class TestHonestMeters:
         live = np.ones(146, dtype=np.bool_)
         for row in np.rint(v / STEP) * STEP:
             memory = repeats.keep(repeats.listen(rule, memory, row**2, live), row**2, np.zeros(146))
-            assert not repeats.suspicious(memory).any()
+            assert not repeats.lags(memory).any()
         assert memory.longest.max() >= 8
 
     @pytest.mark.parametrize("share", [0.0, 0.1, 0.3])
@@ -235,7 +235,7 @@ class TestHonestMeters:
             wander[k] = wander[k - 1] * (1.0 - 1.0 / 1800.0) + steps[k]
         v = 1.0 + wander + share * 5e-4 * rng.standard_normal(steps.shape)
         states = play(law(meters=20), v)
-        assert not any(repeats.suspicious(memory).any() for memory in states)
+        assert not any(repeats.lags(memory).any() for memory in states)
         assert states[-1].longest.max() > 30
 
 
