@@ -7,7 +7,6 @@ no recording, no network of another tool, or cannot be written.
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import sys
@@ -18,10 +17,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
-from rich.markup import escape
 
 from gridsec.errors import DesignInfeasible, FeederInvalid, GridsecError, NotObservable, refuse
-from service import cli_feeders, cli_reproduce, cli_serve, cli_study, console
+from service import cli_feeders, cli_replay, cli_reproduce, cli_serve, cli_study, console
 from service.cli_plan import said
 from service.cli_serve import Endpoints
 from service.console import ADDRESS, DATABASE, FAILED, FEEDER, FILE, USAGE, Feeder, complain
@@ -31,7 +29,6 @@ from service.places import Unusable, see
 if TYPE_CHECKING:
     from feeders.campaign import Kind
     from feeders.load import Site
-    from feeders.recording import Recording
     from feeders.scenario import Scenario
     from gridsec.attack import Attack, InverterAttack
 
@@ -46,6 +43,7 @@ app = typer.Typer(
 app.add_typer(cli_feeders.app, name="feeders")
 app.command("convert")(cli_feeders.convert)
 app.add_typer(cli_study.app, name="study")
+app.command()(cli_replay.replay)
 app.command()(cli_reproduce.reproduce)
 app.command()(cli_serve.serve)
 
@@ -399,82 +397,3 @@ def _publish(
     except KeyboardInterrupt:
         pass
     console.out.print(f"{ticks} ticks of {len(site.meter_ids)} meters and the busbar published")
-
-
-# --------------------------------------------------------------------------------------------------- replay
-
-
-@app.command()
-def replay(
-    file: Annotated[Path, typer.Argument(help="A recording (Parquet).")],
-    feeder: Annotated[
-        str | None, typer.Option(help="Folder or name. [default: the one it was recorded on]")
-    ] = None,
-    clock: Annotated[
-        str,
-        typer.Option(
-            help="events: the readings tell the time; wall: the time of their arrival, as it was live."
-        ),
-    ] = "events",
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object per alarm transition.")] = False,
-) -> None:
-    """Run a recording through the same chain as the live service, and show what it would have said."""
-    from feeders.recording import RecordingInvalid, read_recording
-    from service.alarms import to_json
-    from service.align import Clock
-    from service.replay import Tally
-    from service.replay import replay as run
-
-    if clock not in set(Clock):
-        raise typer.BadParameter(f"{clock!r}; expected one of {', '.join(Clock)}", param_hint="--clock")
-    recording = read_recording(file)
-    if clock == Clock.WALL and not recording.timed:
-        raise RecordingInvalid(
-            f"{file}: no column arrival, so it does not say what was live with --clock wall"
-        )
-    site = _site_of(recording, feeder)
-    tally = Tally()
-    began: float | None = None
-    for result in run(site, recording.readings(), tally, clock=Clock(clock)):
-        began = result.report.t if began is None else began
-        for transition in result.transitions:
-            alarm = transition.alarm
-            if as_json:
-                record = {"t": transition.t, "change": str(transition.change), "alarm": to_json(alarm)}
-                print(json.dumps(record))
-            else:
-                about = escape(f"{alarm.kind} {alarm.meter or alarm.feeder}: {alarm.reason}")
-                console.out.print(f"{transition.t - began:10.1f} s  {transition.change:<12} {about}")
-    summary = console.err if as_json else console.out
-    summary.print(f"ticks:    {_counts(tally.ticks)}")
-    summary.print(f"readings: {_counts(tally.readings)}, never arrived {tally.lost}")
-    if not tally.judged:
-        complain("no tick was judged, which is no answer: whether anybody lied is not known")
-        raise typer.Exit(FAILED)
-
-
-def _site_of(recording: Recording, feeder: str | None) -> Site:
-    """The feeder that is given, or that of the recording; said if it is not quite the same."""
-    from feeders.load import load
-    from feeders.recording import RecordingInvalid
-
-    file = recording.path
-    name = feeder or recording.feeder
-    if name is None:
-        raise typer.BadParameter("the file does not say which feeder it belongs to", param_hint="--feeder")
-    try:
-        site = load(name)
-    except FeederInvalid as error:
-        if feeder is not None:
-            raise
-        where = f"{file} was recorded on {name!r}: --feeder says where its folder is"
-        raise FeederInvalid([where, *error.problems]) from error
-    if recording.feeder not in {None, site.feeder.name}:
-        raise RecordingInvalid(f"{file}: recorded on {recording.feeder}, not on {site.feeder.name}")
-    if recording.digest not in {None, site.digest}:
-        console.err.print(f"[yellow]{escape(name)} has changed since this was recorded.[/]")
-    return site
-
-
-def _counts(counts: dict[str, int]) -> str:
-    return ", ".join(f"{name} {count}" for name, count in sorted(counts.items()) if count) or "none"

@@ -39,6 +39,7 @@ def replay(
     tally: Tally,
     *,
     clock: Clock = Clock.EVENTS,
+    max_skew_s: float | None = None,
     grace_s: float | None = None,
     kept: Kept | None = None,
     distrust: Kept | None = None,
@@ -55,7 +56,7 @@ def replay(
         Filled on the way.
     clock
         Who says what time it is: the readings, or, as it was live, the wall clock by which they arrived.
-    grace_s
+    max_skew_s, grace_s
         As in `align.rules`.
     kept
         What was known of the meters when the recording began, as in `Commissioning`; None: nothing.
@@ -67,7 +68,7 @@ def replay(
     NotObservable, DesignInfeasible
         If the feeder cannot be watched.
     """
-    rules = align_rules(site, clock, grace_s=grace_s)
+    rules = align_rules(site, clock, max_skew_s=max_skew_s, grace_s=grace_s)
     book = AlarmBook(site.feeder.name)
     watch = Watch(site, rules, book, Commissioning(site, kept), Suspicions(site, distrust))
     watch.install(design(site))

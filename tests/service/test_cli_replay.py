@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import pytest
 
 from feeders.campaign import random_attacks
 from feeders.load import load
+from feeders.meters import Channel
 from feeders.recording import record
 from feeders.scenario import Scenario
 from tests.service.commands import command, plain
@@ -70,4 +72,34 @@ def test_the_clock_of_arrival_needs_its_column(day: Path, tmp_path: Path, replay
     code, told, said = replay(changed(day, tmp_path / "bare.parquet", "arrival", None), "--clock", "wall")
     assert (code, told) == (6, "")
     assert "no column arrival" in plain(said)
-    assert replay(day, "--clock", "sun")[0] == 2
+
+
+def test_what_the_service_was_told_a_replay_can_be_told(day: Path, tmp_path: Path, replay: Replay) -> None:
+    """Grace, the largest skew of a clock, and the estimator."""
+    slow = Scenario(seed=5, start=START, duration_s=10.0, channel=Channel(delay_mean_s=0.02))
+    path = record(load(FEEDER), slow, tmp_path / "slow.parquet").path
+    for reason, option in (("late", "--grace"), ("clock-off", "--max-skew")):
+        count = re.compile(rf"\b{reason} (\d+)")
+        told = [plain(replay(path, "--clock", "wall", *more)[1]) for more in ((), (option, "0.001"))]
+        usual, strict = (int(found[1]) if (found := count.search(one)) else 0 for one in told)
+        assert usual < 20
+        assert strict > 100
+    who, limits = zip(
+        *(raised(replay(day, "--json", *one)) for one in ((), ("--estimator", "exact-bank"))), strict=True
+    )
+    assert who[0] == who[1]
+    assert not limits[0] & limits[1]
+
+
+def raised(told: tuple[int, str, str]) -> tuple[set[str], set[float]]:
+    """Whom the alarms of a replay name, and the thresholds they were judged by."""
+    alarms = [json.loads(line)["alarm"] for line in told[1].splitlines()]
+    return {alarm["meter"] for alarm in alarms}, {alarm["evidence"]["threshold"] for alarm in alarms}
+
+
+def test_all_wrong_options_of_a_replay_are_told_at_once(day: Path, replay: Replay) -> None:
+    wrong = ("--clock", "sun", "--estimator", "oracle", "--max-skew", "0", "--grace", "-1")
+    code, told, said = replay(day, *wrong)
+    assert (code, told) == (2, "")
+    for option in wrong[::2]:
+        assert option in plain(said)

@@ -73,15 +73,17 @@ def test_the_live_rounds_and_a_replay_agree_to_the_last_bit(
     assert sum(tally.ticks.values()) == len(replayed)
 
 
+@pytest.mark.parametrize("asked", [{}, {"grace_s": 0.1, "max_skew_s": 1.2}], ids=["default", "strict"])
 def test_what_was_live_by_the_wall_clock_is_replayed_by_the_time_of_arrival(
-    site: Site, scenario: Scenario, tmp_path: Path
+    site: Site, scenario: Scenario, tmp_path: Path, asked: dict[str, float]
 ) -> None:
     """Grace is by the wall clock: who comes after it is late live, and in time where the readings tell it."""
     path = record(site, replace(scenario, duration_s=40.0), tmp_path / "day.parquet").path
     readings = list(read_recording(path).readings())
     clock, outlet, chance = [readings[0].arrival], Outlet(), random.Random(3)
     with Store(f"sqlite:///{tmp_path / 'gridsec.db'}") as store:
-        live = Rounds(RuntimeConfig(), store, [site], wall=lambda: clock[0], stored=lambda: None)
+        config = RuntimeConfig(**asked)
+        live = Rounds(config, store, [site], wall=lambda: clock[0], stored=lambda: None)
         live.watches[FEEDER].install(design(site))
         live.keeper.publisher = outlet
         while readings:
@@ -93,14 +95,15 @@ def test_what_was_live_by_the_wall_clock_is_replayed_by_the_time_of_arrival(
             )
         clock[0] += 1.0
         live.round([])
-    told = {}
+    told, tally = {}, Tally()
     for by in Clock:
-        run = replay(site, read_recording(path).readings(), Tally(), clock=by)
+        run = replay(site, read_recording(path).readings(), tally, clock=by, **asked)
         told[by] = [json.loads(json.dumps(to_json(one.report))) for one in run]
     count = len(told[Clock.WALL])
     assert len(outlet.estimates) >= count >= 39
     assert told[Clock.WALL] == outlet.estimates[:count]
     assert told[Clock.EVENTS] != told[Clock.WALL][: len(told[Clock.EVENTS])]
+    assert (tally.readings["clock-off"] > 0) is bool(asked)
 
 
 @pytest.mark.parametrize("arrival", [None, float("nan"), 5.0])
