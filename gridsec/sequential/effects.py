@@ -56,7 +56,7 @@ class Effects:
         """
         if self.tables is None:
             return columns(self.feeder, power, customers)
-        return np.asarray(self.tables[power is Power.REACTIVE][:, customers])
+        return self.tables[power is Power.REACTIVE].take(customers, axis=1)
 
     def along(self, power: Power, customers: Ints, weights: Floats) -> Floats:
         """What each customer's power does to the weighted sum of some customers' voltages, (N,).
@@ -70,7 +70,9 @@ class Effects:
         """
         if self.tables is None:
             return along(self.feeder, power, customers, weights)
-        return np.asarray(weights @ self.tables[power is Power.REACTIVE][self.feeder.bus[customers]])
+        table = self.tables[power is Power.REACTIVE]
+        at = np.bincount(self.feeder.bus[customers], weights=weights, minlength=len(table))
+        return np.asarray(at @ table)
 
     def at(self, places: Ints) -> Iterator[Floats]:
         """What all powers do at some places, active ones first, (k, …) each, in parts that are small.

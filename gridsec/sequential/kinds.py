@@ -453,10 +453,11 @@ def traced(traces: Traces, who: Ints, lies: Floats, variance: Floats) -> bool:
         Of them.
     """
     weight = 1.0 / (variance + (_TRACE * lies) ** 2)
+    whole = float(weight @ lies**2)
 
     def misfit(of: Floats) -> Floats:
-        power = (weight * lies) @ of / np.maximum(weight @ of**2, np.finfo(np.float64).tiny)
-        return np.asarray(weight @ (lies[:, None] - power * of) ** 2)
+        explained = ((weight * lies) @ of) ** 2 / np.maximum(weight @ of**2, np.finfo(np.float64).tiny)
+        return np.maximum(whole - explained, 0.0)
 
     same = misfit(np.ones((who.size, 1)))[0]
     most = min(_quantile(who.size - 1), same - 2.0 * np.log(2 * traces.effects.feeder.bus.size))

@@ -15,6 +15,9 @@ covariance of `gridsec.sequential.conditional` is ``S + U U^T``, hence
     C = U - S_:T Q U_T,   G = I + U_T^T Q U_T,
     w' = w + C G^-1 U_T^T Q m,   M' = M + C G^-1 C^T.
 
+At the buses of trusted meters, whose readings have variances D, ``S_TT Q = I - D Q`` leaves
+``C = D Q U_T``.
+
 References
 ----------
 Sherman, Morrison and Woodbury's identity; Mitchell and Beauchamp 1988 (spike and slab); here each customer is
@@ -27,10 +30,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import lapack
 from scipy.special import expit
 
-from gridsec.arrays import Floats, Ints, all_of
+from gridsec.arrays import Floats, Ints, all_of, submatrix
 from gridsec.network import Power
 from gridsec.sequential.bounds import FALSE_Q
 from gridsec.sequential.conditional import Fit, Judged
@@ -53,8 +56,10 @@ class Released:
         What false powers do to the trusted meters, as standard deviations; the active ones first.
     form : (l,)
         ``a_T^T Q a_T``.
-    gain : (n, 2 l)
-        C G^-1.
+    C : (n, 2 l)
+        What false powers do to every voltage beside what the meters say of it.
+    factor : (2 l, 2 l)
+        Cholesky factor of G, lower triangle.
     variance : (n,)
         Diagonal of M'.
     """
@@ -65,7 +70,8 @@ class Released:
     share: Floats
     seen: Floats
     form: Floats
-    gain: Floats
+    C: Floats
+    factor: Floats
     variance: Floats
 
     def said(self, judged: Judged) -> Floats:
@@ -77,7 +83,8 @@ class Released:
             What the fit says.
         """
         along = np.tile(self.share, 2) * (judged.weights[self.fit.trusted] @ self.seen)
-        return np.asarray(judged.w + self.gain @ along)
+        amount, _ = lapack.dpotrs(self.factor, along, lower=True)
+        return np.asarray(judged.w + self.C @ amount)
 
     def holds(self, fit: Fit, customers: Ints, sizes: Floats, judged: Judged) -> bool:
         """Whether this is about what `release` would make of the same.
@@ -124,16 +131,29 @@ def release(effects: Effects, fit: Fit, customers: Ints, sizes: Floats, judged: 
     both = np.tile(share, 2)
     G *= np.multiply.outer(both, both)
     G[np.diag_indices(both.size)] += 1.0
-    factor = cho_factor(G, lower=True, overwrite_a=True)
-    loose = fit.loose[prior.meters[at]].T @ known
+    # Symmetric: the transpose is the same in the order of LAPACK.
+    factor, failed = lapack.dpotrf(G.T, lower=True, clean=False, overwrite_a=True)
+    if failed:
+        raise np.linalg.LinAlgError("the matrix is not positive definite")
+    _conditioned(fit, U, known)
+    U *= both
     variance = fit.variance.copy()
-    # C and C G^-1 take the place of U, some rows at a time: they are large where many lie.
     for first in range(0, len(U), _ROWS):
-        rows = slice(first, first + _ROWS)
-        C = (U[rows] - prior.of_meters[rows, at] @ known - fit.loose[rows] @ loose) * both
-        U[rows] = cho_solve(factor, C.T).T
-        variance[rows] += np.einsum("ij,ij->i", U[rows], C)
-    return Released(fit, customers, sizes, share, seen, form, U, variance)
+        half, _ = lapack.dtrtrs(factor, U[first : first + _ROWS].T, lower=True)
+        variance[first : first + _ROWS] += np.einsum("ij,ij->j", half, half)
+    return Released(fit, customers, sizes, share, seen, form, U, factor, variance)
+
+
+def _conditioned(fit: Fit, U: Floats, known: Floats) -> None:
+    """Put C in the place of U, some rows at a time: they are large where many lie."""
+    prior, at = fit.prior, np.flatnonzero(fit.trusted)
+    buses, left = prior.meters[at], np.ones(len(U), dtype=np.bool_)
+    left[buses] = False
+    others, loose = np.flatnonzero(left), fit.loose[buses].T @ known
+    for first in range(0, others.size, _ROWS):
+        rows = others[first : first + _ROWS]
+        U[rows] -= submatrix(prior.of_meters, rows, at) @ known + fit.loose[rows] @ loose
+    U[buses] = fit.noise[at, None] * known
 
 
 # Rows that are worked on together.
