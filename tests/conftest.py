@@ -7,6 +7,7 @@ from collections.abc import Generator
 from fnmatch import fnmatch
 from pathlib import Path
 
+import coverage
 import hypothesis
 import pytest
 
@@ -36,14 +37,34 @@ def pytest_xdist_auto_num_workers() -> int:
     return (os.cpu_count() or 1) + 1
 
 
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Let coverage trace no other tests: that takes half as much time again."""
-    if not config.pluginmanager.hasplugin("_cov"):
-        return
-    for item in items:
-        name = item.path.relative_to(TESTS).as_posix()
-        if item.get_closest_marker("slow") or not any(fnmatch(name, one) for one in MEASURED):
-            item.add_marker("no_cover")
+@pytest.hookimpl(tryfirst=True)
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """End what pytest-cov begins in each of several processes before it knows that it is one of them.
+
+    Otherwise that goes on wherever the process's own measurement pauses, and every test is traced.
+    """
+    early = coverage.Coverage.current()
+    if early is not None and hasattr(session.config, "workerinput"):
+        early.stop()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    """Let coverage trace no other tests, nor their fixtures: that takes as much time again."""
+    measured = coverage.Coverage.current()
+    # Of tests that are marked so pytest-cov takes care.
+    if measured is None or item.get_closest_marker("no_cover") is not None or _measured(item):
+        return (yield)
+    measured.stop()
+    try:
+        return (yield)
+    finally:
+        measured.start()
+
+
+def _measured(item: pytest.Item) -> bool:
+    name = item.path.relative_to(TESTS).as_posix()
+    return item.get_closest_marker("slow") is None and any(fnmatch(name, one) for one in MEASURED)
 
 
 @pytest.hookimpl(wrapper=True)
