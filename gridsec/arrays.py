@@ -91,6 +91,17 @@ def any_of(mask: Bools | Ints | Floats) -> bool:
     return bool(np.count_nonzero(mask))
 
 
+def indices(mask: Bools | Ints) -> Ints:
+    """``np.flatnonzero(mask)``, in a third of the time where the array is small.
+
+    Parameters
+    ----------
+    mask : (n,)
+        What is looked through.
+    """
+    return mask.nonzero()[0]
+
+
 def all_of(mask: Bools) -> bool:
     """``mask.all()``, in a fifth of the time where the array is small.
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from gridsec import detect
 from gridsec.accuracy import busbar_error, reading_error
-from gridsec.arrays import Bools, Floats
+from gridsec.arrays import Bools, Floats, all_of
 from gridsec.detect import Uncertainty
 from gridsec.feeder import Feeder, corrected
 from gridsec.network import InPhases, Network, by_place, interval_bounds, loss_correction
@@ -303,22 +303,28 @@ def losses(
             three, left = corrected(feeder, p + ends * p_error, q + ends * q_error, v0, steps=max(steps, 1))
         # What is left grows with the cube of the load, so the centre says nothing about the ends.
         rest = left.max(axis=0)
-        three = np.nan_to_num(three, nan=0.0, posinf=0.0, neginf=0.0)
+        three = _finite(three, 0.0)
         moved = np.abs(three[1:] - three[0]).max(axis=0)[feeder.bus]
         once = three[0]
     else:
         # Loads on other phases, or around a loop, may lift as well as lower: no end is the worst.
         with np.errstate(all="ignore"):
             once = loss_correction(feeder, p, q, v0, steps=max(steps, 1))
-        once = np.nan_to_num(once, nan=0.0, posinf=0.0, neginf=0.0)
+        once = _finite(once, 0.0)
         moved, rest = interval_bounds(feeder, p, q, v0, p_error=p_error, q_error=q_error)
         if steps > 1:
             moved = moved + 2.0 * rest
-    rest = np.nan_to_num(rest, nan=NO_VOLTAGE, posinf=NO_VOLTAGE)
+    rest = _finite(rest, NO_VOLTAGE)
     if steps == 0:
         rest = rest + np.abs(once[feeder.bus])
         return np.zeros(once.shape), np.minimum(rest + moved, NO_VOLTAGE)
     return np.asarray(once), np.minimum(rest + moved, NO_VOLTAGE)
+
+
+def _finite(values: Floats, instead: float) -> Floats:
+    """The values, with others for those that are none; seldom there are such."""
+    finite = np.isfinite(values)
+    return values if all_of(finite) else np.where(finite, values, instead)
 
 
 def _implied(

@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.linalg import blas, lapack
 
-from gridsec.arrays import Bools, Floats, Ints, submatrix
+from gridsec.arrays import Bools, Floats, Ints, indices, submatrix
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,14 +123,14 @@ class Fit:
         """Inverse covariance of the trusted meters, zero elsewhere, (p, p)."""
         if len(self.inverse) == self.noise.size:
             return self.inverse
-        at = np.flatnonzero(self.trusted)
+        at = indices(self.trusted)
         out = np.zeros((self.noise.size, self.noise.size))
         out[np.ix_(at, at)] = self.inverse
         return out
 
     def trusting(self) -> tuple[Ints, Floats]:
         """The trusted meters, and the inverse covariance of these alone, (t,) and (t, t)."""
-        at = np.flatnonzero(self.trusted)
+        at = indices(self.trusted)
         return at, self.inverse if len(self.inverse) == at.size else submatrix(self.inverse, at, at)
 
     def total(self) -> float:
@@ -157,7 +157,7 @@ class Fit:
 
     def shrink(self) -> None:
         """Keep nothing about meters that are not trusted, where that saves much."""
-        at = np.flatnonzero(self.trusted)
+        at = indices(self.trusted)
         if at.size**2 < _MUCH * len(self.inverse) ** 2:
             self.inverse = submatrix(self.inverse, at, at)
 
@@ -218,7 +218,7 @@ def fit(prior: Prior, noise: Floats, trusted: Bools, loose: Floats | None = None
         Additional directions with their standard deviations, see `loosen`.
     """
     more = np.zeros((prior.variance.size, 0)) if loose is None else loose
-    at = np.flatnonzero(trusted)
+    at = indices(trusted)
     inverse = _between(prior, noise[at], at, more)
     invert(inverse)
     now = Fit(prior, noise, trusted.copy(), inverse.T, _whole(prior, more), more)
@@ -245,7 +245,7 @@ def misfit(  # noqa: PLR0917  # as `fit`, and what is asked
     alike : (p, k)
         Amounts by which some meters are off together, each times its standard deviation.
     """
-    at = np.flatnonzero(trusted)
+    at = indices(trusted)
     if not at.size:
         return 0.0
     more = np.zeros((prior.variance.size, 0)) if loose is None else loose
@@ -292,7 +292,7 @@ def _narrow(now: Fit, at: Ints, inverse: Floats) -> None:
     own = noise[good] * (1.0 - noise[good] * inverse.diagonal()[good])
     left = np.ones(before.size, dtype=np.bool_)
     left[buses[good]] = False
-    others = np.flatnonzero(left)
+    others = indices(left)
     for first in range(0, others.size if at.size else 0, _ROWS):
         some = others[first : first + _ROWS]
         K = submatrix(now.prior.of_meters, some, at)

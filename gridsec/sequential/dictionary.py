@@ -111,7 +111,7 @@ class Powers:
     def __init__(self, now: Fit, dictionary: Dictionary, weights: Floats, live: Bools) -> None:
         towards = dictionary.along(weights) ** 2 / np.maximum(dictionary.size, _TINY)
         self.dictionary, self.now, self.live = dictionary, now, live
-        self.index = np.argsort(-towards)[:_CANDIDATES]
+        self.index = (-towards).argsort()[:_CANDIDATES]
         self.columns = dictionary.columns(self.index)
         self.seen = self.columns[now.prior.meters]
         self.std, self.meter = dictionary.std[self.index], dictionary.meter[self.index]
@@ -147,7 +147,7 @@ class Powers:
         both = self._with_meter(judged.weights) - penalty * (1.0 + of_a_liar(liars))
         both[np.isin(self.meter, innocent)] = -np.inf
         alone[self.accused] = both[self.accused] = -np.inf
-        k, pair = int(np.argmax(alone)), int(np.argmax(both))
+        k, pair = int(alone.argmax()), int(both.argmax())
         if max(alone[k], both[pair]) <= than:
             return []
         if alone[k] >= both[pair]:

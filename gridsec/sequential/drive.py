@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, Ints, all_of, submatrix
+from gridsec.arrays import Bools, Floats, Ints, all_of, indices, submatrix
 from gridsec.errors import DesignInfeasible
 from gridsec.lure import POLICY, Lure, Transition, advance, step, transition
 from gridsec.sequential.design import SequentialDesign
@@ -82,7 +82,7 @@ def drive(  # noqa: PLR0917  # state, what drives it, and for how long
     if w is None or all_of(driven):
         return np.asarray(target + decay * (x - target)), before
     out = np.where(driven, target + decay * (x - target), x)
-    free = _prepared(design, np.flatnonzero(~driven), h, before)
+    free = _prepared(design, indices(~driven), h, before)
     # The driven ones take the mean of their way from x to out.
     held = np.where(driven, 0.5 * (x + out), 0.0)
     at = w[droop.customer[free.rows]] + design.loop[free.rows] @ held
@@ -91,6 +91,26 @@ def drive(  # noqa: PLR0917  # state, what drives it, and for how long
     except DesignInfeasible:
         out[free.rows] = advance(free.loop, x[free.rows], at, h, _PATIENT)
     return out, free
+
+
+def ahead(design: SequentialDesign, believed: Bools, h: float, before: Free | None) -> Free | None:
+    """What the next step needs if the same meters are believed then and it is as long.
+
+    The step after that at which somebody is suspected has the most to do.
+
+    Parameters
+    ----------
+    design
+        The design.
+    believed : (p,)
+        Meters that are heard and trusted.
+    h
+        Step, s.
+    before
+        What was prepared so far.
+    """
+    driven = (design.meter_of >= 0) & believed[design.meter_of]
+    return before if all_of(driven) else _prepared(design, indices(~driven), h, before)
 
 
 def _prepared(design: SequentialDesign, rows: Ints, h: float, before: Free | None) -> Free:

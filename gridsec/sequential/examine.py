@@ -84,7 +84,7 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats, hon
             continue
         here = scales[s]
         now = adapt(before, here, trust.trusted & here.enough, scales.loosened(trust.accused))
-        view = view_of(design, here, now)
+        view = view_of(design, here, judge(now, here.m))
         if design.decoder is not None:
             found[s], trust = _decoded(design, here, now, trust, s)
         else:
@@ -107,7 +107,7 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats, hon
         if s in found:
             trust, calm = _own(trust) if calm else trust, False
             now = found[s].best.fit
-            view = view_of(design, here, now)
+            view = view_of(design, here, found[s].best.judged)
             weight(design, now)
         if not calm:
             # A scale that has caught somebody and does not know enough, yet or any more, stands by it.

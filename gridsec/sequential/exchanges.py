@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gridsec.arrays import Bools, Ints, submatrix
+from gridsec.arrays import Bools, Ints, indices, submatrix
 from gridsec.sequential.dictionary import Dictionary
 from gridsec.sequential.search import Limits, Solution
 
@@ -60,7 +60,7 @@ def swaps(found: Solution, live: Bools, within: float, limits: Limits) -> list[S
         The best exchange of each accused meter for which there is one, cheapest first.
     """
     now, judged = found.fit, found.judged
-    prior, accused, out = now.prior, np.flatnonzero(live & ~now.trusted), []
+    prior, accused, out = now.prior, indices(live & ~now.trusted), []
     inside, (at, Q) = now.loose[prior.meters], now.trusting()
     for first in range(0, accused.size if at.size else 0, _COLUMNS):
         who = accused[first : first + _COLUMNS]
@@ -78,7 +78,7 @@ def swaps(found: Solution, live: Bools, within: float, limits: Limits) -> list[S
         offset = (judged.offset[who] + v * weight / pivot) / (s * precision)
         std = np.ones(now.trusted.size)
         std[who] = 1.0 / np.sqrt(precision)
-        near = np.flatnonzero((worse <= within) & (np.abs(offset) <= limits.of(std)[who]))
+        near = indices((worse <= within) & (np.abs(offset) <= limits.of(std)[who]))
         out += [Swap(int(who[k]), int(at[best[k]]), max(float(worse[k]), 0.0)) for k in near.tolist()]
     return sorted(out, key=lambda swap: swap.worse)
 
@@ -125,5 +125,5 @@ def turns(
         gain = (along + both * own / d) ** 2 / (dictionary.std[others] ** -2.0 + form + both**2 / d)
         # Of the accused itself: (u^T Q' m)^2 / (1 + u^T Q' u) with u^T Q' m = own / d, 1 + u^T Q' u = 1 / d.
         worse = np.maximum(own**2 / d - gain, 0.0)
-        out += [Swap(k, int(others[j]), float(worse[j])) for j in np.flatnonzero(worse <= within).tolist()]
+        out += [Swap(k, int(others[j]), float(worse[j])) for j in indices(worse <= within).tolist()]
     return sorted(out, key=lambda swap: swap.worse)

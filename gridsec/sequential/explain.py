@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, Ints
+from gridsec.arrays import Bools, Floats, Ints, any_of, indices
 from gridsec.network import by_place
 from gridsec.sequential import search
 from gridsec.sequential.conditional import Fit, fit, judge, misfit
@@ -109,7 +109,7 @@ class Search:
         free = None
         if found is None or self._suspected(found) > self.design.options.several:
             free = self._free(found)
-            if (free.best.trusted & self.keep).any():
+            if any_of(free.best.trusted & self.keep):
                 held = self._fit(free.best.trusted & ~self.keep)
                 found = likelier(found, Found(self._descend(held, self.keep, fresh=True)))
             else:
@@ -128,7 +128,7 @@ class Search:
         for other in self._turned(best):
             free = likelier(free, Found(other))
         if free is not None:
-            unknown = (self.owed & self._trusted(free.best)).any()
+            unknown = any_of(self.owed & self._trusted(free.best))
             better = not unknown and free.best.cost < best.cost and self._total(free.best) < self._total(best)
             first, second = (free, found) if better else (found, free)
             found = Found(first.best, (second.best.bare(), *first.others, *second.others))
@@ -147,9 +147,10 @@ class Search:
         design, trust = self.design, self.trust
         here = np.arange(design.hangs_on.shape[1]) == phase
         scales = self.scales.wider(UNMETERED * by_place(design.plant.feeder, here))
-        there = adapt(None, scales[self.s], now.trusted, self.scales.loosened(trust.accused))
+        wide = scales[self.s]
+        there = adapt(None, wide, now.trusted, self.scales.loosened(trust.accused))
         lying = Search(design, scales, self.fits, trust, self.s)
-        best = lying.likeliest(there, view_of(design, scales[self.s], there)).best
+        best = lying.likeliest(there, view_of(design, wide, judge(there, wide.m))).best
         charge = search.price(int(np.count_nonzero(self.here.enough)), 1)
         loosened = (*best.loosened, self.book.std.size + phase)
         return Explanation(best.trusted, loosened, best.charge + charge, best.cost + charge)
@@ -170,7 +171,7 @@ class Search:
         if np.count_nonzero(fresh) > _CLOSE:
             return []
         out, keep, limits = [], self.keep & self.trust.named, self._fair()
-        for j in np.flatnonzero(fresh).tolist():
+        for j in indices(fresh).tolist():
             book, one = self.book.doubtful(), np.array([j])
             other = self._descend(best.fit, keep, book, innocent=one, pairs=True, limits=limits)
             honest = self.scales[self.s].limits.of(other.judged.std)[j]
@@ -208,10 +209,11 @@ class Search:
             return []
         among = np.zeros_like(best.trusted)
         among[group] = True
-        judged = judge(fit(prior, here.noise, among, loose), here.m)
         # What these leave unexplained among themselves, all others can only add to.
-        if judged.misfit > best.cost - best.charge + 2.0 * np.log(self.design.options.like):
+        most_left = best.cost - best.charge + 2.0 * np.log(self.design.options.like)
+        if misfit(prior, here.noise, here.m, among, loose) > most_left:
             return []
+        judged = judge(fit(prior, here.noise, among, loose), here.m)
         start = among | (best.trusted & (np.abs(judged.offset) <= here.limits.of(judged.std)))
         if np.count_nonzero(here.enough & ~start) > _MUCH * most:
             return []
@@ -255,7 +257,7 @@ class Search:
         """Accused meters of one kind: they read too high, or too low, where the same loads move them."""
         accused, out = self.here.enough & ~best.trusted, []
         for sign in (accused & (best.judged.offset > 0.0), accused & (best.judged.offset < 0.0)):
-            at = np.flatnonzero(sign)
+            at = indices(sign)
             out += [at[group] for group in _linked(self._together(at)) if group.size > 1]
         return out
 
@@ -307,7 +309,7 @@ class Search:
 
         By scale; and how many meters more than amounts there are.
         """
-        at = np.flatnonzero(group)
+        at = indices(group)
         parts = _linked(self._together(at))
         alike = np.zeros((group.size, len(parts)))
         for k, part in enumerate(parts):
@@ -333,7 +335,7 @@ class Search:
         the liars are hard to find; once they are, it stands out.
         """
         each = sorted((found.best, *found.others), key=lambda one: one.cost)
-        sets = {one.trusted.tobytes(): one.trusted for one in each if not (one.trusted & self.keep).any()}
+        sets = {one.trusted.tobytes(): one.trusted for one in each if not any_of(one.trusted & self.keep)}
         return list(sets.values())[:_BESIDE]
 
     def _suspected(self, found: Found) -> int:
@@ -362,7 +364,7 @@ class Search:
     def _holds_back(self, found: Solution) -> bool:
         """Whether it would admit somebody who must stay distrusted."""
         judged, who = found.judged, self.keep & self.here.enough & ~found.trusted
-        return bool((who & (np.abs(judged.offset) < self.here.limits.of(judged.std))).any())
+        return any_of(who & (np.abs(judged.offset) < self.here.limits.of(judged.std)))
 
     def _starts(self) -> tuple[Bools, Bools]:
         """A robust fit, and the meters close to the model."""
@@ -440,17 +442,17 @@ def _beyond_chance(left: float, freedom: int) -> bool:
 def _linked(link: Bools) -> list[Ints]:
     """Connected parts of a graph of few nodes, each of which is linked to itself."""
     out, left = [], np.ones(len(link), dtype=np.bool_)
-    while left.any():
+    while any_of(left):
         part, more = link[left.argmax()], True
         while more:
             reached = link[part].any(axis=0)
-            more, part = bool((reached & ~part).any()), reached
-        out.append(np.flatnonzero(part))
+            more, part = any_of(reached & ~part), reached
+        out.append(indices(part))
         left &= ~part
     return out
 
 
 def _held(trust: Trust, s: int) -> Bools:
     """Meters that must stay distrusted: named ones, and those other scales have evidence against."""
-    other = np.delete(trust.still, s, axis=0).any(axis=0)
+    other = trust.still[:s].any(axis=0) | trust.still[s + 1 :].any(axis=0)
     return np.asarray(~trust.trusted & (other | (trust.named & trust.still[s])))

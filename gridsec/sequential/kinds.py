@@ -26,7 +26,7 @@ from functools import cache
 import numpy as np
 from scipy.special import chdtri
 
-from gridsec.arrays import Bools, Floats, Ints, all_of, any_of
+from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, indices
 from gridsec.network import Power
 from gridsec.online import Kind
 from gridsec.sequential import clocks, repeats
@@ -227,12 +227,12 @@ def describe(  # noqa: PLR0917  # what each meter says, and what the others say 
     stuck = named & (memory.stuck | (memory.run * shapes.rules.surprise >= _CALLED))
     replays = named & ~stuck & (memory.lag > 0)
     for kind, which in ((Kind.STUCK, stuck), (Kind.REPLAY, replays)):
-        for j in np.flatnonzero(which).tolist():
+        for j in indices(which).tolist():
             alone[j] = kind
     _, turn = _looks(shapes, tick, np.arange(named.size))
     due = named & ~stuck & ~replays & (turn | _turns(since, tick, shapes.every))
     for age in np.unique(tick - since[due]).tolist():
-        meters = np.flatnonzero(due & (since == tick - age))
+        meters = indices(due & (since == tick - age))
         found = _alone(shapes, memory, meters, age, variance, heard.alone)
         for j, looks in zip(meters.tolist(), found, strict=True):
             alone[j] = looks
@@ -252,7 +252,7 @@ def _turns(since: Ints, tick: int, every: int) -> Bools:
     out = np.zeros(since.size, dtype=np.bool_)
     for start in np.unique(since[since > tick - every]).tolist():
         first = (tick - start) * _FIRST
-        out[np.flatnonzero(since == start)[first : first + _FIRST]] = start >= 0
+        out[indices(since == start)[first : first + _FIRST]] = start >= 0
     return out
 
 
@@ -272,11 +272,12 @@ def _alone(  # noqa: PLR0917  # some meters, and what is known of them
 ) -> Iterator[Kind | None]:
     """What the lies of meters named at the same time look like, each by itself."""
     start = max(memory.first, memory.tick - 2 * age - 4 * _BINS)
-    code, model, _ = repeats.past(memory, meters, start, memory.kept)
+    code, model = repeats.past(memory, meters, start, memory.kept)
     lies = (code * shapes.rules.step[meters]) ** 2 - model
     found = _shapes(lies, np.sqrt(shapes.noise[meters]), age)
     numbers, turn = _looks(shapes, memory.tick, meters)
-    back = turn & (numbers % _SELDOM == 0)
+    # At the tick at which somebody is named there is enough to do.
+    back = turn & (numbers % _SELDOM == 0) & (age > 0)
     moves = _moves(shapes, meters, code)
     turns = zip(meters.tolist(), numbers.tolist(), back.tolist(), moves.tolist(), strict=True)
     for (meter, number, far, begin), lie, looks in zip(turns, lies.T, found, strict=True):
@@ -296,11 +297,11 @@ def _alone(  # noqa: PLR0917  # some meters, and what is known of them
 def _moves(shapes: Shapes, meters: Ints, code: Floats) -> Ints:
     """Since which of the readings (n, k) meters move that have been stuck before; 0 for others, (k,)."""
     out, surprise = np.zeros(meters.size, dtype=np.intp), shapes.rules.surprise[meters]
-    for k in np.flatnonzero(_longest(code) * surprise >= _CALLED).tolist():
-        heard = np.flatnonzero(np.isfinite(code[:, k]))
+    for k in indices(_longest(code) * surprise >= _CALLED).tolist():
+        heard = indices(np.isfinite(code[:, k]))
         read = code[heard, k]
-        ends = np.concatenate([[-1], np.flatnonzero(read[1:] != read[:-1]), [heard.size - 1]])
-        stuck = np.flatnonzero((np.diff(ends) - 1) * surprise[k] >= _CALLED)
+        ends = np.concatenate([[-1], indices(read[1:] != read[:-1]), [heard.size - 1]])
+        stuck = indices((np.diff(ends) - 1) * surprise[k] >= _CALLED)
         if stuck.size:
             out[k] = heard[ends[stuck[-1] + 1]] + 1
     return out
@@ -338,7 +339,7 @@ def _of_the_past(  # noqa: PLR0917  # one meter, and where to look
 
     A clock that is off, or set wrong, never makes a meter say again what it has said: that comes first.
     """
-    code, model, own = repeats.past(memory, meter, memory.first, memory.kept)
+    code, model = repeats.past(memory, meter, memory.first, memory.kept)
     same = repeats.recurring(code) * repeats.surprise(shapes.rules, memory)[meter]
     if same >= _CALLED + np.log(code.size):
         return Kind.REPLAY
@@ -346,6 +347,7 @@ def _of_the_past(  # noqa: PLR0917  # one meter, and where to look
     if before is Kind.CLOCK_SHIFT or heard < clocks.WINDOWS[0]:
         return before
     y = (code * shapes.rules.step[meter]) ** 2
+    own = repeats.own_part(memory, meter)
     lag = clocks.shifted(y, model, own, heard, 3.0 * np.sqrt(spread), spread + float(shapes.noise[meter]))
     return Kind.CLOCK_SHIFT if lag else before
 
@@ -419,12 +421,12 @@ def _ramps(n: int) -> tuple[Floats, Floats, Ints]:
 def _together(shapes: Shapes, memory: Memory, since: Ints, variance: Floats) -> Bools:
     """Named meters whose lies are one load's trace."""
     named = since >= 0
-    who = np.flatnonzero(named)
+    who = indices(named)
     if who.size < 2:  # one meter has no story to share
         return np.zeros_like(named)
     # From when all of them are named; evidence is a tick older than a name.
     start = max(memory.first, memory.kept - _EVERY, int(since.max()) - 1)
-    code, model, _ = repeats.past(memory, who, start, memory.kept)
+    code, model = repeats.past(memory, who, start, memory.kept)
     lies = (code * shapes.rules.step[who]) ** 2 - model
     heard = np.isfinite(lies).sum(axis=0)
     if not all_of(heard):
@@ -464,11 +466,12 @@ def traced(traces: Traces, who: Ints, lies: Floats, variance: Floats) -> bool:
     if most < 0.0:
         return False
     # In three phases a load lowers its own phase and moves the others either way: how much counts.
-    parts = [(misfit(part), np.abs(part).min(axis=0)) for part in traces.of(who)]
-    fits, weakest = (np.concatenate(values) for values in zip(*parts, strict=True))
-    for k in np.flatnonzero((fits <= most) & (weakest > 0.0)).tolist():
+    fits = np.concatenate([misfit(part) for part in traces.of(who)])
+    for k in indices(fits <= most).tolist():
+        felt = np.abs(traces.trace(k))
+        weakest = felt[who].min()
         # Meters beyond the same branch feel it alike: only those that feel more are counted.
-        if np.count_nonzero(np.abs(traces.trace(k)) > weakest[k] * (1.0 + _SAME)) <= 2 * who.size:
+        if weakest > 0.0 and np.count_nonzero(felt > weakest * (1.0 + _SAME)) <= 2 * who.size:
             return True
     return False
 

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gridsec.arrays import Bools, Ints, all_of, any_of
+from gridsec.arrays import Bools, Ints, all_of, any_of, indices
 from gridsec.network import Power
 from gridsec.online import Explanation
 from gridsec.sequential.curves import Curves
@@ -119,7 +119,7 @@ def _felt(design: SequentialDesign, which: Bools, heard: Bools) -> Bools:
     """Which of some inverters move the voltage of somebody who is heard, (m,)."""
     if all_of(heard) or not any_of(which):
         return which
-    out, at = which.copy(), np.flatnonzero(which)
+    out, at = which.copy(), indices(which)
     own = design.plant.droop.customer[at]
     effect = np.abs(design.effects.columns(Power.REACTIVE, own)[design.prior.meters])
     most = effect.max(axis=0, initial=0.0)
@@ -174,7 +174,7 @@ class _Rivals:
 
     def __init__(self, design: SequentialDesign, fresh: Bools, new: Bools, agrees: Bools) -> None:
         self.design, self.fresh, self.new = design, fresh, new
-        self.others = design.customers + np.flatnonzero(~agrees)
+        self.others = design.customers + indices(~agrees)
         self.within = 2.0 * float(np.log(design.options.like))
         self.out: dict[bytes, tuple[Bools, Bools, float, tuple[int, ...]]] = {}
 
@@ -216,7 +216,7 @@ class _Rivals:
             other = near[0][0].copy()
             other[swap.accused], other[swap.innocent] = False, True
             near.append((other, best.loosened, swap.worse))
-        accused = (self.design.customers + np.flatnonzero(self.new)).tolist()
+        accused = (self.design.customers + indices(self.new)).tolist()
         for turn in turns(best, self.design.book, accused, self.others, within):
             loosened = tuple(turn.innocent if k == turn.accused else k for k in best.loosened)
             near.append((near[0][0], loosened, turn.worse))

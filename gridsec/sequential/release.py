@@ -33,7 +33,7 @@ import numpy as np
 from scipy.linalg import lapack
 from scipy.special import expit
 
-from gridsec.arrays import Floats, Ints, all_of, submatrix
+from gridsec.arrays import Floats, Ints, all_of, indices, submatrix
 from gridsec.network import Power
 from gridsec.sequential.bounds import FALSE_Q
 from gridsec.sequential.conditional import Fit, Judged
@@ -146,10 +146,10 @@ def release(effects: Effects, fit: Fit, customers: Ints, sizes: Floats, judged: 
 
 def _conditioned(fit: Fit, U: Floats, known: Floats) -> None:
     """Put C in the place of U, some rows at a time: they are large where many lie."""
-    prior, at = fit.prior, np.flatnonzero(fit.trusted)
+    prior, at = fit.prior, indices(fit.trusted)
     buses, left = prior.meters[at], np.ones(len(U), dtype=np.bool_)
     left[buses] = False
-    others, loose = np.flatnonzero(left), fit.loose[buses].T @ known
+    others, loose = indices(left), fit.loose[buses].T @ known
     for first in range(0, others.size, _ROWS):
         rows = others[first : first + _ROWS]
         U[rows] -= submatrix(prior.of_meters, rows, at) @ known + fit.loose[rows] @ loose

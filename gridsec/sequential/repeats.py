@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from gridsec.arrays import Bools, Floats, Ints, all_of, any_of
+from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, indices
 
 _Codes: TypeAlias = NDArray[np.int32]
 _Hashes: TypeAlias = NDArray[np.uint32]
@@ -335,8 +335,8 @@ def unnoticed(law: Rules, lag: Ints) -> Ints:
     return np.where(lag > 0, most, 0).astype(np.intp)
 
 
-def past(memory: Memory, meter: int | Ints, start: int, stop: int) -> tuple[Floats, Floats, Floats]:
-    """Readings, in steps, models and own parts of one meter, or some, at the ticks start to stop - 1.
+def past(memory: Memory, meter: int | Ints, start: int, stop: int) -> tuple[Floats, Floats]:
+    """Readings, in steps, and models of one meter, or some, at the ticks start to stop - 1.
 
     Parameters
     ----------
@@ -349,13 +349,23 @@ def past(memory: Memory, meter: int | Ints, start: int, stop: int) -> tuple[Floa
 
     Returns
     -------
-    code, model, own : (stop - start, …)
+    code, model : (stop - start, …)
         Readings are NaN where there was none.
     """
-    code = _column(memory, "code", meter, start, stop).astype(np.float64)
-    model, own = (_column(memory, name, meter, start, stop).astype(np.float64) for name in ("model", "own"))
+    code, model = (_column(memory, name, meter, start, stop).astype(np.float64) for name in ("code", "model"))
     code[code == SILENT] = np.nan
-    return code, model, own
+    return code, model
+
+
+def own_part(memory: Memory, meter: int) -> Floats:
+    """What the own powers of a meter contributed to its models at all ticks that are kept, squared pu, (n,).
+
+    Parameters
+    ----------
+    memory, meter
+        As in `past`.
+    """
+    return _column(memory, "own", meter, memory.first, memory.kept).astype(np.float64)
 
 
 def recurring(code: Floats) -> int:
@@ -417,7 +427,7 @@ def _follow(before: Memory, now: _Codes, tick: int) -> Ints:
     if not any_of(before.lag):
         return before.lag
     lag = before.lag.copy()
-    for j in np.flatnonzero(lag).tolist():
+    for j in indices(lag).tolist():
         at = tick - int(lag[j])
         if at < before.first:
             lag[j] = 0
@@ -441,7 +451,7 @@ def _search(law: Rules, memory: Memory) -> Memory:
     with np.errstate(divide="ignore"):
         need = np.maximum(np.ceil(law.replay / _surprise(law, memory.count, memory.longest)), _FEWEST)
     ask &= need <= ROWS * BLOCKS // 2
-    wanted = np.flatnonzero(ask[meters])
+    wanted = indices(ask[meters])
     begin = memory.first + ROWS * turn
     lag = memory.lag.copy()
     for k in np.roll(wanted, -memory.tick)[:_VERIFIED].tolist():
@@ -479,7 +489,7 @@ def repeated(memory: Memory, meter: int, lag: int, most: int) -> int:
         new = np.append(_column(memory, "code", meter, start, memory.tick), new)
     old = _column(memory, "code", meter, start - lag, memory.tick - lag + 1)
     both = (new != SILENT) & (old != SILENT)
-    differ = np.flatnonzero(both & (new != old))
+    differ = indices(both & (new != old))
     return int(np.count_nonzero(both[differ[-1] + 1 if differ.size else 0 :]))
 
 

@@ -13,9 +13,9 @@ from math import ceil
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, any_of
+from gridsec.arrays import Bools, Floats, any_of, indices
 from gridsec.sequential.commission import Learned
-from gridsec.sequential.conditional import Fit, Judged, Prior, admit, drop, fit, judge
+from gridsec.sequential.conditional import Fit, Judged, Prior, admit, drop, fit
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.dictionary import Dictionary
 from gridsec.sequential.doubts import Doubts
@@ -168,15 +168,14 @@ class Scales:
         return Scales(self.design, doubts, self.window, self.learned, self.model)
 
 
-def view_of(design: SequentialDesign, here: Scale, now: Fit) -> View:
+def view_of(design: SequentialDesign, here: Scale, judged: Judged) -> View:
     """What a scale says of every meter when it rests on a fit.
 
     Parameters
     ----------
-    design, here, now
-        The design, the scale, and the fit.
+    design, here, judged
+        The design, the scale, and every meter judged by the fit.
     """
-    judged = judge(now, here.m)
     limit = here.limits.of(judged.std)
     over = here.enough & (np.abs(judged.offset) > limit)
     return View(judged, here.enough, limit, over, here.limits, design.options.lower)
@@ -204,7 +203,7 @@ def adapt(before: Fit | None, here: Scale, wanted: Bools, loose: Floats | None) 
     differs = before.trusted != wanted
     if not any_of(differs):
         return before
-    change = np.flatnonzero(differs)
+    change = indices(differs)
     if change.size * _ANEW > wanted.size or before.changes + change.size > _MOST_CHANGES:
         return fit(prior, noise, wanted, loose)
     now = before.copy()

@@ -29,7 +29,7 @@ from functools import cache, partial
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, Ints, frozen_ints, submatrix
+from gridsec.arrays import Bools, Floats, Ints, frozen_ints, indices, submatrix
 from gridsec.sequential.conditional import Fit, Judged, Move, Prior, admit, drop, follow, judge, solved
 from gridsec.sequential.dictionary import Dictionary, Powers, Step
 
@@ -158,7 +158,7 @@ def likelier(one: Found | None, other: Found) -> Found:
 # No meters.
 NOBODY = frozen_ints(np.zeros(0, dtype=np.intp))
 _MOVES_PER_METER = 4
-# Weights below this are zero to the fit, and well above where Cholesky would notice.
+# Weights up to this are zero to the fit; well above where Cholesky would notice.
 _FEATHER = 1e-6
 
 
@@ -179,7 +179,7 @@ def descend(
     Parameters
     ----------
     start
-        Where to begin; not changed unless `fresh`.
+        Where to begin; not changed unless `fresh`, and the fit of the solution where it needs no change.
     m : (p,)
         Readings minus what the model explains, squared pu.
     live : (p,)
@@ -202,7 +202,7 @@ def descend(
     barred = ~live | keep
     for j in innocent[~now.trusted[innocent]].tolist():
         admit(now, j)
-    for j in np.flatnonzero(now.trusted & ~live):
+    for j in indices(now.trusted & ~live):
         drop(now, int(j))
     judged, before = judge(now, m), now.changes
     powers = None if dictionary is None else Powers(now, dictionary, judged.weights, live)
@@ -212,7 +212,10 @@ def descend(
             break
         for step in steps:
             judged = follow(now, m, judged, step())
-    now.shrink()
+    if now.changes == start.changes:
+        now = start  # and what is kept with it
+    else:
+        now.shrink()
     if now.changes > before:
         judged = judge(now, m)  # without what rounding has left
     dropped = int(np.count_nonzero(live & ~now.trusted))
@@ -265,7 +268,7 @@ def _best(here: _Place) -> list[Step]:
     excess = np.abs(judged.offset) / here.limits.of(judged.std)
     inside = np.where(now.trusted, excess, -np.inf)
     inside[here.innocent] = -np.inf
-    worst = int(np.argmax(inside))
+    worst = int(inside.argmax())
     drops = bool(inside[worst] > 1.0)
     steps: list[Step] = [partial(_drop, now, worst, powers)] if drops else []
     if here.pairs or powers is not None:
@@ -279,7 +282,7 @@ def _best(here: _Place) -> list[Step]:
     if steps:
         return steps
     outside = np.where(now.trusted | here.barred, np.inf, excess)
-    nearest = int(np.argmin(outside))
+    nearest = int(outside.argmin())
     if outside[nearest] < 1.0:
         return [lambda: _moved(admit(now, nearest), powers)]
     return []
@@ -297,7 +300,7 @@ def _pair(here: _Place, than: float) -> tuple[tuple[int, ...], float]:
     now, weights = here.fit, here.judged.weights
     free = now.trusted.copy()
     free[here.innocent] = False
-    at = np.flatnonzero(free)
+    at = indices(free)
     if at.size > _PAIRED:
         at = np.sort(at[np.argsort(-(weights[at] ** 2) / now.Q[at, at])[:_PAIRED]])
     if at.size < 2:
@@ -353,13 +356,13 @@ def robust(prior: Prior, noise: Floats, m: Floats, live: Bools, bound: Floats) -
     (p,)
         The trusted ones.
     """
-    at: Ints = np.flatnonzero(live)
+    at: Ints = indices(live)
     trusted = np.zeros(m.size, dtype=np.bool_)
     if not at.size:
         return trusted
     d, y, limit = noise[at], m[at], bound[at] ** 2
     signal = prior.among(at)
-    rest = _residual(signal, d, y)
+    rest = _residual(signal, d, y, np.ones(at.size))
     largest = float(np.max(rest * rest / limit))
     if largest <= 1.0:
         trusted[at] = True
@@ -369,7 +372,7 @@ def robust(prior: Prior, noise: Floats, m: Floats, live: Bools, bound: Floats) -
         ratio = np.maximum(rest * rest / limit, np.finfo(np.float64).tiny)
         soft = np.sqrt(hardness * (hardness + 1.0) / ratio) - hardness
         weight = np.clip(soft, 0.0, 1.0)
-        rest = _residual(signal, d / np.maximum(weight, _FEATHER), y)
+        rest = _residual(signal, d, y, weight)
         if np.all((weight == 0.0) | (weight == 1.0)):
             break
         hardness *= _HARDER
@@ -377,8 +380,16 @@ def robust(prior: Prior, noise: Floats, m: Floats, live: Bools, bound: Floats) -
     return trusted
 
 
-def _residual(signal: Floats, noise: Floats, y: Floats) -> Floats:
-    """``y - w_hat`` of meters with covariance `signal` and their noise."""
-    whole = signal.copy(order="F")
-    whole.T.flat[:: y.size + 1] += noise
-    return np.asarray(noise * solved(whole, y))
+def _residual(signal: Floats, noise: Floats, y: Floats, weight: Floats) -> Floats:
+    """``y - w_hat`` of meters with covariance `signal`, their noise, and weights in the fit from 0 to 1."""
+    use = indices(weight > _FEATHER)
+    # Symmetric: the transpose is the same in the order of LAPACK.
+    some = submatrix(signal.T, use, use).T if use.size < y.size else signal.copy(order="F")
+    noise = noise[use] / weight[use]
+    some.T.flat[:: use.size + 1] += noise
+    amount = solved(some, y[use])
+    weights = np.zeros(y.size)
+    weights[use] = amount
+    rest = y - signal @ weights
+    rest[use] = noise * amount
+    return rest

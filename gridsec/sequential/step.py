@@ -19,7 +19,7 @@ from gridsec.sequential.conclude import Tick, conclude
 from gridsec.sequential.curves import CONFIRM, Curves, Evidence, compare
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.doubts import Doubts, doubted
-from gridsec.sequential.drive import Free, drive
+from gridsec.sequential.drive import Free, ahead, drive
 from gridsec.sequential.examine import Examined, ended, examine
 from gridsec.sequential.heard import Heard, clean, possible
 from gridsec.sequential.kinds import Kinds, describe, listen, repeated
@@ -123,7 +123,7 @@ def _answer(design: SequentialDesign, look: _Look, frame: Frame) -> tuple[Sequen
         since=frame.t if state.x is None else state.since,
         ticks=state.ticks + 1,
         x=look.x,
-        free=look.free,
+        free=_free(design, look, seen.trust, frame.t),
         lag=look.lag if seen.trust.calm else look.lag.lied_to(_lied_to(design, state.trust, seen.trust)),
         v0_squared=heard.v0_squared,
         window=window,
@@ -140,6 +140,14 @@ def _answer(design: SequentialDesign, look: _Look, frame: Frame) -> tuple[Sequen
         # Only from the next frame on: this one was judged by what was known before.
         after = _learned(design, after)
     return after, estimate, verdict
+
+
+def _free(design: SequentialDesign, look: _Look, trust: Trust, t: float) -> Free | None:
+    """What was prepared for inverters that follow no meter, for those of meters just suspected too."""
+    state = look.state
+    if state.x is None or not any_of(state.trust.trusted & ~trust.trusted):
+        return look.free
+    return ahead(design, trust.trusted & look.heard.live, t - state.t, look.free)
 
 
 def _lied_to(design: SequentialDesign, before: Trust, now: Trust) -> Bools:
