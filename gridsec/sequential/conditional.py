@@ -265,6 +265,8 @@ def solved(matrix: Floats, right: Floats) -> Floats:
     right : (k,)
         Right-hand side.
     """
+    if not right.size:
+        return right.copy()
     _, out, failed = lapack.dposv(matrix, right, lower=True, overwrite_a=True)
     if failed:
         raise np.linalg.LinAlgError("the matrix is not positive definite")

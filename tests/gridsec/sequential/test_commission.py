@@ -28,7 +28,7 @@ from gridsec.sequential.commission import (
     ripe,
     to_arrays,
 )
-from gridsec.sequential.conditional import fit
+from gridsec.sequential.conditional import fit, judge
 from gridsec.sequential.doubts import none as no_doubts
 from gridsec.sequential.loads import LoadDoubt
 from gridsec.sequential.scales import Scales, view_of
@@ -169,7 +169,8 @@ def test_an_honest_meter_not_learned_is_within_its_limit_as_seldom_as_is_said() 
     design, known, residuals = lasting_errors()
     window = empty(design.lengths, P)
     scale = Scales(design, no_doubts(design), window, known, np.zeros(P))[-1]
-    view = view_of(design, scale, fit(scale.prior, scale.noise, np.ones(P, dtype=np.bool_)))
+    everybody = fit(scale.prior, scale.noise, np.ones(P, dtype=np.bool_))
+    view = view_of(design, scale, judge(everybody, scale.m))
     Q = np.linalg.inv(scale.prior.between + np.diag(scale.noise))
     offset = Q[2] @ np.hstack([residuals[:, : 2 * P], np.diag(np.sqrt(design.white / 60))]) / Q[2, 2]
     own = np.arange(3 * P) == P + 2

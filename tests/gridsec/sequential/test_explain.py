@@ -17,7 +17,7 @@ from gridsec.network import Power, columns
 from gridsec.online import Frame
 from gridsec.plant import Plant
 from gridsec.sequential import LoadDoubt, SequentialDesign
-from gridsec.sequential.conditional import Fit, misfit
+from gridsec.sequential.conditional import Fit, judge, misfit
 from gridsec.sequential.dictionary import of_a_liar
 from gridsec.sequential.explain import Search, _linked
 from gridsec.sequential.scales import Scales, View, adapt, view_of
@@ -64,7 +64,7 @@ def prepared(design: SequentialDesign, m: Floats) -> tuple[Search, Fit, View]:
     window = push(state.window, design.lengths, m, everybody)
     scales = Scales(design, state.doubts, window, state.learned, np.zeros(m.size))
     now = adapt(None, scales[0], everybody, None)
-    view = view_of(design, scales[0], now)
+    view = view_of(design, scales[0], judge(now, scales[0].m))
     return Search(design, scales, state.fits, state.trust, 0), now, view
 
 

@@ -236,3 +236,16 @@ def test_what_is_learned_survives_where_nothing_is_ever_learned() -> None:
     learning = prepare(make_plant(np.random.default_rng(3), customers=5), commission_s=100.0)
     with pytest.raises(ValueError, match="neither learned nor being learned"):
         from_arrays(learning, to_arrays(before))
+
+
+def test_the_step_after_a_suspicion_finds_its_inverters_prepared() -> None:
+    made, street, state = calm()
+    state, _ = watch(street, made, 20, state=state)
+    prepared = []
+    for _ in range(4):
+        state, _ = watch(street, made, 1, state=state, lies={LIAR: 0.05})
+        prepared.append(state.free)
+    suspect = prepared[0]
+    assert suspect is not None
+    np.testing.assert_array_equal(suspect.rows, np.flatnonzero(made.meter_of == LIAR))
+    assert all(each is suspect for each in prepared)

@@ -154,12 +154,14 @@ class TestPhasesThatDoNotTouch:
     ) -> None:
         alone, (estimate, verdict), _ = side_by_side(lies, meshed=meshed)
         assert verdict.suspects.sum() == sum(map(len, lies))
+        # How far liars' powers are doubted is asked anew where that has changed enough, for all phases at once.
+        near = 5e-6 if any(lies) else 2e-9
         for name in ("v2", "std", "trusted"):
             expected = np.concatenate([getattr(each, name) for each, _ in alone])
-            np.testing.assert_allclose(getattr(estimate, name), expected, rtol=0, atol=2e-9)
+            np.testing.assert_allclose(getattr(estimate, name), expected, rtol=0, atol=near)
         for name in ("suspects", "score", "attack"):
             expected = np.concatenate([getattr(each, name) for _, each in alone])
-            np.testing.assert_allclose(getattr(verdict, name), expected, rtol=0, atol=2e-9)
+            np.testing.assert_allclose(getattr(verdict, name), expected, rtol=0, atol=near)
         assert verdict.kinds == tuple(kind for _, each in alone for kind in each.kinds)
         wanted = Decision.ATTACKED if verdict.suspects.any() else Decision.CLEAN
         assert verdict.decision is wanted

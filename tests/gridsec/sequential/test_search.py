@@ -100,6 +100,31 @@ def test_honest_meters_are_all_trusted_at_once() -> None:
     assert not robust(p, noise, m, np.zeros(30, dtype=bool), np.ones(30)).any()
 
 
+def test_a_fit_that_needs_no_change_is_the_solutions_own_and_another_is_left_as_it_was() -> None:
+    rng = np.random.default_rng(3)
+    _, p = street(rng, 30)
+    noise = np.full(30, 0.002**2)
+    m, live, nobody = readings(rng, p, noise), np.ones(30, dtype=bool), np.zeros(30, dtype=bool)
+    start = fit(p, noise, live)
+    assert descend(start, m, live, limits(30), keep=nobody).fit is start
+    inverse, variance = start.inverse.copy(), start.variance.copy()
+    m[[2, 9]] += 0.05
+    found = descend(start, m, live, limits(30), keep=nobody)
+    assert np.flatnonzero(~found.trusted).tolist() == [2, 9]
+    assert start.trusted.all()
+    np.testing.assert_array_equal(start.inverse, inverse)
+    np.testing.assert_array_equal(start.variance, variance)
+
+
+def test_readings_of_which_none_can_be_have_a_robust_fit_too() -> None:
+    """All weights are nothing then."""
+    rng = np.random.default_rng(6)
+    _, p = street(rng, 12)
+    for size in (0.1, 10.0, 1e4):
+        m = size * rng.choice([-1.0, 1.0], 12) * rng.uniform(1.0, 2.0, 12)
+        assert robust(p, np.full(12, 1e-8), m, np.ones(12, dtype=bool), np.full(12, 1e-5)).sum() <= 1
+
+
 def test_the_truncated_cost_is_not_higher_than_anywhere_near() -> None:
     """The robust fit minimises what it says: no change of one meter lowers it."""
     rng = np.random.default_rng(4)
