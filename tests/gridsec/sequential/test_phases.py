@@ -154,7 +154,7 @@ class TestPhasesThatDoNotTouch:
     ) -> None:
         alone, (estimate, verdict), _ = side_by_side(lies, meshed=meshed)
         assert verdict.suspects.sum() == sum(map(len, lies))
-        # How far liars' powers are doubted is asked anew where that has changed enough, for all phases at once.
+        # How much liars' powers are doubted is asked anew where it has changed enough, in all phases at once.
         near = 5e-6 if any(lies) else 2e-9
         for name in ("v2", "std", "trusted"):
             expected = np.concatenate([getattr(each, name) for each, _ in alone])
