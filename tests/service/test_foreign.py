@@ -16,6 +16,15 @@ from tests.service.commands import Run, command, plain, text_of
 run = command("study")
 
 
+@pytest.fixture(autouse=True)
+def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where converted feeders are left that nobody asked to keep."""
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(folder))
+    return folder
+
+
 def written(source: str, folder: Path) -> Path:
     """A real file of each tool."""
     if source == "my-net.json":
@@ -62,8 +71,6 @@ def test_a_study_of_another_tools_file(
 def test_without_a_folder_the_list_stays_where_it_is_said_to_be(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
-    (tmp_path / "temporary").mkdir()
     file = pgm(tmp_path / "grid.json", 9, balanced=True)
     code, told, complaint = run(monkeypatch, capsys, "redundancy", str(file))
     assert code == 0, complaint
@@ -122,8 +129,6 @@ def test_what_keeps_it_from_being_a_feeder_is_told_with_the_way_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("opendssdirect", reason="the extra `convert` is not installed")
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
-    (tmp_path / "temporary").mkdir()
     source = looped(tmp_path)
     code, _, told = run(monkeypatch, capsys, "redundancy", str(source))
     assert code == 3
