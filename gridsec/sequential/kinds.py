@@ -231,7 +231,7 @@ def describe(  # noqa: PLR0917  # what each meter says, and what the others say 
             alone[j] = kind
     _, turn = _looks(shapes, tick, np.arange(named.size))
     due = named & ~stuck & ~replays & (turn | _turns(since, tick, shapes.every))
-    for age in np.unique(tick - since[due]).tolist():
+    for age in sorted(set((tick - since[due]).tolist())):
         meters = indices(due & (since == tick - age))
         found = _alone(shapes, memory, meters, age, variance, heard.alone)
         for j, looks in zip(meters.tolist(), found, strict=True):
@@ -250,7 +250,7 @@ _FIRST = 16
 def _turns(since: Ints, tick: int, every: int) -> Bools:
     """Whose turn it is to be looked at for the first time, (p,): after so many ticks everybody has been."""
     out = np.zeros(since.size, dtype=np.bool_)
-    for start in np.unique(since[since > tick - every]).tolist():
+    for start in set(since[since > tick - every].tolist()):
         first = (tick - start) * _FIRST
         out[indices(since == start)[first : first + _FIRST]] = start >= 0
     return out
