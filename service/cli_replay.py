@@ -39,7 +39,8 @@ def replay(
 ) -> None:
     """Run a recording through the same chain as the live service, and show what it would have said.
 
-    With the options that the service had: `--estimator`, `--max-skew` and `--grace` are those of `serve`.
+    With the `--estimator`, `--max-skew` and `--grace` that the service was started with, by options or by
+    GRIDSEC_... variables: these are not read here.
     """
     from feeders.estimators import choose
     from feeders.recording import RecordingInvalid, read_recording
@@ -85,9 +86,9 @@ def _problems(clock: str, estimator: str | None, max_skew: float | None, grace: 
     out = no_choice("--clock", Clock, clock)
     out += no_choice("--estimator", ESTIMATORS, *([estimator] if estimator is not None else []))
     if max_skew is not None and not 0.0 < max_skew < float("inf"):
-        out.append(f"--max-skew is {max_skew:g}; it must be positive, and finite")
+        out.append(f"--max-skew is {max_skew:g}; it must be a positive number")
     if grace is not None and not 0.0 <= grace < float("inf"):
-        out.append(f"--grace is {grace:g}; it must not be negative, and be finite")
+        out.append(f"--grace is {grace:g}; it must be a number that is not negative")
     return out
 
 

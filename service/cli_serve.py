@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from service.app import Running
 
 Feeders = Annotated[list[str] | None, typer.Option(help="Folder or name of a feeder; may be repeated.")]
-Estimator = Annotated[str | None, typer.Option(help="See `feeders estimators`. [default: as in the file]")]
+Estimator = Annotated[str | None, typer.Option(help="See `feeders estimators`. [default: as in feeder.toml]")]
 Listen = Annotated[
     list[str] | None, typer.Option(help="zenoh endpoint to listen on. [default: tcp/127.0.0.1:7447]")
 ]
@@ -46,7 +46,8 @@ MaxSkew = Annotated[
     typer.Option(help="Refuse readings whose time is further off, s. [default: 60 or 2 ticks]"),
 ]
 Grace = Annotated[
-    float | None, typer.Option(help="How long a tick waits for readings, s. [default: half a tick]")
+    float | None,
+    typer.Option(help="How long a tick waits for readings, s. [default: half a tick, at most 60]"),
 ]
 MaxPayload = Annotated[int | None, typer.Option(help="Largest payload, bytes. [default: 262144]")]
 Queue = Annotated[int | None, typer.Option(help="Payloads that may wait. [default: 20000]")]

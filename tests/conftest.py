@@ -6,10 +6,13 @@ import os
 from collections.abc import Generator
 from fnmatch import fnmatch
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import coverage
 import hypothesis
 import pytest
+
+if TYPE_CHECKING:
+    from coverage import Coverage
 
 hypothesis.settings.register_profile(
     "repeatable",
@@ -37,34 +40,45 @@ def pytest_xdist_auto_num_workers() -> int:
     return (os.cpu_count() or 1) + 1
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Let coverage trace no slow tests: others are to cover what it is asked of."""
+    for item in items:
+        if item.get_closest_marker("slow"):
+            item.add_marker("no_cover")
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_sessionstart(session: pytest.Session) -> None:
     """End what pytest-cov begins in each of several processes before it knows that it is one of them.
 
     Otherwise that goes on wherever the process's own measurement pauses, and every test is traced.
     """
-    early = coverage.Coverage.current()
-    if early is not None and hasattr(session.config, "workerinput"):
+    if hasattr(session.config, "workerinput") and (early := _tracer(session.config)) is not None:
         early.stop()
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
-    """Let coverage trace no other tests, nor their fixtures: that takes as much time again."""
-    measured = coverage.Coverage.current()
+    """Let coverage trace no other files' tests, nor their fixtures: that takes as much time again."""
+    name, tracer = item.path.relative_to(TESTS).as_posix(), _tracer(item.config)
     # Of tests that are marked so pytest-cov takes care.
-    if measured is None or item.get_closest_marker("no_cover") is not None or _measured(item):
+    left_out = item.get_closest_marker("no_cover") is None and not any(fnmatch(name, one) for one in MEASURED)
+    if tracer is None or not left_out:
         return (yield)
-    measured.stop()
+    tracer.stop()
     try:
         return (yield)
     finally:
-        measured.start()
+        tracer.start()
 
 
-def _measured(item: pytest.Item) -> bool:
-    name = item.path.relative_to(TESTS).as_posix()
-    return item.get_closest_marker("slow") is None and any(fnmatch(name, one) for one in MEASURED)
+def _tracer(config: pytest.Config) -> Coverage | None:
+    """What pytest-cov measures with in this process; None without it."""
+    if not config.pluginmanager.hasplugin("_cov"):
+        return None
+    from coverage import Coverage
+
+    return Coverage.current()
 
 
 @pytest.hookimpl(wrapper=True)

@@ -17,6 +17,8 @@ from gridsec.network import Network, Power, along, columns
 
 # Entries of 2R and 2X together up to which both are kept: 4 MB.
 _KEPT = 1 << 19
+# Part of the rows of a table from which on none are picked.
+_SOME = 0.25
 # Columns that are made together where they are not kept.
 _PART = 256
 
@@ -70,9 +72,11 @@ class Effects:
         """
         if self.tables is None:
             return along(self.feeder, power, customers, weights)
-        table = self.tables[power is Power.REACTIVE]
-        at = np.bincount(self.feeder.bus[customers], weights=weights, minlength=len(table))
-        return np.asarray(at @ table)
+        table, at = self.tables[power is Power.REACTIVE], self.feeder.bus[customers]
+        if at.size < _SOME * len(table):
+            return np.asarray(weights @ table[at])
+        # A product with all of it costs less than picking most of it.
+        return np.asarray(np.bincount(at, weights=weights, minlength=len(table)) @ table)
 
     def at(self, places: Ints) -> Iterator[Floats]:
         """What all powers do at some places, active ones first, (k, …) each, in parts that are small.

@@ -276,8 +276,7 @@ def _alone(  # noqa: PLR0917  # some meters, and what is known of them
     lies = (code * shapes.rules.step[meters]) ** 2 - model
     found = _shapes(lies, np.sqrt(shapes.noise[meters]), age)
     numbers, turn = _looks(shapes, memory.tick, meters)
-    # At the tick at which somebody is named there is enough to do.
-    back = turn & (numbers % _SELDOM == 0) & (age > 0)
+    back = turn & (numbers % _SELDOM == 0)
     moves = _moves(shapes, meters, code)
     turns = zip(meters.tolist(), numbers.tolist(), back.tolist(), moves.tolist(), strict=True)
     for (meter, number, far, begin), lie, looks in zip(turns, lies.T, found, strict=True):
@@ -465,9 +464,9 @@ def traced(traces: Traces, who: Ints, lies: Floats, variance: Floats) -> bool:
     most = min(_quantile(who.size - 1), same - 2.0 * np.log(2 * traces.effects.feeder.bus.size))
     if most < 0.0:
         return False
-    # In three phases a load lowers its own phase and moves the others either way: how much counts.
     fits = np.concatenate([misfit(part) for part in traces.of(who)])
     for k in indices(fits <= most).tolist():
+        # In three phases a load lowers its own phase and moves the others either way: how much counts.
         felt = np.abs(traces.trace(k))
         weakest = felt[who].min()
         # Meters beyond the same branch feel it alike: only those that feel more are counted.

@@ -57,9 +57,9 @@ class Released:
     form : (l,)
         ``a_T^T Q a_T``.
     C : (n, 2 l)
-        What false powers do to every voltage beside what the meters say of it.
+        What false powers, of that part, do to every voltage beside what the meters say of it.
     factor : (2 l, 2 l)
-        Cholesky factor of G, lower triangle.
+        Cholesky factor of G, of that part too, lower triangle.
     variance : (n,)
         Diagonal of M'.
     """
@@ -145,7 +145,7 @@ def release(effects: Effects, fit: Fit, customers: Ints, sizes: Floats, judged: 
 
 
 def _conditioned(fit: Fit, U: Floats, known: Floats) -> None:
-    """Put C in the place of U, some rows at a time: they are large where many lie."""
+    """Put C of whole standard deviations in the place of U, some rows at a time: many may lie."""
     prior, at = fit.prior, indices(fit.trusted)
     buses, left = prior.meters[at], np.ones(len(U), dtype=np.bool_)
     left[buses] = False

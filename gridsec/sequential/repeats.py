@@ -495,12 +495,12 @@ def repeated(memory: Memory, meter: int, lag: int, most: int) -> int:
 
 def _column(memory: Memory, name: str, meter: int | Ints, start: int, stop: int) -> NDArray[Any]:
     """One meter's past, or some meters', at the ticks start to stop - 1, from the blocks and the tail."""
-    place = ("code", "hash", "model", "own").index(name)
+    place, one = ("code", "hash", "model", "own").index(name), isinstance(meter, int)
     begin, tail = memory.first, memory.kept - len(memory.tail)
     skip, last = (start - begin) // ROWS, (stop - 1 - begin) // ROWS
     parts = [getattr(block, name)[:, meter] for block in memory.blocks[skip : last + 1]]
     skipped = begin + ROWS * skip if parts else start
     if stop > tail:
-        rows = memory.tail[max(start - tail, 0) : stop - tail]
-        parts.append(np.array([row[place] for row in rows])[:, meter])
+        rows = [row[place] for row in memory.tail[max(start - tail, 0) : stop - tail]]
+        parts.append(np.array([row[meter] for row in rows]) if one else np.array(rows)[:, meter])
     return np.concatenate(parts)[start - skipped : stop - skipped]

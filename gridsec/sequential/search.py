@@ -212,7 +212,7 @@ def descend(
             break
         for step in steps:
             judged = follow(now, m, judged, step())
-    if now.changes == start.changes:
+    if not fresh and now.changes == start.changes:
         now = start  # and what is kept with it
     else:
         now.shrink()

@@ -143,7 +143,7 @@ def _answer(design: SequentialDesign, look: _Look, frame: Frame) -> tuple[Sequen
 
 
 def _free(design: SequentialDesign, look: _Look, trust: Trust, t: float) -> Free | None:
-    """What was prepared for inverters that follow no meter, for those of meters just suspected too."""
+    """What was prepared for inverters that follow no meter; anew where meters have just been suspected."""
     state = look.state
     if state.x is None or not any_of(state.trust.trusted & ~trust.trusted):
         return look.free

@@ -26,13 +26,19 @@ CUSTOMERS = 12
 
 
 def problem(seed: int) -> tuple[Effects, Fit, Floats]:
-    """A street, nine of whose meters are believed, one load of it loosened, and what the meters say."""
+    """A street, nine of whose meters are believed, one load of it loosened, and what the meters say.
+
+    Two of the meters are at one bus, and they err by different amounts.
+    """
     rng = np.random.default_rng(seed)
     plant = make_plant(rng, customers=CUSTOMERS, drop=0.03)
+    bus = plant.feeder.bus.copy()
+    bus[6] = bus[2]
+    plant = replace(plant, feeder=replace(plant.feeder, bus=bus))
     doubt = LoadDoubt(np.full(CUSTOMERS, 0.5 / BASE_KVA), np.full(CUSTOMERS, 0.2 / BASE_KVA), 600.0)
     every = np.arange(CUSTOMERS)
     known: Prior = prior(plant.feeder, plant.feeder.bus, doubt, busbar=1e-4, inverters=np.zeros(CUSTOMERS))
-    now = fit(known, np.full(CUSTOMERS, 1e-6), ~np.isin(every, (3, 7, 11)))
+    now = fit(known, 10.0 ** rng.uniform(-7.0, -5.0, CUSTOMERS), ~np.isin(every, (3, 7, 11)))
     effects = Effects(plant.feeder)
     loosen(now, effects.columns(Power.ACTIVE, np.array([5]))[:, 0], 0.01)
     return effects, now, rng.normal(size=CUSTOMERS) * 0.002

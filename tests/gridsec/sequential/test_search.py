@@ -116,6 +116,18 @@ def test_a_fit_that_needs_no_change_is_the_solutions_own_and_another_is_left_as_
     np.testing.assert_array_equal(start.variance, variance)
 
 
+@pytest.mark.parametrize("fresh", [True, False])
+def test_a_solution_keeps_nothing_about_the_many_that_it_accuses(fresh: bool) -> None:
+    rng = np.random.default_rng(3)
+    _, p = street(rng, 30)
+    noise, m = np.full(30, 0.002**2), np.zeros(30)
+    m[::4] = 0.05
+    start = fit(p, noise, np.ones(30, dtype=bool))
+    found = descend(start, m, m < 1.0, limits(30), keep=np.zeros(30, dtype=bool), fresh=fresh)
+    assert found.fit.inverse.shape == (22, 22)
+    assert (found.fit is start) is fresh
+
+
 def test_readings_of_which_none_can_be_have_a_robust_fit_too() -> None:
     """All weights are nothing then."""
     rng = np.random.default_rng(6)
