@@ -208,7 +208,7 @@ def test_no_recording(gridsec: Run, tmp_path: Path) -> None:
 
 
 def test_brackets_in_help_texts_are_shown(gridsec: Run) -> None:
-    assert "[default: as in the file]" in plain(gridsec("serve", "--help").stdout)
+    assert "[default: as in feeder.toml]" in plain(gridsec("serve", "--help").stdout)
     assert "A setting of [monitor]" in plain(gridsec("study", "campaign", "--help").stdout)
 
 
