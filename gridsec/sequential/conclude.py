@@ -327,8 +327,10 @@ def _reconstructed(
     if not liars.size:
         return judged.w, now.variance + after, None
     sizes, released = state.doubts.sizes[liars], state.released
-    if released is None or not released.holds(now, liars, sizes, judged):
+    if released is None or not released.about(now, liars, sizes):
         released = release(design.effects, now, liars, sizes, judged)
+    elif s in tick.seen.found or not released.holds(judged):
+        released = released.anew(judged)
     return released.said(judged), released.variance + after, released
 
 

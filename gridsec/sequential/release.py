@@ -27,7 +27,7 @@ variance. docs/theory-sequential.md, section 7.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import lapack
@@ -54,12 +54,12 @@ class Released:
         Part of the standard deviation of a false power that was reckoned with.
     seen : (t, 2 l)
         What false powers do to the trusted meters, as standard deviations; the active ones first.
-    form : (l,)
-        ``a_T^T Q a_T``.
+    gram : (2 l, 2 l)
+        U_T^T Q U_T of whole standard deviations.
     C : (n, 2 l)
-        What false powers, of that part, do to every voltage beside what the meters say of it.
+        What such false powers do to every voltage beside what the meters say of it.
     factor : (2 l, 2 l)
-        Cholesky factor of G, of that part too, lower triangle.
+        Cholesky factor of G, of the parts that were reckoned with, lower triangle.
     variance : (n,)
         Diagonal of M'.
     """
@@ -69,7 +69,7 @@ class Released:
     sizes: Floats
     share: Floats
     seen: Floats
-    form: Floats
+    gram: Floats
     C: Floats
     factor: Floats
     variance: Floats
@@ -82,23 +82,44 @@ class Released:
         judged
             What the fit says.
         """
-        along = np.tile(self.share, 2) * (judged.weights[self.fit.trusted] @ self.seen)
+        both = np.tile(self.share, 2)
+        along = both * (judged.weights[self.fit.trusted] @ self.seen)
         amount, _ = lapack.dpotrs(self.factor, along, lower=True)
-        return np.asarray(judged.w + self.C @ amount)
+        return np.asarray(judged.w + self.C @ (both * amount))
 
-    def holds(self, fit: Fit, customers: Ints, sizes: Floats, judged: Judged) -> bool:
-        """Whether this is about what `release` would make of the same.
+    def about(self, fit: Fit, customers: Ints, sizes: Floats) -> bool:
+        """Whether `release` would begin with the same, whatever the meters say.
 
         Parameters
         ----------
-        fit, customers, sizes, judged
+        fit, customers, sizes
             As there.
         """
-        if not (fit is self.fit and np.array_equal(customers, self.customers)):
-            return False
-        share = _share(self.seen[:, : self.form.size], self.form, judged.weights[self.fit.trusted])
-        same = (share <= _MORE * self.share) & (share >= _LESS * self.share)
-        return all_of(same) and np.array_equal(sizes, self.sizes)
+        same = fit is self.fit and np.array_equal(customers, self.customers)
+        return same and np.array_equal(sizes, self.sizes)
+
+    def holds(self, judged: Judged) -> bool:
+        """Whether the parts that were reckoned with are as good as those that the meters now ask for.
+
+        Parameters
+        ----------
+        judged
+            What the fit says.
+        """
+        share = _share(self.seen, self.gram, judged.weights[self.fit.trusted])
+        return all_of((share <= _MORE * self.share) & (share >= _LESS * self.share))
+
+    def anew(self, judged: Judged) -> Released:
+        """The same with the parts that the meters ask for.
+
+        Parameters
+        ----------
+        judged
+            What the fit says.
+        """
+        share = _share(self.seen, self.gram, judged.weights[self.fit.trusted])
+        factor, variance = _parts(self.fit, self.gram, self.C, share)
+        return replace(self, share=share, factor=factor, variance=variance)
 
 
 # Parts of a false power's standard deviation that are as good as one another; and the least.
@@ -125,27 +146,31 @@ def release(effects: Effects, fit: Fit, customers: Ints, sizes: Floats, judged: 
     U[:, sizes.size :] = effects.columns(Power.REACTIVE, customers) * (FALSE_Q * std)
     seen = U[prior.meters[at]]
     known = inverse @ seen
-    G = seen.T @ known
-    form = G.diagonal()[: sizes.size].copy()
-    share = _share(seen[:, : sizes.size], form, judged.weights[at])
+    gram = seen.T @ known
+    _conditioned(fit, U, known)
+    share = _share(seen, gram, judged.weights[at])
+    return Released(fit, customers, sizes, share, seen, gram, U, *_parts(fit, gram, U, share))
+
+
+def _parts(fit: Fit, gram: Floats, C: Floats, share: Floats) -> tuple[Floats, Floats]:
+    """The Cholesky factor of G and the diagonal of M' where powers are false by parts of their sizes."""
     both = np.tile(share, 2)
-    G *= np.multiply.outer(both, both)
+    G = gram * np.multiply.outer(both, both)
     G[np.diag_indices(both.size)] += 1.0
     # Symmetric: the transpose is the same in the order of LAPACK.
     factor, failed = lapack.dpotrf(G.T, lower=True, clean=False, overwrite_a=True)
     if failed:
         raise np.linalg.LinAlgError("the matrix is not positive definite")
-    _conditioned(fit, U, known)
-    U *= both
     variance = fit.variance.copy()
-    for first in range(0, len(U), _ROWS):
-        half, _ = lapack.dtrtrs(factor, U[first : first + _ROWS].T, lower=True)
-        variance[first : first + _ROWS] += np.einsum("ij,ij->j", half, half)
-    return Released(fit, customers, sizes, share, seen, form, U, factor, variance)
+    for first in range(0, len(C), _ROWS):
+        rows = slice(first, first + _ROWS)
+        half, _ = lapack.dtrtrs(factor, (C[rows] * both).T, lower=True, overwrite_b=True)
+        variance[rows] += np.einsum("ij,ij->j", half, half)
+    return factor, variance
 
 
 def _conditioned(fit: Fit, U: Floats, known: Floats) -> None:
-    """Put C of whole standard deviations in the place of U, some rows at a time: many may lie."""
+    """Put C in the place of U, some rows at a time: they are large where many lie."""
     prior, at = fit.prior, indices(fit.trusted)
     buses, left = prior.meters[at], np.ones(len(U), dtype=np.bool_)
     left[buses] = False
@@ -160,8 +185,9 @@ def _conditioned(fit: Fit, U: Floats, known: Floats) -> None:
 _ROWS = 256
 
 
-def _share(seen: Floats, form: Floats, weights: Floats) -> Floats:
+def _share(seen: Floats, gram: Floats, weights: Floats) -> Floats:
     """Root of the probability that each power is false, (l,)."""
-    along = weights @ seen
+    count = len(gram) // 2
+    form, along = gram.diagonal()[:count], weights @ seen[:, :count]
     odds = 0.5 * (along**2 / (1.0 + form) - np.log1p(form))
     return np.asarray(np.maximum(np.sqrt(expit(odds)), _LEAST))

@@ -88,11 +88,18 @@ def test_who_feels_nothing_odd_believes_again_and_the_work_is_kept() -> None:
     calm = judge(now, 0.0 * m)
     found = release(effects, now, who, size, calm)
     assert found.share[0] < 0.5
-    assert found.holds(now, who, size, judge(now, 1e-6 * m))
-    assert not found.holds(now, who, 2.0 * size, calm)
-    assert not found.holds(now.copy(), who, size, calm)
+    assert found.about(now, who, size)
+    assert found.holds(judge(now, 1e-6 * m))
+    assert not found.about(now, who, 2.0 * size)
+    assert not found.about(now, who + 1, size)
+    assert not found.about(now.copy(), who, size)
     odd = effects.columns(Power.ACTIVE, who)[now.prior.meters, 0] * 0.3
-    assert not found.holds(now, who, size, judge(now, odd))
+    asked = judge(now, odd)
+    assert not found.holds(asked)
+    again, whole = found.anew(asked), release(effects, now, who, size, asked)
+    for name in ("share", "factor", "variance"):
+        np.testing.assert_allclose(getattr(again, name), getattr(whole, name), rtol=1e-12, atol=0)
+    np.testing.assert_allclose(again.said(asked), whole.said(asked), rtol=1e-12, atol=0)
 
 
 def test_a_third_lies_about_voltages_and_powers_alike() -> None:
