@@ -422,11 +422,13 @@ def reach(feeder: Feeder, p: Floats, q: Floats) -> Floats:
 
 def _remainder(feeder: Feeder, flows: _Flows, once: _Flows) -> Floats:
     with np.errstate(all="ignore"):
-        current = (flows.P**2 + flows.charged**2) / flows.v2[..., 1:]
-        later = (once.P**2 + once.Q**2) / once.v2[..., 1:]
-        charge, change = np.abs(feeder.half * np.array([flows.v2, once.v2 - flows.v2]))
-        first = from_root(feeder, _losses(feeder, np.abs(current), charge, sign=1.0)[2])
-        second = from_root(feeder, _losses(feeder, np.abs(later - current), change, sign=1.0)[2])
+        # What the first step adds, and the second to that.
+        current, charge = np.empty((2, *flows.P.shape)), np.empty((2, *flows.v2.shape))
+        np.divide(flows.P**2 + flows.charged**2, flows.v2[..., 1:], out=current[0])
+        np.subtract((once.P**2 + once.Q**2) / once.v2[..., 1:], current[0], out=current[1])
+        charge[0], charge[1] = flows.v2, once.v2 - flows.v2
+        drop = _losses(feeder, np.abs(current), np.abs(feeder.half * charge), sign=1.0)[2]
+        first, second = from_root(feeder, drop)
         shrinks = shrinking(first, second, (-1,))
         shrinks &= np.all((flows.v2 > 0) & (once.v2 > 0), axis=-1, keepdims=True)
         bound = np.where(shrinks, 2.0 * second, np.inf)

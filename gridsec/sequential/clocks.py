@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gridsec.arrays import Floats
+from gridsec.arrays import Floats, all_of
 
 WINDOWS = (32, 128, 512)
 """So many of the last readings are looked for at other times, one of these numbers at each look."""
@@ -26,6 +26,7 @@ WINDOWS = (32, 128, 512)
 _ALIKE, _SURE = 4.0, 5.0
 # A reading belongs to the tick that it is nearest to.
 _BETWEEN = 0.5
+_TINY = float(np.finfo(np.float64).tiny)
 
 
 def shifted(y: Floats, model: Floats, own: Floats, heard: int, room: float, most: float) -> int:  # noqa: PLR0917
@@ -56,66 +57,84 @@ def shifted(y: Floats, model: Floats, own: Floats, heard: int, room: float, most
     int
         Negative where readings are ahead of their time; 0 for none.
     """
-    if np.isnan(y[-heard:]).mean() > 1.0 / _ALIKE:
+    if _ALIKE * np.count_nonzero(np.isnan(y[-heard:])) > heard:
         return 0
     y = _filled(y)
-    ways = ((y, model), (y - own, model - own))
-    left, lag, lags = np.inf, 0, 0
-    for says, other in ways:
+    left, lag, lags = np.inf, 0, 4 * (y.size - heard)
+    for says, other in ((y, model), (y - own, model - own)):
         for sign, new, old in ((1, says, other), (-1, other, says)):
-            each = _lags(new[-heard:], old, room)[1:]
-            best = int(each.argmin())
-            lags += each.size
-            if each[best] < left:
-                left, lag = float(each[best]), sign * (best + 1)
+            each = _lags(new[-heard:], old, room, most)
+            ago = int(each.argmin())
+            if each[ago] < left:
+                left, lag = float(each[ago]), sign * (ago + 1)
     if left > most:
         return 0
     # Readings that are early are the older ones: the same have to be explained by the other ways.
-    stop = y.size + min(lag, 0)
-    least = min(
-        float(y[stop - heard : stop].var()),
-        *(_in_time(says[stop - heard : stop], other[stop - heard : stop]) for says, other in ways),
-    )
-    tiny = np.finfo(np.float64).tiny
-    surprise = 0.5 * heard / _ALIKE * np.log(max(least, tiny) / max(left, tiny))
-    return lag if surprise > np.log(lags) + _SURE else 0
+    same = slice(y.size + min(lag, 0) - heard, y.size + min(lag, 0))
+    lie, models = y[same] - model[same], np.array([model[same], model[same] - own[same]])
+    most_left = max(left, _TINY) * np.exp(2.0 * _ALIKE / heard * (np.log(lags) + _SURE))
+    # What takes longest comes last.
+    if not min(float(y[same].var()), float(lie.var())) > most_left:
+        return 0
+    return lag if _in_time(lie, np.diff(models)) > most_left else 0
 
 
-def _in_time(y: Floats, model: Floats) -> float:
-    """Least mean square of readings in their own tick, about any level and slope."""
-    lie, later = y - model, np.diff(model)
-    lies = _straightened(lie)
+def _in_time(lie: Floats, later: Floats) -> float:
+    """Least mean square of readings in their own tick, about any level and slope.
+
+    `later` is how some models change from tick to tick, (k, n - 1).
+    """
+    lies, ways = _straightened(lie), _straightened(later)
     best = float(lies @ lies) / lies.size
+    size = np.maximum(np.einsum("ij,ij->i", ways, ways), _TINY)[:, None]
     # Late towards the tick before, which the oldest does not have; early towards the one after.
-    for part, way in ((lie[1:], -later), (lie[:-1], later)):
-        rest, towards = _straightened(part), _straightened(way)
-        size = max(float(towards @ towards), np.finfo(np.float64).tiny)
-        rest = rest - np.clip(float(towards @ rest) / size, 0.0, _BETWEEN) * towards
-        best = min(best, float(rest @ rest) / rest.size)
+    for part, sign in ((lie[1:], -1.0), (lie[:-1], 1.0)):
+        rest = _straightened(part)
+        amount = np.clip(sign * (ways @ rest)[:, None] / size, 0.0, _BETWEEN)
+        left = rest - sign * amount * ways
+        best = min(best, float(np.einsum("ij,ij->i", left, left).min()) / rest.size)
     return best
 
 
 def _straightened(x: Floats) -> Floats:
-    """Less its level and slope."""
-    at = np.arange(x.size) - 0.5 * (x.size - 1)
-    return np.asarray(x - x.mean() - at * (at @ x) / (at @ at))
+    """Less its level and slope; (…, n)."""
+    at = np.arange(x.shape[-1]) - 0.5 * (x.shape[-1] - 1)
+    level, slope = x.mean(axis=-1, keepdims=True), x @ at / (at @ at)
+    return np.asarray(x - level - np.multiply.outer(slope, at))
 
 
-def _lags(short: Floats, long: Floats, room: float) -> Floats:
-    """Mean square of the difference of `short` and each stretch of `long`, the newest first."""
-    n = short.size
-    level = long.mean()
+def _lags(short: Floats, long: Floats, room: float, most: float = np.inf) -> Floats:
+    """Mean square of the difference of `short` and each earlier stretch of `long`, by lag from 1.
+
+    Infinite for all where that is more than `most` by the levels alone.
+    """
+    n, level = short.size, float(long.mean())
     short, long = short - level, long - level
-    sums = np.cumsum(np.concatenate([[0.0], long]))
-    squares = np.cumsum(np.concatenate([[0.0], long**2]))
-    mean = short.mean() - (sums[n:] - sums[:-n]) / n
-    whole = (short @ short + squares[n:] - squares[:-n] - 2.0 * np.correlate(long, short, "valid")) / n
+    # The last stretch is that of no lag.
+    mean = float(short.mean()) - _sums(long, n) / n
     # About the level that is nearest to the mean and within the room.
-    return np.asarray(whole - mean**2 + np.maximum(np.abs(mean) - room, 0.0) ** 2)[::-1]
+    beyond = np.maximum(np.abs(mean) - room, 0.0)
+    if beyond.min() ** 2 > most:
+        return np.full(mean.size, np.inf)
+    whole = _sums(long * long, n) - 2.0 * np.correlate(long, short, "valid")[:-1]
+    whole += float(short @ short)
+    whole /= n
+    whole += beyond * beyond - mean * mean
+    return whole[::-1]
+
+
+def _sums(x: Floats, n: int) -> Floats:
+    """Sum of each n values that follow each other, but for the last n."""
+    sums = np.cumsum(x)
+    out = sums[n - 1 : -1].copy()
+    out[1:] -= sums[: -n - 1]
+    return out
 
 
 def _filled(y: Floats) -> Floats:
     """Missing readings repeat the one before; those at the beginning the first one."""
     there = np.isfinite(y)
+    if all_of(there):
+        return y
     last = np.maximum.accumulate(np.where(there, np.arange(y.size), 0))
     return np.where(there[last], y[last], y[there.argmax()])

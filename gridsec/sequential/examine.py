@@ -32,8 +32,8 @@ class Examined:
     ----------
     trust
         Who is believed now.
-    fits, views : (s,)
-        By scale; a view is None where the scale was not looked at.
+    fits, wholes, views : (s,)
+        By scale, as in the state; a view is None where the scale was not looked at.
     found
         The likeliest explanation that a search came to, and the others, by scale.
     busbar
@@ -43,6 +43,7 @@ class Examined:
 
     trust: Trust
     fits: tuple[Fit | None, ...]
+    wholes: tuple[Fit | None, ...]
     views: tuple[View | None, ...]
     found: dict[int, Found]
     busbar: tuple[int, int] | None = None
@@ -73,6 +74,7 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats, hon
     trust = trust if calm else _own(trust)
     views: list[View | None] = []
     after: list[Fit | None] = []
+    wholes = list(state.wholes)
     found: dict[int, Found] = {}
     scales = Scales(design, state.doubts, state.window, state.learned, model)
     for s, length in enumerate(design.lengths):
@@ -85,6 +87,7 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats, hon
         here = scales[s]
         now = adapt(before, here, trust.trusted & here.enough, scales.loosened(trust.accused))
         view = view_of(design, here, judge(now, here.m))
+        wholes[s] = _whole(wholes[s], before, now, here)
         if design.decoder is not None:
             found[s], trust = _decoded(design, here, now, trust, s)
         else:
@@ -96,11 +99,11 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats, hon
             phases = opposed(design, doubt, now, view.judged)
             phases = phases if over else _beyond(design, here, now, honest, phases)
             if over or phases:
-                search = Search(design, scales, fits, trust, s)
+                search = Search(design, scales, tuple(wholes), trust, s)
                 outcome, believed = search(now, view) if over else (search.likeliest(now, view), trust)
                 outcome, liar = _without_busbar(search, outcome, now, (doubt, honest.powers), phases)
                 if liar is not None:
-                    return Examined(state.trust, fits, (None,) * len(fits), {}, (liar, s))
+                    return Examined(state.trust, fits, state.wholes, (None,) * len(fits), {}, (liar, s))
                 # Where no meter was beyond chance nobody is suspected for what is said of the busbar.
                 if over:
                     found[s], trust = outcome, believed
@@ -116,7 +119,18 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats, hon
             trust.bad[s], trust.still[s] = view.over & ~trust.trusted, stands & ~trust.trusted
         views.append(view)
         after.append(now)
-    return Examined(trust, tuple(after), tuple(views), found)
+    return Examined(trust, tuple(after), tuple(wholes), tuple(views), found)
+
+
+# Meters up to which it is kept what all of them said: 4 MB for each scale.
+_REMEMBERED = 724
+
+
+def _whole(kept: Fit | None, before: Fit | None, now: Fit, here: Scale) -> Fit | None:
+    """What all that report say, if these are all trusted, else what is kept of that."""
+    if now is before or here.enough.size > _REMEMBERED or now.loose.shape[1]:
+        return kept
+    return kept if any_of(here.enough & ~now.trusted) else now
 
 
 def _own(trust: Trust) -> Trust:

@@ -18,6 +18,7 @@ from gridsec.sequential.conditional import Fit, fit, judge, misfit
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.dictionary import Dictionary
 from gridsec.sequential.loads import UNMETERED
+from gridsec.sequential.robust import covers, robust
 from gridsec.sequential.scales import Scales, View, adapt, believe, view_of
 from gridsec.sequential.search import Explanation, Found, Limits, Solution, likelier
 from gridsec.sequential.state import Trust
@@ -57,8 +58,8 @@ class Search:
     ----------
     design, scales
         The design, and the scales.
-    fits
-        The last fit of each scale.
+    wholes
+        What all that report said when they last were trusted, by scale; None where that is not known.
     trust
         Who is believed.
     s
@@ -69,12 +70,12 @@ class Search:
         self,
         design: SequentialDesign,
         scales: Scales,
-        fits: tuple[Fit | None, ...],
+        wholes: tuple[Fit | None, ...],
         trust: Trust,
         s: int,
     ) -> None:
         self.design, self.scales, self.book = design, scales, scales.book
-        self.fits, self.trust, self.s = fits, trust, s
+        self.wholes, self.trust, self.s = wholes, trust, s
         here = scales[s]
         sigmas = min(design.suspect, here.limits.sigmas)
         self.here = replace(here, limits=replace(here.limits, sigmas=sigmas))
@@ -149,7 +150,7 @@ class Search:
         scales = self.scales.wider(UNMETERED * by_place(design.plant.feeder, here))
         wide = scales[self.s]
         there = adapt(None, wide, now.trusted, self.scales.loosened(trust.accused))
-        lying = Search(design, scales, self.fits, trust, self.s)
+        lying = Search(design, scales, self.wholes, trust, self.s)
         best = lying.likeliest(there, view_of(design, wide, judge(there, wide.m))).best
         charge = search.price(int(np.count_nonzero(self.here.enough)), 1)
         loosened = (*best.loosened, self.book.std.size + phase)
@@ -370,7 +371,10 @@ class Search:
         """A robust fit, and the meters close to the model."""
         here, prior = self.here, self.here.prior
         focus, std = self.design.options.focus, np.sqrt(here.noise)
-        chosen = search.robust(prior, here.noise, here.m, here.enough, here.limits.model + focus * std)
+        bound, whole = here.limits.model + focus * std, self.wholes[self.s]
+        if whole is not None and not covers(whole, prior, here.noise, here.enough):
+            whole = None
+        chosen = robust(prior, here.noise, here.m, here.enough, bound, whole)
         alone = np.sqrt(prior.variance[prior.meters] + here.noise)
         return chosen, here.enough & (np.abs(here.m) <= here.limits.model + focus * alone)
 
@@ -420,7 +424,7 @@ class Search:
         trusted, out = self._trusted(found), []
         trusted = trusted if more is None else trusted | more
         loose = self.scales.loosened((*self.accused, *((k, self.s) for k in found.loosened)))
-        for s in range(len(self.fits)):
+        for s in range(len(self.design.lengths)):
             there = self.scales[s]
             if s == self.s and more is None and isinstance(found, Solution):
                 out.append(found.judged.misfit)

@@ -35,7 +35,7 @@ from gridsec.sequential.repeats import Memory, Rules
 
 # A named meter's readings are looked at every so many ticks, and every so many seconds where ticks are long.
 _EVERY, _EVERY_S = 16, 240.0
-# At every so many of these looks they are looked for in the past.
+# So many times more seldom they are looked for in the past.
 _SELDOM = 4
 # Surprise from which repetition of a meter that is named anyway is called stuck, or a replay.
 _CALLED = 12.0
@@ -229,11 +229,15 @@ def describe(  # noqa: PLR0917  # what each meter says, and what the others say 
     for kind, which in ((Kind.STUCK, stuck), (Kind.REPLAY, replays)):
         for j in indices(which).tolist():
             alone[j] = kind
-    _, turn = _looks(shapes, tick, np.arange(named.size))
-    due = named & ~stuck & ~replays & (turn | _turns(since, tick, shapes.every))
+    others, meters = named & ~stuck & ~replays, np.arange(named.size)
+    numbers, back = _backward(shapes, tick - since)
+    for j in indices(others & back).tolist():
+        window = clocks.WINDOWS[numbers[j] % len(clocks.WINDOWS)]
+        alone[j] = _of_the_past(shapes, memory, j, float(variance[j]), window, alone[j])
+    due, before = others & (_turn(shapes, tick, meters) | _turns(since, tick, shapes.every)), tuple(alone)
     for age in sorted(set((tick - since[due]).tolist())):
         meters = indices(due & (since == tick - age))
-        found = _alone(shapes, memory, meters, age, variance, heard.alone)
+        found = _alone(shapes, memory, meters, age, before)
         for j, looks in zip(meters.tolist(), found, strict=True):
             alone[j] = looks
     if new or tick % shapes.every == 0:
@@ -262,33 +266,20 @@ def _nobody(meters: int) -> tuple[Ints, tuple[Kind | None, ...], Bools]:
     return none.since, none.alone, none.told
 
 
-def _alone(  # noqa: PLR0917  # some meters, and what is known of them
-    shapes: Shapes,
-    memory: Memory,
-    meters: Ints,
-    age: int,
-    variance: Floats,
-    before: tuple[Kind | None, ...],
+def _alone(
+    shapes: Shapes, memory: Memory, meters: Ints, age: int, before: tuple[Kind | None, ...]
 ) -> Iterator[Kind | None]:
     """What the lies of meters named at the same time look like, each by itself."""
     start = max(memory.first, memory.tick - 2 * age - 4 * _BINS)
     code, model = repeats.past(memory, meters, start, memory.kept)
     lies = (code * shapes.rules.step[meters]) ** 2 - model
     found = _shapes(lies, np.sqrt(shapes.noise[meters]), age)
-    numbers, turn = _looks(shapes, memory.tick, meters)
-    back = turn & (numbers % _SELDOM == 0)
     moves = _moves(shapes, meters, code)
-    turns = zip(meters.tolist(), numbers.tolist(), back.tolist(), moves.tolist(), strict=True)
-    for (meter, number, far, begin), lie, looks in zip(turns, lies.T, found, strict=True):
+    for meter, begin, lie, looks in zip(meters.tolist(), moves.tolist(), lies.T, found, strict=True):
         # What takes a long look to see stays true when the lie rests: a drift that has arrived, a clock in
         # calm.
-        kind = before[meter]
-        # The past is long, and those that are named at once may be many: each has its turn.
-        if far and kind is not Kind.REPLAY:
-            window = clocks.WINDOWS[number // _SELDOM % len(clocks.WINDOWS)]
-            kind = _of_the_past(shapes, memory, meter, float(variance[meter]), window, kind)
-        if kind in _LASTING:
-            yield kind
+        if before[meter] in _LASTING:
+            yield before[meter]
         else:
             yield _again(shapes, meter, lie[begin:], age) if begin else looks
 
@@ -322,10 +313,21 @@ def _again(shapes: Shapes, meter: int, lie: Floats, age: int) -> Kind | None:
     return shape(lie, float(np.sqrt(shapes.noise[meter])), min(age, lie.size))
 
 
-def _looks(shapes: Shapes, tick: int, meters: Ints) -> tuple[Ints, Bools]:
-    """Number of the look at each of some meters, different for those at once, and whether it is due."""
-    look, early = np.divmod(tick + meters % _PARTS * -(-shapes.every // _PARTS), shapes.every)
-    return look + meters // _PARTS, early == 0
+def _turn(shapes: Shapes, tick: int, meters: Ints) -> Bools:
+    """Which of some meters are looked at again."""
+    early = (tick + meters % _PARTS * -(-shapes.every // _PARTS)) % shapes.every
+    return np.asarray(early == 0)
+
+
+def _backward(shapes: Shapes, age: Ints) -> tuple[Ints, Bools]:
+    """Number of the look at the past of each meter, named so many ticks ago, and whose turn it is; (p,) each.
+
+    A past is long, and each takes its own time: of those named at once each has another turn, or number, and
+    none has its turn at that tick, which has the most to do.
+    """
+    meters = np.arange(age.size)
+    number, early = np.divmod(age - 1 - meters, shapes.every * _SELDOM)
+    return number, (early == 0) & (age > 0)
 
 
 _LASTING = (Kind.REPLAY, Kind.CLOCK_SHIFT, Kind.DRIFT)
@@ -338,6 +340,8 @@ def _of_the_past(  # noqa: PLR0917  # one meter, and where to look
 
     A clock that is off, or set wrong, never makes a meter say again what it has said: that comes first.
     """
+    if before is Kind.REPLAY:
+        return before
     code, model = repeats.past(memory, meter, memory.first, memory.kept)
     same = repeats.recurring(code) * repeats.surprise(shapes.rules, memory)[meter]
     if same >= _CALLED + np.log(code.size):

@@ -122,7 +122,7 @@ class Scales:
         model: Floats,
     ) -> None:
         self.design, self.doubts, self.window, self.model = design, doubts, window, model
-        self.learned = learned
+        self.learned, self.made = learned, dict[int, Scale]()
 
     @cached_property
     def book(self) -> Dictionary:
@@ -130,6 +130,11 @@ class Scales:
         return replace(self.design.book, std=self.doubts.sizes)
 
     def __getitem__(self, s: int) -> Scale:
+        if s not in self.made:
+            self.made[s] = self._scale(s)
+        return self.made[s]
+
+    def _scale(self, s: int) -> Scale:
         design, counts, learned = self.design, self.window.counts[s], self.learned
         need = needed(design, s)
         return Scale(

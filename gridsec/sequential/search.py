@@ -13,13 +13,11 @@ Dropping trusted meter j lowers the misfit by ``offset_j^2 / std_j^2`` exactly, 
 refitting. It drops and admits where an offset is beyond, or back within, what chance explains.
 
 Descent alone swamps when many lie in the same way: their neighbours look wrong. So there are two starts:
-the set that was trusted before, and a robust one by graduated non-convexity, which first fits with a convex
-cost and hardens it step by step. The cheaper explanation wins.
+the set that was trusted before, and a robust one (`gridsec.sequential.robust`). The cheaper explanation wins.
 
 References
 ----------
-Chen and Chen 2008 (the prior over sets); Yang, Antonante, Tzoumas and Carlone 2020 (graduated
-non-convexity, truncated least squares).
+Chen and Chen 2008 (the prior over sets).
 """
 
 from __future__ import annotations
@@ -30,7 +28,7 @@ from functools import cache, partial
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, frozen_ints, indices, submatrix
-from gridsec.sequential.conditional import Fit, Judged, Move, Prior, admit, drop, follow, judge, solved
+from gridsec.sequential.conditional import Fit, Judged, Move, admit, drop, follow, judge
 from gridsec.sequential.dictionary import Dictionary, Powers, Step
 
 
@@ -158,8 +156,6 @@ def likelier(one: Found | None, other: Found) -> Found:
 # No meters.
 NOBODY = frozen_ints(np.zeros(0, dtype=np.intp))
 _MOVES_PER_METER = 4
-# Weights up to this are zero to the fit; well above where Cholesky would notice.
-_FEATHER = 1e-6
 
 
 def descend(
@@ -329,67 +325,3 @@ def _drop(now: Fit, j: int, powers: Powers | None) -> Move:
 
 def _moved(move: Move, powers: Powers | None) -> Move:
     return move if powers is None else powers.follow(move)
-
-
-_HARDER = 2.5
-_ROUNDS = 30
-
-
-def robust(prior: Prior, noise: Floats, m: Floats, live: Bools, bound: Floats) -> Bools:
-    """Meters that a robust fit trusts, whatever was trusted before; O(p^3).
-
-    Minimises ``w^T S^-1 w + sum_j min((m_j - w_j)^2, bound_j^2) / d_j`` by graduated non-convexity.
-
-    Parameters
-    ----------
-    prior, noise
-        As in `conditional.fit`.
-    m : (p,)
-        Readings minus what the model explains.
-    live : (p,)
-        Which meters have a reading.
-    bound : (p,)
-        Largest honest difference between a reading and the truth, squared pu.
-
-    Returns
-    -------
-    (p,)
-        The trusted ones.
-    """
-    at: Ints = indices(live)
-    trusted = np.zeros(m.size, dtype=np.bool_)
-    if not at.size:
-        return trusted
-    d, y, limit = noise[at], m[at], bound[at] ** 2
-    signal = prior.among(at)
-    rest = _residual(signal, d, y, np.ones(at.size))
-    largest = float(np.max(rest * rest / limit))
-    if largest <= 1.0:
-        trusted[at] = True
-        return trusted
-    hardness = 1.0 / (2.0 * largest - 1.0)
-    for _ in range(_ROUNDS):
-        ratio = np.maximum(rest * rest / limit, np.finfo(np.float64).tiny)
-        soft = np.sqrt(hardness * (hardness + 1.0) / ratio) - hardness
-        weight = np.clip(soft, 0.0, 1.0)
-        rest = _residual(signal, d, y, weight)
-        if np.all((weight == 0.0) | (weight == 1.0)):
-            break
-        hardness *= _HARDER
-    trusted[at] = rest * rest <= limit
-    return trusted
-
-
-def _residual(signal: Floats, noise: Floats, y: Floats, weight: Floats) -> Floats:
-    """``y - w_hat`` of meters with covariance `signal`, their noise, and weights in the fit from 0 to 1."""
-    use = indices(weight > _FEATHER)
-    # Symmetric: the transpose is the same in the order of LAPACK.
-    some = submatrix(signal.T, use, use).T if use.size < y.size else signal.copy(order="F")
-    noise = noise[use] / weight[use]
-    some.T.flat[:: use.size + 1] += noise
-    amount = solved(some, y[use])
-    weights = np.zeros(y.size)
-    weights[use] = amount
-    rest = y - signal @ weights
-    rest[use] = noise * amount
-    return rest

@@ -112,6 +112,8 @@ class SequentialState:
         Who is believed.
     fits : (s,)
         What the trusted meters say on each scale; None where no meter can be judged yet.
+    wholes : (s,)
+        What all that reported said when they last were trusted; None where that is not kept.
     released
         What they say where the powers of the others are not believed; None where all are.
     doubts
@@ -144,6 +146,7 @@ class SequentialState:
     window: Window
     trust: Trust
     fits: tuple[Fit | None, ...]
+    wholes: tuple[Fit | None, ...]
     released: Released | None
     doubts: Doubts
     learning: Learning | None
@@ -206,6 +209,7 @@ def init(
             np.zeros(m, dtype=np.bool_),
         ),
         fits=(None,) * s,
+        wholes=(None,) * s,
         released=None,
         doubts=no_doubts(design),
         learning=known.learning,

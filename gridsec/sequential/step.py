@@ -129,6 +129,7 @@ def _answer(design: SequentialDesign, look: _Look, frame: Frame) -> tuple[Sequen
         window=window,
         trust=seen.trust,
         fits=seen.fits,
+        wholes=seen.wholes,
         doubts=look.doubts,
         curves=_curves(design, look, frame, seen),
         kinds=_kinds(design, state, look.kinds, seen, window, v2, own),

@@ -65,7 +65,7 @@ def prepared(design: SequentialDesign, m: Floats) -> tuple[Search, Fit, View]:
     scales = Scales(design, state.doubts, window, state.learned, np.zeros(m.size))
     now = adapt(None, scales[0], everybody, None)
     view = view_of(design, scales[0], judge(now, scales[0].m))
-    return Search(design, scales, state.fits, state.trust, 0), now, view
+    return Search(design, scales, state.wholes, state.trust, 0), now, view
 
 
 def cost(design: SequentialDesign, m: Floats, liars: Bools, loosened: tuple[int, ...] = ()) -> float:

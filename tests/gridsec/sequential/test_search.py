@@ -15,7 +15,8 @@ from gridsec.sequential.conditional import Prior, fit, judge
 from gridsec.sequential.dictionary import Dictionary
 from gridsec.sequential.exchanges import swaps
 from gridsec.sequential.loads import LoadDoubt, prior
-from gridsec.sequential.search import Limits, descend, price, robust
+from gridsec.sequential.robust import robust
+from gridsec.sequential.search import Limits, descend, price
 from tests.gridsec.street import random_tree
 
 SIGMAS = 3.5
