@@ -26,7 +26,6 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of
 from gridsec.frames import busbar_errors
-from gridsec.network import Power
 from gridsec.sequential.bounds import Powers
 from gridsec.sequential.conditional import Fit, Judged
 from gridsec.sequential.design import SequentialDesign
@@ -181,11 +180,10 @@ def aligned(  # who says what, and how far that may be off
     plant, (at, Q) = design.plant, now.trusting()
     v = Q @ design.hangs_on[at] / np.maximum(weight(design, now), np.finfo(np.float64).tiny)
     injected = plant.droop.per_customer(honest.injected, design.customers)
-    errors = honest.powers.errors(plant, injected)
+    errors = np.concatenate(honest.powers.errors(plant, injected))
     room = np.abs(v).T @ (fixed + design.sigmas[0] * np.sqrt(design.white))[at]
     for k, one in enumerate(v.T):
-        for power, error in zip(Power, errors, strict=True):
-            room[k] += np.abs(design.effects.along(power, plant.meters[at], one)) @ error
+        room[k] += np.abs(design.effects.along(plant.meters[at], one)) @ errors
     return np.abs(m[at] @ v) <= room + busbar_errors(plant, honest.powers.v0_squared, design.sigmas[0])
 
 

@@ -171,6 +171,10 @@ class Fit:
             self.variance.copy(),
             self.loose,
             self.changes,
+            self.pivot,
+            self.std,
+            self.together,
+            self.left,
         )
 
 

@@ -417,17 +417,13 @@ def _suspicions(plant: Plant, effects: Effects, options: SequentialOptions) -> D
     """Columns of 2R for the customers' active powers, and of 2X for the inverters."""
     feeder, meters, owner = plant.feeder, plant.meters, plant.droop.customer
     customers = feeder.bus.size
-    of = np.concatenate([np.arange(customers), owner])
+    of = np.concatenate([np.arange(customers), customers + owner])
 
     def changes(which: Ints) -> Floats:
-        out = np.empty((len(feeder.buses), which.size))
-        for power, some in ((Power.ACTIVE, which < customers), (Power.REACTIVE, which >= customers)):
-            out[:, some] = effects.columns(power, of[which[some]])
-        return out
+        return effects.of(of[which])
 
     def towards(weights: Floats) -> Floats:
-        load = effects.along(Power.ACTIVE, meters, weights)
-        return np.concatenate([load, effects.along(Power.REACTIVE, meters, weights)[owner]])
+        return np.asarray(effects.along(meters, weights)[of])
 
     load, injection = (sizes(feeder, power, meters) for power in Power)
     return Dictionary(

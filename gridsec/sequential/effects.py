@@ -27,24 +27,24 @@ _PART = 256
 class Effects:
     """Changes of the squared voltages per customer's power. N customers, n places.
 
+    Powers have numbers: the active ones come first, customer by customer, then the reactive ones.
+
     Attributes
     ----------
     feeder
         The feeder.
-    tables
-        Derived. 2R and 2X, (n, N) each, where they are small enough to be kept; else None.
+    table
+        Derived. 2R and 2X side by side, (n, 2 N), where they are small enough to be kept; else None.
     """
 
     feeder: Network
-    tables: tuple[Floats, Floats] | None = field(init=False, repr=False)
+    table: Floats | None = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        customers, tables = self.feeder.bus.size, None
-        if 2 * len(self.feeder.buses) * customers <= _KEPT:
-            every = np.arange(customers)
-            active, reactive = (frozen(columns(self.feeder, power, every)) for power in Power)
-            tables = active, reactive
-        object.__setattr__(self, "tables", tables)
+        table, every = None, np.arange(self.feeder.bus.size)
+        if 2 * len(self.feeder.buses) * every.size <= _KEPT:
+            table = frozen(np.hstack([columns(self.feeder, power, every) for power in Power]))
+        object.__setattr__(self, "table", table)
 
     def columns(self, power: Power, customers: Ints) -> Floats:
         """What some customers' powers do at every place, (n, k).
@@ -56,38 +56,51 @@ class Effects:
         customers : (k,)
             The customers.
         """
-        if self.tables is None:
+        if self.table is None:
             return columns(self.feeder, power, customers)
-        return self.tables[power is Power.REACTIVE].take(customers, axis=1)
+        return self.table.take(customers + self.feeder.bus.size * (power is Power.REACTIVE), axis=1)
 
-    def along(self, power: Power, customers: Ints, weights: Floats) -> Floats:
-        """What each customer's power does to the weighted sum of some customers' voltages, (N,).
+    def of(self, which: Ints) -> Floats:
+        """The same of some powers by their numbers, (n, k).
 
         Parameters
         ----------
-        power
-            Which power.
+        which : (k,)
+            The numbers.
+        """
+        if self.table is not None:
+            return self.table.take(which, axis=1)
+        count, out = self.feeder.bus.size, np.empty((len(self.feeder.buses), which.size))
+        for power, some in ((Power.ACTIVE, which < count), (Power.REACTIVE, which >= count)):
+            out[:, some] = columns(self.feeder, power, which[some] % count)
+        return out
+
+    def along(self, customers: Ints, weights: Floats) -> Floats:
+        """What each power does to the weighted sum of some customers' voltages, (2 N,).
+
+        Parameters
+        ----------
         customers, weights : (p,)
             The customers whose voltages are summed, each once, and their weights.
         """
-        if self.tables is None:
-            return along(self.feeder, power, customers, weights)
-        table, at = self.tables[power is Power.REACTIVE], self.feeder.bus[customers]
-        if at.size < _SOME * len(table):
-            return np.asarray(weights @ table[at])
+        if self.table is None:
+            return np.concatenate([along(self.feeder, power, customers, weights) for power in Power])
+        at = self.feeder.bus[customers]
+        if at.size < _SOME * len(self.table):
+            return np.asarray(weights @ self.table[at])
         # A product with all of it costs less than picking most of it.
-        return np.asarray(np.bincount(at, weights=weights, minlength=len(table)) @ table)
+        return np.asarray(np.bincount(at, weights=weights, minlength=len(self.table)) @ self.table)
 
     def at(self, places: Ints) -> Iterator[Floats]:
-        """What all powers do at some places, active ones first, (k, …) each, in parts that are small.
+        """What all powers do at some places, by number, (k, …) each, in parts that are small.
 
         Parameters
         ----------
         places : (k,)
             The places.
         """
-        if self.tables is not None:
-            yield from (table[places] for table in self.tables)
+        if self.table is not None:
+            yield self.table[places]
             return
         every = np.arange(self.feeder.bus.size)
         for power in Power:

@@ -14,7 +14,7 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, Ints, any_of, indices
 from gridsec.network import by_place
 from gridsec.sequential import search
-from gridsec.sequential.conditional import Fit, fit, judge, misfit
+from gridsec.sequential.conditional import Fit, Judged, fit, judge, misfit
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.dictionary import Dictionary
 from gridsec.sequential.loads import UNMETERED
@@ -106,7 +106,8 @@ class Search:
         """
         start = now if len(self.accused) == len(self.trust.accused) else self._fit(now.trusted)
         few = np.count_nonzero(view.over & now.trusted) <= _FEW
-        found = Found(self._descend(start, self.keep)) if few else None
+        judged = view.judged if start is now else None
+        found = Found(self._descend(start, self.keep, judged=judged)) if few else None
         free = None
         if found is None or self._suspected(found) > self.design.options.several:
             free = self._free(found)
@@ -116,7 +117,7 @@ class Search:
             else:
                 found, free = likelier(found, free), None
         if few and self._suspected(found) > 0:
-            found = likelier(found, Found(self._descend(start, self.keep, self.book)))
+            found = likelier(found, Found(self._descend(start, self.keep, self.book, judged=judged)))
             if self._suspected(found) <= _CLOSE:
                 nobody, all_ = np.zeros_like(self.keep), self._fit(self.here.enough)
                 close = self._descend(all_, nobody, self.book, pairs=True, fresh=True)
@@ -388,6 +389,7 @@ class Search:
         pairs: bool = False,
         limits: Limits | None = None,
         fresh: bool = False,
+        judged: Judged | None = None,
     ) -> Solution:
         here = self.here
         return search.descend(
@@ -400,6 +402,7 @@ class Search:
             innocent=innocent,
             pairs=pairs,
             fresh=fresh,
+            judged=judged,
         )
 
     def _fit(self, trusted: Bools) -> Fit:

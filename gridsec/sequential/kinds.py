@@ -27,7 +27,6 @@ import numpy as np
 from scipy.special import chdtri
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, indices
-from gridsec.network import Power
 from gridsec.online import Kind
 from gridsec.sequential import clocks, repeats
 from gridsec.sequential.effects import Effects
@@ -72,9 +71,7 @@ class Traces:
 
     def trace(self, which: int) -> Floats:
         """One of them, (p,)."""
-        customers = self.effects.feeder.bus.size
-        power = Power.ACTIVE if which < customers else Power.REACTIVE
-        return np.asarray(self.effects.columns(power, np.array([which % customers]))[self.at, 0])
+        return np.asarray(self.effects.of(np.array([which]))[self.at, 0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

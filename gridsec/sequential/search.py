@@ -169,6 +169,7 @@ def descend(
     innocent: Ints = NOBODY,
     pairs: bool = False,
     fresh: bool = False,
+    judged: Judged | None = None,
 ) -> Solution:
     """Drop, admit and loosen until no move makes the explanation better.
 
@@ -193,14 +194,18 @@ def descend(
         dropping either of them gains little; O(p^2) per move.
     fresh
         `start` is of no further use.
+    judged
+        Every meter judged by `start`, where that is known.
     """
-    now = start if fresh else start.copy()
+    now, changed = start if fresh else start.copy(), start.changes
     barred = ~live | keep
     for j in innocent[~now.trusted[innocent]].tolist():
         admit(now, j)
     for j in indices(now.trusted & ~live):
         drop(now, int(j))
-    judged, before = judge(now, m), now.changes
+    if judged is None or now.changes != changed:
+        judged = judge(now, m)
+    before = now.changes
     powers = None if dictionary is None else Powers(now, dictionary, judged.weights, live)
     for _ in range(_MOVES_PER_METER * m.size):
         steps = _best(_Place(now, judged, limits, barred, innocent, pairs, powers))
