@@ -320,11 +320,11 @@ def _backward(shapes: Shapes, age: Ints) -> tuple[Ints, Bools]:
     """Number of the look at the past of each meter, named so many ticks ago, and whose turn it is; (p,) each.
 
     A past is long, and each takes its own time: of those named at once each has another turn, or number, and
-    none has its turn at that tick, which has the most to do.
+    none has its turn at that tick, which has the most to do. Where ticks are long there is time for all.
     """
-    meters = np.arange(age.size)
-    number, early = np.divmod(age - 1 - meters, shapes.every * _SELDOM)
-    return number, (early == 0) & (age > 0)
+    spared = min(shapes.every - 1, 1)
+    number, early = np.divmod(age - spared - np.arange(age.size), shapes.every * _SELDOM)
+    return number, (early == 0) & (age >= spared)
 
 
 _LASTING = (Kind.REPLAY, Kind.CLOCK_SHIFT, Kind.DRIFT)
