@@ -423,7 +423,7 @@ def reach(feeder: Feeder, p: Floats, q: Floats) -> Floats:
 def _remainder(feeder: Feeder, flows: _Flows, once: _Flows) -> Floats:
     with np.errstate(all="ignore"):
         # What the first step adds, and the second to that.
-        current, charge = np.empty((2, *flows.P.shape)), np.empty((2, *flows.v2.shape))
+        current, charge = np.empty((2, *flows.v2[..., 1:].shape)), np.empty((2, *flows.v2.shape))
         np.divide(flows.P**2 + flows.charged**2, flows.v2[..., 1:], out=current[0])
         np.subtract((once.P**2 + once.Q**2) / once.v2[..., 1:], current[0], out=current[1])
         charge[0], charge[1] = flows.v2, once.v2 - flows.v2

@@ -18,6 +18,7 @@ from gridsec.sequential.conditional import Fit, Prior, drop, judge
 from gridsec.sequential.decoder import Accused, Evidence
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.explain import Search
+from gridsec.sequential.robust import covers
 from gridsec.sequential.scales import Scale, Scales, View, adapt, believe, view_of
 from gridsec.sequential.search import Explanation, Found, Solution
 from gridsec.sequential.state import SequentialState, Trust
@@ -87,10 +88,10 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats, hon
         here = scales[s]
         now = adapt(before, here, trust.trusted & here.enough, scales.loosened(trust.accused))
         view = view_of(design, here, judge(now, here.m))
-        wholes[s] = _whole(wholes[s], before, now, here)
         if design.decoder is not None:
             found[s], trust = _decoded(design, here, now, trust, s)
         else:
+            wholes[s] = _whole(wholes[s], before, now, here)
             over = any_of(view.over & trust.trusted)
             over = over or _due(design, trust, view, s, tick, searched=bool(found))
             # Once something is beyond chance, less is suspected too.
@@ -122,15 +123,22 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats, hon
     return Examined(trust, tuple(after), tuple(wholes), tuple(views), found)
 
 
-# Meters up to which it is kept what all of them said: 4 MB for each scale.
+# Meters up to which it is kept what all of them said: 4 MB for each scale, and what they rest on.
 _REMEMBERED = 724
 
 
 def _whole(kept: Fit | None, before: Fit | None, now: Fit, here: Scale) -> Fit | None:
-    """What all that report say, if these are all trusted, else what is kept of that."""
-    if now is before or here.enough.size > _REMEMBERED or now.loose.shape[1]:
+    """A fit that `covers` all that report, or what is kept of one."""
+    if now is before:
         return kept
-    return kept if any_of(here.enough & ~now.trusted) else now
+    if kept is not None and not covers(kept, here.prior, here.noise, np.zeros_like(here.enough)):
+        kept = None
+    if here.enough.size > _REMEMBERED or not covers(now, here.prior, here.noise, here.enough):
+        return kept
+    # Who is silent for a tick will be heard again.
+    if kept is not None and any_of(kept.trusted & ~now.trusted) and not any_of(now.trusted & ~kept.trusted):
+        return kept
+    return now
 
 
 def _own(trust: Trust) -> Trust:

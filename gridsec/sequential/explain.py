@@ -59,7 +59,7 @@ class Search:
     design, scales
         The design, and the scales.
     wholes
-        What all that report said when they last were trusted, by scale; None where that is not known.
+        Fits of all that reported, from when they were trusted, by scale; None where none is kept.
     trust
         Who is believed.
     s

@@ -227,7 +227,7 @@ def describe(  # noqa: PLR0917  # what each meter says, and what the others say 
         for j in indices(which).tolist():
             alone[j] = kind
     others, meters = named & ~stuck & ~replays, np.arange(named.size)
-    numbers, back = _backward(shapes, tick - since)
+    numbers, back = _backward(shapes, tick, since)
     for j in indices(others & back).tolist():
         window = clocks.WINDOWS[numbers[j] % len(clocks.WINDOWS)]
         alone[j] = _of_the_past(shapes, memory, j, float(variance[j]), window, alone[j])
@@ -316,15 +316,18 @@ def _turn(shapes: Shapes, tick: int, meters: Ints) -> Bools:
     return np.asarray(early == 0)
 
 
-def _backward(shapes: Shapes, age: Ints) -> tuple[Ints, Bools]:
-    """Number of the look at the past of each meter, named so many ticks ago, and whose turn it is; (p,) each.
+def _backward(shapes: Shapes, tick: int, since: Ints) -> tuple[Ints, Bools]:
+    """Number of the look at each meter's past, and whose turn it is, (p,) each; `since` when each was named.
 
-    A past is long, and each takes its own time: of those named at once each has another turn, or number, and
-    none has its turn at that tick, which has the most to do. Where ticks are long there is time for all.
+    A past is long, and each takes its own time: every meter has its own turn, or number, whenever it is
+    named. The tick of naming has the most to do: where ticks are short, what would fall on it is left to the
+    next.
     """
-    spared = min(shapes.every - 1, 1)
-    number, early = np.divmod(age - spared - np.arange(age.size), shapes.every * _SELDOM)
-    return number, (early == 0) & (age >= spared)
+    number, early = np.divmod(tick + np.arange(since.size), shapes.every * _SELDOM)
+    if shapes.every == 1:
+        return number, early == 0
+    age = tick - since
+    return number, (early == 0) & (age > 0) | (early == 1) & (age == 1)
 
 
 _LASTING = (Kind.REPLAY, Kind.CLOCK_SHIFT, Kind.DRIFT)

@@ -113,7 +113,7 @@ class SequentialState:
     fits : (s,)
         What the trusted meters say on each scale; None where no meter can be judged yet.
     wholes : (s,)
-        What all that reported said when they last were trusted; None where that is not kept.
+        Fits of all that reported, or of more, from when they were trusted; None where none is kept.
     released
         What they say where the powers of the others are not believed; None where all are.
     doubts

@@ -148,6 +148,18 @@ def test_correction_and_its_bound_together(seed: int, steps: int) -> None:
     assert np.array_equal(both[1], model_error_bound(feeder, p, q, 1.02))
 
 
+def test_several_busbar_voltages_for_the_same_powers() -> None:
+    feeder, p, q = operating_point(3)
+    each = np.array([0.95, 1.0, 1.05])
+    corrections, bounds = corrected(feeder, p, q, each)
+    many = model_error_bound(feeder, np.stack([p, 0.5 * p])[:, None], q, each)
+    assert many.shape == (2, 3, p.size)
+    for k, v0 in enumerate(each.tolist()):
+        np.testing.assert_allclose(corrections[k], loss_correction(feeder, p, q, v0), rtol=1e-12)
+        np.testing.assert_allclose(bounds[k], model_error_bound(feeder, p, q, v0), rtol=1e-12)
+        np.testing.assert_allclose(many[1, k], model_error_bound(feeder, 0.5 * p, q, v0), rtol=1e-12)
+
+
 def test_bound_is_infinite_beyond_voltage_collapse() -> None:
     feeder = replace(random_feeder(1, customers=1), bus=np.array([1]))
     assert model_error_bound(feeder, np.array([-1e3]), np.array([0.0]), 1.0)[0] == np.inf

@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 
 from gridsec import sequential
+from gridsec.accuracy import busbar_error
+from gridsec.feeder import lindistflow
 from gridsec.network import bus_voltages
 from gridsec.online import Cause, Decision, Explanation, Frame
 from gridsec.sequential import SequentialDesign
-from gridsec.sequential.busbar import Busbar, Doubt, believed, follow, opposed
+from gridsec.sequential.bounds import Powers
+from gridsec.sequential.busbar import Busbar, Doubt, Honest, aligned, believed, follow, opposed
 from gridsec.sequential.conditional import fit, judge
 from gridsec.sequential.loads import prior
 from gridsec.sequential.words import ways
@@ -96,6 +99,27 @@ class TestOneMore:
         judged = judge(now, shift + off * np.sign(weights))
         doubt = Doubt(self.design.sigmas[0], np.full(CUSTOMERS, off), np.ones(1, dtype=np.bool_))
         assert opposed(self.design, doubt, now, judged) == []
+
+    @pytest.mark.parametrize("active", [True, False])
+    def test_errors_of_powers_at_their_ends_explain_what_they_can_and_no_more(self, active: bool) -> None:
+        """By the matrices of the linear model: all that errs does so in the worst direction."""
+        design, rng = self.design, np.random.default_rng(8)
+        plant, model = design.plant, lindistflow(design.plant.feeder)
+        everybody, none = np.ones(CUSTOMERS, dtype=np.bool_), np.zeros(CUSTOMERS, dtype=np.bool_)
+        now, fixed = fit(design.prior, self.noise, everybody), rng.uniform(0.0, 1e-3, CUSTOMERS)
+        errors, nothing = rng.uniform(0.01, 0.05, CUSTOMERS), np.zeros(CUSTOMERS)
+        frame = Street(plant, rng).frame()
+        p_error, q_error = (errors, nothing) if active else (nothing, errors)
+        frame = replace(frame, p_error=p_error, q_error=q_error)
+        powers = Powers(frame, frame.q, none, frame.v0_squared, everybody, design.book.std)
+        honest = Honest(powers, np.zeros(plant.droop.tau.size))
+        v = now.Q.sum(axis=0) / now.Q.sum()
+        moved = 2.0 * (model.R_bus if active else model.X_bus)[design.prior.meters]
+        room = np.abs(v) @ (fixed + design.sigmas[0] * np.sqrt(design.white)) + np.abs(v @ moved) @ errors
+        room += busbar_error(plant.accuracy, float(frame.v0_squared), design.sigmas[0])
+        for part, explained in ((1.0 - 1e-9, True), (1.0 + 1e-9, False)):
+            m = np.full(CUSTOMERS, part * room)
+            assert aligned(design, now, m, fixed, honest).tolist() == [explained]
 
     def test_nobody_trusted_contradicts_nobody(self) -> None:
         nobody = np.zeros(CUSTOMERS, dtype=np.bool_)

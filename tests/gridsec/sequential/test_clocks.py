@@ -150,6 +150,58 @@ class TestShifted:
         assert clocks.shifted(y, model, np.zeros(600), 128, ROOM, 1e-3) == 0
 
 
+def by_definition(y: Floats, model: Floats, own: Floats, heard: int) -> int:
+    """The lag as `shifted` promises it, lag by lag, straight lines by `polyfit`."""
+    n, best = y.size, (np.inf, 0)
+    ways = ((y, model), (y - own, model - own))
+    for says, other in ways:
+        for sign, new, old in ((1, says, other), (-1, other, says)):
+            for ago in range(1, n - heard + 1):
+                apart = new[n - heard :] - old[n - heard - ago : n - ago]
+                level = np.clip(apart.mean(), -ROOM, ROOM)
+                best = min(best, (float(np.mean((apart - level) ** 2)), sign * ago), key=lambda one: one[0])
+    left, lag = best
+    if left > MOST:
+        return 0
+    last = slice(n + min(lag, 0) - heard, n + min(lag, 0))
+
+    def rest(x: Floats) -> Floats:
+        at = np.arange(x.size)
+        return np.asarray(x - np.polyval(np.polyfit(at, x, 1), at))
+
+    lie = (y - model)[last]
+    least = [float(y[last].var()), float(np.mean(rest(lie) ** 2))]
+    for says, other in ways:
+        assert np.allclose((says - other)[last], lie)
+        steps = np.diff(other[last])
+        for part, way in ((lie[1:], -steps), (lie[:-1], steps)):
+            a, b = rest(part), rest(way)
+            theta = np.clip(a @ b / (b @ b), 0.0, 0.5)
+            least.append(float(np.mean((a - theta * b) ** 2)))
+    surprise = heard / 8.0 * np.log(min(least) / left)
+    return lag if surprise > np.log(4 * (n - heard)) + 5.0 else 0
+
+
+def test_the_lag_is_that_of_the_definition() -> None:
+    """Clocks and voltages late or early, alone or with powers, of all sizes around what is just believed."""
+    hits = [0, 0]
+    for seed in range(400):
+        rng = np.random.default_rng([9, seed])
+        n, heard, lag = int(rng.integers(50, 120)), 32, int(rng.integers(-8, 9))
+        others = 1.0 + np.cumsum(10.0 ** rng.uniform(-3.5, -1.5) * rng.standard_normal(n + 40))
+        power = rng.choice([0.0, 1e-3, 1e-2]) * rng.standard_normal(n + 40)
+        here, there = slice(20, 20 + n), slice(20 - lag, 20 - lag + n)
+        whole = bool(rng.integers(2))
+        own = power[there] if whole else power[here]
+        model = others[here] + own + noise(rng, n)
+        y = (others + power)[there] + noise(rng, n) + rng.choice([0.0, 0.0, 0.004, 0.05])
+        got = clocks.shifted(y, model, own, heard, ROOM, MOST)
+        assert got == by_definition(y, model, own, heard)
+        hits[whole] += got != 0
+    assert min(hits) > 20
+    assert sum(hits) < 350
+
+
 @pytest.fixture(scope="module")
 def quarters() -> tuple[Site, Watcher, Days]:
     """Three days of a street that is read every quarter of an hour."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,12 +17,12 @@ from gridsec.feeder import Feeder
 from gridsec.network import Power, columns
 from gridsec.online import Frame
 from gridsec.plant import Plant
-from gridsec.sequential import LoadDoubt, SequentialDesign
-from gridsec.sequential.conditional import Fit, judge, misfit
+from gridsec.sequential import LoadDoubt, SequentialDesign, explain
+from gridsec.sequential.conditional import Fit, Judged, judge, misfit
 from gridsec.sequential.dictionary import of_a_liar
 from gridsec.sequential.explain import Search, _linked
 from gridsec.sequential.scales import Scales, View, adapt, view_of
-from gridsec.sequential.search import Found, price
+from gridsec.sequential.search import Found, Solution, descend, price
 from gridsec.sequential.windows import push
 
 NEAR, FAR = 30, 15  # customers close to the busbar, and at the end of a long cable
@@ -182,6 +183,43 @@ def test_a_street_is_turned_round_where_powers_are_accused_too() -> None:
             assert each.cost == pytest.approx(cost(design, m, liars, each.loosened) + charge, rel=1e-6)
     assert told > 4
     assert full > 0
+
+
+@pytest.mark.parametrize("suspected", [False, True])
+def test_what_is_judged_is_what_each_search_begins_with(
+    suspected: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where this scale lifts a suspicion, and so begins with another fit than that it was asked of."""
+    design, told = two_streets(), list[bool]()
+    m, liars = draw(design, 3, 0.05)
+    m[liars & (np.arange(m.size) >= NEAR)] += 0.05
+    liars[NEAR:] = False
+    made, now, view = prepared(design, m)
+    if suspected:
+        trust = replace(made.trust, accused=((0, 0),))
+        direction = made.scales.loosened(trust.accused)
+        now = adapt(None, made.scales[0], np.ones(m.size, dtype=np.bool_), direction)
+        view = view_of(design, made.scales[0], judge(now, m))
+        made = Search(design, made.scales, made.wholes, trust, 0)
+    plain = descend
+
+    def checked(start: Fit, m: Floats, *rest: Any, judged: Judged | None = None, **more: Any) -> Solution:
+        told.append(judged is not None)
+        if judged is not None:
+            np.testing.assert_allclose(judged.offset, judge(start, m).offset)
+        return plain(start, m, *rest, judged=judged, **more)
+
+    monkeypatch.setattr(explain.search, "descend", checked)
+    found, _ = made(now, view)
+    np.testing.assert_array_equal(~found.best.trusted, liars)
+    assert any(told) is not suspected
+
+
+def test_each_scale_is_made_once() -> None:
+    scales = prepared(two_streets(), np.zeros(NEAR + FAR))[0].scales
+    each = [scales[s] for s in range(4)]
+    assert all(scales[s] is one for s, one in enumerate(each))
+    assert len({one.limits.sigmas for one in each}) == len(each)
 
 
 def test_linked_are_connected_components() -> None:

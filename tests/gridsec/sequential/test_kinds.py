@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -15,11 +17,12 @@ from feeders.estimators import SEQUENTIAL, Watcher, choose, design
 from feeders.load import Site, load, to_frame
 from feeders.meters import MeterErrors
 from feeders.scenario import START, Scenario, simulate, snapshots
-from gridsec.arrays import Bools, Floats
+from gridsec.arrays import Bools, Floats, Ints
 from gridsec.attack import Bias, Replay
 from gridsec.feeder import lindistflow
 from gridsec.online import Kind
 from gridsec.sequential import kinds, repeats
+from gridsec.sequential.kinds import Shapes
 from gridsec.sequential.repeats import BLOCKS, BYTES, ROWS, SPAN, Block, Memory, Rules
 
 STEP = 0.1 / 230.0
@@ -395,6 +398,57 @@ class TestFeeders:
         site, watcher = street
         late = (Replay(np.array([2]), START, START + 1e6, delay_s=200.0),)
         assert not watch(site, watcher, Scenario(seed=4, duration_s=900.0, attacks=late)).alone
+
+
+@pytest.mark.parametrize("every", [1, 4, 16])
+class TestTurns:
+    """Looks at the past: 150 meters, 4 looks at the shape of a lie for one of these."""
+
+    def turns(self, every: int, since: Ints, ticks: range) -> list[tuple[Ints, Bools]]:
+        """At each of some ticks: numbers, and whose turn it is."""
+        shapes = cast("Shapes", SimpleNamespace(every=every))
+        return [kinds._backward(shapes, tick, since) for tick in ticks]
+
+    def test_each_has_a_turn_in_each_round_and_few_have_the_same(self, every: int) -> None:
+        whole, since = 4 * every, np.full(150, -1000)
+        turns = np.array([turn for _, turn in self.turns(every, since, range(7, 7 + 3 * whole))])
+        assert (turns.reshape(3, whole, -1).sum(axis=1) == 1).all()
+        assert turns.sum(axis=1).max() <= -(-150 // whole)
+
+    def test_each_is_looked_for_in_all_windows_by_turns(self, every: int) -> None:
+        seen = [list[int]() for _ in range(150)]
+        for numbers, turn in self.turns(every, np.full(150, -1000), range(40, 40 + 12 * every)):
+            for j in np.flatnonzero(turn):
+                seen[j].append(int(numbers[j]) % 3)
+        assert all(sorted(each) == [0, 1, 2] for each in seen)
+
+    def test_not_in_the_tick_of_naming_unless_ticks_are_long_but_in_the_next(self, every: int) -> None:
+        found = np.zeros(150, dtype=np.intp)
+        for age, (_, turn) in enumerate(self.turns(every, np.full(150, 30), range(30, 30 + 4 * every + 1))):
+            assert every == 1 or age or not turn.any()
+            found += turn
+        assert (found >= 1).all()
+        assert found.sum() <= 150 + -(-150 // (4 * every))
+
+    def test_who_is_named_again_and_again_has_its_turns_too(self, every: int) -> None:
+        """Named for a third of the time, in stretches shorter than a round: a third of the turns."""
+        rounds, whole = 60, 4 * every
+        seen = [set[int]() for _ in range(150)]
+        stretch = max(2, whole // 5)
+        for tick in range(rounds * whole):
+            since = tick - tick % (3 * stretch + 1)
+            if tick - since < stretch:
+                numbers, turn = self.turns(every, np.full(150, since), range(tick, tick + 1))[0]
+                for j in np.flatnonzero(turn):
+                    seen[j].add(int(numbers[j]) % 3)
+        assert np.mean([len(each) == 3 for each in seen]) > 0.9
+
+
+def test_who_has_repeated_itself_is_a_replay_for_good() -> None:
+    """Nothing of the past is asked: there is none."""
+    shapes = cast("Shapes", SimpleNamespace())
+    found = kinds._of_the_past(shapes, repeats.empty(1), 0, 1.0, 32, Kind.REPLAY)
+    assert found is Kind.REPLAY
 
 
 def test_many_who_are_named_at_once_are_looked_at_one_after_the_other() -> None:

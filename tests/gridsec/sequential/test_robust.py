@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,11 +12,13 @@ from hypothesis import strategies as st
 from benchmarks.sequential_step import Watched
 from gridsec.arrays import Bools, Floats
 from gridsec.feeder import lindistflow
-from gridsec.sequential import examine
+from gridsec.sequential import examine, explain
 from gridsec.sequential import robust as module
-from gridsec.sequential.conditional import Prior, drop, fit, loosen
+from gridsec.sequential.conditional import Fit, Prior, drop, fit, loosen
 from gridsec.sequential.loads import LoadDoubt, prior
 from gridsec.sequential.robust import covers, robust
+from gridsec.sequential.scales import Scale
+from gridsec.sequential.search import Limits
 from tests.gridsec.street import random_tree
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -68,19 +72,18 @@ def test_what_is_left_is_that_of_a_dense_fit_with_weights(seed: int, count: int)
     np.testing.assert_allclose(short, expected, rtol=1e-8, atol=1e-11)
 
 
-def test_a_fit_to_which_meters_were_admitted_one_by_one_serves_as_well() -> None:
+def test_meters_that_are_silent_now_do_not_matter() -> None:
     rng = np.random.default_rng(4)
     p, noise = street(rng, 20), np.full(20, 0.002**2)
     m, liars = readings(rng, p, noise, 0.06)
-    whole, live = fit(p, noise, np.ones(20, dtype=np.bool_)), np.ones(20, dtype=np.bool_)
-    drop(whole, 3)
-    live[3] = False
+    whole, live = fit(p, noise, np.ones(20, dtype=np.bool_)), np.arange(20) != 3
+    m[3] = 1e3
     got = robust(p, noise, m, live, 3.0 * np.sqrt(noise), whole)
     np.testing.assert_array_equal(got, robust(p, noise, m, live, 3.0 * np.sqrt(noise)))
     np.testing.assert_array_equal(got, live & ~liars)
 
 
-@pytest.mark.parametrize("what", ["prior", "noise", "silent", "direction"])
+@pytest.mark.parametrize("what", ["prior", "noise", "silent", "change", "direction"])
 def test_a_fit_of_something_else_covers_nothing(what: str) -> None:
     rng = np.random.default_rng(5)
     p, noise, live = street(rng, 8), np.full(8, 0.002**2), np.ones(8, dtype=np.bool_)
@@ -91,8 +94,10 @@ def test_a_fit_of_something_else_covers_nothing(what: str) -> None:
     elif what == "noise":
         assert not covers(whole, p, 2.0 * noise, live)
     elif what == "silent":
+        assert not covers(fit(p, noise, np.arange(8) != 2), p, noise, live)
+    elif what == "change":
         drop(whole, 2)
-        assert not covers(whole, p, noise, live)
+        assert not covers(whole, p, noise, live & whole.trusted)
     else:
         loosen(whole, lindistflow(random_tree(8, np.random.default_rng(5), drop=0.04)).R_bus[:, 0], 1.0)
         assert not covers(whole, p, noise, live)
@@ -123,3 +128,51 @@ def test_on_large_feeders_it_is_not_kept_and_the_same_are_named(monkeypatch: pyt
     not_kept.play(20, 5, not_kept.lies())
     np.testing.assert_array_equal(not_kept.state.trust.named, kept.state.trust.named)
     np.testing.assert_allclose(not_kept.state.last[0].std, kept.state.last[0].std)
+
+
+def test_while_some_lie_the_start_is_made_from_what_all_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    street, asked = Watched(30), list[bool]()
+
+    def watched(*given: Any) -> Bools:
+        asked.append(given[-1] is not None)
+        return robust(*given)
+
+    monkeypatch.setattr(explain, "robust", watched)
+    street.play(0, 20)
+    street.play(20, 5, street.lies())
+    assert asked
+    assert all(asked)
+
+
+def test_less_is_kept_only_where_more_is_of_no_use() -> None:
+    """A fit of all who report takes the place of one of as many or fewer, or of another prior or noise."""
+    rng = np.random.default_rng(6)
+    p, noise = street(rng, 8), np.full(8, 0.002**2)
+    everybody = np.ones(8, dtype=np.bool_)
+    most = np.arange(8) != 3
+
+    def here(enough: Bools, noise: Floats = noise, p: Prior = p) -> Scale:
+        limits = Limits(3.0, np.zeros(8), np.zeros(8), np.zeros(8))
+        return Scale(p, noise, np.zeros(8), enough, limits)
+
+    def kept(before: Fit | None, now: Fit, here: Scale) -> Fit | None:
+        return examine._whole(before, None, now, here)
+
+    all_, some = fit(p, noise, everybody), fit(p, noise, most)
+    assert kept(None, all_, here(everybody)) is all_
+    assert kept(None, some, here(most)) is some
+    assert kept(None, some, here(everybody)) is None
+    assert kept(all_, some, here(everybody)) is all_
+    assert kept(all_, some, here(most)) is all_
+    assert kept(some, all_, here(everybody)) is all_
+    assert kept(fit(p, 2.0 * noise, everybody), some, here(most)) is some
+    assert kept(fit(p.wider(np.full(p.variance.size, 0.1)), noise, everybody), some, here(most)) is some
+    open_ = fit(p, noise, everybody, np.full((p.variance.size, 1), 0.1))
+    assert kept(None, open_, here(everybody)) is None
+    assert kept(some, open_, here(everybody)) is some
+    # What is of no use any more is not kept either.
+    assert kept(all_, open_, here(everybody, 2.0 * noise)) is None
+    changed = all_.copy()
+    drop(changed, 3)
+    assert kept(None, changed, here(most)) is None
+    assert examine._whole(some, all_, all_, here(everybody)) is some

@@ -129,6 +129,25 @@ def test_a_solution_keeps_nothing_about_the_many_that_it_accuses(fresh: bool) ->
     assert (found.fit is start) is fresh
 
 
+def test_what_was_judged_before_counts_only_where_nothing_has_changed_since() -> None:
+    """Silent meters are dropped, and innocent ones admitted, before the search begins."""
+    rng = np.random.default_rng(3)
+    _, p = street(rng, 30)
+    noise, nobody = np.full(30, 0.002**2), np.zeros(30, dtype=bool)
+    m = readings(rng, p, noise)
+    m[[2, 9]] += 0.05
+    start = fit(p, noise, np.arange(30) != 4)
+    silent = np.arange(30) == 17
+    m[17] = 10.0
+    for live, innocent in ((~silent, []), (~silent, [4]), (~nobody, [4])):
+        who = np.array(innocent, dtype=np.intp)
+        plain = descend(start, m, live, limits(30), keep=nobody, innocent=who)
+        told = descend(start, m, live, limits(30), keep=nobody, innocent=who, judged=judge(start, m))
+        np.testing.assert_array_equal(told.trusted, plain.trusted)
+        assert told.cost == pytest.approx(plain.cost, rel=1e-9)
+        np.testing.assert_allclose(told.judged.offset, plain.judged.offset, rtol=1e-9, atol=1e-12)
+
+
 def test_readings_of_which_none_can_be_have_a_robust_fit_too() -> None:
     """All weights are nothing then."""
     rng = np.random.default_rng(6)
