@@ -202,6 +202,16 @@ def test_the_lag_is_that_of_the_definition() -> None:
     assert sum(hits) < 350
 
 
+@pytest.mark.parametrize(("beyond", "expected"), [(0.0, 5), (0.9, 5), (1.1, 0)])
+def test_a_level_beyond_the_room_is_left_as_far_as_an_honest_meter_leaves_it(
+    beyond: float, expected: int
+) -> None:
+    sign = np.random.default_rng(3).choice([-1.0, 1.0], 153)
+    truth = 1.0 + 0.02 * np.stack([sign, -sign], axis=1).ravel()[:305]  # whose level is the same at all times
+    level = ROOM + np.sqrt(beyond * MOST)
+    assert found(truth[:300] + level, truth[5:]) == expected
+
+
 @pytest.fixture(scope="module")
 def quarters() -> tuple[Site, Watcher, Days]:
     """Three days of a street that is read every quarter of an hour."""

@@ -425,8 +425,11 @@ class TestTurns:
     def test_not_in_the_tick_of_naming_unless_ticks_are_long_but_in_the_next(self, every: int) -> None:
         found = np.zeros(150, dtype=np.intp)
         for age, (_, turn) in enumerate(self.turns(every, np.full(150, 30), range(30, 30 + 4 * every + 1))):
-            assert every == 1 or age or not turn.any()
+            assert age or turn.any() == (every == 1)
             found += turn
+            if age == 1:
+                put_off = (30 + np.arange(150)) % (4 * every) == 0
+                assert found[put_off].all()
         assert (found >= 1).all()
         assert found.sum() <= 150 + -(-150 // (4 * every))
 
