@@ -1,14 +1,16 @@
 """How long one step of the sequential monitor takes, from 13 to 2 000 customers, and its memory.
 
-    python -m benchmarks.sequential_step [picture.png]
+    python -m benchmarks.sequential_step [--runs 5] [picture.png]
 
 Streets of one long feeder with side branches; every customer has a meter, every second one a droop inverter.
 Steady state: the median over 200 steps after the first minute. Attack: a third of the meters lie by 3 % for
 a minute; median and mean of its steps. Search: the longest step of an attack, that in which they are named;
 its median, and the largest, over 120 onsets one second apart (fewer where there are more than 300 customers).
 All in processor time of the one thread, modules and design out of the garbage collector's sight as in the
-service. Limits: 146 customers in 0.5 ms in steady state and in 5 ms while 48 lie; steady state no worse than
-with the square of the number; 500 MB for 2 000.
+service. Of several runs of a size that of the shortest steady step counts: a machine that does something else
+meanwhile takes longer, never less. Limits: 146 customers in 0.5 ms in steady state and in 5 ms while 48 lie,
+the step in which they are named as well; steady state no worse than with the square of the number; 500 MB for
+2 000.
 """
 
 from __future__ import annotations
@@ -209,19 +211,30 @@ def measure(customers: int) -> Measured:
     )
 
 
-def main(picture: str | None) -> int:
-    """Every size in a process of its own; 1 if a limit is missed."""
+def measured(customers: int) -> Measured:
+    """What one size takes, in a process of its own.
+
+    Parameters
+    ----------
+    customers
+        N.
+    """
+    done = subprocess.run(
+        [sys.executable, "-m", "benchmarks.sequential_step", "--one", str(customers)],
+        capture_output=True,
+        check=True,
+        text=True,
+    )
+    return Measured(*(float(cell) for cell in done.stdout.split()))
+
+
+def main(picture: str | None, runs: int) -> int:
+    """Every size, as often as asked for; 1 if a limit is missed."""
     print(f"{'':>9}{'steady':>10}{'attack, ms':>30}{'':>10}{'memory':>10}")
     print(f"{'customers':>9}{'ms':>10}{'median':>10}{'mean':>10}{'search':>10}{'largest':>10}{'MB':>10}")
     rows = []
     for size in SIZES:
-        done = subprocess.run(
-            [sys.executable, "-m", "benchmarks.sequential_step", "--one", str(size)],
-            capture_output=True,
-            check=True,
-            text=True,
-        )
-        row = Measured(*(float(cell) for cell in done.stdout.split()))
+        row = min((measured(size) for _ in range(runs)), key=lambda each: each.steady)
         rows.append(row)
         times = (row.steady, row.median, row.mean, row.search, row.largest)
         print(f"{size:>9}" + "".join(f"{each:>10.2f}" for each in times) + f"{row.memory:>10.0f}", flush=True)
@@ -231,7 +244,7 @@ def main(picture: str | None) -> int:
     print(f"steady state grows with N^{power:.2f} from {AT} customers on")
     if picture is not None:
         _draw(picture, sizes, rows)
-    good = at.steady <= STEADY_MS and max(at.median, at.mean) <= ATTACK_MS
+    good = at.steady <= STEADY_MS and max(at.median, at.mean, at.search) <= ATTACK_MS
     return 0 if good and rows[-1].memory <= MEMORY_MB and power <= POWER else 1
 
 
@@ -260,6 +273,7 @@ def _asked() -> argparse.Namespace:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("picture", nargs="?", help="draw the times into this file")
+    parser.add_argument("--runs", type=count, default=1, help="of each size; the quickest counts")
     parser.add_argument("--one", type=count, metavar="N", help="measure N customers only, and print numbers")
     return parser.parse_args()
 
@@ -269,4 +283,4 @@ if __name__ == "__main__":
     if asked.one is not None:
         print(*astuple(measure(asked.one)))
         sys.exit(0)
-    sys.exit(main(asked.picture))
+    sys.exit(main(asked.picture, asked.runs))
