@@ -67,6 +67,7 @@ class Droop:
     # Ramp k of z is slope[k] * (clip(z, low[k], high[k]) - low_or_high[k]); see `_ramps`.
     _ramps: tuple[_Ramp, ...] = field(init=False, repr=False)
     _offset: Floats = field(init=False, repr=False)
+    _shifted: bool = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "customer", frozen_ints(self.customer))
@@ -83,6 +84,7 @@ class Droop:
             np.maximum(steepest, ramp.slope, out=steepest)
         object.__setattr__(self, "_ramps", tuple(ramp.compact() for ramp in ramps))
         object.__setattr__(self, "_offset", _compact(offset))
+        object.__setattr__(self, "_shifted", bool(np.any(offset)))
         object.__setattr__(self, "slope", frozen(steepest))
         object.__setattr__(self, "limit", frozen(np.max(np.abs(self.q), axis=1, initial=0.0)))
 
@@ -111,7 +113,7 @@ class Droop:
             total = part if total is None else np.add(total, part, out=total)
         if total is None:
             total = np.zeros(np.shape(z))
-        if self._offset.any():
+        if self._shifted:
             total += _pick(self._offset, rows)
         return total
 
@@ -160,6 +162,7 @@ class Droop:
         object.__setattr__(out, "vbar", self.vbar)
         object.__setattr__(out, "_ramps", ramps)
         object.__setattr__(out, "_offset", _compact(_pick(self._offset, rows)))
+        object.__setattr__(out, "_shifted", bool(np.any(out._offset)))
         return out
 
 

@@ -60,6 +60,10 @@ class Feeder:
         Derived. 1 where the bus of the row is fed through that of the column; None for large trees.
     half : (b + 1,)
         Derived. Shunt susceptance at the buses, pu.
+    charges
+        Derived. Whether there is any.
+    squared : (b,)
+        Derived. ``r^2 + x^2``, pu.
 
     Raises
     ------
@@ -85,6 +89,8 @@ class Feeder:
     leave: Ints = field(init=False, repr=False)
     inside: Floats | None = field(init=False, repr=False)
     half: Floats = field(init=False, repr=False)
+    charges: bool = field(init=False, repr=False)
+    squared: Floats = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         for name in ("r", "x", "charging"):
@@ -101,6 +107,8 @@ class Feeder:
         np.add.at(half, self.parent, 0.5 * self.charging)
         half[1:] += 0.5 * self.charging
         object.__setattr__(self, "half", frozen(half))
+        object.__setattr__(self, "charges", any_of(half))
+        object.__setattr__(self, "squared", frozen(self.r**2 + self.x**2))
 
 
 def _problems(feeder: Feeder) -> list[str]:
@@ -367,8 +375,9 @@ def corrected(
 def _lossy(feeder: Feeder, flows: _Flows, now: _Flows, steps: int) -> _Flows:
     """The linear power flow with the losses of another, and so on."""
     for _ in range(steps):
-        current = (now.P**2 + now.charged**2) / now.v2[..., 1:]
-        loss_p, loss_q, drop = _losses(feeder, current, feeder.half * now.v2, sign=-1.0)
+        current = (now.P * now.P + now.charged * now.charged) / now.v2[..., 1:]
+        charge = feeder.half * now.v2 if feeder.charges else now.v2
+        loss_p, loss_q, drop = _losses(feeder, current, charge, sign=-1.0)
         # Charging is one of the losses here.
         Q = flows.Q + loss_q
         now = _Flows(flows.P + loss_p, Q, Q, flows.v2 - from_root(feeder, drop))
@@ -456,7 +465,7 @@ def _linear_flows(feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats | flo
     P, Q = -below(feeder, _at_buses(feeder, both))[..., 1:]
     base = np.asarray(v0_squared, dtype=np.float64)[..., None]
     v2 = base + from_root(feeder, -2.0 * (feeder.r * P + feeder.x * Q))
-    charged = Q - below(feeder, feeder.half * v2)[..., 1:] if any_of(feeder.half) else Q
+    charged = Q - below(feeder, feeder.half * v2)[..., 1:] if feeder.charges else Q
     return _Flows(P, Q, charged, v2)
 
 
@@ -466,9 +475,9 @@ def _losses(feeder: Feeder, current: Floats, charge: Floats, *, sign: float) -> 
     np.multiply(feeder.r, current, out=own[0, ..., 1:])
     np.multiply(feeder.x, current, out=own[1, ..., 1:])
     loss_p, loss_q = (below(feeder, own) - own)[..., 1:]
-    if any_of(feeder.half):
+    if feeder.charges:
         loss_q = loss_q + sign * below(feeder, charge)[..., 1:]
-    drop = 2.0 * (feeder.r * loss_p + feeder.x * loss_q) + (feeder.r**2 + feeder.x**2) * current
+    drop = 2.0 * (feeder.r * loss_p + feeder.x * loss_q) + feeder.squared * current
     return loss_p, loss_q, drop
 
 

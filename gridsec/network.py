@@ -88,6 +88,17 @@ def by_place(feeder: Network, of_busbar: Floats | float) -> Floats:
     return np.tile(np.broadcast_to(np.asarray(of_busbar, dtype=np.float64), 3), len(feeder.tree.buses))
 
 
+def over_places(feeder: Network, of_busbar: Floats | float) -> Floats | float:
+    """As `by_place`, but one number where all places have the same.
+
+    Parameters
+    ----------
+    feeder, of_busbar
+        As in `by_place`.
+    """
+    return by_place(feeder, of_busbar) if isinstance(feeder, InPhases) else of_busbar
+
+
 def bus_voltages(
     feeder: Network, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1
 ) -> Floats:

@@ -22,6 +22,7 @@ docs/theory-sequential.md, section 6.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -33,6 +34,7 @@ from gridsec.errors import refuse
 from gridsec.network import one_busbar
 from gridsec.sequential.conditional import invert
 from gridsec.sequential.design import SequentialDesign
+from gridsec.sequential.search import Recent
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +72,11 @@ class Learned:
         if all_of(unknown) or not any_of(unknown):
             return None
         return np.where(unknown, self.hidden.max(), 0.0)
+
+    @cached_property
+    def recent(self) -> defaultdict[int, Recent]:
+        """What was answered last of the largest honest offsets, by scale."""
+        return defaultdict(Recent)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -216,7 +223,10 @@ def ripe(design: SequentialDesign, gathered: Learning) -> Bools:
     design, gathered
         The design, and what was gathered.
     """
-    needed, heard = design.options.commission_s, np.where(gathered.open, gathered.time_s, 0.0)
+    needed = design.options.commission_s
+    if not gathered.time_s.max(initial=0.0) >= needed > 0:
+        return np.zeros(gathered.since.size, dtype=np.bool_)
+    heard = np.where(gathered.open, gathered.time_s, 0.0)
     if not heard.max(initial=0.0) >= needed > 0:
         return np.zeros_like(gathered.open)
     return np.asarray(heard >= design.options.enough * needed)

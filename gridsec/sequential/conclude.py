@@ -7,13 +7,13 @@ docs/theory-sequential.md, sections 5 and 7.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, all_of, any_of
 from gridsec.judge import Situation, decide
-from gridsec.network import busbar_places, by_place, one_busbar
+from gridsec.network import busbar_places, one_busbar, over_places
 from gridsec.online import Cause, Decision, Estimate, Explanation, Frame, Verdict
 from gridsec.sequential import words
 from gridsec.sequential.bounds import Bounded, Grounds, Powers
@@ -24,6 +24,7 @@ from gridsec.sequential.examine import Examined
 from gridsec.sequential.heard import Heard
 from gridsec.sequential.release import Released, release
 from gridsec.sequential.state import SequentialState
+from gridsec.values import changed
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,7 +118,7 @@ def conclude(
         busbar_attack=np.where(differs.named, busbar.off, 0.0),
     )
     last = estimate, verdict
-    return replace(state, released=released, busbar=busbar, last=last), estimate, verdict
+    return changed(state, released=released, busbar=busbar, last=last), estimate, verdict
 
 
 def _busbar(design: SequentialDesign, state: SequentialState, heard: Heard, estimate: Estimate) -> Busbar:
@@ -247,6 +248,8 @@ def _unvouched(
 
 def _open(design: SequentialDesign, state: SequentialState, said: _Said) -> tuple[Explanation, ...]:
     """What metered reactive powers leave open, whoever else is named."""
+    if state.curves.idle:
+        return ()
     sure = state.trust.named if said[1] is Cause.RESIDUALS else np.zeros_like(state.trust.named)
     return state.curves.explanations(design, sure) if said[1] in (*_MILD, Cause.RESIDUALS) else ()
 
@@ -299,11 +302,16 @@ def _amounts(design: SequentialDesign, state: SequentialState, seen: Examined) -
         if view is not None:
             weights = view.judged.weights
         elif now is not None:
-            weights = now.weights(state.window.sums[s] / np.maximum(state.window.counts[s], 1))
+            weights = now.weights(_mean(state, s))
         else:
             continue
         out[k] = float(std[k] ** 2 * book.along(weights)[k])
     return out
+
+
+def _mean(state: SequentialState, s: int) -> Floats:
+    """Mean residuals on a scale, (p,)."""
+    return np.asarray(state.window.sums[s] / np.maximum(state.window.counts[s], 1))
 
 
 def _reconstructed(
@@ -315,11 +323,10 @@ def _reconstructed(
     now, view = (None, None) if s < 0 else (state.fits[s], tick.seen.views[s])
     if now is None:
         return np.zeros_like(prior_.variance), prior_.variance, None
-    m = state.window.sums[s] / np.maximum(state.window.counts[s], 1)
-    judged = judge(now, m) if view is None else view.judged
+    judged = judge(now, _mean(state, s)) if view is None else view.judged
     # The model begins at this reading of the busbar, a mean takes only its part of that one's jitter off.
     jitter = (1.0 - 1.0 / design.lengths[s]) * design.flicker
-    flicker = by_place(design.plant.feeder, np.where(tick.heard.busbar, jitter, 0.0))
+    flicker = over_places(design.plant.feeder, np.where(tick.heard.busbar, jitter, 0.0))
     after = moved * prior_.variance + _hidden(state, prior_) + flicker
     liars = design.plant.meters[~state.trust.trusted]
     # Nobody lies about powers that nobody told, which are known by a standard deviation.
@@ -353,6 +360,8 @@ def _best(design: SequentialDesign, state: SequentialState) -> tuple[int, float]
 def _hidden(state: SequentialState, prior_: Prior) -> Floats:
     """What learning could not tell from errors of the loads that last, at every bus, (n,)."""
     hidden, late = state.learned.hidden, state.learned.late
+    if not any_of(hidden):
+        return np.zeros(prior_.variance.size)
     out = np.full(prior_.variance.size, hidden.max(initial=0.0))
     out[prior_.meters] = hidden if late is None else np.maximum(hidden, late)
     return np.asarray(np.minimum(out, prior_.variance))
@@ -363,10 +372,15 @@ def _worst(design: SequentialDesign, seen: Examined, p: int) -> tuple[Floats, Fl
     views = [view for view in seen.views if view is not None]
     if not views:
         return np.full(p, np.nan), np.full(p, design.options.widest), np.zeros(p, dtype=np.bool_)
-    offset = np.abs([view.judged.offset for view in views])
-    limit, enough = np.array([view.limit for view in views]), np.array([view.enough for view in views])
-    ratio = np.where(enough, offset / limit, -1.0)
-    worst, each = ratio.argmax(axis=0), np.arange(p)
-    judged = np.asarray(enough.any(axis=0))
-    score = np.where(judged, offset[worst, each], np.nan)
-    return score, np.where(judged, limit[worst, each], design.options.widest), judged
+    score, limit, judged = np.abs(views[0].judged.offset), views[0].limit, views[0].enough
+    ratio = score / limit if all_of(judged) else np.where(judged, score / limit, -1.0)
+    for view in views[1:]:
+        offset = np.abs(view.judged.offset)
+        here = offset / view.limit
+        more = view.enough & (here > ratio)
+        ratio = np.where(more, here, ratio)
+        score, limit = np.where(more, offset, score), np.where(more, view.limit, limit)
+        judged = judged | view.enough
+    if all_of(judged):
+        return score, limit, judged
+    return np.where(judged, score, np.nan), np.where(judged, limit, design.options.widest), judged

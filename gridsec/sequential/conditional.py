@@ -19,11 +19,12 @@ Dubrule 1983 (leave-one-out by one inverse), the Schur complement otherwise; doc
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import cast
 
 import numpy as np
 from scipy.linalg import blas, lapack
 
-from gridsec.arrays import Bools, Floats, Ints, indices, submatrix
+from gridsec.arrays import Bools, Floats, Ints, all_of, indices, submatrix
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -194,17 +195,28 @@ class Judged:
         Reading minus what the trusted others say, squared pu.
     std : (p,)
         Its standard deviation for an honest meter.
-    w : (n,)
-        What the trusted meters say about every bus.
     misfit
         m^T Q m, chi-square with as many degrees of freedom as there are trusted meters.
+    prior, loose
+        What is known without meters, and the directions that were loosened, as in the fit.
+    said : (n,) or None
+        `w`; None until asked for.
     """
 
     weights: Floats
     offset: Floats
     std: Floats
-    w: Floats
     misfit: float
+    prior: Prior
+    loose: Floats
+    said: Floats | None = None
+
+    @property
+    def w(self) -> Floats:
+        """What the trusted meters say about every bus, (n,)."""
+        if self.said is None:
+            object.__setattr__(self, "said", _said(self.prior, self.loose, self.weights))
+        return cast("Floats", self.said)
 
 
 def fit(prior: Prior, noise: Floats, trusted: Bools, loose: Floats | None = None) -> Fit:
@@ -345,21 +357,28 @@ def judge(now: Fit, m: Floats) -> Judged:
     m : (p,)
         Readings minus what the model explains, squared pu; any finite value where not trusted.
     """
-    prior = now.prior
-    weights = now.weights(m)
-    w = prior.of_meters @ weights
-    if now.loose.shape[1]:
-        w += now.loose @ (weights @ now.loose[prior.meters])
-    return _judged(now, m, weights, w)
+    return _judged(now, m, now.weights(m), None)
 
 
-def _judged(now: Fit, m: Floats, weights: Floats, w: Floats) -> Judged:
+def _judged(now: Fit, m: Floats, weights: Floats, w: Floats | None) -> Judged:
     trusted, at = now.trusted, now.prior.meters
     if now.pivot is None or now.std is None:
         now.pivot = np.where(trusted, now.diagonal(), 1.0)
         now.std = np.sqrt(np.where(trusted, 1.0 / now.pivot, now.variance[at] + now.noise))
-    offset = np.where(trusted, weights / now.pivot, m - w[at])
-    return Judged(weights, offset, now.std, w, float(m @ weights))
+    offset = weights / now.pivot
+    # What the meters say of the buses matters for the others only.
+    if not all_of(trusted):
+        w = _said(now.prior, now.loose, weights) if w is None else w
+        offset = np.where(trusted, offset, m - w[at])
+    return Judged(weights, offset, now.std, float(m @ weights), now.prior, now.loose, w)
+
+
+def _said(prior: Prior, loose: Floats, weights: Floats) -> Floats:
+    """Covariance of all buses' w with a combination of the meters' w, (n,)."""
+    out = prior.of_meters @ weights
+    if loose.shape[1]:
+        out += loose @ (weights @ loose[prior.meters])
+    return np.asarray(out)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -391,7 +410,7 @@ def drop(now: Fit, j: int) -> Move:
     """
     now.inverse = now.Q
     q = now.inverse[:, j].copy()
-    move = Move(-1.0 / q[j], q, _covariance(now, q))
+    move = Move(-1.0 / q[j], q, _said(now.prior, now.loose, q))
     _change(now, move)
     now.inverse[j] = now.inverse[:, j] = 0.0
     now.trusted[j] = False
@@ -411,7 +430,7 @@ def admit(now: Fit, j: int) -> Move:
     column = _column(now, j)
     now.inverse = now.Q
     q = now.inverse @ column[now.prior.meters]
-    open_ = column - _covariance(now, q)
+    open_ = column - _said(now.prior, now.loose, q)
     pivot = max(open_[now.prior.meters[j]], 0.0) + now.noise[j]
     q[j] -= 1.0
     move = Move(1.0 / pivot, q, -open_)
@@ -436,7 +455,7 @@ def loosen(now: Fit, direction: Floats, std: float) -> Move:
     now.inverse = now.Q
     q = now.inverse @ u[now.prior.meters]
     pivot = 1.0 + float(u[now.prior.meters] @ q)
-    move = Move(-1.0 / pivot, q, _covariance(now, q) - u)
+    move = Move(-1.0 / pivot, q, _said(now.prior, now.loose, q) - u)
     _change(now, move)
     now.loose = np.column_stack([now.loose, u])
     return move
@@ -466,14 +485,6 @@ def follow(now: Fit, m: Floats, judged: Judged, move: Move) -> Judged:
     amount = move.factor * float(move.q @ m)
     weights = np.where(now.trusted, judged.weights + amount * move.q, 0.0)
     return _judged(now, m, weights, judged.w + amount * move.spread)
-
-
-def _covariance(now: Fit, weights: Floats) -> Floats:
-    """Covariance of all buses' w with a combination of the meters' w, (n,)."""
-    out = now.prior.of_meters @ weights
-    if now.loose.shape[1]:
-        out += now.loose @ (weights @ now.loose[now.prior.meters])
-    return np.asarray(out)
 
 
 def _column(now: Fit, j: int) -> Floats:

@@ -32,6 +32,8 @@ class View:
     ----------
     judged
         Every meter, judged by the trusted others.
+    m : (p,)
+        Mean residual, squared pu.
     enough : (p,)
         Meters with enough readings on this scale.
     limit : (p,)
@@ -44,6 +46,7 @@ class View:
     """
 
     judged: Judged
+    m: Floats
     enough: Bools
     limit: Floats
     over: Bools
@@ -143,7 +146,8 @@ class Scales:
             m=self.window.sums[s] / np.maximum(counts, 1),
             enough=counts >= need,
             limits=Limits(
-                design.sigmas[s], self.model, learned.allowed, learned.variance, design.most, learned.late
+                *(design.sigmas[s], self.model, learned.allowed, learned.variance, design.most, learned.late),
+                learned.recent[s],
             ),
         )
 
@@ -183,7 +187,7 @@ def view_of(design: SequentialDesign, here: Scale, judged: Judged) -> View:
     """
     limit = here.limits.of(judged.std)
     over = here.enough & (np.abs(judged.offset) > limit)
-    return View(judged, here.enough, limit, over, here.limits, design.options.lower)
+    return View(judged, here.m, here.enough, limit, over, here.limits, design.options.lower)
 
 
 def adapt(before: Fit | None, here: Scale, wanted: Bools, loose: Floats | None) -> Fit:

@@ -32,6 +32,15 @@ from gridsec.sequential.conditional import Fit, Judged, Move, admit, drop, follo
 from gridsec.sequential.dictionary import Dictionary, Powers, Step
 
 
+class Recent:
+    """The last answer of `Limits.of`: in calm the same is asked at every tick."""
+
+    __slots__ = ("answer",)
+
+    def __init__(self) -> None:
+        self.answer: tuple[float, Floats, Floats] | None = None
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Limits:
     """What is evidence. p meters.
@@ -50,6 +59,8 @@ class Limits:
         How many liars can be told apart; None: however many.
     late : (p,)
         Variance of offsets beside that by which they are judged, squared pu^2; None for none.
+    recent
+        The last answer where `allowed`, `certain` and `late` were these very ones; None where none is kept.
     """
 
     sigmas: float
@@ -58,6 +69,7 @@ class Limits:
     certain: Floats
     most: int | None = None
     late: Floats | None = None
+    recent: Recent | None = None
 
     @property
     def penalty(self) -> float:
@@ -74,11 +86,19 @@ class Limits:
         part
             Of `sigmas`, how many count.
         """
+        sigmas, recent = part * self.sigmas, self.recent
+        last = None if recent is None else recent.answer
+        if last is None or last[0] != sigmas or last[1] is not std:
+            last = sigmas, std, self._within(std, sigmas)
+            if recent is not None and part == 1.0:
+                recent.answer = last
+        return np.asarray(self.model + last[2])
+
+    def _within(self, std: Floats, sigmas: float) -> Floats:
         if self.late is not None:
             std = np.sqrt(std * std + self.late)
-        rest, sigmas = np.sqrt(np.maximum(std * std - self.certain, 0.0)), part * self.sigmas
-        within = np.minimum(sigmas * std, self.allowed + sigmas * rest)
-        return np.asarray(self.model + within)
+        rest = np.sqrt(np.maximum(std * std - self.certain, 0.0))
+        return np.asarray(np.minimum(sigmas * std, self.allowed + sigmas * rest))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

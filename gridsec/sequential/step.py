@@ -8,7 +8,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of
 from gridsec.frames import NO_VOLTAGE, nothing_new
-from gridsec.network import bus_voltages, by_place, model_error_bound
+from gridsec.network import bus_voltages, by_place, model_error_bound, over_places
 from gridsec.online import Estimate, Explanation, Frame, Verdict
 from gridsec.sequential.bounds import Lag, Powers, follow
 from gridsec.sequential.bounds import start as begin
@@ -26,6 +26,7 @@ from gridsec.sequential.kinds import Kinds, describe, listen, repeated
 from gridsec.sequential.naming import name
 from gridsec.sequential.state import SequentialState, Trust
 from gridsec.sequential.windows import Window, empty, forget, push, shift
+from gridsec.values import changed
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,7 +78,7 @@ def step(
     look = _look(design, state, frame)
     while look.seen.busbar is not None:
         # As if nobody read it at this tick either.
-        state = replace(state, busbar=state.busbar.caught(*look.seen.busbar))
+        state = changed(state, busbar=state.busbar.caught(*look.seen.busbar))
         look = _look(design, state, frame)
     return _answer(design, look, frame)
 
@@ -89,7 +90,7 @@ def _look(design: SequentialDesign, state: SequentialState, frame: Frame) -> _Lo
     if doubts.priors is not state.doubts.priors:
         pairs = zip(state.fits, doubts.priors, strict=True)
         fits = tuple(fit if fit is not None and fit.prior is prior else None for fit, prior in pairs)
-        state = replace(state, fits=fits)
+        state = changed(state, fits=fits)
     kinds = listen(design.shapes, state.kinds, heard.y, heard.live)
     copies = repeated(kinds) * (design.decoder is None)
     x, free, lag = _inverters(design, state, frame, heard, doubts.sizes)
@@ -97,14 +98,14 @@ def _look(design: SequentialDesign, state: SequentialState, frame: Frame) -> _Lo
     residual = heard.y - v2_bus[design.prior.meters] - state.learned.bias
     if state.x is not None and frame.t - state.t >= design.lengths[-1] * design.step_s:
         # After a pause as long as the longest scale loads are others: nothing is remembered.
-        state = replace(state, window=empty(design.lengths, residual.size), fits=(None,) * len(state.fits))
+        state = changed(state, window=empty(design.lengths, residual.size), fits=(None,) * len(state.fits))
     window = push(state.window, design.lengths, residual, heard.live)
     swing = _swing(design, v2_bus, heard.v0_squared)
     if state.ticks % _STALE == 0 or swing > max(_GROWN * state.swing, _CALM):
         error = _model_error(design, frame.p, q, heard.v0_squared)
-        state = replace(state, model_error=error, swing=swing)
+        state = changed(state, model_error=error, swing=swing)
     transient = _transient(design, 0.0 if state.x is None else frame.t - state.since)
-    now = replace(state, trust=_distrust(state.trust, copies), window=window, doubts=doubts)
+    now = changed(state, trust=_distrust(state.trust, copies), window=window, doubts=doubts)
     powers = Powers(frame, q, heard.told, heard.v0_squared, state.trust.trusted, doubts.sizes)
     seen = examine(design, now, state.model_error + transient, Honest(powers, lag.error))
     return _Look(state, heard, doubts, kinds, copies, x, free, lag, q, v2_bus, residual, transient, now, seen)
@@ -116,7 +117,7 @@ def _answer(design: SequentialDesign, look: _Look, frame: Frame) -> tuple[Sequen
     seen, window, rivals = _judge(design, look, state.trust)
     v2 = look.v2_bus[design.prior.meters]
     own = _own(design, frame.p, heard.q)
-    after = replace(
+    after = changed(
         state,
         t=frame.t,
         frame=frame,
@@ -132,7 +133,7 @@ def _answer(design: SequentialDesign, look: _Look, frame: Frame) -> tuple[Sequen
         wholes=seen.wholes,
         doubts=look.doubts,
         curves=_curves(design, look, frame, seen),
-        kinds=_kinds(design, state, look.kinds, seen, window, v2, own),
+        kinds=_kinds(design, look, seen, window, v2, own),
         learning=_gathered(design, look, seen.trust, frame.t - state.t),
     )
     tick = Tick(frame, heard, look.q, look.v2_bus, look.transient, seen, rivals)
@@ -216,7 +217,8 @@ def _voltages(design: SequentialDesign, frame: Frame, heard: Heard, x: Floats) -
     with np.errstate(all="ignore"):
         v2_bus = bus_voltages(plant.feeder, frame.p, q, heard.v0_squared, steps=plant.loss_correction)
         v2_bus = np.minimum(np.maximum(v2_bus, 0.0), NO_VOLTAGE)
-    return q, np.where(np.isnan(v2_bus), by_place(plant.feeder, heard.v0_squared), v2_bus)
+    none = np.isnan(v2_bus)
+    return q, np.where(none, over_places(plant.feeder, heard.v0_squared), v2_bus) if any_of(none) else v2_bus
 
 
 def _net(design: SequentialDesign, heard: Heard, x: Floats) -> Floats:
@@ -226,7 +228,7 @@ def _net(design: SequentialDesign, heard: Heard, x: Floats) -> Floats:
 
 def _swing(design: SequentialDesign, v2_bus: Floats, v0_squared: Floats | float) -> float:
     """By how much the powers change a squared voltage at most."""
-    return float(np.abs(v2_bus - by_place(design.plant.feeder, v0_squared)).max())
+    return float(np.abs(v2_bus - over_places(design.plant.feeder, v0_squared)).max())
 
 
 def _distrust(trust: Trust, copies: Ints) -> Trust:
@@ -259,22 +261,23 @@ def _curves(design: SequentialDesign, look: _Look, frame: Frame, seen: Examined)
 
 def _kinds(  # noqa: PLR0917  # everything that lies are compared with
     design: SequentialDesign,
-    state: SequentialState,
-    kinds: Kinds,
+    look: _Look,
     seen: Examined,
     window: Window,
     v2: Floats,
     own: Floats,
 ) -> Kinds:
     """What the manipulations look like, by what the other meters say of each."""
-    view, prior_ = seen.views[0], state.doubts.priors[0]
+    state, view = look.state, seen.views[0]
     expected = v2 + state.learned.bias
     if view is None:
+        prior_ = state.doubts.priors[0]
         variance = prior_.variance[prior_.meters] + design.white + state.learned.variance
     else:
-        mean = window.sums[0] / np.maximum(window.counts[0], 1)
-        expected, variance = expected + mean - view.judged.offset, view.judged.std**2
-    return describe(design.shapes, kinds, expected, own, seen.trust.named, variance)
+        std = view.judged.std
+        mean = view.m if window is look.now.window else window.sums[0] / np.maximum(window.counts[0], 1)
+        expected, variance = expected + mean - view.judged.offset, std * std
+    return describe(design.shapes, look.kinds, expected, own, seen.trust.named, variance)
 
 
 def _own(design: SequentialDesign, p: Floats, q: Floats) -> Floats:
@@ -306,7 +309,7 @@ def _learned(design: SequentialDesign, state: SequentialState) -> SequentialStat
     known = learn(design, state.learned, learning, ready, state.t)
     window = shift(state.window, state.learned.bias - known.learned.bias)
     fits = (None,) * len(state.fits)
-    return replace(state, learning=known.learning, learned=known.learned, window=window, fits=fits)
+    return changed(state, learning=known.learning, learned=known.learned, window=window, fits=fits)
 
 
 def _known(design: SequentialDesign, doubts: Doubts) -> Bools:
@@ -333,8 +336,10 @@ def _inverters(
     droop, meter = design.plant.droop, design.meter_of
     believed = state.trust.trusted & heard.live
     driven = (meter >= 0) & believed[meter]
-    here = by_place(design.plant.feeder, heard.v0_squared)[design.plant.feeder.bus[droop.customer]]
-    y = np.where(driven, heard.y[meter], here) if meter.size else np.zeros(0)
+    y = heard.y[meter] if meter.size else np.zeros(0)
+    if not all_of(driven):
+        here = by_place(design.plant.feeder, heard.v0_squared)[design.plant.feeder.bus[droop.customer]]
+        y = np.where(driven, y, here)
     if state.x is None:
         return np.asarray(droop(droop.vbar**2 - y)), None, begin(design.plant, y)
     w, follows, h = None, None, frame.t - state.t
