@@ -195,8 +195,8 @@ class Judged:
         Reading minus what the trusted others say, squared pu.
     std : (p,)
         Its standard deviation for an honest meter.
-    misfit
-        m^T Q m, chi-square with as many degrees of freedom as there are trusted meters.
+    m : (p,)
+        The readings that were judged, minus what the model explains, squared pu.
     prior, loose
         What is known without meters, and the directions that were loosened, as in the fit.
     said : (n,) or None
@@ -206,10 +206,15 @@ class Judged:
     weights: Floats
     offset: Floats
     std: Floats
-    misfit: float
+    m: Floats
     prior: Prior
     loose: Floats
     said: Floats | None = None
+
+    @property
+    def misfit(self) -> float:
+        """m^T Q m, chi-square with as many degrees of freedom as there are trusted meters."""
+        return float(self.m @ self.weights)
 
     @property
     def w(self) -> Floats:
@@ -370,7 +375,7 @@ def _judged(now: Fit, m: Floats, weights: Floats, w: Floats | None) -> Judged:
     if not all_of(trusted):
         w = _said(now.prior, now.loose, weights) if w is None else w
         offset = np.where(trusted, offset, m - w[at])
-    return Judged(weights, offset, now.std, float(m @ weights), now.prior, now.loose, w)
+    return Judged(weights, offset, now.std, m, now.prior, now.loose, w)
 
 
 def _said(prior: Prior, loose: Floats, weights: Floats) -> Floats:

@@ -19,7 +19,7 @@ from gridsec.frames import usual
 from gridsec.online import Frame
 from gridsec.sequential.conditional import Prior
 from gridsec.sequential.design import SequentialDesign
-from gridsec.sequential.loads import UNMETERED, prior
+from gridsec.sequential.loads import EXACT, UNMETERED, prior
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,10 +78,6 @@ def none(design: SequentialDesign) -> Doubts:
 
 # Frames that claim to know loads so much less well than the design assumes are believed.
 _MUCH_LESS = 4.0
-# Powers are known no better than this, pu.
-_EXACT = 1e-6
-# Half-width of a uniform error per standard deviation.
-_ROOT_3 = 3.0**0.5
 
 
 def doubted(
@@ -115,10 +111,10 @@ def _doubts(design: SequentialDesign, before: Doubts, frame: Frame, busbar: Bool
     # The design has standard deviations, and so have frames that tell them apart from their intervals.
     frame, lengths = usual(frame), design.lengths
     p, p_calm, p_rest = _factors(
-        frame.p_error, design.doubt.p, (before.p, before.p_calm, before.p_rest), lengths
+        frame.p_error, design.doubt.even_p, (before.p, before.p_calm, before.p_rest), lengths
     )
     q, q_calm, q_rest = _factors(
-        frame.q_error, design.doubt.q, (before.q, before.q_calm, before.q_rest), lengths
+        frame.q_error, design.doubt.even_q, (before.q, before.q_calm, before.q_rest), lengths
     )
     sizes = _claims(np.abs(frame.p), design.options.hidden_power, before.sizes)
     metered, calm = _metered(busbar, before.busbar, before.busbar_calm, lengths)
@@ -156,8 +152,8 @@ def _prior(design: SequentialDesign, p: Floats, q: Floats, busbar: Bools) -> Pri
     unknown = np.where(busbar, design.busbar, UNMETERED)
     doubt = replace(
         design.doubt,
-        p=np.where(p > 1.0, np.maximum(design.doubt.p, _EXACT) * p, design.doubt.p),
-        q=np.where(q > 1.0, np.maximum(design.doubt.q, _EXACT) * q, design.doubt.q),
+        p=np.where(p > 1.0, np.maximum(design.doubt.p, EXACT) * p, design.doubt.p),
+        q=np.where(q > 1.0, np.maximum(design.doubt.q, EXACT) * q, design.doubt.q),
     )
     return prior(
         design.plant.feeder,
@@ -191,14 +187,14 @@ def _metered(busbar: Bools | bool, old: Bools, calm: Ints, lengths: tuple[int, .
 
 
 def _factors(
-    error: Floats, std: Floats, before: tuple[Floats, Ints, Floats], lengths: tuple[int, ...]
+    error: Floats, known: Floats, before: tuple[Floats, Ints, Floats], lengths: tuple[int, ...]
 ) -> tuple[Floats, Ints, Floats]:
     """`_factor`, but as long as residuals are remembered that were made with a larger one, that one.
 
     Then the largest of those made since, for as long again: they are remembered still.
     """
     old, calm, rest = before
-    new = _factor(error, std, old)
+    new = _factor(error, known, old)
     if new is old:
         return before
     lower = new < old
@@ -209,9 +205,8 @@ def _factors(
     return after, np.where(held, calm + 1, 0), np.where(held, rest, 1.0)
 
 
-def _factor(error: Floats, std: Floats, old: Floats) -> Floats:
+def _factor(error: Floats, known: Floats, old: Floats) -> Floats:
     """Power of two by which a frame knows a power less well than the design assumes, with hysteresis."""
-    known = _ROOT_3 * np.maximum(std, _EXACT)
     if all_of(error <= _MUCH_LESS * known) and all_of(old <= 1.0):
         return old
     ratio = error / known

@@ -89,7 +89,7 @@ def clean(design: SequentialDesign, state: SequentialState, frame: Frame) -> Hea
     """
     plant = design.plant
     live = frame.seen & np.isfinite(frame.y)
-    told = np.zeros(frame.q.size, dtype=np.bool_)
+    told, q = np.zeros(frame.q.size, dtype=np.bool_), frame.q
     # As `possible` has it: who is sure of nothing tells nothing.
     within = (frame.q_net_error >= 0.0) & (frame.q_net_error <= design.most_q)
     reported = (np.abs(frame.q_net) <= design.most_q) & within
@@ -102,10 +102,11 @@ def clean(design: SequentialDesign, state: SequentialState, frame: Frame) -> Hea
             frame.q_error + np.where(reported, frame.q_net_error, 0.0),
         )
         told = trusted & reported & (least - room <= rest) & (rest <= most + room)
+        q = np.where(told, frame.q_net, frame.q)
     return Heard(
         live,
         np.minimum(np.maximum(np.where(live, frame.y, 0.0), 0.0), NO_VOLTAGE),
-        np.where(told, frame.q_net, frame.q),
+        q,
         told,
         reported,
         *_busbar(design, state, frame),

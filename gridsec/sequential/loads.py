@@ -11,7 +11,7 @@ docs/theory-sequential.md, section 1.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -22,6 +22,8 @@ from gridsec.errors import refuse
 from gridsec.network import Network, Power, bus_voltages, by_place, covariance, one_busbar, variances
 from gridsec.sequential.conditional import Prior
 
+EXACT = 1e-6
+"""Standard deviation of a power that is known exactly, pu: none is known better."""
 UNMETERED = 0.1
 """Standard deviation of a squared busbar voltage that nobody reads, squared pu."""
 LONGEST_S = 1e12
@@ -47,6 +49,8 @@ class LoadDoubt:
     together : (N,) or one for all
         Share of both variances, 0 to 1, that goes up and down with that of all others: powers that nobody
         meters are low together by night, the active and the reactive one alike.
+    even_p, even_q : (N,)
+        Derived. Half-widths of errors that are evenly spread and deviate by p and q, pu.
 
     Raises
     ------
@@ -61,6 +65,8 @@ class LoadDoubt:
     common_q: float = 0.0
     lasting: float = 0.0
     together: Floats | float = 0.0
+    even_p: Floats = field(init=False, repr=False)
+    even_q: Floats = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         problems = [
@@ -77,6 +83,8 @@ class LoadDoubt:
             if not (np.greater_equal(getattr(self, name), 0) & np.less_equal(getattr(self, name), 1)).all()
         ]
         refuse(problems)
+        for name, std in (("even_p", self.p), ("even_q", self.q)):
+            object.__setattr__(self, name, np.sqrt(3.0) * np.maximum(std, EXACT))
 
 
 def prior(

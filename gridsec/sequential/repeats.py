@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 from scipy.special import erf
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, indices
+from gridsec.values import changed
 
 _Codes: TypeAlias = NDArray[np.int32]
 _Hashes: TypeAlias = NDArray[np.uint32]
@@ -293,10 +294,10 @@ def keep(memory: Memory, model: Floats, own: Floats) -> Memory:
     """
     tail = (*memory.tail, (memory.now, memory.hash, model.astype(np.float32), own.astype(np.float32)))
     if len(tail) < ROWS:
-        return replace(memory, kept=memory.kept + 1, tail=tail)
+        return changed(memory, kept=memory.kept + 1, tail=tail)
     block = Block(*(np.stack(rows) for rows in zip(*tail, strict=True)))
     blocks = (*memory.blocks, block)[-_kept(memory.now.size) :]
-    return replace(memory, kept=memory.kept + 1, blocks=blocks, tail=())
+    return changed(memory, kept=memory.kept + 1, blocks=blocks, tail=())
 
 
 def _kept(meters: int) -> int:

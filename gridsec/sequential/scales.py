@@ -32,8 +32,6 @@ class View:
     ----------
     judged
         Every meter, judged by the trusted others.
-    m : (p,)
-        Mean residual, squared pu.
     enough : (p,)
         Meters with enough readings on this scale.
     limit : (p,)
@@ -46,7 +44,6 @@ class View:
     """
 
     judged: Judged
-    m: Floats
     enough: Bools
     limit: Floats
     over: Bools
@@ -187,7 +184,7 @@ def view_of(design: SequentialDesign, here: Scale, judged: Judged) -> View:
     """
     limit = here.limits.of(judged.std)
     over = here.enough & (np.abs(judged.offset) > limit)
-    return View(judged, here.m, here.enough, limit, over, here.limits, design.options.lower)
+    return View(judged, here.enough, limit, over, here.limits, design.options.lower)
 
 
 def adapt(before: Fit | None, here: Scale, wanted: Bools, loose: Floats | None) -> Fit:

@@ -223,7 +223,8 @@ def _voltages(design: SequentialDesign, frame: Frame, heard: Heard, x: Floats) -
 
 def _net(design: SequentialDesign, heard: Heard, x: Floats) -> Floats:
     """Net reactive injections with observed ones of the inverters where they are not metered, (N,)."""
-    return heard.q + np.where(heard.told, 0.0, design.plant.droop.per_customer(x, heard.q.size))
+    observed = design.plant.droop.per_customer(x, heard.q.size)
+    return heard.q + (np.where(heard.told, 0.0, observed) if any_of(heard.told) else observed)
 
 
 def _swing(design: SequentialDesign, v2_bus: Floats, v0_squared: Floats | float) -> float:
@@ -275,7 +276,9 @@ def _kinds(  # noqa: PLR0917  # everything that lies are compared with
         variance = prior_.variance[prior_.meters] + design.white + state.learned.variance
     else:
         std = view.judged.std
-        mean = view.m if window is look.now.window else window.sums[0] / np.maximum(window.counts[0], 1)
+        mean = (
+            view.judged.m if window is look.now.window else window.sums[0] / np.maximum(window.counts[0], 1)
+        )
         expected, variance = expected + mean - view.judged.offset, std * std
     return describe(design.shapes, look.kinds, expected, own, seen.trust.named, variance)
 
@@ -292,7 +295,9 @@ def _gathered(design: SequentialDesign, look: _Look, trust: Trust, h: float) -> 
     # While more than meters is suspected, what the others read is not their own error.
     if before is None or not look.state.ticks or trust.accused:
         return before
-    use = look.heard.live & trust.trusted & _known(design, look.doubts)
+    use = look.heard.live & trust.trusted
+    if look.doubts.priors[0] is not design.prior:
+        use &= _known(design, look.doubts)
     # A pause of the frames is no time in which anything was heard.
     return gather(before, look.residual, use, h if h <= _PAUSE * design.step_s else design.step_s)
 
@@ -314,8 +319,6 @@ def _learned(design: SequentialDesign, state: SequentialState) -> SequentialStat
 
 def _known(design: SequentialDesign, doubts: Doubts) -> Bools:
     """Where what is not known is about as large as learning supposes, (p,)."""
-    if doubts.priors[0] is design.prior:
-        return np.ones(design.prior.meters.size, dtype=np.bool_)
     variance, at = doubts.priors[0].variance, design.prior.meters
     return np.asarray(variance[at] <= _WIDER**2 * design.prior.variance[at])
 
