@@ -26,6 +26,7 @@ from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -77,6 +78,10 @@ class Learned:
     def recent(self) -> defaultdict[int, Recent]:
         """What was answered last of the largest honest offsets, by scale."""
         return defaultdict(Recent)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # What was answered can be worked out again.
+        return {name: each for name, each in vars(self).items() if name != "recent"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
