@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -11,6 +12,11 @@ from gridsec import sequential
 from gridsec.online import Cause, Decision, Explanation, Frame
 from gridsec.plant import Plant
 from gridsec.sequential import LoadDoubt, SequentialDesign, SequentialOptions
+from gridsec.sequential.conclude import _worst
+from gridsec.sequential.conditional import fit, judge
+from gridsec.sequential.examine import Examined
+from gridsec.sequential.scales import View
+from gridsec.sequential.search import Limits
 from gridsec.sequential.words import ways
 from tests.gridsec.sequential.test_monitor import prepare, watch
 from tests.gridsec.street import BASE_KVA, Street, accuracy, make_plant
@@ -99,3 +105,38 @@ def test_one_of_two_at_the_same_bus_lies_and_that_is_said_at_every_tick() -> Non
         assert {(12,), (13,)} <= accused
         assert sum(each.probability for each in verdict.explanations) == pytest.approx(1.0)
         assert verdict.reason.startswith("Wrong are either the meter of c1")
+
+
+def test_a_meters_score_is_that_of_the_scale_that_speaks_most_against_it(design: SequentialDesign) -> None:
+    """Against a loop over scales and meters; whoever no scale has enough readings of is not judged."""
+    rng = np.random.default_rng(5)
+    for _ in range(50):
+        offset, limit = rng.normal(size=(4, 12)), rng.uniform(0.1, 2.0, (4, 12))
+        enough = rng.random((4, 12)) < rng.choice([0.3, 0.9, 1.0])
+        there = rng.random(4) < 0.7
+        views = tuple(
+            replace(_view(design), judged=replace(_view(design).judged, offset=o), limit=a, enough=e)
+            if here
+            else None
+            for o, a, e, here in zip(offset, limit, enough, there, strict=True)
+        )
+        seen = Examined(sequential.init(design, 0.0).trust, (None,) * 4, (None,) * 4, views, {})
+        score, threshold, judged = _worst(design, seen, 12)
+        for j in range(12):
+            by = [s for s in range(4) if there[s] and enough[s, j]]
+            assert judged[j] == bool(by)
+            if not by:
+                assert np.isnan(score[j])
+                assert threshold[j] == design.options.widest
+                continue
+            s = max(by, key=lambda s: abs(offset[s, j]) / limit[s, j])
+            assert (score[j], threshold[j]) == (abs(offset[s, j]), limit[s, j])
+
+
+@cache
+def _view(design: SequentialDesign) -> View:
+    """Any view of a scale."""
+    zero, prior = np.zeros(12), design.prior
+    judged = judge(fit(prior, design.white, zero == 0.0), zero)
+    limits = Limits(4.0, zero, design.allowed, design.fixed)
+    return View(judged, zero == 0.0, zero, zero > 0.0, limits, 0.5)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -172,3 +173,21 @@ def test_a_fit_that_keeps_less_says_the_same(seed: int) -> None:
     expected_misfit = judge(now, m).misfit
     found = misfit(prior, noise, m, now.trusted, 0.5 * direction[:, None])
     np.testing.assert_allclose(found, expected_misfit, rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize("silent", [0, 2])
+def test_what_was_judged_stays_though_the_fit_is_changed(silent: int) -> None:
+    """What the meters say of the buses may be asked for after others are believed."""
+    rng = np.random.default_rng(6)
+    _, prior, noise, m = problem(rng, 9, 6)
+    trusted = np.arange(6) >= silent
+    now = fit(prior, noise, trusted)
+    loosen(now, rng.normal(size=9), 0.5)
+    late, early = judge(now, m), judge(now, m)
+    w, misfit = early.w.copy(), early.misfit
+    drop(now, 4)
+    loosen(now, rng.normal(size=9), 0.5)
+    np.testing.assert_array_equal(late.w, w)
+    assert late.w is late.w
+    assert late.misfit == misfit
+    assert not np.allclose(judge(now, m).w, w)

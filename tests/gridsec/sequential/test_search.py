@@ -16,7 +16,7 @@ from gridsec.sequential.dictionary import Dictionary
 from gridsec.sequential.exchanges import swaps
 from gridsec.sequential.loads import LoadDoubt, prior
 from gridsec.sequential.robust import robust
-from gridsec.sequential.search import Limits, descend, price
+from gridsec.sequential.search import Limits, Recent, descend, price
 from tests.gridsec.street import random_tree
 
 SIGMAS = 3.5
@@ -313,3 +313,19 @@ def test_a_bounded_fixed_error_is_allowed_as_a_bound() -> None:
     np.testing.assert_allclose(both.of(std), [0.1 + 1.5 + 4.0 * 0.5, 4.0])
     np.testing.assert_allclose(both.of(std, 0.5), [0.1 + 2.0, 2.0])
     assert both.penalty == 16.0
+
+
+def test_what_was_answered_last_is_answered_again_for_the_same_only() -> None:
+    rng = np.random.default_rng(4)
+    allowed, certain, late = (rng.uniform(0.1, 1.0, 5) for _ in range(3))
+    recent, stds = Recent(), [rng.uniform(0.5, 2.0, 5) for _ in range(2)]
+    for _ in range(40):
+        std, sigmas, part = (
+            stds[rng.integers(2)],
+            float(rng.choice([3.0, 4.0])),
+            float(rng.choice([0.6, 1.0])),
+        )
+        model = rng.uniform(0.0, 1.0, 5)
+        given = (sigmas, model, allowed, certain, None, late)
+        np.testing.assert_array_equal(Limits(*given, recent).of(std, part), Limits(*given).of(std, part))
+    assert recent.answer is not None
