@@ -64,6 +64,8 @@ class Feeder:
         Derived. Whether there is any.
     squared : (b,)
         Derived. ``r^2 + x^2``, pu.
+    alone
+        Derived. Whether no two customers are at the same bus.
 
     Raises
     ------
@@ -91,6 +93,7 @@ class Feeder:
     half: Floats = field(init=False, repr=False)
     charges: bool = field(init=False, repr=False)
     squared: Floats = field(init=False, repr=False)
+    alone: bool = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         for name in ("r", "x", "charging"):
@@ -108,6 +111,7 @@ class Feeder:
         half[1:] += 0.5 * self.charging
         object.__setattr__(self, "half", frozen(half))
         object.__setattr__(self, "charges", any_of(half))
+        object.__setattr__(self, "alone", np.unique(self.bus).size == self.bus.size)
         object.__setattr__(self, "squared", frozen(self.r**2 + self.x**2))
 
 
@@ -484,6 +488,10 @@ def _losses(feeder: Feeder, current: Floats, charge: Floats, *, sign: float) -> 
 def _at_buses(feeder: Feeder, values: Floats) -> Floats:
     """Sum of the customers' `values` (…, N) at every bus, (…, b + 1)."""
     shape = (*values.shape[:-1], len(feeder.buses))
+    if feeder.alone:
+        out = np.zeros(shape)
+        out[..., feeder.bus] = values
+        return out
     first = np.arange(0, prod(shape), shape[-1])[:, None]
     total = np.bincount((first + feeder.bus).ravel(), weights=values.ravel(), minlength=prod(shape))
     return np.asarray(total.reshape(shape))

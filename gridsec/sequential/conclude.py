@@ -75,12 +75,15 @@ def conclude(
     SequentialState, Estimate, Verdict
         The state with the answer in it, and the answer.
     """
-    trust, heard, at = state.trust, tick.heard, design.prior.meters
+    trust, heard = state.trust, tick.heard
     estimate, released = _estimate(design, state, tick)
     busbar, inverters = _busbar(design, state, heard, estimate), _inverters(design, state)
     score, threshold, judged = _worst(design, tick.seen, heard.live.size)
     live, beyond = judged & heard.live, score > threshold
-    attack = np.where(trust.named & heard.live, heard.y - state.learned.bias - estimate.v2_bus[at], 0.0)
+    attack = np.zeros(live.size)
+    if any_of(trust.named):
+        off = heard.y - state.learned.bias - estimate.v2_bus[design.prior.meters]
+        attack = np.where(trust.named & heard.live, off, 0.0)
     amounts = _amounts(design, state, tick.seen)
     settled = all_of(tick.transient <= design.options.settled * threshold)
     said = decide(

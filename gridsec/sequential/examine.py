@@ -8,6 +8,7 @@ docs/theory-sequential.md, sections 3 to 5.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
@@ -268,6 +269,7 @@ def _due(design: SequentialDesign, trust: Trust, view: View, s: int, tick: int, 
     return s == last and tick % design.lengths[last] == 0 and not searched
 
 
+@cache
 def _every(length: int) -> int:
     """Ticks from one look at a scale to the next."""
     return max(1, round(length / _LOOKS))

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, Ints, any_of
+from gridsec.arrays import Bools, Floats, Ints, all_of, any_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,14 +74,18 @@ def push(window: Window, lengths: tuple[int, ...], residual: Floats, heard: Bool
         Where there is a reading.
     """
     before, marks, turn = window.residuals, window.heard, window.turn + 1
-    values = np.where(heard, residual, 0.0)
+    # In calm the same array comes at every tick: what it was is what drops out.
+    steady = all(marks[-length] is heard for length in lengths)
+    values = residual if all_of(heard) else np.where(heard, residual, 0.0)
     after = (*before[1:], values)
     if turn == len(after):
         # Differences of running sums gather rounding errors; one round's worth is all there ever is.
         sums, turn = np.stack([np.sum(after[-length:], axis=0) for length in lengths]), 0
     else:
         sums = window.sums + values - np.array([before[-length] for length in lengths])
-    counts = window.counts + heard - np.array([marks[-length] for length in lengths])
+    counts = window.counts
+    if not steady:
+        counts = counts + heard - np.array([marks[-length] for length in lengths])
     return Window(after, (*marks[1:], heard), turn, sums, counts)
 
 
