@@ -152,8 +152,11 @@ class TestWindows:
         lengths = (1, 4, 9)
         window = empty(lengths, 3)
         rows, marks = [], []
+        often = np.ones(3, dtype=np.bool_), np.array([True, False, True])
         for _ in range(ticks):
             values, heard = rng.normal(size=3), rng.random(3) < 0.7
+            # The very array of before now and then, as where everybody reports at every tick.
+            heard = often[int(rng.random() < 0.2)] if rng.random() < 0.9 else heard
             window = push(window, lengths, np.where(heard, values, np.nan), heard)
             rows.append(np.where(heard, values, 0.0))
             marks.append(heard)
