@@ -124,9 +124,11 @@ class Fit:
         """Inverse covariance of the trusted meters, zero elsewhere, (p, p)."""
         if len(self.inverse) == self.noise.size:
             return self.inverse
-        at = indices(self.trusted)
-        out = np.zeros((self.noise.size, self.noise.size))
-        out[np.ix_(at, at)] = self.inverse
+        at, size = indices(self.trusted), self.noise.size
+        rows, out = np.zeros((at.size, size)), np.zeros((size, size))
+        # Columns, then rows: far faster than both at once.
+        rows[:, at] = self.inverse
+        out[at] = rows
         return out
 
     def trusting(self) -> tuple[Ints, Floats]:

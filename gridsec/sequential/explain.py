@@ -14,6 +14,7 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, Ints, any_of, indices
 from gridsec.network import by_place
 from gridsec.sequential import search
+from gridsec.sequential.blocks import misfit_without, without
 from gridsec.sequential.conditional import Fit, Judged, fit, judge, misfit
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.dictionary import Dictionary
@@ -37,6 +38,8 @@ _EFFORT = 4e9
 _BESIDE = 3
 # Those no worse than the likeliest by this many times log(like) are looked at more closely.
 _NEAR = 8.0
+# A fit of more meters is worth it where it is of no more than so many times fewer than it has to be.
+_PART = 2
 # Standard deviations of chi-square that chance may add; what all of a group may be off by, squared pu.
 _CHANCE, _ANY_LIE = 4.0, 0.2
 
@@ -83,6 +86,8 @@ class Search:
         self.owed = ~trust.trusted & (trust.owed > 0)
         self.accused = tuple(suspicion for suspicion in trust.accused if suspicion[1] > s)
         self.turned: list[Explanation] = []
+        self.covering: dict[int, Fit | None] = {}
+        self.left: dict[tuple[bytes, tuple[int, ...]], list[float]] = {}
 
     def __call__(self, now: Fit, view: View) -> tuple[Found, Trust]:
         """What is found, and whom that leaves trusted.
@@ -112,8 +117,11 @@ class Search:
         if found is None or self._suspected(found) > self.design.options.several:
             free = self._free(found)
             if any_of(free.best.trusted & self.keep):
-                held = self._fit(free.best.trusted & ~self.keep)
-                found = likelier(found, Found(self._descend(held, self.keep, fresh=True)))
+                trusted = free.best.trusted & ~self.keep
+                # From where a descent began already it would come to the same.
+                if found is None or not np.array_equal(trusted & self.here.enough, start.trusted):
+                    held = self._descend(self._fit(trusted), self.keep, fresh=True)
+                    found = likelier(found, Found(held))
             else:
                 found, free = likelier(found, free), None
         if few and self._suspected(found) > 0:
@@ -219,8 +227,8 @@ class Search:
         start = among | (best.trusted & (np.abs(judged.offset) <= here.limits.of(judged.std)))
         if np.count_nonzero(here.enough & ~start) > _MUCH * most:
             return []
-        nobody, now = np.zeros_like(among), fit(prior, here.noise, start, loose)
-        other = self._descend(now, nobody, innocent=group, fresh=True)
+        now = fit(prior, here.noise, start, loose) if loose.shape[1] else self._fit(start)
+        other = self._descend(now, np.zeros_like(among), innocent=group, fresh=True)
         return [self._after(best, other)] if self._admissible(other) else []
 
     def _admissible(self, found: Explanation) -> bool:
@@ -372,10 +380,8 @@ class Search:
         """A robust fit, and the meters close to the model."""
         here, prior = self.here, self.here.prior
         focus, std = self.design.options.focus, np.sqrt(here.noise)
-        bound, whole = here.limits.model + focus * std, self.wholes[self.s]
-        if whole is not None and not covers(whole, prior, here.noise, here.enough):
-            whole = None
-        chosen = robust(prior, here.noise, here.m, here.enough, bound, whole)
+        bound = here.limits.model + focus * std
+        chosen = robust(prior, here.noise, here.m, here.enough, bound, self._whole(self.s))
         alone = np.sqrt(prior.variance[prior.meters] + here.noise)
         return chosen, here.enough & (np.abs(here.m) <= here.limits.model + focus * alone)
 
@@ -406,8 +412,21 @@ class Search:
         )
 
     def _fit(self, trusted: Bools) -> Fit:
-        loose = self.scales.loosened(self.accused)
-        return fit(self.here.prior, self.here.noise, trusted & self.here.enough, loose)
+        loose, wanted = self.scales.loosened(self.accused), trusted & self.here.enough
+        whole = self._whole(self.s) if loose is None else None
+        if whole is not None:
+            fallen = whole.trusted & ~wanted
+            if np.count_nonzero(fallen) * _PART <= np.count_nonzero(wanted):
+                return without(whole, fallen)
+        return fit(self.here.prior, self.here.noise, wanted, loose)
+
+    def _whole(self, s: int) -> Fit | None:
+        """A fit of all that report on a scale, and perhaps of others, as it was factorised; None for none."""
+        if s not in self.covering:
+            whole, here = self.wholes[s], self.scales[s]
+            good = whole is not None and covers(whole, here.prior, here.noise, here.enough)
+            self.covering[s] = whole if good else None
+        return self.covering[s]
 
     def _total(self, found: Explanation) -> float:
         """The misfit on all scales and, once, what the accusations cost."""
@@ -424,17 +443,30 @@ class Search:
         self, found: Explanation, more: Bools | None = None, alike: Floats | None = None
     ) -> list[float]:
         """What an explanation leaves unexplained on each scale; of `more` meters, which may be off alike."""
-        trusted, out = self._trusted(found), []
+        trusted, each = self._trusted(found), range(len(self.design.lengths))
+        who = trusted.tobytes(), found.loosened
+        if more is None and who in self.left:
+            return self.left[who]
         trusted = trusted if more is None else trusted | more
         loose = self.scales.loosened((*self.accused, *((k, self.s) for k in found.loosened)))
-        for s in range(len(self.design.lengths)):
-            there = self.scales[s]
-            if s == self.s and more is None and isinstance(found, Solution):
-                out.append(found.judged.misfit)
-            else:
-                wanted = trusted & there.enough
-                out.append(misfit(there.prior, there.noise, there.m, wanted, loose, alike))
-        return out
+        if more is not None:
+            return [self._misfit(s, trusted, loose, alike) for s in each]
+        own = found.judged.misfit if isinstance(found, Solution) else None
+        self.left[who] = [
+            self._misfit(s, trusted, loose) if own is None or s != self.s else own for s in each
+        ]
+        return self.left[who]
+
+    def _misfit(self, s: int, trusted: Bools, loose: Floats | None, alike: Floats | None = None) -> float:
+        """What those who are trusted leave unexplained on a scale."""
+        here = self.scales[s]
+        wanted = trusted & here.enough
+        whole = self._whole(s) if loose is None and alike is None else None
+        if whole is not None:
+            fallen = whole.trusted & ~wanted
+            if np.count_nonzero(fallen) * _PART <= np.count_nonzero(wanted):
+                return misfit_without(whole, here.m, fallen)
+        return misfit(here.prior, here.noise, here.m, wanted, loose, alike)
 
     def _believe(self, best: Explanation) -> Trust:
         accused = (*self.accused, *((k, self.s) for k in best.loosened))

@@ -14,6 +14,7 @@ from math import ceil
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, any_of, indices
+from gridsec.sequential.blocks import without
 from gridsec.sequential.commission import Learned
 from gridsec.sequential.conditional import Fit, Judged, Prior, admit, drop, fit
 from gridsec.sequential.design import SequentialDesign
@@ -59,6 +60,8 @@ class View:
 
 # A fit is made anew when that part of its meters changed, or after so many changes (rounding).
 _ANEW = 6
+# Unless no more than that part of those that were trusted just fell.
+_WHOLE = 3
 _MOST_CHANGES = 400
 
 
@@ -210,7 +213,10 @@ def adapt(before: Fit | None, here: Scale, wanted: Bools, loose: Floats | None) 
     if not any_of(differs):
         return before
     change = indices(differs)
-    if change.size * _ANEW > wanted.size or before.changes + change.size > _MOST_CHANGES:
+    many = change.size * _ANEW > wanted.size
+    if many and not before.changes and change.size * _WHOLE < wanted.size and not any_of(wanted[change]):
+        return without(before, differs)
+    if many or before.changes + change.size > _MOST_CHANGES:
         return fit(prior, noise, wanted, loose)
     now = before.copy()
     for j in change.tolist():

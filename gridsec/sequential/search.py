@@ -22,12 +22,15 @@ Chen and Chen 2008 (the prior over sets).
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 
 import numpy as np
+from scipy.linalg import lapack
 
 from gridsec.arrays import Bools, Floats, Ints, frozen_ints, indices, submatrix
+from gridsec.sequential.blocks import Outside
 from gridsec.sequential.conditional import Fit, Judged, Move, admit, drop, follow, judge
 from gridsec.sequential.dictionary import Dictionary, Powers, Step
 
@@ -99,6 +102,17 @@ class Limits:
             std = np.sqrt(std * std + self.late)
         rest = np.sqrt(np.maximum(std * std - self.certain, 0.0))
         return np.asarray(np.minimum(sigmas * std, self.allowed + sigmas * rest))
+
+    def some(self, at: Ints) -> Limits:
+        """The same of some meters.
+
+        Parameters
+        ----------
+        at : (k,)
+            Which.
+        """
+        late = None if self.late is None else self.late[at]
+        return Limits(self.sigmas, self.model[at], self.allowed[at], self.certain[at], self.most, late)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -232,7 +246,8 @@ def descend(
         if not steps:
             break
         for step in steps:
-            judged = follow(now, m, judged, step())
+            move = step()
+            judged = judge(now, m) if move is None else follow(now, m, judged, move)
     if not fresh and now.changes == start.changes:
         now = start  # and what is kept with it
     else:
@@ -283,8 +298,8 @@ class _Place:
     powers: Powers | None
 
 
-def _best(here: _Place) -> list[Step]:
-    """The next move in steps; none where none helps."""
+def _best(here: _Place) -> Sequence[Callable[[], Move | None]]:
+    """The next move in steps; none where none helps. A step that is no single change returns None."""
     now, judged, powers = here.fit, here.judged, here.powers
     excess = np.abs(judged.offset) / here.limits.of(judged.std)
     inside = np.where(now.trusted, excess, -np.inf)
@@ -304,9 +319,58 @@ def _best(here: _Place) -> list[Step]:
         return steps
     outside = np.where(now.trusted | here.barred, np.inf, excess)
     nearest = int(outside.argmin())
-    if outside[nearest] < 1.0:
-        return [lambda: _moved(admit(now, nearest), powers)]
-    return []
+    if not outside[nearest] < 1.0:
+        return []
+    if powers is None and not here.pairs and np.count_nonzero(outside < 1.0) >= _MANY:
+        return [partial(_admit_many, here, indices(outside < np.inf))]
+    return [lambda: _moved(admit(now, nearest), powers)]
+
+
+# From so many on that might be admitted it is faster to follow them beside each other.
+_MANY = 6
+
+
+def _admit_many(here: _Place, at: Ints) -> None:
+    """Admit one after the other as long as the nearest is close enough and nobody is to be dropped.
+
+    What is open of those outside is followed alone; whether anybody inside would have had to be dropped is
+    then asked for all moves at once, and the moves from there on are taken back.
+    """
+    now, judged = here.fit, here.judged
+    outside = Outside.of(now, at)
+    order = _nearest(outside.apart.copy(), judged.offset[at], here.limits.some(at))
+    factor = outside.factor(order)
+    changes = outside.changes(order, factor)
+    error, _ = lapack.dtrtrs(factor, judged.offset[at[order]], lower=True)
+    pivot = now.diagonal() + np.cumsum(changes * changes, axis=0)[:-1]
+    weights = judged.weights + np.cumsum(changes * error[:, None], axis=0)[:-1]
+    inside = pivot > 0.0
+    pivot = np.where(inside, pivot, 1.0)
+    beyond = inside & (np.abs(weights) > pivot * here.limits.of(np.sqrt(1.0 / pivot)))
+    beyond[:, here.innocent] = False
+    wrong = indices(beyond.any(axis=1))
+    outside.admit(order[: wrong[0] + 1] if wrong.size else order, factor, changes)
+
+
+def _nearest(apart: Floats, offset: Floats, limits: Limits) -> Ints:
+    """The order in which meters outside are admitted, each time the one that is closest, places, (r,).
+
+    `apart` (k, k), lost: what the trusted leave open of their readings.
+    """
+    order: list[int] = []
+    done = np.zeros(offset.size)
+    for _ in range(offset.size):
+        excess = np.abs(offset) / limits.of(np.sqrt(apart.diagonal())) + done
+        j = int(excess.argmin())
+        if not excess[j] < 1.0:
+            break
+        order.append(j)
+        done[j] = np.inf
+        column = apart[:, j] / apart[j, j]
+        offset = offset - column * offset[j]
+        apart -= np.multiply.outer(column, apart[j])
+        apart[j, j] = 1.0
+    return np.array(order, dtype=np.intp)
 
 
 # Pairs are looked for among so many meters, those that dropping alone gains most for.

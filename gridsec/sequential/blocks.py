@@ -1,0 +1,212 @@
+"""Many meters dropped or admitted at once: one change of the rank of their number.
+
+Dropping or admitting one meter after the other takes some passes over all matrices for each. With Q the
+inverse covariance of trusted meters T, and D those of them that fall,
+
+    Q' = Q_KK - Q_KD Q_DD^-1 Q_DK,        K = T without D,
+
+and what is left unexplained falls by ``b^T Q_DD^-1 b`` with ``b = Q_D: m``, where m may be anything at D.
+With A meters that are not trusted, ``X = Q S_TA``, and what is left open of their readings,
+``S_AA + D_AA - S_AT X``, of which L is the Cholesky factor in the order in which they are admitted,
+
+    Q' = Q + F^T F,   F = L^-1 [-X^T  I],
+
+and every row of F is one of the changes of rank one by which `conditional.admit` comes to the same.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import blas, lapack
+
+from gridsec.arrays import Bools, Floats, Ints, indices, submatrix
+from gridsec.sequential.conditional import Fit, fit, solved
+
+# Rows that are worked on together.
+_ROWS = 256
+
+
+def without(now: Fit, fallen: Bools) -> Fit:
+    """A fit of all that another one trusts but for some; O(p^2 k) for k of these.
+
+    Parameters
+    ----------
+    now
+        The other one; not changed.
+    fallen : (p,)
+        Those it trusts and the new one does not; whom it does not trust counts for nothing.
+    """
+    at, Q = now.trusting()
+    gone, stay = indices(fallen[at]), indices(~fallen[at])
+    if not gone.size:
+        return now.copy()
+    if not stay.size:
+        return fit(now.prior, now.noise, np.zeros_like(now.trusted), now.loose)
+    factor = _factor(submatrix(Q, gone, gone).T)
+    # Symmetric: the transpose is the same in the order of LAPACK.
+    half, _ = lapack.dtrtrs(factor, submatrix(Q, stay, gone).T, lower=True, overwrite_b=True)
+    inverse = submatrix(Q, stay, stay)
+    inverse = blas.dgemm(-1.0, half, half, beta=1.0, c=inverse.T, trans_a=True, overwrite_c=True).T
+    variance = _opened(now, at, Q, gone, factor)
+    noise, buses = now.noise[at[stay]], now.prior.meters[at[stay]]
+    # As in `conditional.fit`: what a meter knows of its own bus follows from what it leaves open of it.
+    good = noise < _before(now)[buses]
+    variance[buses[good]] = (noise * (1.0 - noise * inverse.diagonal()))[good]
+    np.maximum(variance, 0.0, out=variance)
+    trusted = now.trusted & ~fallen
+    return Fit(now.prior, now.noise, trusted, inverse, variance, now.loose, now.changes + gone.size)
+
+
+def _before(now: Fit) -> Floats:
+    """Variance at every bus before anybody is heard, (n,)."""
+    return np.asarray(now.prior.variance + np.einsum("ij,ij->i", now.loose, now.loose))
+
+
+def _factor(matrix: Floats) -> Floats:
+    """Cholesky factor, lower triangle; `matrix` is in the order of LAPACK, and lost."""
+    factor, failed = lapack.dpotrf(matrix, lower=True, clean=True, overwrite_a=True)
+    if failed:
+        raise np.linalg.LinAlgError("the matrix is not positive definite")
+    return np.asarray(factor)
+
+
+def _opened(now: Fit, at: Ints, Q: Floats, gone: Ints, factor: Floats) -> Floats:
+    """Variance at every bus without some of the trusted, but at the buses of those who stay."""
+    who, (prior, noise) = at[gone], (now.prior, now.noise)
+    out, known = now.variance.copy(), np.zeros(now.variance.size, dtype=np.bool_)
+    known[prior.meters[at]] = noise[at] < _before(now)[prior.meters[at]]
+    rows = indices(~known)
+    for first in range(0, rows.size, _ROWS):
+        some = rows[first : first + _ROWS]
+        between = submatrix(prior.of_meters, some, at)
+        if now.loose.shape[1]:
+            between += now.loose[some] @ now.loose[prior.meters[at]].T
+        part, _ = lapack.dtrtrs(factor, (between @ Q[:, gone]).T, lower=True)
+        out[some] += np.einsum("ij,ij->j", part, part)
+    # What the others leave open of a reading is its noise and what they leave open at its bus.
+    upper, _ = lapack.dtrtri(factor, lower=True)
+    own = np.einsum("ij,ij->j", upper, upper) - noise[who]
+    mine = known[prior.meters[who]]
+    buses = prior.meters[who[mine]]
+    out[buses] = np.maximum(out[buses], own[mine])
+    return out
+
+
+def misfit_without(whole: Fit, m: Floats, fallen: Bools) -> float:
+    """``m^T Q m`` of those whom a fit trusts but for some; O(p^2 + k^3) for k of these.
+
+    Parameters
+    ----------
+    whole
+        The fit.
+    m : (p,)
+        As in `conditional.judge`; anything at those that fall.
+    fallen : (p,)
+        Those it trusts that do not count.
+    """
+    gone = indices(fallen & whole.trusted)
+    m = np.where(whole.trusted & ~fallen, m, 0.0)
+    weights = whole.weights(m)
+    left = float(m @ weights)
+    if not gone.size:
+        return left
+    at = gone if len(whole.inverse) == m.size else np.searchsorted(indices(whole.trusted), gone)
+    b = weights[gone]
+    return left - float(b @ solved(submatrix(whole.inverse, at, at).T, b))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outside:
+    """Some meters that are not trusted beside those that are. n buses, p meters, k of them outside.
+
+    Attributes
+    ----------
+    fit
+        The trusted ones.
+    at : (k,)
+        The others.
+    columns : (n, k)
+        Prior covariance of every bus with them.
+    seen : (t, k)
+        Q S_TA: what the trusted ones make of that.
+    apart : (k, k)
+        What these leave open of the readings of the others.
+    """
+
+    fit: Fit
+    at: Ints
+    columns: Floats
+    seen: Floats
+    apart: Floats
+
+    @staticmethod
+    def of(now: Fit, at: Ints) -> Outside:
+        """The same, worked out; O(p^2 k).
+
+        Parameters
+        ----------
+        now, at
+            As above.
+        """
+        prior, (who, Q) = now.prior, now.trusting()
+        columns = prior.of_meters.take(at, axis=1)
+        if now.loose.shape[1]:
+            columns += now.loose @ now.loose[prior.meters[at]].T
+        inside = columns[prior.meters[who]]
+        seen = Q @ inside
+        apart = columns[prior.meters[at]] - inside.T @ seen
+        apart[np.diag_indices(at.size)] += now.noise[at]
+        return Outside(now, at, columns, seen, apart)
+
+    def factor(self, order: Ints) -> Floats:
+        """Cholesky factor of what is open of some of them, in an order, lower triangle, (r, r).
+
+        Parameters
+        ----------
+        order : (r,)
+            Places in `at`, one at least.
+        """
+        return _factor(submatrix(self.apart, order, order).T)
+
+    def changes(self, order: Ints, factor: Floats) -> Floats:
+        """F: what admitting them in an order does to Q one by one, each as its square, (r, p).
+
+        Parameters
+        ----------
+        order : (r,)
+            As in `factor`.
+        factor : (r, r)
+            From there.
+        """
+        out = np.zeros((order.size, self.fit.noise.size))
+        out[:, self.fit.trusted] = -self.seen.take(order, axis=1).T
+        out[np.arange(order.size), self.at[order]] = 1.0
+        return np.asarray(lapack.dtrtrs(factor, out, lower=True)[0])
+
+    def admit(self, order: Ints, factor: Floats, changes: Floats) -> None:
+        """Trust the first of them from now on; O(p^2 r), and nothing here is true any more.
+
+        Parameters
+        ----------
+        order : (r,)
+            Whom, as in `factor`.
+        factor, changes
+            From above; what belongs to those that come later counts for nothing.
+        """
+        now, prior, r = self.fit, self.fit.prior, order.size
+        who, columns = indices(now.trusted), self.columns.take(order, axis=1)
+        seen = np.zeros((now.noise.size, r))
+        seen[who] = self.seen.take(order, axis=1)
+        columns -= prior.of_meters @ seen
+        if now.loose.shape[1]:
+            columns -= now.loose @ (now.loose[prior.meters].T @ seen)
+        spread, _ = lapack.dtrtrs(factor[:r, :r], columns.T, lower=True)
+        some = changes[:r]
+        # In place: Q is symmetric, and its transpose in the order of BLAS.
+        now.inverse = blas.dgemm(1.0, some, some, beta=1.0, c=now.Q.T, trans_a=True, overwrite_c=True).T
+        now.variance = np.maximum(now.variance - np.einsum("ij,ij->j", spread, spread), 0.0)
+        now.trusted[self.at[order]] = True
+        now.changes += r
+        now.pivot = now.std = now.together = now.left = None

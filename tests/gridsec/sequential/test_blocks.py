@@ -1,0 +1,116 @@
+"""Many meters at once: against one after the other, and against dense linear algebra made anew."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gridsec.arrays import Bools, Floats
+from gridsec.sequential import search
+from gridsec.sequential.blocks import Outside, misfit_without, without
+from gridsec.sequential.conditional import Fit, Prior, admit, drop, fit, judge, loosen
+from gridsec.sequential.search import Limits, Solution, descend
+from tests.gridsec.sequential.test_conditional import agrees, problem
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def started(rng: np.random.Generator, prior: Prior, noise: Floats, *, loose: bool) -> Fit:
+    """Most meters trusted, perhaps with a direction loosened."""
+    now = fit(prior, noise, rng.random(noise.size) < 0.8)
+    if loose:
+        loosen(now, rng.normal(size=prior.variance.size), 0.7)
+        now = fit(prior, noise, now.trusted, now.loose)
+    return now
+
+
+def opened(S: Floats, now: Fit) -> Floats:
+    """The covariance with what was loosened."""
+    return S + now.loose @ now.loose.T
+
+
+@settings(max_examples=80)
+@given(seed=SEEDS, meters=st.integers(1, 9), extra=st.integers(0, 6), loose=st.booleans(), lean=st.booleans())
+def test_who_falls_together_might_have_fallen_one_by_one(
+    seed: int, meters: int, extra: int, loose: bool, lean: bool
+) -> None:
+    rng = np.random.default_rng(seed)
+    S, prior, noise, m = problem(rng, meters + extra, meters)
+    # Also meters that know less of their bus than what is known without them.
+    noise = noise * 10.0 ** rng.integers(-2, 3, meters)
+    before = started(rng, prior, noise, loose=loose)
+    if not lean:
+        before.inverse = before.Q
+    kept, fallen = before.copy(), rng.random(meters) < 0.5
+    after, one_by_one = without(before, fallen), before.copy()
+    for j in np.flatnonzero(fallen & before.trusted).tolist():
+        drop(one_by_one, j)
+    agrees(after, opened(S, before), m)
+    assert after.changes == one_by_one.changes or not after.trusted.any()
+    np.testing.assert_array_equal(after.trusted, one_by_one.trusted)
+    np.testing.assert_allclose(after.Q, one_by_one.Q, rtol=1e-9, atol=1e-9 * np.abs(after.Q).max(initial=0.0))
+    np.testing.assert_array_equal(before.Q, kept.Q)
+    np.testing.assert_array_equal(before.variance, kept.variance)
+    expected = float(judge(fit(prior, noise, after.trusted, before.loose), m).misfit)
+    wild = np.where(fallen, 1e6, m)
+    assert misfit_without(before, wild, fallen) == pytest.approx(expected, rel=1e-8, abs=1e-8)
+
+
+@settings(max_examples=80)
+@given(seed=SEEDS, meters=st.integers(2, 9), extra=st.integers(0, 6), loose=st.booleans())
+def test_who_is_admitted_together_might_have_been_one_by_one(
+    seed: int, meters: int, extra: int, loose: bool
+) -> None:
+    rng = np.random.default_rng(seed)
+    S, prior, noise, m = problem(rng, meters + extra, meters)
+    now = started(rng, prior, noise, loose=loose)
+    now = without(now, np.arange(meters) == 0)
+    at = np.flatnonzero(~now.trusted)
+    order = rng.permutation(at.size)
+    outside, one_by_one = Outside.of(now, at), now.copy()
+    factor = outside.factor(order)
+    changes = outside.changes(order, factor)
+    part = order[: rng.integers(1, order.size + 1)]
+    for k, j in enumerate(at[part].tolist()):
+        move = admit(one_by_one, j)
+        square = move.factor * np.multiply.outer(move.q, move.q)
+        np.testing.assert_allclose(np.multiply.outer(changes[k], changes[k]), square, rtol=1e-7, atol=1e-8)
+    outside.admit(part, factor, changes)
+    assert now.changes == one_by_one.changes
+    np.testing.assert_array_equal(now.trusted, one_by_one.trusted)
+    np.testing.assert_allclose(now.Q, one_by_one.Q, rtol=1e-7, atol=1e-8)
+    agrees(now, opened(S, now), m)
+
+
+def single(found: dict[str, Solution], seed: int, few: int) -> dict[str, Solution]:
+    """A descent from hardly anybody, in which some must be believed; readings of one level, a few off."""
+    rng = np.random.default_rng(seed)
+    _, prior, noise, m = problem(rng, 24, 20)
+    off = rng.random(20) < 0.3
+    readings = 0.3 * m + np.where(off, rng.normal(size=20) * 10.0, 0.0)
+    limits = Limits(2.5, np.full(20, 0.01), np.full(20, 0.3), np.full(20, 0.01), None, np.full(20, 0.02))
+    keep: Bools = rng.random(20) < 0.1
+    innocent = np.flatnonzero(rng.random(20) < 0.2)
+    start = fit(prior, noise, rng.random(20) < 0.3)
+    return {
+        **found,
+        str(few): descend(start, readings, np.ones(20, bool), limits, keep=keep, innocent=innocent),
+    }
+
+
+@settings(max_examples=150)
+@given(seed=SEEDS)
+def test_a_descent_admits_many_as_it_would_one_by_one(seed: int) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        found: dict[str, Solution] = {}
+        for few in (1, 10**6):
+            patch.setattr(search, "_MANY", few)
+            found = single(found, seed, few)
+    many, one_by_one = found.values()
+    np.testing.assert_array_equal(many.trusted, one_by_one.trusted)
+    assert many.cost == pytest.approx(one_by_one.cost, rel=1e-8, abs=1e-8)
+    assert many.fit.changes == one_by_one.fit.changes
+    np.testing.assert_allclose(many.judged.offset, one_by_one.judged.offset, rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(many.fit.variance, one_by_one.fit.variance, rtol=1e-6, atol=1e-7)
