@@ -26,6 +26,8 @@ from gridsec.sequential.conditional import Fit, fit, solved
 
 # Rows that are worked on together.
 _ROWS = 256
+# Noise is not taken off again from what it has been added to where it is so many times as large.
+_LARGE = 1e3
 
 
 def without(now: Fit, fallen: Bools) -> Fit:
@@ -49,19 +51,12 @@ def without(now: Fit, fallen: Bools) -> Fit:
     half, _ = lapack.dtrtrs(factor, submatrix(Q, stay, gone).T, lower=True, overwrite_b=True)
     inverse = submatrix(Q, stay, stay)
     inverse = blas.dgemm(-1.0, half, half, beta=1.0, c=inverse.T, trans_a=True, overwrite_c=True).T
-    variance = _opened(now, at, Q, gone, factor)
-    noise, buses = now.noise[at[stay]], now.prior.meters[at[stay]]
-    # As in `conditional.fit`: what a meter knows of its own bus follows from what it leaves open of it.
-    good = noise < _before(now)[buses]
-    variance[buses[good]] = (noise * (1.0 - noise * inverse.diagonal()))[good]
-    np.maximum(variance, 0.0, out=variance)
+    variance = _opened(now, at, gone, factor)
+    buses = now.prior.meters[at[stay]]
+    # Of the meters themselves ``S_TT Q = I - D Q`` leaves nothing to be summed up.
+    variance[buses] = now.variance[buses] + now.noise[at[stay]] ** 2 * np.einsum("ij,ij->j", half, half)
     trusted = now.trusted & ~fallen
     return Fit(now.prior, now.noise, trusted, inverse, variance, now.loose, now.changes + gone.size)
-
-
-def _before(now: Fit) -> Floats:
-    """Variance at every bus before anybody is heard, (n,)."""
-    return np.asarray(now.prior.variance + np.einsum("ij,ij->i", now.loose, now.loose))
 
 
 def _factor(matrix: Floats) -> Floats:
@@ -72,25 +67,25 @@ def _factor(matrix: Floats) -> Floats:
     return np.asarray(factor)
 
 
-def _opened(now: Fit, at: Ints, Q: Floats, gone: Ints, factor: Floats) -> Floats:
+def _opened(now: Fit, at: Ints, gone: Ints, factor: Floats) -> Floats:
     """Variance at every bus without some of the trusted, but at the buses of those who stay."""
-    who, (prior, noise) = at[gone], (now.prior, now.noise)
-    out, known = now.variance.copy(), np.zeros(now.variance.size, dtype=np.bool_)
-    known[prior.meters[at]] = noise[at] < _before(now)[prior.meters[at]]
-    rows = indices(~known)
+    who, prior, out = at[gone], now.prior, now.variance.copy()
+    noise, buses, left = now.noise[who], prior.meters[who], np.ones(out.size, dtype=np.bool_)
+    # What the others leave open of a reading is its noise and what they leave open at its bus.
+    upper, _ = lapack.dtrtri(factor, lower=True)
+    good = noise < _LARGE * prior.variance[buses]
+    own = np.einsum("ij,ij->j", upper, upper) - noise
+    out[buses[good]] = np.maximum(out[buses], own)[good]
+    left[prior.meters[at]] = False
+    left[buses[~good]] = True
+    rows, Q = indices(left), now.trusting()[1]
     for first in range(0, rows.size, _ROWS):
         some = rows[first : first + _ROWS]
         between = submatrix(prior.of_meters, some, at)
         if now.loose.shape[1]:
             between += now.loose[some] @ now.loose[prior.meters[at]].T
-        part, _ = lapack.dtrtrs(factor, (between @ Q[:, gone]).T, lower=True)
+        part, _ = lapack.dtrtrs(factor, (between @ Q.take(gone, axis=1)).T, lower=True)
         out[some] += np.einsum("ij,ij->j", part, part)
-    # What the others leave open of a reading is its noise and what they leave open at its bus.
-    upper, _ = lapack.dtrtri(factor, lower=True)
-    own = np.einsum("ij,ij->j", upper, upper) - noise[who]
-    mine = known[prior.meters[who]]
-    buses = prior.meters[who[mine]]
-    out[buses] = np.maximum(out[buses], own[mine])
     return out
 
 
@@ -195,14 +190,8 @@ class Outside:
         factor, changes
             From above; what belongs to those that come later counts for nothing.
         """
-        now, prior, r = self.fit, self.fit.prior, order.size
-        who, columns = indices(now.trusted), self.columns.take(order, axis=1)
-        seen = np.zeros((now.noise.size, r))
-        seen[who] = self.seen.take(order, axis=1)
-        columns -= prior.of_meters @ seen
-        if now.loose.shape[1]:
-            columns -= now.loose @ (now.loose[prior.meters].T @ seen)
-        spread, _ = lapack.dtrtrs(factor[:r, :r], columns.T, lower=True)
+        now, r = self.fit, order.size
+        spread, _ = lapack.dtrtrs(factor[:r, :r], self._open(order).T, lower=True)
         some = changes[:r]
         # In place: Q is symmetric, and its transpose in the order of BLAS.
         now.inverse = blas.dgemm(1.0, some, some, beta=1.0, c=now.Q.T, trans_a=True, overwrite_c=True).T
@@ -210,3 +199,20 @@ class Outside:
         now.trusted[self.at[order]] = True
         now.changes += r
         now.pivot = now.std = now.together = now.left = None
+
+    def _open(self, order: Ints) -> Floats:
+        """What the trusted ones leave open between every bus and some of the others, (n, r)."""
+        now, prior, r = self.fit, self.fit.prior, order.size
+        who, seen = indices(now.trusted), self.seen.take(order, axis=1)
+        out, left = np.empty((now.variance.size, r)), np.ones(now.variance.size, dtype=np.bool_)
+        # Of the meters themselves it is known, or ``S_TT Q = I - D Q`` leaves nothing to be summed up.
+        out[prior.meters[self.at]] = self.apart.take(order, axis=1)
+        out[prior.meters[self.at[order]], np.arange(r)] -= now.noise[self.at[order]]
+        out[prior.meters[who]] = now.noise[who, None] * seen
+        left[prior.meters[self.at]] = left[prior.meters[who]] = False
+        rows = indices(left)
+        between = submatrix(prior.of_meters, rows, who)
+        if now.loose.shape[1]:
+            between += now.loose[rows] @ now.loose[prior.meters[who]].T
+        out[rows] = self.columns[np.ix_(rows, order)] - between @ seen
+        return out

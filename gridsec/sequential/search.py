@@ -240,6 +240,7 @@ def descend(
     if judged is None or now.changes != changed:
         judged = judge(now, m)
     before = now.changes
+    anew = True
     powers = None if dictionary is None else Powers(now, dictionary, judged.weights, live)
     for _ in range(_MOVES_PER_METER * m.size):
         steps = _best(_Place(now, judged, limits, barred, innocent, pairs, powers))
@@ -247,12 +248,13 @@ def descend(
             break
         for step in steps:
             move = step()
+            anew = move is None
             judged = judge(now, m) if move is None else follow(now, m, judged, move)
     if not fresh and now.changes == start.changes:
         now = start  # and what is kept with it
     else:
         now.shrink()
-    if now.changes > before:
+    if now.changes > before and not anew:
         judged = judge(now, m)  # without what rounding has left
     dropped = int(np.count_nonzero(live & ~now.trusted))
     loosened = () if powers is None else powers.loosened
