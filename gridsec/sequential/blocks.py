@@ -26,6 +26,8 @@ from gridsec.sequential.conditional import Fit, fit, solved
 
 # Rows that are worked on together.
 _ROWS = 256
+# A row of a product takes so many times less than picking a column of its factor.
+_SEVERAL = 8
 # Noise is not taken off again from what it has been added to where it is so many times as large.
 _LARGE = 1e3
 
@@ -51,7 +53,7 @@ def without(now: Fit, fallen: Bools) -> Fit:
     half, _ = lapack.dtrtrs(factor, submatrix(Q, stay, gone).T, lower=True, overwrite_b=True)
     inverse = submatrix(Q, stay, stay)
     inverse = blas.dgemm(-1.0, half, half, beta=1.0, c=inverse.T, trans_a=True, overwrite_c=True).T
-    variance = _opened(now, at, gone, factor)
+    variance = _opened(now, at, Q, gone, factor)
     buses = now.prior.meters[at[stay]]
     # Of the meters themselves ``S_TT Q = I - D Q`` leaves nothing to be summed up.
     variance[buses] = now.variance[buses] + now.noise[at[stay]] ** 2 * np.einsum("ij,ij->j", half, half)
@@ -67,7 +69,7 @@ def _factor(matrix: Floats) -> Floats:
     return np.asarray(factor)
 
 
-def _opened(now: Fit, at: Ints, gone: Ints, factor: Floats) -> Floats:
+def _opened(now: Fit, at: Ints, Q: Floats, gone: Ints, factor: Floats) -> Floats:
     """Variance at every bus without some of the trusted, but at the buses of those who stay."""
     who, prior, out = at[gone], now.prior, now.variance.copy()
     noise, buses, left = now.noise[who], prior.meters[who], np.ones(out.size, dtype=np.bool_)
@@ -78,13 +80,16 @@ def _opened(now: Fit, at: Ints, gone: Ints, factor: Floats) -> Floats:
     out[buses[good]] = np.maximum(out[buses], own)[good]
     left[prior.meters[at]] = False
     left[buses[~good]] = True
-    rows, Q = indices(left), now.trusting()[1]
+    rows = indices(left)
     for first in range(0, rows.size, _ROWS):
         some = rows[first : first + _ROWS]
         between = submatrix(prior.of_meters, some, at)
         if now.loose.shape[1]:
             between += now.loose[some] @ now.loose[prior.meters[at]].T
-        part, _ = lapack.dtrtrs(factor, (between @ Q.take(gone, axis=1)).T, lower=True)
+        # A product with all of Q costs less than picking most of it.
+        whole = some.size * _SEVERAL < gone.size
+        known = (between @ Q).take(gone, axis=1) if whole else between @ Q.take(gone, axis=1)
+        part, _ = lapack.dtrtrs(factor, known.T, lower=True)
         out[some] += np.einsum("ij,ij->j", part, part)
     return out
 

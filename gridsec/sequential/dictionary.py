@@ -106,9 +106,13 @@ class Powers:
         Q m.
     live : (p,)
         Which meters report.
+    innocent : (k,)
+        Meters that are not dropped.
     """
 
-    def __init__(self, now: Fit, dictionary: Dictionary, weights: Floats, live: Bools) -> None:
+    def __init__(
+        self, now: Fit, dictionary: Dictionary, weights: Floats, live: Bools, innocent: Ints
+    ) -> None:
         towards = dictionary.along(weights) ** 2 / np.maximum(dictionary.size, _TINY)
         self.dictionary, self.now, self.live = dictionary, now, live
         self.index = (-towards).argsort()[:_CANDIDATES]
@@ -120,6 +124,7 @@ class Powers:
         self.spread = np.zeros_like(self.seen)
         self.spread[at] = spread = Q @ seen
         self.form = np.einsum("ij,ij->j", spread, seen)
+        self.innocent = np.isin(self.meter, innocent) if innocent.size else None
         self.accused: list[int] = []
 
     @property
@@ -127,7 +132,7 @@ class Powers:
         """What has been loosened, indices into the dictionary."""
         return tuple(self.index[self.accused].tolist())
 
-    def best(self, judged: Judged, penalty: float, than: float, innocent: Ints) -> list[Step]:
+    def best(self, judged: Judged, penalty: float, than: float) -> list[Step]:
         """Loosening a direction, alone or with its meter dropped as well; nothing unless it gains more.
 
         Parameters
@@ -138,14 +143,13 @@ class Powers:
             What an accusation must gain at least.
         than
             What something else would gain.
-        innocent : (k,)
-            Meters that are not dropped.
         """
         trusted = self.now.trusted
         liars = int(np.count_nonzero(self.live & ~trusted))
         alone = self._alone(judged.weights) - penalty * self.dictionary.charges(self.index, trusted, liars)
         both = self._with_meter(judged.weights) - penalty * (1.0 + of_a_liar(liars))
-        both[np.isin(self.meter, innocent)] = -np.inf
+        if self.innocent is not None:
+            both[self.innocent] = -np.inf
         alone[self.accused] = both[self.accused] = -np.inf
         k, pair = int(alone.argmax()), int(both.argmax())
         if max(alone[k], both[pair]) <= than:

@@ -183,7 +183,9 @@ class Search:
         out, keep, limits = [], self.keep & self.trust.named, self._fair()
         for j in indices(fresh).tolist():
             book, one = self.book.doubtful(), np.array([j])
-            other = self._descend(best.fit, keep, book, innocent=one, pairs=True, limits=limits)
+            other = self._descend(
+                best.fit, keep, book, innocent=one, pairs=True, limits=limits, judged=best.judged
+            )
             honest = self.scales[self.s].limits.of(other.judged.std)[j]
             if self._admissible(other) and abs(other.judged.offset[j]) <= honest:
                 charge = best.charge + other.charge
@@ -238,12 +240,15 @@ class Search:
     def _closer(self, group: Ints, other: Solution) -> Explanation:
         """One that believes the group on less evidence against the rest: what might be the case."""
         nobody = np.zeros_like(other.trusted)
-        closer = self._descend(other.fit, nobody, innocent=group, limits=self._fair())
+        fair, judged = self._fair(), other.judged
+        closer = self._descend(other.fit, nobody, innocent=group, limits=fair, judged=judged)
         return (self._after(other, closer) if self._admissible(closer) else other).bare()
 
     def _after(self, before: Solution, found: Solution) -> Solution:
         """What a descent without a book found, from all that another loosened: powers of liars cost less."""
         loosened, live = before.loosened, self.here.enough
+        if not loosened:
+            return found
         liars = int(np.count_nonzero(live & ~found.trusted))
         charges = self.book.charges(np.array(loosened, dtype=np.intp), found.trusted, liars)
         charge = float(charges.sum()) * search.price(int(np.count_nonzero(live)), 1)

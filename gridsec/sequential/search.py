@@ -241,7 +241,7 @@ def descend(
         judged = judge(now, m)
     before = now.changes
     anew = True
-    powers = None if dictionary is None else Powers(now, dictionary, judged.weights, live)
+    powers = None if dictionary is None else Powers(now, dictionary, judged.weights, live, innocent)
     for _ in range(_MOVES_PER_METER * m.size):
         steps = _best(_Place(now, judged, limits, barred, innocent, pairs, powers))
         if not steps:
@@ -316,7 +316,7 @@ def _best(here: _Place) -> Sequence[Callable[[], Move | None]]:
             pair, gain = _pair(here, gain)
             steps = [partial(_drop, now, j, powers) for j in pair] or steps
         if powers is not None:
-            steps = powers.best(judged, here.limits.penalty, gain, here.innocent) or steps
+            steps = powers.best(judged, here.limits.penalty, gain) or steps
     if steps:
         return steps
     outside = np.where(now.trusted | here.barred, np.inf, excess)
@@ -340,7 +340,7 @@ def _admit_many(here: _Place, at: Ints) -> None:
     """
     now, judged = here.fit, here.judged
     outside = Outside.of(now, at)
-    order = _nearest(outside.apart.copy(), judged.offset[at], here.limits.some(at))
+    order = _nearest(outside.apart, judged.offset[at], here.limits.some(at))
     factor = outside.factor(order)
     changes = outside.changes(order, factor)
     error, _ = lapack.dtrtrs(factor, judged.offset[at[order]], lower=True)
@@ -357,21 +357,24 @@ def _admit_many(here: _Place, at: Ints) -> None:
 def _nearest(apart: Floats, offset: Floats, limits: Limits) -> Ints:
     """The order in which meters outside are admitted, each time the one that is closest, places, (r,).
 
-    `apart` (k, k), lost: what the trusted leave open of their readings.
+    `apart` (k, k): what the trusted leave open of their readings.
     """
     order: list[int] = []
-    done = np.zeros(offset.size)
-    for _ in range(offset.size):
-        excess = np.abs(offset) / limits.of(np.sqrt(apart.diagonal())) + done
+    open_, done = apart.diagonal().copy(), np.zeros(offset.size)
+    # Rows of the Cholesky factor, as far as it is known.
+    rows = np.empty(apart.shape)
+    for k in range(offset.size):
+        excess = np.abs(offset) / limits.of(np.sqrt(open_)) + done
         j = int(excess.argmin())
         if not excess[j] < 1.0:
             break
         order.append(j)
-        done[j] = np.inf
-        column = apart[:, j] / apart[j, j]
-        offset = offset - column * offset[j]
-        apart -= np.multiply.outer(column, apart[j])
-        apart[j, j] = 1.0
+        row = apart[j] - rows[:k, j] @ rows[:k] if k else apart[j]
+        std = float(row[j]) ** 0.5
+        rows[k] = row = row / std
+        offset = offset - row * (offset[j] / std)
+        open_ -= row * row
+        open_[j], done[j] = 1.0, np.inf
     return np.array(order, dtype=np.intp)
 
 
