@@ -38,7 +38,7 @@ _EFFORT = 4e9
 _BESIDE = 3
 # Those no worse than the likeliest by this many times log(like) are looked at more closely.
 _NEAR = 8.0
-# A fit of more meters is worth it where it is of no more than so many times fewer than it has to be.
+# A fit of more meters helps where those are so many times fewer than they should be.
 _PART = 2
 # Standard deviations of chi-square that chance may add; what all of a group may be off by, squared pu.
 _CHANCE, _ANY_LIE = 4.0, 0.2
@@ -418,15 +418,19 @@ class Search:
 
     def _fit(self, trusted: Bools) -> Fit:
         loose, wanted = self.scales.loosened(self.accused), trusted & self.here.enough
-        whole = self._whole(self.s) if loose is None else None
-        if whole is not None:
-            fallen = whole.trusted & ~wanted
-            if np.count_nonzero(fallen) * _PART <= np.count_nonzero(wanted):
-                return without(whole, fallen)
-        return fit(self.here.prior, self.here.noise, wanted, loose)
+        near = self._near(self.s, wanted) if loose is None else None
+        return fit(self.here.prior, self.here.noise, wanted, loose) if near is None else without(*near)
+
+    def _near(self, s: int, wanted: Bools) -> tuple[Fit, Bools] | None:
+        """A fit just as it was factorised that rests on not many more, and these; None for none."""
+        whole = self._whole(s)
+        if whole is None:
+            return None
+        more = whole.trusted & ~wanted
+        return (whole, more) if np.count_nonzero(more) * _PART <= np.count_nonzero(wanted) else None
 
     def _whole(self, s: int) -> Fit | None:
-        """A fit of all that report on a scale, and perhaps of others, as it was factorised; None for none."""
+        """The same of all that report on a scale and perhaps of others, whatever is wanted."""
         if s not in self.covering:
             whole, here = self.wholes[s], self.scales[s]
             good = whole is not None and covers(whole, here.prior, here.noise, here.enough)
@@ -448,30 +452,25 @@ class Search:
         self, found: Explanation, more: Bools | None = None, alike: Floats | None = None
     ) -> list[float]:
         """What an explanation leaves unexplained on each scale; of `more` meters, which may be off alike."""
-        trusted, each = self._trusted(found), range(len(self.design.lengths))
+        trusted, out = self._trusted(found), []
         who = trusted.tobytes(), found.loosened
         if more is None and who in self.left:
             return self.left[who]
         trusted = trusted if more is None else trusted | more
         loose = self.scales.loosened((*self.accused, *((k, self.s) for k in found.loosened)))
-        if more is not None:
-            return [self._misfit(s, trusted, loose, alike) for s in each]
-        own = found.judged.misfit if isinstance(found, Solution) else None
-        self.left[who] = [
-            self._misfit(s, trusted, loose) if own is None or s != self.s else own for s in each
-        ]
-        return self.left[who]
-
-    def _misfit(self, s: int, trusted: Bools, loose: Floats | None, alike: Floats | None = None) -> float:
-        """What those who are trusted leave unexplained on a scale."""
-        here = self.scales[s]
-        wanted = trusted & here.enough
-        whole = self._whole(s) if loose is None and alike is None else None
-        if whole is not None:
-            fallen = whole.trusted & ~wanted
-            if np.count_nonzero(fallen) * _PART <= np.count_nonzero(wanted):
-                return misfit_without(whole, here.m, fallen)
-        return misfit(here.prior, here.noise, here.m, wanted, loose, alike)
+        for s in range(len(self.design.lengths)):
+            there = self.scales[s]
+            wanted = trusted & there.enough
+            near = self._near(s, wanted) if loose is None and more is None else None
+            if s == self.s and more is None and isinstance(found, Solution):
+                out.append(found.judged.misfit)
+            elif near is not None:
+                out.append(misfit_without(near[0], there.m, near[1]))
+            else:
+                out.append(misfit(there.prior, there.noise, there.m, wanted, loose, alike))
+        if more is None:
+            self.left[who] = out
+        return out
 
     def _believe(self, best: Explanation) -> Trust:
         accused = (*self.accused, *((k, self.s) for k in best.loosened))

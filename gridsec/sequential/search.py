@@ -323,13 +323,16 @@ def _best(here: _Place) -> Sequence[Callable[[], Move | None]]:
     nearest = int(outside.argmin())
     if not outside[nearest] < 1.0:
         return []
-    if powers is None and not here.pairs and np.count_nonzero(outside < 1.0) >= _MANY:
-        return [partial(_admit_many, here, indices(outside < np.inf))]
+    if powers is None and not here.pairs:
+        at = indices(outside < np.inf)
+        if np.count_nonzero(outside < 1.0) >= max(_MANY, at.size / _ASKED):
+            return [partial(_admit_many, here, at)]
     return [lambda: _moved(admit(now, nearest), powers)]
 
 
-# From so many on that might be admitted it is faster to follow them beside each other.
-_MANY = 6
+# From so many on that might be admitted it is faster to follow them beside each other, unless so many times
+# more are asked; and at most so many at once, or there would be large matrices of large feeders.
+_MANY, _ASKED, _AT_ONCE = 6, 8, 64
 
 
 def _admit_many(here: _Place, at: Ints) -> None:
@@ -362,8 +365,8 @@ def _nearest(apart: Floats, offset: Floats, limits: Limits) -> Ints:
     order: list[int] = []
     open_, done = apart.diagonal().copy(), np.zeros(offset.size)
     # Rows of the Cholesky factor, as far as it is known.
-    rows = np.empty(apart.shape)
-    for k in range(offset.size):
+    rows = np.empty((min(offset.size, _AT_ONCE), offset.size))
+    for k in range(len(rows)):
         excess = np.abs(offset) / limits.of(np.sqrt(open_)) + done
         j = int(excess.argmin())
         if not excess[j] < 1.0:

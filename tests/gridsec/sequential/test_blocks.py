@@ -101,9 +101,10 @@ def single(found: dict[str, Solution], seed: int, few: int) -> dict[str, Solutio
 
 
 @settings(max_examples=150)
-@given(seed=SEEDS)
-def test_a_descent_admits_many_as_it_would_one_by_one(seed: int) -> None:
+@given(seed=SEEDS, at_once=st.sampled_from([2, 5, 64]))
+def test_a_descent_admits_many_as_it_would_one_by_one(seed: int, at_once: int) -> None:
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(search, "_AT_ONCE", at_once)
         found: dict[str, Solution] = {}
         for few in (1, 10**6):
             patch.setattr(search, "_MANY", few)
