@@ -30,7 +30,7 @@ import numpy as np
 from scipy.linalg import lapack
 
 from gridsec.arrays import Bools, Floats, Ints, frozen_ints, indices, submatrix
-from gridsec.sequential.blocks import Outside
+from gridsec.sequential.blocks import Outside, without
 from gridsec.sequential.conditional import Fit, Judged, Move, admit, drop, follow, judge
 from gridsec.sequential.dictionary import Dictionary, Powers, Step
 
@@ -308,6 +308,9 @@ def _best(here: _Place) -> Sequence[Callable[[], Move | None]]:
     inside[here.innocent] = -np.inf
     worst = int(inside.argmax())
     drops = bool(inside[worst] > 1.0)
+    alone = powers is None and not here.pairs
+    if drops and alone and np.count_nonzero(inside > 1.0) >= _MANY:
+        return [partial(_drop_many, here)]
     steps: list[Step] = [partial(_drop, now, worst, powers)] if drops else []
     if here.pairs or powers is not None:
         gain = (judged.offset[worst] / judged.std[worst]) ** 2 - here.limits.penalty if drops else 0.0
@@ -323,15 +326,15 @@ def _best(here: _Place) -> Sequence[Callable[[], Move | None]]:
     nearest = int(outside.argmin())
     if not outside[nearest] < 1.0:
         return []
-    if powers is None and not here.pairs:
+    if alone:
         at = indices(outside < np.inf)
         if np.count_nonzero(outside < 1.0) >= max(_MANY, at.size / _ASKED):
             return [partial(_admit_many, here, at)]
     return [lambda: _moved(admit(now, nearest), powers)]
 
 
-# From so many on that might be admitted it is faster to follow them beside each other, unless so many times
-# more are asked; and at most so many at once, or there would be large matrices of large feeders.
+# From so many on that might be admitted, or dropped, it is faster to follow them beside each other, unless so
+# many times more are asked; and at most so many at once, or there would be large matrices of large feeders.
 _MANY, _ASKED, _AT_ONCE = 6, 8, 64
 
 
@@ -379,6 +382,31 @@ def _nearest(apart: Floats, offset: Floats, limits: Limits) -> Ints:
         open_ -= row * row
         open_[j], done[j] = 1.0, np.inf
     return np.array(order, dtype=np.intp)
+
+
+def _drop_many(here: _Place) -> None:
+    """Drop one after the other as long as the worst is beyond chance; only what they leave is followed."""
+    now, (at, Q) = here.fit, here.fit.trusting()
+    limits, weights = here.limits.some(at), here.judged.weights[at]
+    pivot, kept = Q.diagonal().copy(), np.where(np.isin(at, here.innocent), np.inf, 0.0)
+    rows = np.empty((min(at.size, _AT_ONCE), at.size))
+    fallen = np.zeros_like(now.trusted)
+    for k in range(len(rows)):
+        excess = np.abs(weights / pivot) / limits.of(np.sqrt(1.0 / pivot)) - kept
+        j = int(excess.argmax())
+        if not excess[j] > 1.0:
+            break
+        fallen[at[j]] = True
+        row = Q[j] - rows[:k, j] @ rows[:k]
+        root = float(row[j]) ** 0.5
+        rows[k] = row = row / root
+        weights = weights - row * (weights[j] / root)
+        pivot -= row * row
+        pivot[j], kept[j] = 1.0, np.inf
+    after = without(now, fallen)
+    now.inverse, now.variance, now.changes = after.inverse, after.variance, after.changes
+    now.trusted[fallen] = False
+    now.pivot = now.std = now.together = now.left = None
 
 
 # Pairs are looked for among so many meters, those that dropping alone gains most for.
