@@ -47,7 +47,9 @@ def without(now: Fit, fallen: Bools) -> Fit:
     if not gone.size:
         return now.copy()
     if not stay.size:
-        return fit(now.prior, now.noise, np.zeros_like(now.trusted), now.loose)
+        nobody = fit(now.prior, now.noise, np.zeros_like(now.trusted), now.loose)
+        nobody.changes = now.changes + gone.size
+        return nobody
     factor = _factor(submatrix(Q, gone, gone).T)
     # Symmetric: the transpose is the same in the order of LAPACK.
     half, _ = lapack.dtrtrs(factor, submatrix(Q, stay, gone).T, lower=True, overwrite_b=True)
