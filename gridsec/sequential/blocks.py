@@ -22,14 +22,28 @@ import numpy as np
 from scipy.linalg import blas, lapack
 
 from gridsec.arrays import Bools, Floats, Ints, indices, submatrix
-from gridsec.sequential.conditional import Fit, fit, solved
+from gridsec.sequential.conditional import MUCH_NOISE, Fit, Prior, fit, solved
 
 # Rows that are worked on together.
 _ROWS = 256
 # A row of a product takes so many times less than picking a column of its factor.
 _SEVERAL = 8
-# Noise is not taken off again from what it has been added to where it is so many times as large.
-_LARGE = 1e3
+# Part of the largest variance that noise must be at least: less, as of exact meters while nobody reads the
+# busbar, and what many changes at once take off one another would be lost in rounding.
+_LEAST = 1e-6
+
+
+def sound(prior: Prior, noise: Floats) -> bool:
+    """Whether numbers are such that many changes at once come to what one after the other comes to.
+
+    Parameters
+    ----------
+    prior
+        What is known without meters.
+    noise : (p,)
+        Variance of each meter's reading.
+    """
+    return bool(noise.min(initial=np.inf) >= _LEAST * prior.variance.max(initial=0.0))
 
 
 def without(now: Fit, fallen: Bools) -> Fit:
@@ -77,11 +91,13 @@ def _opened(now: Fit, at: Ints, Q: Floats, gone: Ints, factor: Floats) -> Floats
     noise, buses, left = now.noise[who], prior.meters[who], np.ones(out.size, dtype=np.bool_)
     # What the others leave open of a reading is its noise and what they leave open at its bus.
     upper, _ = lapack.dtrtri(factor, lower=True)
-    good = noise < _LARGE * prior.variance[buses]
+    good = noise < MUCH_NOISE * prior.variance[buses]
     own = np.einsum("ij,ij->j", upper, upper) - noise
     out[buses[good]] = np.maximum(out[buses], own)[good]
     left[prior.meters[at]] = False
     left[buses[~good]] = True
+    # Where two meters share a bus one good one is enough.
+    left[buses[good]] = False
     rows = indices(left)
     for first in range(0, rows.size, _ROWS):
         some = rows[first : first + _ROWS]
@@ -133,14 +149,17 @@ class Outside:
         Prior covariance of every bus with them.
     seen : (t, k)
         Q S_TA: what the trusted ones make of that.
+    open : (k, k)
+        What these leave open at the buses of the others.
     apart : (k, k)
-        What these leave open of the readings of the others.
+        And of their readings.
     """
 
     fit: Fit
     at: Ints
     columns: Floats
     seen: Floats
+    open: Floats
     apart: Floats
 
     @staticmethod
@@ -158,9 +177,10 @@ class Outside:
             columns += now.loose @ now.loose[prior.meters[at]].T
         inside = columns[prior.meters[who]]
         seen = Q @ inside
-        apart = columns[prior.meters[at]] - inside.T @ seen
+        left = columns[prior.meters[at]] - inside.T @ seen
+        apart = left.copy()
         apart[np.diag_indices(at.size)] += now.noise[at]
-        return Outside(now, at, columns, seen, apart)
+        return Outside(now, at, columns, seen, left, apart)
 
     def factor(self, order: Ints) -> Floats:
         """Cholesky factor of what is open of some of them, in an order, lower triangle, (r, r).
@@ -193,7 +213,7 @@ class Outside:
         Parameters
         ----------
         order : (r,)
-            Whom, as in `factor`.
+            Whom: the first of those that `factor` and `changes` were made for, in that order.
         factor, changes
             From above; what belongs to those that come later counts for nothing.
         """
@@ -213,8 +233,7 @@ class Outside:
         who, seen = indices(now.trusted), self.seen.take(order, axis=1)
         out, left = np.empty((now.variance.size, r)), np.ones(now.variance.size, dtype=np.bool_)
         # Of the meters themselves it is known, or ``S_TT Q = I - D Q`` leaves nothing to be summed up.
-        out[prior.meters[self.at]] = self.apart.take(order, axis=1)
-        out[prior.meters[self.at[order]], np.arange(r)] -= now.noise[self.at[order]]
+        out[prior.meters[self.at]] = self.open.take(order, axis=1)
         out[prior.meters[who]] = now.noise[who, None] * seen
         left[prior.meters[self.at]] = left[prior.meters[who]] = False
         rows = indices(left)

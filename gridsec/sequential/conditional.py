@@ -313,7 +313,7 @@ def _narrow(now: Fit, at: Ints, inverse: Floats) -> None:
     """Take off the variances what meters `at` know, with their inverse covariance."""
     buses, noise, before = now.prior.meters[at], now.noise[at], now.variance
     # What a meter knows of its own bus follows from what it leaves open of its reading.
-    good = noise < _LARGE * before[buses]
+    good = noise < MUCH_NOISE * before[buses]
     own = noise[good] * (1.0 - noise[good] * inverse.diagonal()[good])
     left = np.ones(before.size, dtype=np.bool_)
     left[buses[good]] = False
@@ -328,8 +328,8 @@ def _narrow(now: Fit, at: Ints, inverse: Floats) -> None:
     np.maximum(before, 0.0, out=before)
 
 
-# Unless that is so many times less: then it would be lost in rounding.
-_LARGE = 1e3
+# Unless its noise is so many times as large: rounding would take more than a digit off what it leaves open.
+MUCH_NOISE = 10.0
 # Rows that are worked on together, and where such a block has its lower triangle.
 _ROWS = 256
 _LOWER = np.tri(_ROWS, dtype=np.bool_)

@@ -14,7 +14,7 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, Ints, any_of, indices
 from gridsec.network import by_place
 from gridsec.sequential import search
-from gridsec.sequential.blocks import misfit_without, without
+from gridsec.sequential.blocks import misfit_without, sound, without
 from gridsec.sequential.conditional import Fit, Judged, fit, judge, misfit
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.dictionary import Dictionary
@@ -38,7 +38,7 @@ _EFFORT = 4e9
 _BESIDE = 3
 # Those no worse than the likeliest by this many times log(like) are looked at more closely.
 _NEAR = 8.0
-# A fit of more meters helps where those are so many times fewer than they should be.
+# A fit of more meters helps where there are so many times as many wanted as it rests on beside these.
 _PART = 2
 # Standard deviations of chi-square that chance may add; what all of a group may be off by, squared pu.
 _CHANCE, _ANY_LIE = 4.0, 0.2
@@ -183,9 +183,7 @@ class Search:
         out, keep, limits = [], self.keep & self.trust.named, self._fair()
         for j in indices(fresh).tolist():
             book, one = self.book.doubtful(), np.array([j])
-            other = self._descend(
-                best.fit, keep, book, innocent=one, pairs=True, limits=limits, judged=best.judged
-            )
+            other = self._descend(best.fit, keep, book, innocent=one, pairs=True, limits=limits)
             honest = self.scales[self.s].limits.of(other.judged.std)[j]
             if self._admissible(other) and abs(other.judged.offset[j]) <= honest:
                 charge = best.charge + other.charge
@@ -424,7 +422,7 @@ class Search:
     def _near(self, s: int, wanted: Bools) -> tuple[Fit, Bools] | None:
         """A fit just as it was factorised that rests on not many more, and these; None for none."""
         whole = self._whole(s)
-        if whole is None:
+        if whole is None or not sound(whole.prior, whole.noise):
             return None
         more = whole.trusted & ~wanted
         return (whole, more) if np.count_nonzero(more) * _PART <= np.count_nonzero(wanted) else None

@@ -14,7 +14,7 @@ from math import ceil
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, any_of, indices
-from gridsec.sequential.blocks import without
+from gridsec.sequential.blocks import sound, without
 from gridsec.sequential.commission import Learned
 from gridsec.sequential.conditional import Fit, Judged, Prior, admit, drop, fit
 from gridsec.sequential.design import SequentialDesign
@@ -60,7 +60,7 @@ class View:
 
 # A fit is made anew when that part of its meters changed, or after so many changes (rounding).
 _ANEW = 6
-# Unless no more than that part of those that were trusted just fell.
+# Unless all that changed is that some fell, no more than that part of all meters, since a factorisation.
 _WHOLE = 3
 _MOST_CHANGES = 400
 
@@ -214,7 +214,8 @@ def adapt(before: Fit | None, here: Scale, wanted: Bools, loose: Floats | None) 
         return before
     change = indices(differs)
     many = change.size * _ANEW > wanted.size
-    if many and not before.changes and change.size * _WHOLE < wanted.size and not any_of(wanted[change]):
+    few = not before.changes and change.size * _WHOLE < wanted.size and not any_of(wanted[change])
+    if many and few and sound(prior, before.noise):
         return without(before, differs)
     if many or before.changes + change.size > _MOST_CHANGES:
         return fit(prior, noise, wanted, loose)

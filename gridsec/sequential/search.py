@@ -23,14 +23,14 @@ Chen and Chen 2008 (the prior over sets).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 
 import numpy as np
 from scipy.linalg import lapack
 
 from gridsec.arrays import Bools, Floats, Ints, frozen_ints, indices, submatrix
-from gridsec.sequential.blocks import Outside, without
+from gridsec.sequential.blocks import Outside, sound, without
 from gridsec.sequential.conditional import Fit, Judged, Move, admit, drop, follow, judge
 from gridsec.sequential.dictionary import Dictionary, Powers, Step
 
@@ -239,17 +239,19 @@ def descend(
         drop(now, int(j))
     if judged is None or now.changes != changed:
         judged = judge(now, m)
-    before = now.changes
-    anew = True
+    before, moves, anew = now.changes, 0, True
+    many = dictionary is None and not pairs and sound(now.prior, now.noise)
     powers = None if dictionary is None else Powers(now, dictionary, judged.weights, live, innocent)
-    for _ in range(_MOVES_PER_METER * m.size):
-        steps = _best(_Place(now, judged, limits, barred, innocent, pairs, powers))
+    while moves < _MOVES_PER_METER * m.size:
+        steps = _best(_Place(now, judged, limits, barred, innocent, pairs, powers, many))
         if not steps:
             break
+        moves, changed = moves + 1, now.changes
         for step in steps:
             move = step()
             anew = move is None
             judged = judge(now, m) if move is None else follow(now, m, judged, move)
+        moves += now.changes - changed - 1 if anew else 0
     if not fresh and now.changes == start.changes:
         now = start  # and what is kept with it
     else:
@@ -298,6 +300,7 @@ class _Place:
     innocent: Ints
     pairs: bool
     powers: Powers | None
+    many: bool
 
 
 def _best(here: _Place) -> Sequence[Callable[[], Move | None]]:
@@ -308,9 +311,8 @@ def _best(here: _Place) -> Sequence[Callable[[], Move | None]]:
     inside[here.innocent] = -np.inf
     worst = int(inside.argmax())
     drops = bool(inside[worst] > 1.0)
-    alone = powers is None and not here.pairs
-    if drops and alone and np.count_nonzero(inside > 1.0) >= _MANY:
-        return [partial(_drop_many, here)]
+    if drops and here.many and np.count_nonzero(inside > 1.0) >= _MANY:
+        return [partial(_drop_many, here, worst)]
     steps: list[Step] = [partial(_drop, now, worst, powers)] if drops else []
     if here.pairs or powers is not None:
         gain = (judged.offset[worst] / judged.std[worst]) ** 2 - here.limits.penalty if drops else 0.0
@@ -326,10 +328,10 @@ def _best(here: _Place) -> Sequence[Callable[[], Move | None]]:
     nearest = int(outside.argmin())
     if not outside[nearest] < 1.0:
         return []
-    if alone:
+    if here.many:
         at = indices(outside < np.inf)
         if np.count_nonzero(outside < 1.0) >= max(_MANY, at.size / _ASKED):
-            return [partial(_admit_many, here, at)]
+            return [partial(_admit_many, here, at, nearest)]
     return [lambda: _moved(admit(now, nearest), powers)]
 
 
@@ -338,15 +340,18 @@ def _best(here: _Place) -> Sequence[Callable[[], Move | None]]:
 _MANY, _ASKED, _AT_ONCE = 6, 8, 64
 
 
-def _admit_many(here: _Place, at: Ints) -> None:
+def _admit_many(here: _Place, at: Ints, first: int) -> Move | None:
     """Admit one after the other as long as the nearest is close enough and nobody is to be dropped.
 
     What is open of those outside is followed alone; whether anybody inside would have had to be dropped is
-    then asked for all moves at once, and the moves from there on are taken back.
+    then asked for all moves at once, and the moves from there on are taken back. `first` alone is admitted
+    where rounding has it that nobody is.
     """
     now, judged = here.fit, here.judged
     outside = Outside.of(now, at)
     order = _nearest(outside.apart, judged.offset[at], here.limits.some(at))
+    if not order.size:
+        return admit(now, first)
     factor = outside.factor(order)
     changes = outside.changes(order, factor)
     error, _ = lapack.dtrtrs(factor, judged.offset[at[order]], lower=True)
@@ -354,10 +359,13 @@ def _admit_many(here: _Place, at: Ints) -> None:
     weights = judged.weights + np.cumsum(changes * error[:, None], axis=0)[:-1]
     inside = pivot > 0.0
     pivot = np.where(inside, pivot, 1.0)
-    beyond = inside & (np.abs(weights) > pivot * here.limits.of(np.sqrt(1.0 / pivot)))
+    # Not to be remembered: it is asked for once.
+    limit = replace(here.limits, recent=None).of(np.sqrt(1.0 / pivot))
+    beyond = inside & (np.abs(weights) > pivot * limit)
     beyond[:, here.innocent] = False
     wrong = indices(beyond.any(axis=1))
     outside.admit(order[: wrong[0] + 1] if wrong.size else order, factor, changes)
+    return None
 
 
 def _nearest(apart: Floats, offset: Floats, limits: Limits) -> Ints:
@@ -372,10 +380,10 @@ def _nearest(apart: Floats, offset: Floats, limits: Limits) -> Ints:
     for k in range(len(rows)):
         excess = np.abs(offset) / limits.of(np.sqrt(open_)) + done
         j = int(excess.argmin())
-        if not excess[j] < 1.0:
+        row = apart[j] - rows[:k, j] @ rows[:k] if k else apart[j]
+        if not (excess[j] < 1.0 and row[j] > 0.0):
             break
         order.append(j)
-        row = apart[j] - rows[:k, j] @ rows[:k] if k else apart[j]
         std = float(row[j]) ** 0.5
         rows[k] = row = row / std
         offset = offset - row * (offset[j] / std)
@@ -384,8 +392,11 @@ def _nearest(apart: Floats, offset: Floats, limits: Limits) -> Ints:
     return np.array(order, dtype=np.intp)
 
 
-def _drop_many(here: _Place) -> None:
-    """Drop one after the other as long as the worst is beyond chance; only what they leave is followed."""
+def _drop_many(here: _Place, first: int) -> Move | None:
+    """Drop one after the other as long as the worst is beyond chance; only what they leave is followed.
+
+    `first` alone where rounding has it that nobody is.
+    """
     now, (at, Q) = here.fit, here.fit.trusting()
     limits, weights = here.limits.some(at), here.judged.weights[at]
     pivot, kept = Q.diagonal().copy(), np.where(np.isin(at, here.innocent), np.inf, 0.0)
@@ -394,19 +405,22 @@ def _drop_many(here: _Place) -> None:
     for k in range(len(rows)):
         excess = np.abs(weights / pivot) / limits.of(np.sqrt(1.0 / pivot)) - kept
         j = int(excess.argmax())
-        if not excess[j] > 1.0:
+        row = Q[j] - rows[:k, j] @ rows[:k]
+        if not (excess[j] > 1.0 and row[j] > 0.0):
             break
         fallen[at[j]] = True
-        row = Q[j] - rows[:k, j] @ rows[:k]
         root = float(row[j]) ** 0.5
         rows[k] = row = row / root
         weights = weights - row * (weights[j] / root)
         pivot -= row * row
         pivot[j], kept[j] = 1.0, np.inf
+    if not fallen.any():
+        return drop(now, first)
     after = without(now, fallen)
     now.inverse, now.variance, now.changes = after.inverse, after.variance, after.changes
     now.trusted[fallen] = False
     now.pivot = now.std = now.together = now.left = None
+    return None
 
 
 # Pairs are looked for among so many meters, those that dropping alone gains most for.
