@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from gridsec.arrays import Bools, Floats
 from gridsec.sequential import search
-from gridsec.sequential.blocks import Outside, misfit_without, without
+from gridsec.sequential.blocks import Outside, misfit_without, sound, without
 from gridsec.sequential.conditional import Fit, Prior, admit, drop, fit, judge, loosen
 from gridsec.sequential.search import Limits, Solution, descend
 from tests.gridsec.sequential.test_conditional import agrees, problem
@@ -129,3 +129,45 @@ def test_many_may_be_all() -> None:
     assert found.fit.changes == 10
     assert found.judged.misfit == 0.0
     np.testing.assert_allclose(found.fit.variance, prior.variance)
+
+
+@settings(max_examples=80)
+@given(seed=SEEDS, loud=st.booleans())
+def test_meters_may_share_a_bus(seed: int, loud: bool) -> None:
+    """Two customers of one bus have a meter each; some know far less of it than is known without them."""
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(7, 7))
+    S, at = A @ A.T, rng.integers(0, 7, 9)
+    prior, noise, m = Prior(S[:, at], at, S.diagonal().copy()), rng.uniform(0.1, 0.5, 9), rng.normal(size=9)
+    noise = np.where(rng.random(9) < 0.4, 1e3 * noise, noise) if loud else noise
+    before, fallen = fit(prior, noise, rng.random(9) < 0.8), rng.random(9) < 0.4
+    after = without(before, fallen)
+    agrees(after, S, m)
+    others = np.flatnonzero(~after.trusted)
+    outside, order = Outside.of(after, others), rng.permutation(others.size)[:4]
+    if order.size:
+        factor = outside.factor(order)
+        outside.admit(order, factor, outside.changes(order, factor))
+        agrees(after, S, m)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("exact", [1e-5, 1e-7, 1e-9])
+def test_exact_meters_are_moved_one_by_one(seed: int, exact: float) -> None:
+    """What they leave open of one another is lost in rounding where many move at once."""
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(40, 3))
+    S, every, zero = A @ A.T, np.ones(40, dtype=np.bool_), np.zeros(40)
+    noise = np.full(40, exact * float(S.diagonal().max()))
+    prior, found = Prior(S, np.arange(40), S.diagonal().copy()), []
+    m = A @ rng.normal(size=3) + np.sqrt(noise) * rng.normal(size=40)
+    assert sound(prior, noise) == (exact > 1e-6)
+    with pytest.MonkeyPatch.context() as patch:
+        for few in (search._MANY, 10**6):
+            patch.setattr(search, "_MANY", few)
+            start = fit(prior, noise, np.arange(40) % 2 == 0)
+            found.append(descend(start, m, every, Limits(5.0, zero, zero, zero), keep=~every))
+    np.testing.assert_array_equal(found[0].trusted, found[1].trusted)
+    assert found[0].fit.changes == found[1].fit.changes
+    # Still more exact ones are beyond what doubles tell apart.
+    assert found[0].trusted.all() or exact < 1e-8
