@@ -18,11 +18,11 @@ from gridsec.network import Power, columns
 from gridsec.online import Frame
 from gridsec.plant import Plant
 from gridsec.sequential import LoadDoubt, SequentialDesign, explain
-from gridsec.sequential.conditional import Fit, Judged, judge, misfit
+from gridsec.sequential.conditional import Fit, Judged, fit, judge, misfit
 from gridsec.sequential.dictionary import of_a_liar
 from gridsec.sequential.explain import Search, _linked
 from gridsec.sequential.scales import Scales, View, adapt, view_of
-from gridsec.sequential.search import Found, Solution, descend, price
+from gridsec.sequential.search import Explanation, Found, Solution, descend, price
 from gridsec.sequential.windows import push
 
 NEAR, FAR = 30, 15  # customers close to the busbar, and at the end of a long cable
@@ -234,3 +234,57 @@ def test_linked_are_connected_components() -> None:
         assert {frozenset(part.tolist()) for part in parts} == {
             frozenset(np.flatnonzero(label == k).tolist()) for k in set(label.tolist())
         }
+
+
+def several_scales(seed: int, accused: tuple[tuple[int, int], ...] = ()) -> Search:
+    """A search on the first scale when each has seen something else, with a kept fit of all meters each."""
+    rng, design = np.random.default_rng([17, seed]), two_streets()
+    state, every = sequential.init(design, 0.0), np.ones(NEAR + FAR, dtype=np.bool_)
+    window = state.window
+    for _ in range(design.lengths[-1]):
+        window = push(window, design.lengths, 0.01 * rng.normal(size=every.size), every)
+    scales = Scales(design, state.doubts, window, state.learned, np.zeros(every.size))
+    each = range(len(design.lengths))
+    wholes = tuple(fit(scales[s].prior, scales[s].noise, every) for s in each)
+    return Search(design, scales, wholes, replace(state.trust, accused=accused), 0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_each_scale_has_its_own_misfit(seed: int) -> None:
+    """Whether it is worked out anew, from a kept fit, or with what else is accused; asked in any order."""
+    rng, made = np.random.default_rng(seed), several_scales(seed)
+    trusted = rng.random(NEAR + FAR) < 0.85
+    start = made._fit(trusted)
+    solution = Solution(trusted, (), 0.0, 0.0, start, judge(start, made.here.m))
+    lone, also = Explanation(trusted, (), 0.0, 0.0), Explanation(trusted, (3,), 0.0, 0.0)
+    group = np.flatnonzero(~trusted)[:3]
+    more, alike = np.isin(np.arange(trusted.size), group), np.zeros((trusted.size, 1))
+    alike[group] = 0.2
+
+    def expected(who: Bools, loosened: tuple[int, ...], alike: Floats | None = None) -> list[float]:
+        book, all_ = made.scales.book, [made.scales[s] for s in range(len(made.design.lengths))]
+        which = np.array(loosened, dtype=int)
+        loose = book.columns(which) * book.std[which] if loosened else None
+        return [misfit(one.prior, one.noise, one.m, who, loose, alike) for one in all_]
+
+    plain = expected(trusted, ())
+    assert len({round(each, 6) for each in plain}) == len(plain) > 2
+    for _ in range(2):
+        np.testing.assert_allclose(made._misfits(lone), plain, rtol=1e-8)
+        np.testing.assert_allclose(made._misfits(also), expected(trusted, (3,)), rtol=1e-8)
+        np.testing.assert_allclose(made._misfits(solution), plain, rtol=1e-8)
+        for found in (lone, solution):
+            both = expected(trusted | more, (), alike)
+            np.testing.assert_allclose(made._misfits(found, more, alike), both, rtol=1e-8)
+
+
+def test_what_else_is_accused_stays_so_in_every_start() -> None:
+    """A kept fit of all meters knows nothing of it."""
+    rng, made = np.random.default_rng(1), several_scales(1, accused=((4, 1),))
+    trusted = rng.random(NEAR + FAR) < 0.85
+    loose = made.scales.loosened(made.accused)
+    assert loose is not None
+    found = made._fit(trusted)
+    anew = fit(made.here.prior, made.here.noise, trusted, loose)
+    np.testing.assert_array_equal(found.loose, anew.loose)
+    np.testing.assert_allclose(found.Q, anew.Q, rtol=1e-9, atol=1e-9 * np.abs(anew.Q).max())
