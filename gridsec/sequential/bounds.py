@@ -312,7 +312,7 @@ _LATER: Floats = np.zeros(0)
 
 
 class Bounded(Estimate):
-    """An estimate whose bound is worked out when it is first asked for: that takes half as long as a step.
+    """An estimate whose bound is worked out when it is first asked for: that is half a step more.
 
     From the arrays of its frame, which must not be changed meanwhile.
     """
