@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gridsec.arrays import Bools, Floats
+from gridsec.arrays import Bools, Floats, Ints
 from gridsec.sequential import search
 from gridsec.sequential.blocks import Outside, misfit_without, sound, without
 from gridsec.sequential.conditional import Fit, Prior, admit, drop, fit, judge, loosen
@@ -171,3 +173,76 @@ def test_exact_meters_are_moved_one_by_one(seed: int, exact: float) -> None:
     assert found[0].fit.changes == found[1].fit.changes
     # Still more exact ones are beyond what doubles tell apart.
     assert found[0].trusted.all() or exact < 1e-8
+
+
+@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("loud", [False, True])
+def test_a_descent_where_meters_share_a_bus_ends_in_a_fit_made_anew(seed: int, loud: bool) -> None:
+    """Two or three customers of one bus; one of them may know far less than is known without it."""
+    rng = np.random.default_rng([21, seed])
+    root = rng.normal(size=(12, 4))
+    S, at = root @ root.T, rng.integers(0, 12, 24)
+    prior, noise = Prior(S[:, at], at, S.diagonal().copy()), rng.uniform(0.05, 0.4, 24)
+    if loud:
+        noise[rng.integers(24)] = 100.0 * float(S.diagonal().max())
+    m = (root @ rng.normal(size=4))[at] + np.sqrt(noise) * rng.normal(size=24)
+    m[rng.choice(24, 8, replace=False)] += 4.0 * rng.choice([-1.0, 1.0], 8)
+    zero, every = np.zeros(24), np.ones(24, dtype=np.bool_)
+    limits, found = Limits(2.5, zero, zero + 0.02, zero + 0.01), list[Solution]()
+    start = fit(prior, noise, rng.random(24) < (1.0 if seed % 2 else 0.3))
+    with pytest.MonkeyPatch.context() as patch:
+        for few in (2, 10**6):
+            patch.setattr(search, "_MANY", few)
+            found.append(descend(start, m, every, limits, keep=~every))
+    many, one_by_one = found
+    np.testing.assert_array_equal(many.trusted, one_by_one.trusted)
+    assert many.fit.changes == one_by_one.fit.changes
+    assert many.cost == pytest.approx(one_by_one.cost, rel=1e-8)
+    agrees(many.fit, S, m)
+    anew, fallen = judge(fit(prior, noise, many.trusted), m), start.trusted & ~many.trusted
+    assert many.judged.misfit == pytest.approx(anew.misfit, rel=1e-8)
+    left = judge(fit(prior, noise, start.trusted & ~fallen), m).misfit
+    assert misfit_without(start, np.where(fallen, 1e6, m), fallen) == pytest.approx(left, rel=1e-8, abs=1e-8)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_nobody_knows_more_of_a_bus_when_somebody_falls(seed: int) -> None:
+    """Also where many good meters know the bus as well as the noisy ones that fall know little of it."""
+    rng = np.random.default_rng([22, seed])
+    root = rng.uniform(0.5, 1.5, (50, 1))
+    S = root @ root.T
+    noise = np.where(np.arange(50) < 10, 8.0 * S.diagonal(), 1e-6)
+    before = fit(Prior(S, np.arange(50), S.diagonal().copy()), noise, np.ones(50, dtype=np.bool_))
+    after = without(before, np.arange(50) < 10)
+    assert (after.variance >= before.variance).all()
+    # Of one cause only: what all say of it together is known without a matrix.
+    known = 1.0 + float((root[10:, 0] ** 2 / noise[10:]).sum())
+    np.testing.assert_allclose(after.variance, root[:, 0] ** 2 / known, atol=5e-9)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_exact_numbers_tell_what_meters_leave_open_that_know_next_to_nothing(seed: int) -> None:
+    """Two of six meters have noise so large that their own reading says nothing of their bus."""
+    rng = np.random.default_rng([23, seed])
+    root = rng.normal(size=(6, 8))
+    S = root @ root.T
+    noise = rng.uniform(0.1, 0.5, 6)
+    noise[[1, 4]] = 1e12 * S.diagonal()[[1, 4]]
+    prior, every = Prior(S, np.arange(6), S.diagonal().copy()), np.ones(6, dtype=np.bool_)
+    whole = fit(prior, noise, every)
+    np.testing.assert_allclose(whole.variance, exactly(S, noise, np.arange(6)), rtol=1e-9)
+    for gone in ([1], [4, 2], [1, 4], [0, 1, 4]):
+        stay = np.setdiff1d(np.arange(6), gone)
+        after = without(whole, np.isin(np.arange(6), gone))
+        np.testing.assert_allclose(after.variance, exactly(S, noise, stay), rtol=1e-9)
+
+
+def exactly(S: Floats, noise: Floats, at: Ints) -> Floats:
+    """What meters at the first buses leave open at every bus, in fractions: elimination of one by one."""
+    open_ = [[Fraction(float(value)) for value in row] for row in S]
+    for j in at.tolist():
+        pivot, row = open_[j][j] + Fraction(float(noise[j])), list(open_[j])
+        open_ = [
+            [own - row[a] * row[b] / pivot for b, own in enumerate(each)] for a, each in enumerate(open_)
+        ]
+    return np.array([float(open_[k][k]) for k in range(len(open_))])

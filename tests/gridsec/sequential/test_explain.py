@@ -288,3 +288,16 @@ def test_what_else_is_accused_stays_so_in_every_start() -> None:
     anew = fit(made.here.prior, made.here.noise, trusted, loose)
     np.testing.assert_array_equal(found.loose, anew.loose)
     np.testing.assert_allclose(found.Q, anew.Q, rtol=1e-9, atol=1e-9 * np.abs(anew.Q).max())
+
+
+def test_fits_of_exact_meters_are_not_made_from_a_kept_one() -> None:
+    """What many that fall at once leave would be lost in rounding."""
+    rng, made = np.random.default_rng(2), several_scales(2)
+    trusted, prior = rng.random(NEAR + FAR) < 0.85, made.here.prior
+    assert made._fit(trusted).changes == np.count_nonzero(~trusted) > 0
+    noise = np.full(trusted.size, 1e-8 * float(prior.variance.max()))
+    made.here = replace(made.here, noise=noise)
+    made.covering[0] = fit(prior, noise, np.ones_like(trusted))
+    found, anew = made._fit(trusted), fit(prior, noise, trusted)
+    assert found.changes == 0
+    np.testing.assert_array_equal(found.Q, anew.Q)

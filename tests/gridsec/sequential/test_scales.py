@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gridsec.arrays import Bools
-from gridsec.sequential.conditional import Fit, drop, fit
+from gridsec.sequential.conditional import Fit, Prior, drop, fit
 from gridsec.sequential.scales import Scale, adapt
 from gridsec.sequential.search import Limits
 from tests.gridsec.sequential.test_conditional import problem
@@ -54,3 +54,19 @@ def test_many_that_fall_are_taken_off_a_fit_just_factorised_only() -> None:
     part = fit(here.prior, here.noise, every >= 2)
     assert changed_to(part, here, (every >= 4) | (every == 0)).changes == 0
     assert changed_to(whole, here, every >= 5).changes == 0
+
+
+def test_who_falls_from_exact_meters_is_not_taken_off() -> None:
+    """Rounding would take too much of what they leave open: a fit is made anew."""
+    rng = np.random.default_rng(3)
+    root, zero, every = rng.normal(size=(12, 3)), np.zeros(12), np.arange(12)
+    S = root @ root.T
+    for exact, changes in ((1e-5, 3), (1e-8, 0)):
+        noise = np.full(12, exact * float(S.diagonal().max()))
+        prior = Prior(S, every, S.diagonal().copy())
+        here = Scale(prior, noise, zero, every >= 0, Limits(3.0, zero, zero, zero))
+        now = adapt(fit(prior, noise, every >= 0), here, every >= 3, None)
+        np.testing.assert_array_equal(now.trusted, every >= 3)
+        assert now.changes == changes
+        anew = fit(prior, noise, every >= 3)
+        np.testing.assert_allclose(now.Q, anew.Q, rtol=1e-6, atol=1e-6 * np.abs(anew.Q).max())

@@ -11,12 +11,13 @@ import pytest
 
 from gridsec.arrays import Bools, Floats
 from gridsec.feeder import lindistflow
+from gridsec.sequential import search
 from gridsec.sequential.conditional import Prior, fit, judge
 from gridsec.sequential.dictionary import Dictionary
 from gridsec.sequential.exchanges import swaps
 from gridsec.sequential.loads import LoadDoubt, prior
 from gridsec.sequential.robust import robust
-from gridsec.sequential.search import Limits, Recent, descend, price
+from gridsec.sequential.search import Limits, Recent, Solution, descend, price
 from tests.gridsec.street import random_tree
 
 SIGMAS = 3.5
@@ -329,3 +330,109 @@ def test_what_was_answered_last_is_answered_again_for_the_same_only() -> None:
         given = (sigmas, model, allowed, certain, None, late)
         np.testing.assert_array_equal(Limits(*given, recent).of(std, part), Limits(*given).of(std, part))
     assert recent.answer is not None
+
+
+def crowd(seed: int, count: int) -> tuple[np.random.Generator, Prior, Floats, Floats]:
+    """Meters that few common causes move, their noise, and honest readings."""
+    rng = np.random.default_rng([25, seed])
+    root = rng.normal(size=(count, 5))
+    S, noise = root @ root.T, rng.uniform(0.05, 0.4, count)
+    m = root @ rng.normal(size=5) + np.sqrt(noise) * rng.normal(size=count)
+    return rng, Prior(S, np.arange(count), S.diagonal().copy()), noise, m
+
+
+@pytest.mark.parametrize("seed", range(20, 60))
+def test_who_was_believed_is_judged_by_those_admitted_too(seed: int) -> None:
+    """The more is known the less an honest meter is off: one is dropped where, one by one, it would be."""
+    rng, p, noise, m = crowd(seed, 24)
+    m += np.where(rng.random(24) < 0.3, rng.normal(size=24) * 3.0, 0.0)
+    start, every, zero = fit(p, noise, rng.random(24) < 0.4), np.ones(24, dtype=bool), np.zeros(24)
+    # The better the others know, the less is left but for what is allowed.
+    strict, found = Limits(2.5, zero, zero + 0.02, noise), list[Solution]()
+    with pytest.MonkeyPatch.context() as patch:
+        for few in (search._MANY, 10**6):
+            patch.setattr(search, "_MANY", few)
+            found.append(descend(start, m, every, strict, keep=~every))
+    many, one_by_one = found
+    np.testing.assert_array_equal(many.trusted, one_by_one.trusted)
+    assert many.fit.changes == one_by_one.fit.changes
+    assert many.judged.misfit == pytest.approx(judge(fit(p, noise, many.trusted), m).misfit, rel=1e-8)
+
+
+def vouching(seed: int) -> tuple[Prior, Floats, Floats]:
+    """Eight of 24 meters lie, and two more at one bus tell the same lie."""
+    rng, p, noise, m = crowd(seed, 24)
+    m[rng.choice(24, 8, replace=False)] += rng.choice([-1.0, 1.0], 8) * 4.0
+    S = np.zeros((25, 25))
+    S[:24, :24], S[24, :24] = p.of_meters, 0.6 * p.of_meters[0]
+    S[:24, 24], S[24, 24] = S[24, :24], 0.36 * p.variance[0] + 0.05
+    at = np.append(np.arange(24), [24, 24])
+    m = np.append(m, 0.6 * m[0] + np.array([3.0, 3.05]))
+    return Prior(S[:, at], at, S.diagonal().copy()), np.append(noise, [0.02, 0.02]), m
+
+
+def test_where_pairs_may_fall_nobody_falls_in_a_crowd() -> None:
+    """Each move is the best there is, of one or of two, however many are beyond their limits."""
+    every, vouched = np.ones(26, dtype=bool), 0
+    for seed in range(20):
+        p, noise, m = vouching(seed)
+        start, found = fit(p, noise, every), list[Solution]()
+        judged = judge(start, m)
+        beyond = np.abs(judged.offset) > limits(26).of(judged.std)
+        with pytest.MonkeyPatch.context() as patch:
+            for few, pairs in ((search._MANY, True), (10**6, True), (10**6, False)):
+                patch.setattr(search, "_MANY", few)
+                found.append(descend(start, m, every, limits(26), keep=~every, pairs=pairs))
+        asked, one_by_one, single = found
+        np.testing.assert_array_equal(asked.trusted, one_by_one.trusted)
+        assert asked.fit.changes == one_by_one.fit.changes
+        assert asked.cost == pytest.approx(one_by_one.cost, rel=1e-9)
+        enough = np.count_nonzero(beyond) >= 6
+        vouched += bool(enough and single.trusted[24:].all() and not asked.trusted[24:].any())
+    assert vouched >= 2
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_where_powers_may_be_false_nobody_falls_in_a_crowd(seed: int) -> None:
+    """What loosening gains changes with each who falls: the cost stays what it is by definition."""
+    rng = np.random.default_rng([26, seed])
+    columns, p = street(rng, 24)
+    noise, every = np.full(24, 0.001**2), np.ones(24, dtype=bool)
+    m = readings(rng, p, noise)
+    m[rng.choice(24, 8, replace=False)] += 0.03 * rng.choice([-1.0, 1.0], 8)
+    m -= 0.3 * columns[1:, int(np.argmax(columns[1:].sum(axis=0)))]
+    book = Dictionary(
+        std=np.full(24, 0.1),
+        charge=np.full(24, 3.0),
+        size=(columns[1:] ** 2).sum(axis=0),
+        meter=np.full(24, -1),
+        columns=lambda which: columns[:, which],
+        along=lambda weights: weights @ columns[1:],
+    )
+    start, found = fit(p, noise, every), list[Solution]()
+    with pytest.MonkeyPatch.context() as patch:
+        for few in (search._MANY, 10**6):
+            patch.setattr(search, "_MANY", few)
+            found.append(descend(start, m, every, limits(24), keep=~every, dictionary=book))
+    asked, one_by_one = found
+    np.testing.assert_array_equal(asked.trusted, one_by_one.trusted)
+    assert asked.loosened == one_by_one.loosened
+    assert asked.fit.changes == one_by_one.fit.changes
+    loose = 0.1 * columns[:, list(asked.loosened)]
+    anew = judge(fit(p, noise, asked.trusted, loose), m).misfit
+    liars = int(np.count_nonzero(~asked.trusted))
+    assert asked.cost == pytest.approx(anew + price(24, liars) + asked.charge, rel=1e-6)
+
+
+@pytest.mark.parametrize("few", [1, 10**6])
+def test_moves_are_bounded_though_many_are_made_at_once(few: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each who moves counts, not each time that some do: half as many moves as meters leave half of them."""
+    _, p, noise, m = crowd(0, 24)
+    every = np.ones(24, dtype=bool)
+    start = fit(p, noise, ~every)
+    monkeypatch.setattr(search, "_MANY", few)
+    monkeypatch.setattr(search, "_AT_ONCE", 6)
+    assert descend(start, m, every, replace(limits(24), sigmas=9.0), keep=~every).trusted.all()
+    monkeypatch.setattr(search, "_MOVES_PER_METER", 0.5)
+    found = descend(start, m, every, replace(limits(24), sigmas=9.0), keep=~every)
+    assert found.fit.changes == np.count_nonzero(found.trusted) == 12
