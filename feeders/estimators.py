@@ -282,6 +282,7 @@ FAMILIES: Final = Families(
                 commission=lambda state: state.commission,
                 renew=sequential.renew,
                 read=sequential.from_arrays,
+                progress=sequential.progress,
             ),
             Memory(sequential.distrusted, sequential.restore),
         ),

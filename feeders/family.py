@@ -10,7 +10,7 @@ from typing import Any
 from feeders.load import Site
 from gridsec.arrays import Bools, Floats
 from gridsec.online import Estimate, Frame, Verdict
-from gridsec.sequential import Commission, Distrust
+from gridsec.sequential import Commission, Distrust, LearningProgress
 
 __all__ = ["Family", "Job", "Learner", "Memory", "Watcher"]
 
@@ -51,6 +51,8 @@ class Learner:
     read
         `read(design, arrays)`: what `gridsec.sequential.to_arrays` gave, if it fits the design; a
         `ValueError` names every problem.
+    progress
+        `progress(design, commission)`: state and reason of each meter, and the time expected.
     """
 
     needed_s: Callable[[Any], float]
@@ -58,6 +60,7 @@ class Learner:
     commission: Callable[[Any], Commission]
     renew: Callable[[Any, Any, Bools], Any]
     read: Callable[[Any, Mapping[str, Floats]], Commission]
+    progress: Callable[[Any, Commission], LearningProgress]
 
 
 @dataclass(frozen=True, slots=True)

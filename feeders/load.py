@@ -31,14 +31,14 @@ from feeders.schema import CustomerRow, FeederTables, validate
 from feeders.taps import Referred, refer
 from feeders.topology import Edge, Tree, tree
 from gridsec.accuracy import MeterAccuracy
-from gridsec.arrays import Floats, Ints, frozen
+from gridsec.arrays import Bools, Floats, Ints, frozen
 from gridsec.droop import Droop
 from gridsec.errors import FeederInvalid
 from gridsec.feeder import Feeder
 from gridsec.mesh import Meshed, MeshedFeeder, PhasedMesh
 from gridsec.monitor import Plant
 from gridsec.network import Network
-from gridsec.online import Frame
+from gridsec.online import Frame, PowerOrigin
 from gridsec.phases import PHASES, PhasedFeeder, ThreePhaseFeeder
 
 __all__ = [
@@ -400,8 +400,16 @@ def to_frame(site: Site, snapshot: Snapshot) -> Frame:
         q_net=q_net,
         q_net_error=np.maximum(model.q_error, model.q_fraction * size),
         v0_phases=v0_phases,
+        p_origin=_origin(metered, known, beyond),
     )
     return frame if site.forecast is None else site.forecast.fill(frame, ~known)
+
+
+def _origin(metered: Floats, known: Bools, beyond: Floats) -> Ints:
+    """`PowerOrigin` of the powers, (N,)."""
+    excess = (known & (beyond > 0.0)) | (np.isfinite(metered) & ~known)
+    read = np.where(known, PowerOrigin.READ, PowerOrigin.UNREAD)
+    return np.where(excess, PowerOrigin.BEYOND, read).astype(np.intp)
 
 
 def _busbar(v0_volt: Floats | float, base_volt: float) -> tuple[float, Floats | None]:

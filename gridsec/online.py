@@ -12,13 +12,14 @@ Outcomes are values. UNDECIDED is an answer of its own: no answer must never loo
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from enum import StrEnum
+from enum import IntEnum, StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
+Ints = NDArray[np.intp]
 
 
 class Decision(StrEnum):
@@ -40,6 +41,7 @@ class Cause(StrEnum):
     NO_BUSBAR = "no-busbar"
     TOO_MANY_SUSPECTS = "too-many-suspects"
     AMBIGUOUS = "ambiguous"
+    MISFIT = "misfit"
     DESIGN_INVALID = "design-invalid"
 
 
@@ -52,6 +54,17 @@ class Kind(StrEnum):
     REPLAY = "replay"
     CLOCK_SHIFT = "clock-shift"
     COORDINATED = "coordinated"
+
+
+class PowerOrigin(IntEnum):
+    """Origin of a customer's active power in a frame."""
+
+    READ = 0
+    """A reading within the customer's declared load and generation."""
+    UNREAD = 1
+    """No usable reading: a range, or a forecast."""
+    BEYOND = 2
+    """A reading beyond the declared load or generation, believed in part or not at all."""
 
 
 def _none() -> Bools:
@@ -118,6 +131,8 @@ class Frame:
     p_std, q_std : (N,) or None
         Standard deviation of the truth about `p` and `q` where it is known apart from the intervals, as that
         of forecasts is, pu; NaN, or None for all, where it is that of a uniform distribution in the interval.
+    p_origin : (N,) or None
+        `PowerOrigin` of `p`; None: `READ` everywhere. No estimate depends on it: it explains wide intervals.
     """
 
     t: float
@@ -133,6 +148,7 @@ class Frame:
     v0_phases: Floats | None = None
     p_std: Floats | None = None
     q_std: Floats | None = None
+    p_origin: Ints | None = None
 
 
 @dataclass(frozen=True, slots=True)

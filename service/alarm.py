@@ -9,7 +9,7 @@ from typing import Any
 
 from gridsec.errors import GridsecError
 from service.conditions import AlarmKind, Evidence, Severity
-from service.report import ExplanationReport
+from service.report import ExplanationReport, StalledMeter
 
 
 class AlarmState(StrEnum):
@@ -154,5 +154,6 @@ def from_json(data: Mapping[str, Any]) -> Alarm:
         )
         for e in shown
     )
-    fields["evidence"] = Evidence(**evidence, explanations=explanations)
+    learning = tuple(StalledMeter(**meter) for meter in evidence.pop("learning", ()))
+    fields["evidence"] = Evidence(**evidence, explanations=explanations, learning=learning)
     return Alarm(**fields)

@@ -9,8 +9,8 @@ A condition is present, absent, or unknown at a tick, and what a tick says stand
 *holds*: the clock of that condition stands still, nothing is raised and nothing is cleared, because no answer
 must never look like no attack. So an alarm is raised once its condition has been seen for `on_delay_s`
 without a tick in between that saw it absent, and cleared once it has been seen absent for `off_delay_s`
-without a tick that saw it present; time after an unknown tick counts for neither. A restart is a hold, too:
-see `restore`.
+without a tick that saw it present; time after an unknown tick counts for neither. Ticks that were not judged
+are unknown (`hold`), and so is a restart (`restore`).
 """
 
 from __future__ import annotations
@@ -50,9 +50,11 @@ __all__ = [
     "acknowledge",
     "acknowledged",
     "advance",
+    "carried",
     "close",
     "conditions",
     "from_json",
+    "hold",
     "restore",
     "to_json",
 ]
@@ -211,6 +213,19 @@ def advance(
     return AlarmBook(book.feeder, t, entries), tuple(transitions)
 
 
+def hold(book: AlarmBook, t: float) -> AlarmBook:
+    """Return the book after ticks that were not judged: every clock stands still, as at an unknown tick.
+
+    Parameters
+    ----------
+    book
+        The feeder's alarms so far.
+    t
+        Unix time of the first tick that was not judged, s.
+    """
+    return replace(book, entries={key: _hold(entry, t) for key, entry in book.entries.items()})
+
+
 def _order(key: Key) -> tuple[str, str]:
     return key[0].value, key[1] or ""
 
@@ -332,6 +347,27 @@ def acknowledged(alarm: Alarm, who: str, comment: str, t: float, *, count: int |
         comment=comment,
     )
     return Transition(answered, Change.ACKNOWLEDGED, t, who, comment)
+
+
+def carried(alarm: Alarm, answered: Alarm) -> Alarm:
+    """Return an alarm with the acknowledgement that was stored while it changed.
+
+    Parameters
+    ----------
+    alarm
+        The alarm after the change.
+    answered
+        The acknowledged alarm; of another alarm or occurrence nothing is carried over.
+    """
+    if (alarm.id, alarm.count) != (answered.id, answered.count):
+        return alarm
+    return replace(
+        alarm,
+        state=AlarmState.ACKNOWLEDGED if alarm.active else alarm.state,
+        acknowledged_by=answered.acknowledged_by,
+        t_acknowledged=answered.t_acknowledged,
+        comment=answered.comment,
+    )
 
 
 def acknowledge(

@@ -19,6 +19,7 @@ from collections import Counter, OrderedDict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from enum import StrEnum
+from itertools import zip_longest
 
 from service.reading import Reading
 
@@ -26,7 +27,10 @@ HELD_PER_SOURCE = 512
 """A source that is more than this many readings ahead of the ticks is not listened to."""
 
 BACKLOG_TICKS = 3600
-"""After a longer gap (a suspended machine, a hole in a recording) the older ticks are skipped."""
+"""Ticks formed after one step of the time where time may wait (`Clock.EVENTS`, replay); older are skipped."""
+
+LEAP_TICKS = 60
+"""Ticks formed after one step of the wall clock of a running service, where old ticks are stale."""
 
 BRIDGED_TICK_S = 2.0
 """Up to this tick, a lost reading is replaced by the one before."""
@@ -76,6 +80,8 @@ class AlignRules:
         A source whose last usable reading is older than this is silent.
     clock
         Who says what time it is.
+    backlog
+        Ticks formed after one step of the time; older ones are skipped and counted.
     """
 
     tick_s: float
@@ -85,6 +91,7 @@ class AlignRules:
     max_skew_s: float
     silence_s: float
     clock: Clock = Clock.WALL
+    backlog: int = BACKLOG_TICKS
 
     def __post_init__(self) -> None:
         times = (self.tick_s, self.max_age_s, self.max_skew_s, self.silence_s)
@@ -101,6 +108,7 @@ def rules(
     clock: Clock = Clock.WALL,
     max_skew_s: float | None = None,
     grace_s: float | None = None,
+    live: bool = False,
 ) -> AlignRules:
     """Return the rules that follow from a feeder's tick.
 
@@ -118,6 +126,8 @@ def rules(
         None: a minute, or two ticks where they are longer.
     grace_s
         None: half a tick, at most a minute.
+    live
+        By the wall clock at most `LEAP_TICKS` missed ticks are formed.
     """
     lead_s = min(0.1 * tick_s, 1.0)
     max_age_s = 2.5 * tick_s if tick_s <= BRIDGED_TICK_S else tick_s - lead_s
@@ -130,6 +140,7 @@ def rules(
         # Nobody is silent before two ticks have gone by without a reading; the silent are not waited for.
         silence_s=max(silence_s, tick_s + max_age_s),
         clock=clock,
+        backlog=LEAP_TICKS if live and clock is Clock.WALL else BACKLOG_TICKS,
     )
 
 
@@ -148,12 +159,15 @@ class Tick:
     silent
         (meter, seconds since its last usable reading) of those who are silent; None is the busbar meter,
         and infinity says never.
+    skipped
+        Number of ticks directly before this one that are not judged.
     """
 
     t: float
     readings: tuple[Reading | None, ...]
     busbar: Reading | None
     silent: tuple[tuple[str | None, float], ...]
+    skipped: int = 0
 
 
 @dataclass(slots=True)
@@ -186,8 +200,6 @@ class Aligner:
         Readings by outcome.
     lost
         Readings that never came, by the gaps in their running numbers.
-    skipped
-        Ticks that were skipped because the backlog was too long.
     restarts
         How often the clock was set back by more than `silence_s`, and the ticks with it.
     """
@@ -197,8 +209,8 @@ class Aligner:
         self.rules = rules
         self.counts: Counter[Outcome] = Counter()
         self.lost = 0
-        self.skipped = 0
         self.restarts = 0
+        self._skipped = 0
         self._sources: dict[str | None, _Source] = {meter: _Source() for meter in (*self.meters, None)}
         self._waiting: set[str | None] = set()
         self._next: int | None = None
@@ -273,7 +285,7 @@ class Aligner:
 
     def _thin(self, source: _Source) -> None:
         """Keep of the readings between two ticks the last one: no tick uses the others."""
-        numbers = [math.ceil((held.t - self.rules.lead_s) / self.rules.tick_s) for held in source.held]
+        numbers = [self._serves(held) for held in source.held]
         pairs = zip(source.held, numbers, [*numbers[1:], None], strict=True)
         source.held = [held for held, number, after in pairs if number != after]
 
@@ -371,10 +383,10 @@ class Aligner:
             return
         if self._next is None:
             self._begin(now)
-        behind = math.floor(now / self.rules.tick_s) - self._number()
-        if behind > BACKLOG_TICKS:
-            self.skipped += behind - BACKLOG_TICKS
-            self._turn_to(self._number() + behind - BACKLOG_TICKS)
+        first = self._number()
+        behind = math.floor(now / self.rules.tick_s) - first
+        if behind > self.rules.backlog:
+            self._skip(first, first + behind - self.rules.backlog)
         while True:
             t = self._time(self._number())
             if now < t or (self._waiting and now < t + self.rules.grace_s):
@@ -397,8 +409,24 @@ class Aligner:
             self._turn_to(self._number() + 1)
             yield tick
 
+    def _skip(self, first: int, following: int) -> None:
+        """Go on with the tick `following`; sources are as silent as if the skipped ticks had been formed."""
+        for source in self._sources.values():
+            for reading, later in zip_longest(source.held, source.held[1:]):
+                begin = max(first, self._serves(reading))
+                end = following if later is None else min(following, self._serves(later))
+                if begin < end and self._time(begin) - reading.t < self.rules.max_age_s:
+                    source.last_used = max(source.last_used, reading.t)
+        self._skipped += following - first
+        self._turn_to(following)
+
+    def _serves(self, reading: Reading) -> int:
+        """Return the number of the first tick that may use a reading."""
+        return math.ceil((reading.t - self.rules.lead_s) / self.rules.tick_s)
+
     def _begin(self, now: float) -> None:
         self._first = math.ceil(now / self.rules.tick_s)
+        self._skipped = 0
         self._turn_to(self._first)
 
     def _number(self) -> int:
@@ -445,7 +473,8 @@ class Aligner:
             for meter, source in self._sources.items()
             if (seconds := self._silent_for(source, source.last_used, t)) > 0.0
         )
-        return Tick(t, tuple(seen[meter] for meter in self.meters), seen[None], silent)
+        skipped, self._skipped = self._skipped, 0
+        return Tick(t, tuple(seen[meter] for meter in self.meters), seen[None], silent, skipped)
 
     def _usable(self, source: _Source, t: float) -> Reading | None:
         index = bisect_left(source.held, math.nextafter(t + self.rules.lead_s, math.inf), key=_time_of)

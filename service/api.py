@@ -30,6 +30,7 @@ from service.alarms import AlarmKind, AlarmState, AlarmUnknown, Severity
 from service.alarms import to_json as alarm_json
 from service.backend import Backend, wakes
 from service.errors import FeederNotLoaded, FeederUnknown
+from service.probe import Probe
 from service.problem import Guard, handlers, problem
 from service.report import FeederReport
 from service.report import to_json as report_json
@@ -45,7 +46,7 @@ _WEB = FilePath(__file__).with_name("web")
 _NAME = r"^[A-Za-z0-9_-]{1,64}$"
 
 
-def create_api(backend: Backend, hosts: Collection[str] = ()) -> FastAPI:
+def create_api(backend: Backend, hosts: Collection[str] = (), *, max_streams: int = MAX_STREAMS) -> FastAPI:
     """Return the HTTP application.
 
     Parameters
@@ -54,6 +55,8 @@ def create_api(backend: Backend, hosts: Collection[str] = ()) -> FastAPI:
         The running service.
     hosts
         Names by which it may be asked to change something, besides `localhost` and this machine's.
+    max_streams
+        Event streams that may be open at once.
     """
     app = FastAPI(
         title="gridsec",
@@ -65,7 +68,8 @@ def create_api(backend: Backend, hosts: Collection[str] = ()) -> FastAPI:
         responses={"default": {"model": models.Problem, "description": "Any error."}},
     )
     app.state.backend = backend
-    app.state.streams = 0
+    app.state.probe = Probe(backend.store)
+    app.state.streams, app.state.max_streams = 0, max_streams
     app.state.run = secrets.token_hex(4)
     app.add_middleware(Guard, max_body=MAX_BODY, hosts=hosts)
     for error, handler in handlers().items():
@@ -137,8 +141,8 @@ async def _json_only(request: Request) -> None:
 async def _slot(request: Request) -> AsyncIterator[None]:
     """Count an open stream for as long as it is open."""
     state = request.app.state
-    if state.streams >= MAX_STREAMS:
-        raise HTTPException(503, f"{MAX_STREAMS} event streams are open already", {"Retry-After": "10"})
+    if state.streams >= state.max_streams:
+        raise HTTPException(503, f"{state.max_streams} event streams are open already", {"Retry-After": "10"})
     state.streams += 1
     try:
         yield
@@ -170,7 +174,8 @@ def _summary(backend: Backend, fields: dict[str, Any]) -> models.FeederSummary:
     report = backend.report(fields["name"])
     now: dict[str, Any] = {}
     if report is not None:
-        now = {"t": report.t, "verdict": report.verdict, "age_s": backend.age(report)}
+        age_s, model_only = backend.age(report), report.model_only
+        now = {"t": report.t, "verdict": report.verdict, "age_s": age_s, "model_only": model_only}
     return models.FeederSummary.model_validate({**fields, **now})
 
 
@@ -460,13 +465,12 @@ async def healthz(request: Request, backend: BackendHere) -> Any:
 
 @_operations.get("/readyz", response_model=models.Health)
 @_operations.head("/readyz", include_in_schema=False)
-def readyz(request: Request, backend: BackendHere) -> Any:
+async def readyz(request: Request, backend: BackendHere) -> Any:
     """Whether feeders are designed, the database can be written and zenoh is connected."""
     ready, reasons = backend.ready()
-    try:
-        backend.store.check(wait=False)
-    except StoreUnavailable as error:
-        ready, reasons = False, [*reasons, *([] if str(error) in reasons else [str(error)])]
+    trouble = await request.app.state.probe.trouble()
+    if trouble is not None:
+        ready, reasons = False, [*reasons, *([] if any(trouble in one for one in reasons) else [trouble])]
     return _probe(request, ready, reasons, "the service cannot watch at the moment")
 
 

@@ -6,22 +6,23 @@ import asyncio
 import contextlib
 import signal
 import socket
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
 
 import structlog
-import uvicorn
 
 from feeders.estimators import choose
 from feeders.load import Site, from_tables, load
 from feeders.schema import from_json
 from gridsec.errors import FeederInvalid, GridsecError
 from service.align import Clock
-from service.api import create_api
+from service.api import MAX_STREAMS, create_api
 from service.bus import BusConfig
 from service.ingest import Bus
+from service.listener import BoundedServer, Shares, raise_limit
 from service.rounds import RuntimeConfig
 from service.runtime import Runtime
 from service.settings import Settings, split_address
@@ -50,6 +51,8 @@ async def serve(
     announce: Callable[[Running], None] = lambda _: None,
     signals: bool = True,
     settled: Callable[[], None] = lambda: None,
+    stopping: Callable[[], None] = lambda: None,
+    wall: Callable[[], float] = time.time,
 ) -> None:
     """Run the service until SIGINT, SIGTERM or `Running.stop`.
 
@@ -63,12 +66,17 @@ async def serve(
         Whether to listen to signals; not possible outside of the main thread.
     settled
         As in `Runtime`.
+    stopping
+        Called when the end begins.
+    wall
+        The wall clock, Unix s.
 
     Raises
     ------
     FeederInvalid, StoreUnavailable, BusUnavailable, AddressUnavailable
         If it cannot start.
     """
+    shares = Shares.of(raise_limit())
     sites = {
         name: choose(site, estimator=settings.estimator)
         for name, site in load_sites(settings.feeders).items()
@@ -87,57 +95,68 @@ async def serve(
             max_samples=settings.queue,
             max_feeders=settings.max_feeders,
         )
-        runtime = Runtime(config, store, sites.values(), given=given, unloaded=unloaded, settled=settled)
+        runtime = Runtime(
+            config, store, sites.values(), given=given, unloaded=unloaded, wall=wall, settled=settled
+        )
         listener = stack.enter_context(_listen(settings.http))
         bus = stack.enter_context(
             Bus(
                 BusConfig(
-                    settings.zenoh_mode, settings.listen, settings.zenoh_connect, settings.zenoh_config
+                    settings.zenoh_mode,
+                    settings.listen,
+                    settings.zenoh_connect,
+                    settings.zenoh_config,
+                    max_sessions=shares.sessions,
+                    accept_pending=shares.pending,
                 ),
                 settings.prefix,
                 runtime.deliver,
                 max_payload=settings.max_payload,
                 lossless=settings.clock is Clock.EVENTS,
+                wall=wall,
             )
         )
         runtime.attach(bus)
-        api = create_api(runtime, settings.http_hosts)
-        await _run(runtime, api, listener, tuple(sites), announce=announce, signals=signals)
-
-
-async def _run(
-    runtime: Runtime,
-    api: Callable[..., Any],
-    listener: socket.socket,
-    feeders: tuple[str, ...],
-    *,
-    announce: Callable[[Running], None],
-    signals: bool,
-) -> None:
-    server = _Server(
-        uvicorn.Config(
+        api = create_api(runtime, settings.http_hosts, max_streams=min(MAX_STREAMS, shares.streams))
+        server = _Server(
             api,
+            shares.http,
             lifespan="off",
             log_config=None,
             access_log=False,
             timeout_graceful_shutdown=_GRACE_S,
             server_header=False,
         )
-    )
+        await _run(
+            runtime, server, listener, tuple(sites), announce=announce, signals=signals, stopping=stopping
+        )
+
+
+async def _run(
+    runtime: Runtime,
+    server: _Server,
+    listener: socket.socket,
+    feeders: tuple[str, ...],
+    *,
+    announce: Callable[[Running], None],
+    signals: bool,
+    stopping: Callable[[], None],
+) -> None:
     stop = asyncio.Event()
     with _signals(stop) if signals else contextlib.nullcontext():
         watching = asyncio.create_task(runtime.run(), name="runtime")
         serving = asyncio.create_task(server.serve(sockets=[listener]), name="http")
-        stopping = asyncio.create_task(stop.wait(), name="stop")
+        stopped = asyncio.create_task(stop.wait(), name="stop")
         started = asyncio.create_task(server.up.wait(), name="started")
-        await asyncio.wait({started, serving, stopping}, return_when=asyncio.FIRST_COMPLETED)
+        await asyncio.wait({started, serving, stopped}, return_when=asyncio.FIRST_COMPLETED)
         started.cancel()
         host, port = listener.getsockname()[:2]
         url = f"http://{f'[{host}]' if ':' in host else host}:{port}"
         _log.info("serving", url=url, feeders=list(feeders))
         announce(Running(url, feeders, stop.set))
-        await asyncio.wait({watching, serving, stopping}, return_when=asyncio.FIRST_COMPLETED)
-        stopping.cancel()
+        await asyncio.wait({watching, serving, stopped}, return_when=asyncio.FIRST_COMPLETED)
+        stopping()
+        stopped.cancel()
         runtime.stop()
         server.should_exit = True
         results = await asyncio.gather(watching, serving, return_exceptions=True)
@@ -146,14 +165,14 @@ async def _run(
             raise result
 
 
-class _Server(uvicorn.Server):
+class _Server(BoundedServer):
     """uvicorn that says when it is up, and leaves signals to `serve`.
 
     Its own handling would end the process before zenoh and the database are closed.
     """
 
-    def __init__(self, config: uvicorn.Config) -> None:
-        super().__init__(config)
+    def __init__(self, app: Callable[..., Any], most: int, **options: Any) -> None:
+        super().__init__(app, most, **options)
         self.up = asyncio.Event()
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:

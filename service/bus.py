@@ -27,12 +27,16 @@ class BusConfig:
     file
         A user's own json5 configuration (TLS, users, access control, ...). What it says is kept; mode and
         endpoints given here are put on top.
+    max_sessions, accept_pending
+        Sessions at most, and those that are being opened; not where a file is given. Each takes a descriptor.
     """
 
     mode: str | None = None
     listen: tuple[str, ...] = ()
     connect: tuple[str, ...] = ()
     file: Path | None = None
+    max_sessions: int = 100_000
+    accept_pending: int = 1_000
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ from gridsec.arrays import Bools, Floats
 from gridsec.network import busbar_places
 from gridsec.online import Estimate, Verdict
 from service.align import Tick
-from service.voltages import busbar_phases, busbar_volt, excess_volts
+from service.voltages import busbar_phases, busbar_volt, excess_volts, grounds
 
 BUSBAR = "substation"
 """The name under which the busbar meter is reported, as in its zenoh key. No other meter may have it."""
@@ -26,7 +26,8 @@ class BusbarReport:
     Attributes
     ----------
     judged
-        Whether the estimator can tell: others believe this meter, or do without.
+        The estimator judges this meter, and this tick has readings to do so: of this meter and of a trusted
+        meter in the same phase. Estimators that rely on this meter, or do without, never judge it.
     seen
         Whether a usable reading of it belongs to this tick.
     suspect
@@ -44,6 +45,8 @@ class BusbarReport:
     attack_volt_estimated
         Reconstructed manipulation, V: the mean over the time scale on which it was found; 0 if it is no
         suspect.
+    model_only
+        `v_volt_estimated` rests on no reading of this tick, see `voltages.Grounds`.
     """
 
     judged: bool
@@ -54,6 +57,7 @@ class BusbarReport:
     v_volt_reported: float | None = None
     v_volt_estimated: float | None = None
     attack_volt_estimated: float | None = None
+    model_only: bool = False
 
     def to_json(self) -> dict[str, Any]:
         """Return what REST's `state` shows."""
@@ -78,10 +82,11 @@ def busbar_report(
     """
     names, reported = busbar_phases(site), _reported(site, tick)
     nothing = np.full(reported.size, math.nan)
-    judged = verdict is not None and verdict.busbar.size > 0
+    judges = verdict is not None and verdict.busbar.size > 0
+    rests_on = grounds(site, tick, estimate, verdict)
     suspect = np.zeros(reported.size, dtype=np.bool_)
     attack, estimated = nothing, nothing
-    if verdict is not None and judged:
+    if verdict is not None and judges:
         suspect, attack = verdict.busbar, _attack_volts(site, reported, verdict)
     if estimate is not None:
         places = busbar_places(site.feeder)
@@ -92,7 +97,7 @@ def busbar_report(
         return float(values[k]) if math.isfinite(values[k]) else None
 
     return BusbarReport(
-        judged=judged,
+        judged=judges and bool((np.isfinite(reported) & rests_on.meters).any()),
         seen=math.isfinite(reported[k]),
         suspect=bool(suspect.any()),
         phases=tuple(name for name, one in zip(names, suspect, strict=True) if one and name is not None),
@@ -100,6 +105,7 @@ def busbar_report(
         v_volt_reported=number(reported),
         v_volt_estimated=number(estimated),
         attack_volt_estimated=number(attack),
+        model_only=not rests_on.measured[k],
     )
 
 

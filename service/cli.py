@@ -2,7 +2,7 @@
 
 Exit codes: 0 done; 1 a check failed or something unexpected; 2 wrong usage or settings; 3 a feeder is invalid
 or cannot be watched; 4 the database cannot be used; 5 an address cannot be used (HTTP or zenoh); 6 a file is
-no recording, no network of another tool, or cannot be written.
+no recording, no network of another tool, or cannot be written; 7 the writer's lock of the database is lost.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from gridsec.errors import DesignInfeasible, FeederInvalid, GridsecError, NotObs
 from service import cli_feeders, cli_replay, cli_reproduce, cli_serve, cli_study, console
 from service.cli_plan import said
 from service.cli_serve import Endpoints
-from service.console import ADDRESS, DATABASE, FAILED, FEEDER, FILE, USAGE, Feeder, complain
+from service.console import ADDRESS, DATABASE, FAILED, FEEDER, FILE, USAGE, WRITER_LOST, Feeder, complain
 from service.options import read_all
 from service.places import Unusable, see
 
@@ -76,7 +76,7 @@ def exit_code(error: GridsecError) -> int:
     from service.app import AddressUnavailable
     from service.bus import BusUnavailable
     from service.settings import SettingsInvalid
-    from service.store import StoreUnavailable
+    from service.store import StoreUnavailable, WriterLost
 
     codes: dict[type[GridsecError], int] = {
         SettingsInvalid: USAGE,
@@ -84,6 +84,7 @@ def exit_code(error: GridsecError) -> int:
         NotObservable: FEEDER,
         DesignInfeasible: FEEDER,
         BusbarUnclear: FEEDER,
+        WriterLost: WRITER_LOST,
         StoreUnavailable: DATABASE,
         AddressUnavailable: ADDRESS,
         BusUnavailable: ADDRESS,

@@ -35,6 +35,10 @@ def replay(
     ] = "events",
     max_skew: MaxSkew = None,
     grace: Grace = None,
+    skipped: Annotated[
+        list[str] | None,
+        typer.Option(help="FROM:TO, Unix s: ticks that the live service skipped; may be repeated."),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object per alarm transition.")] = False,
 ) -> None:
     """Run a recording through the same chain as the live service, and show what it would have said.
@@ -49,7 +53,8 @@ def replay(
     from service.replay import Tally
     from service.replay import replay as run
 
-    refuse_options(_problems(clock, estimator, max_skew, grace))
+    refuse_options(_problems(clock, estimator, max_skew, grace, skipped or []))
+    intervals = [interval for one in skipped or [] if (interval := _interval(one)) is not None]
     recording = read_recording(file)
     if clock == Clock.WALL and not recording.timed:
         raise RecordingInvalid(
@@ -58,7 +63,15 @@ def replay(
     site = choose(_site_of(recording, feeder), estimator=estimator)
     tally = Tally()
     began: float | None = None
-    results = run(site, recording.readings(), tally, clock=Clock(clock), max_skew_s=max_skew, grace_s=grace)
+    results = run(
+        site,
+        recording.readings(),
+        tally,
+        clock=Clock(clock),
+        max_skew_s=max_skew,
+        grace_s=grace,
+        skipped=intervals,
+    )
     for result in results:
         began = result.report.t if began is None else began
         for transition in result.transitions:
@@ -70,15 +83,17 @@ def replay(
                 about = escape(f"{alarm.kind} {alarm.meter or alarm.feeder}: {alarm.reason}")
                 console.out.print(f"{transition.t - began:10.1f} s  {transition.change:<12} {about}")
     summary = console.err if as_json else console.out
-    summary.print(f"ticks:    {_counts(tally.ticks)}")
+    summary.print(f"ticks:    {_counts(tally.ticks)}, skipped {tally.skipped}")
     summary.print(f"readings: {_counts(tally.readings)}, never arrived {tally.lost}")
     if not tally.judged:
         complain("no tick was judged, which is no answer: whether anybody lied is not known")
         raise typer.Exit(FAILED)
 
 
-def _problems(clock: str, estimator: str | None, max_skew: float | None, grace: float | None) -> list[str]:
-    """What is wrong with the options."""
+def _problems(
+    clock: str, estimator: str | None, max_skew: float | None, grace: float | None, skipped: list[str]
+) -> list[str]:
+    """Problems of the options."""
     from feeders.columns import ESTIMATORS
     from gridsec.choices import no_choice
     from service.align import Clock
@@ -89,7 +104,18 @@ def _problems(clock: str, estimator: str | None, max_skew: float | None, grace: 
         out.append(f"--max-skew is {max_skew:g}; it must be a positive number")
     if grace is not None and not 0.0 <= grace < float("inf"):
         out.append(f"--grace is {grace:g}; it must be a number that is not negative")
+    wrong = [one for one in skipped if _interval(one) is None]
+    out += [f"--skipped is {one!r}; it must be FROM:TO, two Unix times in this order" for one in wrong]
     return out
+
+
+def _interval(text: str) -> tuple[float, float] | None:
+    """First and last time of `FROM:TO`, Unix s; None if the text is something else."""
+    try:
+        first, last = map(float, text.split(":"))
+    except ValueError:
+        return None
+    return (first, last) if first <= last else None
 
 
 def _site_of(recording: Recording, feeder: str | None) -> Site:

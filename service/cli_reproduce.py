@@ -43,11 +43,12 @@ def reproduce(
         see(over={"--out": out})
         out.mkdir(parents=True, exist_ok=True)
     failed: list[Claim] = []
-    count = 0
+    count = met = 0
     for made, seconds in _computed(papers):
         _show(made, seconds)
         failed += made.unexplained
         count += len(made.claims)
+        met += len(made.claims) - len(made.unmet)
         for figure in made.figures if drawing else ():
             path = out / f"{figure.name}.png"
             path.write_bytes(draw.png(figure))
@@ -58,7 +59,9 @@ def reproduce(
         complain(f"not met: {claim.what} ({claim.where}): {_printed(claim)}, ours {_text(claim.ours)}")
     if failed:
         raise typer.Exit(FAILED)
-    console.out.print(f"[green]{count} claims: every one is met, or the reason why not is known.[/]")
+    console.out.print(
+        f"[green]{count} claims: {met} met, {count - met} differ, each for a reason printed above.[/]"
+    )
 
 
 def _chosen(paper: str) -> tuple[str, ...]:
@@ -90,8 +93,11 @@ def _show(made: Reproduction, seconds: float) -> None:
     for claim in made.claims:
         mark = "[green]met[/]" if claim.met else "[bold red]not met[/]"
         if claim.why:
-            reasons.append(claim.why)
-            mark = f"{'[green]met[/]' if claim.met else '[yellow]differs[/]'} ({len(reasons)})"
+            if claim.why not in reasons:
+                reasons.append(claim.why)
+            mark = (
+                f"{'[green]met[/]' if claim.met else '[yellow]differs[/]'} ({reasons.index(claim.why) + 1})"
+            )
         cells = (claim.what, claim.where, _printed(claim), _text(claim.ours))
         table.add_row(mark, *map(escape, cells))
     console.out.print(table, soft_wrap=False)

@@ -6,10 +6,13 @@ import asyncio
 import os
 import sys
 import threading
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from service.console import FAILED
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -54,6 +57,8 @@ Queue = Annotated[int | None, typer.Option(help="Payloads that may wait. [defaul
 MaxFeeders = Annotated[int | None, typer.Option(help="Feeders that may be put over REST. [default: 100]")]
 LogLevel = Annotated[str | None, typer.Option(help="debug, info, warning or error. [default: info]")]
 LogFormat = Annotated[str | None, typer.Option(help="console or json. [default: console]")]
+STOP_S = 2.7
+"""Time from a signal to the end by force, s; the promise is 3 s."""
 UntilEof = Annotated[bool, typer.Option(hidden=True, help="End when standard input ends.")]
 
 
@@ -122,10 +127,35 @@ def serve(
         if until_eof:
             _stop_at_eof(asyncio.get_running_loop(), running.stop)
 
+    ended = threading.Event()
     try:
-        asyncio.run(run(chosen, announce=announce, settled=settle))
+        stopping = partial(_end_within, STOP_S, ended)
+        asyncio.run(run(chosen, announce=announce, settled=settle, stopping=stopping))
+        ended.set()
     finally:
         abandon()
+
+
+def _end_within(seconds: float, ended: threading.Event) -> None:
+    """End the process after a time even if something hangs: a commit, a socket, a design.
+
+    A request is confirmed after its commit only, so nothing confirmed is lost. The exit code is 0 where the
+    service itself has ended and only the interpreter has not.
+    """
+    import structlog
+
+    from service.designs import abandon
+
+    def end() -> None:
+        if ended.is_set():
+            os._exit(0)
+        structlog.get_logger().error("ended by force: something did not end in time", after_s=seconds)
+        abandon()
+        os._exit(FAILED)
+
+    timer = threading.Timer(seconds, end)
+    timer.daemon = True
+    timer.start()
 
 
 def _stop_at_eof(loop: asyncio.AbstractEventLoop, stop: Callable[[], None]) -> None:

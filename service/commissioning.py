@@ -17,8 +17,16 @@ from feeders.estimators import Learner, Watcher
 from feeders.load import Site
 from gridsec.arrays import Bools, Floats
 from gridsec.errors import GridsecError
-from gridsec.sequential import Commission, to_arrays
+from gridsec.sequential import (
+    Commission,
+    Learning,
+    LearningProgress,
+    LearningReason,
+    LearningState,
+    to_arrays,
+)
 from service.kept import Kept, KeptInvalid, decode, encode, fingerprint
+from service.report import LearningReport, StalledMeter
 
 SAVE_S = 60.0
 """What is gathered is kept this often, s; all else at once."""
@@ -94,6 +102,12 @@ class MeterStage:
         Its own fixed error at the nominal voltage, and the standard deviation of that, V.
     allowed_volt
         By how much it may honestly differ from that error, V.
+    learning_state, learning_reason
+        As in `gridsec.sequential.LearningProgress`.
+    watched_s
+        Time of all ticks since learning began, s; None once the meter is learned.
+    lost_s
+        Time that did not count, s, by reason; reasons without any are left out.
     """
 
     meter: str
@@ -105,6 +119,10 @@ class MeterStage:
     error_volt: float
     error_volt_std: float
     allowed_volt: float
+    learning_state: LearningState
+    learning_reason: LearningReason | None
+    watched_s: float | None
+    lost_s: dict[LearningReason, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +150,10 @@ class Progress:
         Whether this goes on from what was kept by an earlier run.
     note
         Why it does not, if something was kept.
+    expected_s
+        Time that learning takes if every tick counts, s; None without a monitor that learns.
+    stalled
+        Number of meters that are not learned after twice that time.
     meters
         One by one.
     """
@@ -149,6 +171,8 @@ class Progress:
     held: bool
     restored: bool
     note: str
+    expected_s: float | None
+    stalled: int
     meters: tuple[MeterStage, ...]
 
 
@@ -278,6 +302,12 @@ class Commissioning:
 
     # ---------------------------------------------------------------- to keep
 
+    def now(self) -> Kept | None:
+        """Return the present state as it is stored; None before the first tick."""
+        if self.known is None or self._t is None:
+            return None
+        return encode(self._site, self._fingerprint, self._t, to_arrays(self.known))
+
     def due(self, *, at_once: bool = False) -> tuple[tuple[Kept, ...], tuple[Happened, ...]]:
         """Return what is to be stored now; it counts as stored from here on.
 
@@ -294,14 +324,37 @@ class Commissioning:
         if not (happened or wanted):
             return (), happened
         self._saved_t = self._t
-        return (encode(self._site, self._fingerprint, self._t, to_arrays(self.known)),), happened
+        kept = self.now()
+        return () if kept is None else (kept,), happened
 
     # ---------------------------------------------------------------- to show
+
+    def report(self) -> LearningReport:
+        """Return the learning of the meters as a tick's report shows it."""
+        known = self.known
+        found = self._found(known)
+        if known is None or found is None:
+            return LearningReport()
+        gathered = np.zeros(len(found.state)) if known.learning is None else known.learning.time_s
+        stalled = tuple(
+            StalledMeter(meter, found.reason[k], float(gathered[k]))
+            for k, meter in enumerate(self._site.meter_ids)
+            if found.state[k] is LearningState.STALLED
+        )
+        return LearningReport(found.state, found.reason, found.expected_s, stalled)
+
+    def _found(self, known: Commission | None) -> LearningProgress | None:
+        """Progress by the estimator; None without one that learns, and before the first tick."""
+        watcher = self._watcher
+        if known is None or watcher is None or watcher.learner is None:
+            return None
+        return watcher.learner.progress(watcher.design, known)
 
     def progress(self) -> Progress:
         """Return how far it is."""
         known, learner, monitor = self.known, self.learner, self._site.tables.meta.monitor
-        meters = () if known is None else self._meters(known)
+        found = self._found(known)
+        meters = () if known is None or found is None else self._meters(known, found)
         still = [m for m in meters if m.state is Stage.LEARNING]
         if self._watcher is not None and learner is None:
             state = Stage.OFF
@@ -325,10 +378,12 @@ class Commissioning:
             held=held,
             restored=self.restored,
             note=self.note,
+            expected_s=None if found is None else found.expected_s,
+            stalled=sum(m.learning_state is LearningState.STALLED for m in meters),
             meters=meters,
         )
 
-    def _meters(self, known: Commission) -> tuple[MeterStage, ...]:
+    def _meters(self, known: Commission, found: LearningProgress) -> tuple[MeterStage, ...]:
         learned, learning = known.learned, known.learning
         base = self._site.customer_volt[self._site.meters]
         needed, t = self._site.tables.meta.monitor.commission_s, self._t
@@ -349,6 +404,10 @@ class Commissioning:
                 error_volt=float(error[k]),
                 error_volt_std=float(std[k]),
                 allowed_volt=float(allowed[k]),
+                learning_state=found.state[k],
+                learning_reason=found.reason[k],
+                watched_s=None if learning is None or np.isnan(since[k]) else float(learning.watched_s[k]),
+                lost_s=_lost(learning, k) if np.isfinite(since[k]) else {},
             )
             for k, meter in enumerate(self._site.meter_ids)
         )
@@ -363,6 +422,14 @@ def to_json(progress: Progress) -> dict[str, Any]:
         How far it is.
     """
     return asdict(progress)
+
+
+def _lost(learning: Learning | None, k: int) -> dict[LearningReason, float]:
+    """Time that did not count for one meter, s, by reason."""
+    if learning is None:
+        return {}
+    each = zip(LearningReason, learning.lost_s[:, k].tolist(), strict=True)
+    return {reason: lost for reason, lost in each if lost > 0.0}
 
 
 def _time(values: Floats, k: int) -> float | None:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 
 from gridsec.online import Cause, Decision
-from service.report import BUSBAR, ExplanationReport, FeederReport, MeterReport, finite
+from service.report import BUSBAR, ExplanationReport, FeederReport, MeterReport, StalledMeter, finite
 
 
 class AlarmKind(StrEnum):
@@ -19,6 +20,7 @@ class AlarmKind(StrEnum):
     VOLTAGE_LIMIT = "voltage-limit"
     DATA_LOSS = "data-loss"
     UNDECIDED = "undecided"
+    LEARNING_STALLED = "learning-stalled"
 
 
 class Severity(StrEnum):
@@ -45,6 +47,8 @@ class Evidence:
         Reactive power that an inverter injects beside its droop curve, kvar.
     explanations
         What could all explain the readings, where nobody can be named.
+    learning
+        Meters that are not learned after twice the expected time, with the reasons.
     """
 
     score: float | None = None
@@ -55,6 +59,7 @@ class Evidence:
     kind: str | None = None
     attack_kvar_estimated: float | None = None
     explanations: tuple[ExplanationReport, ...] = ()
+    learning: tuple[StalledMeter, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,10 +107,12 @@ def conditions(report: FeederReport) -> list[Condition]:
       an estimator that does not judge inverters.
     - `voltage-limit`: the whole interval around the *reconstructed* voltage is outside the limits, so a
       lying meter raises none. Unknown while the interval straddles a limit with its middle outside, or
-      while the reconstruction itself carries no guarantee.
+      while the reconstruction itself carries no guarantee or is model only.
     - `data-loss`: a meter, or the busbar meter, is silent. Unknown while it is unseen but not for long.
     - `undecided`: there is no verdict, for a cause of its own. Unknown while the monitor settles, or where
       `data-loss` says already why: everybody of whom a reading is missing is silent.
+    - `learning-stalled`: the fixed error of a meter is not learned after twice the expected time; one
+      condition per feeder. Unknown at a tick without a monitor.
 
     Parameters
     ----------
@@ -118,7 +125,7 @@ def conditions(report: FeederReport) -> list[Condition]:
         What is not in it is known to be absent.
     """
     manipulated = (*_manipulated(report), *_busbar(report), *_inverters(report))
-    found = [*manipulated, *_data_loss(report), *_undecided(report)]
+    found = [*manipulated, *_data_loss(report), *_undecided(report), *_learning(report)]
     for meter in report.meters:
         found.extend(_voltage_limit(report, meter))
     return found
@@ -132,8 +139,8 @@ def _evidence(meter: MeterReport) -> Evidence:
         number(meter.score),
         number(meter.threshold),
         number(meter.v_volt_reported),
-        number(meter.v_volt_estimated),
-        number(meter.attack_volt_estimated),
+        None if meter.model_only else number(meter.v_volt_estimated),
+        None if meter.model_only else number(meter.attack_volt_estimated),
         meter.kind,
     )
 
@@ -150,13 +157,18 @@ def _manipulated(report: FeederReport) -> Iterable[Condition]:
             continue
         evidence = _evidence(meter)
         reported, estimated = _volt(evidence.v_volt_reported), _volt(evidence.v_volt_estimated)
+        beside = (
+            "no trusted meter reports beside it"
+            if meter.model_only
+            else f"but the rest of the feeder says {estimated}"
+        )
         yield Condition(
             AlarmKind.METER_MANIPULATED,
             report.feeder,
             meter.meter,
             Severity.CRITICAL,
             evidence,
-            f"reports {reported}, but the rest of the feeder says {estimated}",
+            f"reports {reported}, {beside}",
             known,
         )
 
@@ -210,10 +222,9 @@ _SOUND = frozenset({Cause.AGREEMENT, Cause.RESIDUALS, Cause.SILENT_METERS})
 
 def _voltage_limit(report: FeederReport, meter: MeterReport) -> Iterable[Condition]:
     evidence = _evidence(meter)
-    v = evidence.v_volt_estimated
+    v = evidence.v_volt_estimated  # None where it is model only
     half_width = None if meter.v_volt_std is None else finite(3.0 * meter.v_volt_std)
-    sound = report.cause in _SOUND and v is not None and half_width is not None
-    if v is None or half_width is None or not sound:
+    if v is None or half_width is None or report.cause not in _SOUND:
         yield Condition(
             AlarmKind.VOLTAGE_LIMIT, report.feeder, meter.meter, Severity.MAJOR, evidence, known=False
         )
@@ -269,4 +280,24 @@ def _undecided(report: FeederReport) -> Iterable[Condition]:
         reason=report.reason,
         known=not told and report.cause is not Cause.SETTLING,
         unheard=unheard,
+    )
+
+
+def _learning(report: FeederReport) -> Iterable[Condition]:
+    learning = report.learning
+    if learning is not None and not learning.stalled:
+        return
+    stalled = () if learning is None else learning.stalled
+    count = Counter(meter.reason or "no time lost" for meter in stalled)
+    why = ", ".join(f"{reason} ({number})" for reason, number in sorted(count.items()))
+    time = "" if learning is None or learning.expected_s is None else f" of {learning.expected_s:.0f} s"
+    yield Condition(
+        AlarmKind.LEARNING_STALLED,
+        report.feeder,
+        None,
+        Severity.MINOR,
+        Evidence(learning=stalled),
+        f"{len(stalled)} of {len(report.meters)} meters are not learned after twice the expected time{time}: "
+        f"{why}",
+        known=learning is not None,
     )

@@ -19,7 +19,7 @@ import numpy as np
 from service.report import BUSBAR, FeederReport, MeterReport, finite
 
 _COLUMNS = ("v_volt_reported", "v_volt_estimated", "score", "threshold")
-_SEEN, _SUSPECT = 1, 2
+_SEEN, _SUSPECT, _MODEL_ONLY = 1, 2, 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +87,7 @@ def rows(report: FeederReport) -> tuple[MeterReport, ...]:
         v_volt_std=None,
         v2_pu_estimated=None,
         attack_volt_estimated=now.attack_volt_estimated,
+        model_only=now.model_only,
     )
     return (*report.meters, busbar)
 
@@ -97,7 +98,7 @@ def pack(meters: Sequence[MeterReport]) -> bytes:
     table = np.array(
         [[none if (v := getattr(m, name)) is None else v for m in meters] for name in _COLUMNS], dtype="<f4"
     )
-    flags = bytes(_SEEN * m.seen | _SUSPECT * m.suspect for m in meters)
+    flags = bytes(_SEEN * m.seen | _SUSPECT * m.suspect | _MODEL_ONLY * m.model_only for m in meters)
     return zlib.compress(table.tobytes() + flags, 6)
 
 
@@ -116,8 +117,9 @@ def unpack(data: bytes, meters: Sequence[str], only: str | None = None) -> dict[
     Returns
     -------
     dict
-        `seen` (how many), `suspects`, `v_volt_lowest`, `v_volt_highest`, and `meter`: its fields as in REST's
-        `state`, or None. The busbar's meter may be among the suspects, and is not among the others.
+        `seen` (number of meters), `suspects`, `v_volt_lowest`, `v_volt_highest`, `model_only`, and `meter`:
+        its fields as in REST's `state`, or None. The busbar's meter may be among the suspects; `seen` and the
+        extremes leave it out. The extremes leave out model-only values; rows of earlier versions mark none.
     """
     raw = zlib.decompress(data)
     size = len(meters)
@@ -125,7 +127,8 @@ def unpack(data: bytes, meters: Sequence[str], only: str | None = None) -> dict[
     flags = np.frombuffer(raw, dtype=np.uint8, offset=16 * size)
     volts = table[_COLUMNS.index("v_volt_estimated")]
     others = np.array([meter != BUSBAR for meter in meters], dtype=np.bool_)
-    volts = volts[np.isfinite(volts) & others]
+    alone = (flags & _MODEL_ONLY) > 0
+    volts = volts[np.isfinite(volts) & others & ~alone]
     one = None
     if only in meters:
         k = meters.index(only)
@@ -134,12 +137,14 @@ def unpack(data: bytes, meters: Sequence[str], only: str | None = None) -> dict[
             "seen": bool(flags[k] & _SEEN),
             "suspect": bool(flags[k] & _SUSPECT),
             **{name: _short(float(table[row, k])) for row, name in enumerate(_COLUMNS)},
+            "model_only": bool(alone[k]),
         }
     return {
         "seen": int(np.count_nonzero((flags & _SEEN) * others)),
         "suspects": [meters[int(k)] for k in np.flatnonzero(flags & _SUSPECT)],
         "v_volt_lowest": _short(float(volts.min())) if volts.size else None,
         "v_volt_highest": _short(float(volts.max())) if volts.size else None,
+        "model_only": bool(alone.size and alone.all()),
         "meter": one,
     }
 

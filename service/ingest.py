@@ -27,8 +27,6 @@ BATCH = 1024
 _HEAD = 1024
 QUERIES_WAITING = 256
 _ESTIMATES = 1024
-_MAX_SESSIONS = 100_000
-_ACCEPT_PENDING = 1_000
 _OPEN_TIMEOUT_MS = 5_000
 JSON = "application/json"
 
@@ -44,8 +42,8 @@ def _config(config: BusConfig) -> zenoh.Config:
                 "connect/timeout_ms": {"router": -1, "peer": -1, "client": _OPEN_TIMEOUT_MS},
                 "scouting/multicast/enabled": False,
                 "transport/shared_memory/enabled": False,
-                "transport/unicast/max_sessions": _MAX_SESSIONS,
-                "transport/unicast/accept_pending": _ACCEPT_PENDING,
+                "transport/unicast/max_sessions": config.max_sessions,
+                "transport/unicast/accept_pending": config.accept_pending,
             }
         else:
             built = zenoh.Config.from_file(str(config.file))
@@ -114,6 +112,8 @@ class Bus:
     lossless
         When we are slow, let the senders wait instead of dropping the oldest samples: right where time is
         told by the readings, wrong in real time, where old data are worth nothing.
+    wall
+        The wall clock, Unix s.
     """
 
     def __init__(
@@ -124,7 +124,9 @@ class Bus:
         *,
         max_payload: int,
         lossless: bool,
+        wall: Callable[[], float] = time.time,
     ) -> None:
+        self._wall = wall
         self._config = config
         self._prefix = prefix
         self._deliver = deliver
@@ -199,7 +201,7 @@ class Bus:
         kept = payload if size <= self._max_payload else payload[:_HEAD]
         # What is cut is longer than any key that is read, and stays so.
         key = str(raw.key_expr)[: len(self._prefix) + _HEAD]
-        return Sample(key, kept, str(raw.encoding), time.time(), size)
+        return Sample(key, kept, str(raw.encoding), self._wall(), size)
 
     # ---------------------------------------------------------------- out
 

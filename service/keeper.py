@@ -3,16 +3,20 @@
 What a round brings is gathered in `Waiting` and handed to `apart`, which the runtime sets to a thread of its
 own where time does not wait; one write is on its way at a time. If the database refuses it, what it held is
 kept and tried again. Alarms are published when they are stored, not before.
+
+A command stores a `Wish` in the same way and gets the outcome between two rounds. A commit without an answer
+is repeated with its key until the database tells that it is stored.
 """
 
 from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Protocol
+from itertools import count
+from typing import Any, Protocol, TypeVar
 
 import msgspec
 import structlog
@@ -24,7 +28,7 @@ from service.commissioning import Happened
 from service.kept import Kept
 from service.metrics import Metrics
 from service.report import FeederReport
-from service.store import Event, Store, StoreUnavailable
+from service.store import Event, OutcomeUnknown, Store, StoreUnavailable
 from service.waiting import Batch, Waiting
 
 RETRY_S = 1.0
@@ -35,6 +39,8 @@ OUTBOX_PAGE = 1000
 UNPUBLISHED_KEPT = 10_000
 """So many stored events wait in memory for zenoh; the others are read from the outbox later."""
 _log = structlog.get_logger("gridsec.keeper")
+
+T = TypeVar("T")
 
 
 class Publisher(Protocol):
@@ -57,23 +63,70 @@ class Publisher(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
+class Wish:
+    """Contents of a command's write: all of it is stored, or the command fails.
+
+    Attributes
+    ----------
+    transitions, kept, happened, without, put
+        As in `Store.commit`.
+    """
+
+    transitions: tuple[Transition, ...] = ()
+    kept: tuple[Kept, ...] = ()
+    happened: tuple[Happened, ...] = ()
+    without: str | None = None
+    put: tuple[str, Mapping[str, Any]] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """A command's part of a job.
+
+    Attributes
+    ----------
+    wish
+        Its contents.
+    read
+        Called after the commit, in the writing thread.
+    landed
+        Called between two rounds when it is stored, with the result of `read`.
+    refused
+        Called between two rounds if it is not stored, or not known to be; `landed` may follow the latter.
+    """
+
+    wish: Wish
+    read: Callable[[Store], Any]
+    landed: Callable[[Any], None]
+    refused: Callable[[StoreUnavailable], None]
+
+
+@dataclass(frozen=True, slots=True)
 class Job:
     """One visit to the database: what to store, what has been published, whether to read the outbox on."""
 
+    key: int
     batch: Batch
     published: tuple[int, ...] = ()
     probe: bool = False
     page_after: int | None = None
-    without: str | None = None
+    command: Command | None = None
+
+    @property
+    def transitions(self) -> tuple[Transition, ...]:
+        """All transitions, in the order of their event numbers."""
+        own = () if self.command is None else self.command.wish.transitions
+        return (*self.batch.transitions, *own)
 
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """What came of a job: event numbers if the batch was stored, a page of the outbox, or what went wrong."""
+    """What came of a job: event numbers if it was stored, what was read, or what went wrong."""
 
     numbers: tuple[int, ...] | None = None
     marked: bool = False
     page: tuple[Event, ...] | None = None
+    found: Any = None
     error: StoreUnavailable | None = None
 
 
@@ -137,6 +190,9 @@ class Keeper:
         self._stored, self._kept = stored, kept
         self._apart = apart
         self._retry_at = self._began = 0.0
+        self._keys = count(1)
+        # A job whose outcome is not known; nothing else is stored before it.
+        self._unknown: Job | None = None
         self._published: deque[int] = deque()
         self._unpublished: deque[tuple[int, Alarm]] = deque()
         # The outbox holds events after this number that are not in `_unpublished`; None: it holds none.
@@ -153,63 +209,84 @@ class Keeper:
         self._publish_waiting()
         if self.storing or (time.monotonic() < self._retry_at and not at_once):
             return
+        job = self._unknown or self._job()
+        if job.batch or job.command or job.published or job.probe or job.page_after is not None:
+            self._send(job)
+
+    @property
+    def takes_commands(self) -> bool:
+        """Whether a command can be sent, or is refused at once because the database is known to be away."""
+        return self.problem is not None or not self.storing
+
+    def store(
+        self, wish: Wish, landed: Callable[[], None], refused: Callable[[StoreUnavailable], None]
+    ) -> None:
+        """Have everything gathered and a command's wish stored, all or nothing.
+
+        Parameters
+        ----------
+        wish, landed, refused
+            As in `Command`.
+
+        Raises
+        ------
+        StoreUnavailable
+            If the database is known to be away; it is not asked again.
+        """
+        self._command(Command(wish, lambda _: None, lambda _: landed(), refused))
+
+    def look(
+        self,
+        read: Callable[[Store], T],
+        landed: Callable[[T], None],
+        refused: Callable[[StoreUnavailable], None],
+    ) -> None:
+        """Have something read after everything gathered is stored.
+
+        Parameters
+        ----------
+        read, landed, refused
+            As in `Command`.
+
+        Raises
+        ------
+        StoreUnavailable
+            As in `store`.
+        """
+        self._command(Command(Wish(), read, landed, refused))
+
+    def _command(self, command: Command) -> None:
+        if self.problem is not None:
+            raise StoreUnavailable(self.problem)
+        self._send(replace(self._job(), command=command))
+
+    def _job(self) -> Job:
         more = self._outbox_after is not None and len(self._unpublished) < OUTBOX_PAGE
-        job = Job(
+        return Job(
+            next(self._keys),
             self.waiting.take(),
             tuple(self._published),
             probe=self.problem is not None,
             page_after=self._outbox_after if more else None,
         )
-        if job.batch or job.published or job.probe or more:
-            self.storing, self._began = True, time.monotonic()
-            self._metrics.unstored.set(len(self.waiting))
-            self._apart(partial(_write, self._store, job), partial(self._written, job))
 
-    def store_now(
-        self,
-        more: tuple[Transition, ...] = (),
-        *,
-        kept: tuple[Kept, ...] = (),
-        happened: tuple[Happened, ...] = (),
-        without: str | None = None,
-    ) -> None:
-        """Commit everything gathered and what is given, all or nothing, before this returns.
-
-        Parameters
-        ----------
-        more, kept, happened
-            What is only wanted if it can be stored now.
-        without
-            Forget the tables of this feeder.
-
-        Raises
-        ------
-        StoreUnavailable
-            If nothing was stored. A database that is known to be away is not asked again.
-        """
-        if self.problem is not None:
-            raise StoreUnavailable(self.problem)
-        gathered = self.waiting.take()
-        batch = replace(
-            gathered,
-            transitions=(*gathered.transitions, *more),
-            kept=(*gathered.kept, *kept),
-            happened=(*gathered.happened, *happened),
-        )
-        done = _write(self._store, Job(batch, without=without))
-        self._written(Job(gathered if done.numbers is None else batch), done)
-        if done.error is not None:
-            raise done.error
+    def _send(self, job: Job) -> None:
+        self.storing, self._began = True, time.monotonic()
+        self._metrics.unstored.set(len(self.waiting))
+        self._apart(partial(_write, self._store, job), partial(self._written, job))
 
     def _written(self, job: Job, done: Done) -> None:
         """Take in what came of a job."""
         self.storing = False
-        if done.numbers is None:
-            self.waiting.give_back(job.batch)
-        else:
+        if done.numbers is not None:
+            self._unknown = None
             self.waiting.stored()
             self._kept(job.batch.reports)
-            self._tell(job.batch.transitions, done.numbers)
+            self._tell(job.transitions, done.numbers)
+        elif isinstance(done.error, OutcomeUnknown) or job is self._unknown:
+            self._unknown = job
+        else:
+            self.waiting.give_back(job.batch)
         if done.marked:
             for _ in job.published:
                 self._published.popleft()
@@ -224,6 +301,15 @@ class Keeper:
             self.problem, self._retry_at = None, 0.0
         self._metrics.unstored.set(len(self.waiting))
         self._publish_waiting()
+        if job.command is not None:
+            self._answer(job.command, done)
+
+    def _answer(self, command: Command, done: Done) -> None:
+        """Tell a command its outcome. What was stored is so, whatever failed after it."""
+        if done.numbers is not None and (done.error is None or command.wish != Wish()):
+            command.landed(done.found)
+        elif done.error is not None:
+            command.refused(done.error)
 
     def _tell(self, transitions: tuple[Transition, ...], numbers: tuple[int, ...]) -> None:
         """Say what has been stored, and let it be published."""
@@ -298,18 +384,22 @@ def _write(store: Store, job: Job) -> Done:
     try:
         if job.probe:
             store.check()
-        batch = job.batch
+        batch, wish = job.batch, Wish() if job.command is None else job.command.wish
         numbers = store.commit(
-            batch.transitions,
+            job.transitions,
             reports=batch.reports,
             rejected=batch.rejected,
-            kept=batch.kept,
-            happened=batch.happened,
-            without=job.without,
+            kept=(*batch.kept, *wish.kept),
+            happened=(*batch.happened, *wish.happened),
+            without=wish.without,
+            put=wish.put,
+            key=job.key,
         )
         done = Done(numbers)
+        if job.command is not None:
+            done = replace(done, found=job.command.read(store))
         store.outbox_done(job.published)
-        done = Done(numbers, marked=True)
+        done = replace(done, marked=True)
         if job.page_after is not None:
             page = store.outbox_pending(OUTBOX_PAGE, after=job.page_after)
             done = replace(done, page=tuple(page))

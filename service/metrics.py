@@ -7,8 +7,10 @@ from functools import partial
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 
+from gridsec.sequential import LearningReason, LearningState
 from service.bus import BusCounts
 from service.logs import LineLogger
+from service.report import FeederReport
 
 _STEP_BUCKETS = (0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 _DELAY_BUCKETS = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0, 60.0, 300.0)
@@ -45,12 +47,14 @@ class Metrics:
         """What is made of it."""
         counter, gauge = partial(Counter, registry=registry), partial(Gauge, registry=registry)
         self.ticks = counter("gridsec_ticks", "Ticks, by verdict.", ["feeder", "verdict"])
-        self.skipped = counter(
-            "gridsec_ticks_skipped", "Ticks skipped because the backlog was too long.", ["feeder"]
-        )
+        self.skipped = counter("gridsec_ticks_skipped", "Ticks that were due and not judged.", ["feeder"])
         self.seen = gauge("gridsec_meters_seen", "Meters seen at the latest tick.", ["feeder"])
         self.suspects = gauge("gridsec_suspects", "Meters under suspicion at the latest tick.", ["feeder"])
         self.learned = gauge("gridsec_meters_learned", "Meters whose own error is known.", ["feeder"])
+        self.learning = gauge("gridsec_meters_learning", "Meters by state of learning.", ["feeder", "state"])
+        self.delayed = gauge(
+            "gridsec_meters_learning_delayed", "Meters behind schedule, by reason.", ["feeder", "reason"]
+        )
         self.alarms = gauge("gridsec_alarms_active", "Alarms that stand.", ["feeder"])
         self.cycle = Histogram(
             "gridsec_cycle_seconds",
@@ -100,6 +104,21 @@ class Metrics:
             self.bus.labels(what.replace("_", "-")).inc(total - self._bus_before[what])
         self._bus_before = now
 
+    def count_learning(self, report: FeederReport) -> None:
+        """Count a feeder's meters by state and reason of learning; unchanged at a tick without a monitor.
+
+        Parameters
+        ----------
+        report
+            The latest.
+        """
+        if report.learning is None:
+            return
+        for state in LearningState:
+            self.learning.labels(report.feeder, state).set(report.learning.states.count(state))
+        for reason in LearningReason:
+            self.delayed.labels(report.feeder, reason).set(report.learning.reasons.count(reason))
+
     def forget(self, feeder: str) -> None:
         """Show the present state of a feeder no more; what has been counted stays.
 
@@ -108,9 +127,10 @@ class Metrics:
         feeder
             Its name.
         """
-        for gauge in (self.seen, self.suspects, self.learned, self.alarms):
-            if (feeder,) in {tuple(sample.labels.values()) for m in gauge.collect() for sample in m.samples}:
-                gauge.remove(feeder)
+        for gauge in (self.seen, self.suspects, self.learned, self.learning, self.delayed, self.alarms):
+            for labels in [sample.labels for m in gauge.collect() for sample in m.samples]:
+                if labels["feeder"] == feeder:
+                    gauge.remove(*labels.values())
 
     def exposition(self) -> bytes:
         """Return everything in Prometheus's text format."""

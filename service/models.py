@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StringConstraints, ValidationError
 
 from gridsec.online import Cause, Decision
+from gridsec.sequential import LearningReason, LearningState
 from service.alarms import AlarmKind, AlarmState, Change, Severity
 from service.busbar import BUSBAR
 from service.commissioning import Stage, Step
@@ -44,6 +45,15 @@ class Problem(BaseModel):
     instance: str = Field(description="Path of the request.")
 
 
+ModelOnly = Annotated[
+    bool,
+    Field(
+        description="The estimated values rest on no voltage reading of this tick: on powers, the model and "
+        "what the estimator remembers alone."
+    ),
+]
+
+
 class MeterState(BaseModel):
     """One meter at the latest tick."""
 
@@ -62,13 +72,24 @@ class MeterState(BaseModel):
     phase: str | None = Field(default=None, description="Phase that it measures; null if balanced.")
     v_min_volt: Number = Field(default=None, description="Lowest voltage allowed where it is, V.")
     v_max_volt: Number = Field(default=None, description="Highest voltage allowed where it is, V.")
+    learning_state: LearningState | None = Field(
+        default=None, description="Learning of its own error; null where the estimator does not learn."
+    )
+    learning_reason: LearningReason | None = Field(
+        default=None, description="Reason that took most of the time that did not count; null on schedule."
+    )
+    model_only: ModelOnly = False
 
 
 class BusbarMeterState(BaseModel):
     """The busbar's own meter at the latest tick; in three phases the numbers are those of one of them."""
 
     meter: str = Field(default=BUSBAR, description="Its name in alarms and explanations.")
-    judged: bool = Field(default=False, description="The estimator can tell whether it is manipulated.")
+    judged: bool = Field(
+        default=False,
+        description="The estimator judges this meter, and this tick has readings to do so: of this meter and "
+        "of a trusted meter in the same phase.",
+    )
     seen: bool = Field(default=False, description="A usable reading belongs to this tick.")
     suspect: bool = Field(default=False, description="The verdict names it as manipulated.")
     phases: list[str] = Field(
@@ -82,6 +103,7 @@ class BusbarMeterState(BaseModel):
     attack_volt_estimated: Number = Field(
         default=None, description="What it reads too much, on average, V; 0 if no suspect."
     )
+    model_only: ModelOnly = False
 
 
 class CustomerState(BaseModel):
@@ -90,6 +112,7 @@ class CustomerState(BaseModel):
     customer: str
     v_volt_estimated: Number = Field(description="Reconstructed voltage, V.")
     v_volt_std: Number = Field(description="Its standard deviation, or a third of its hard bound, V.")
+    model_only: ModelOnly = False
 
 
 class InverterState(BaseModel):
@@ -102,6 +125,7 @@ class InverterState(BaseModel):
     suspect: bool = Field(description="The verdict names this inverter as manipulated.")
     q_kvar_estimated: Number = Field(description="Reactive power that it injects, kvar.")
     attack_kvar_estimated: Number = Field(description="What its curve does not ask for of it, kvar.")
+    model_only: ModelOnly = False
 
 
 class ExplanationModel(BaseModel):
@@ -125,6 +149,7 @@ class BusState(BaseModel):
     v_phases: list[Number] | None = Field(
         default=None, description="Reconstructed voltage of each phase, V; null on a balanced feeder."
     )
+    model_only: ModelOnly = False
 
 
 class Silence(BaseModel):
@@ -145,6 +170,17 @@ class State(BaseModel):
     reason: str
     cause: Cause
     max_attacked: int
+    skipped: int = Field(default=0, description="Ticks directly before this one that were not judged.")
+    model_only: bool = Field(
+        default=False, description="No value of the feeder rests on a voltage reading of this tick."
+    )
+    model_only_phases: list[str] = Field(
+        default=[], description="Of a, b and c those without such a reading; empty on a balanced feeder."
+    )
+    t_measured: Number = Field(
+        default=None,
+        description="Newest tick at which a value rested on a reading, Unix s; null: none since the start.",
+    )
     meters: list[MeterState]
     buses: list[BusState]
     silent: list[Silence]
@@ -168,6 +204,15 @@ class MeterCommissioning(BaseModel):
     error_volt: Number = Field(description="Its own error at nominal voltage, V; 0 while not learned.")
     error_volt_std: Number = Field(description="Standard deviation of that, ageing included, V.")
     allowed_volt: Number = Field(description="By how much it may honestly differ from its error, V.")
+    learning_state: LearningState = Field(
+        description="`waiting`: no tick counted yet. `learning`. `stalled`: not learned after twice "
+        "`expected_s`. `learned`."
+    )
+    learning_reason: LearningReason | None = Field(
+        description="Reason that took most of the time that did not count; null on schedule."
+    )
+    watched_s: Number = Field(description="Time of all ticks since learning began, s; null once learned.")
+    lost_s: dict[LearningReason, float] = Field(description="Time that did not count, s, by reason.")
 
 
 class MeterNow(MeterState):
@@ -202,6 +247,8 @@ class Commissioning(BaseModel):
     held: bool = Field(description="Time enough has passed, but nothing is learned while one is suspected.")
     restored: bool = Field(description="It goes on from what an earlier run of the service kept.")
     note: str = Field(description="Why what was kept is not used; empty if all is well.")
+    expected_s: Number = Field(description="Time that learning takes if every tick counts, s.")
+    stalled: int = Field(description="Meters that are not learned after twice that time.")
     kept: Number = Field(description="Tick up to which it is in the database, Unix s.")
     meters: list[MeterCommissioning]
 
@@ -232,7 +279,11 @@ class FeederSummary(BaseModel):
     t: Number = Field(default=None, description="Latest tick; null before the first one.")
     age_s: Number = Field(default=None, description="How old that is by the service's clock, s.")
     patience_s: Number = Field(default=None, description="An older tick is stale, s.")
+    ticks_skipped: int | None = Field(
+        default=None, description="Ticks that were not judged since the service started; null if not watched."
+    )
     verdict: Decision | None = None
+    model_only: bool | None = Field(default=None, description="As in the state; null before the first tick.")
 
 
 class Feeders(BaseModel):
@@ -282,6 +333,14 @@ class FeederDetail(BaseModel):
     tables: dict[str, Any]
 
 
+class StalledMeterModel(BaseModel):
+    """A meter that is not learned after twice the expected time."""
+
+    meter: str
+    reason: LearningReason | None
+    gathered_s: float = Field(description="Time that counted, s.")
+
+
 class AlarmEvidence(BaseModel):
     """The numbers behind an alarm when it was raised."""
 
@@ -295,6 +354,7 @@ class AlarmEvidence(BaseModel):
         default=None, description="Wrong part of an inverter's injection, kvar."
     )
     explanations: list[ExplanationModel] = []
+    learning: list[StalledMeterModel] = Field(default=[], description="Meters whose learning is stalled.")
 
 
 class AlarmModel(BaseModel):
@@ -420,8 +480,11 @@ class HistoryPoint(BaseModel):
     cause: Cause
     seen: int = Field(description="Number of meters with a usable reading.")
     suspects: list[str]
-    v_volt_lowest: Number = Field(description="Lowest reconstructed voltage at a meter, V.")
-    v_volt_highest: Number = Field(description="Highest reconstructed voltage at a meter, V.")
+    v_volt_lowest: Number = Field(
+        description="Lowest reconstructed voltage at a meter that is not model only, V."
+    )
+    v_volt_highest: Number = Field(description="Highest one likewise, V.")
+    model_only: bool = Field(default=False, description="As in the state.")
     meter: HistoryMeter | None = Field(default=None, description="If one was asked for and was there.")
 
 
@@ -435,6 +498,7 @@ class HistoryMeter(BaseModel):
     v_volt_estimated: Number
     score: Number
     threshold: Number
+    model_only: ModelOnly = False
 
 
 class History(BaseModel):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import socket
 from collections.abc import Awaitable, Callable, Collection
 from http import HTTPStatus
@@ -10,7 +11,7 @@ from typing import Any, cast
 from urllib.parse import urlsplit
 
 from starlette.exceptions import HTTPException
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -19,7 +20,7 @@ from gridsec.errors import DesignInfeasible, FeederInvalid, GridsecError, NotObs
 from service.alarms import AlarmUnknown, AlreadyAcknowledged, RaisedAgain
 from service.commissioning import NothingToLearn
 from service.errors import FeederFixed, FeederNotLoaded, FeederUnknown, TooManyFeeders
-from service.store import StoreUnavailable
+from service.store import OutcomeUnknown, StoreUnavailable
 
 _CSP = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
@@ -136,7 +137,9 @@ class Guard:
         elif declared.isdecimal() and int(declared) > self.max_body:
             await problem(request, 413, text, headers={"Connection": "close"})(scope, receive, guarded)
         else:
-            await self.app(scope, limited, guarded)
+            # A client that leaves before its body is complete gets no answer, and is no defect.
+            with contextlib.suppress(ClientDisconnect):
+                await self.app(scope, limited, guarded)
 
 
 _READS = frozenset({"GET", "HEAD", "OPTIONS"})
@@ -186,7 +189,11 @@ def handlers() -> dict[type[Exception], Handler]:
 
 def _gridsec_handler(status: int) -> Handler:
     async def handler(request: Request, error: Exception) -> Response:
-        more = {"problems": list(error.problems)} if isinstance(error, FeederInvalid) else {}
+        more: dict[str, Any] = {}
+        if isinstance(error, FeederInvalid):
+            more["problems"] = list(error.problems)
+        if isinstance(error, OutcomeUnknown):
+            more["outcome"] = "unknown"
         headers = {"Retry-After": "5"} if status == 503 else None
         return problem(request, status, str(error), headers=headers, **more)
 

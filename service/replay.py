@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from feeders.load import Site
@@ -21,11 +21,12 @@ from service.watch import TickResult, Watch, align_rules, design, known_of
 
 @dataclass(slots=True)
 class Tally:
-    """What a replay has seen so far: readings by outcome or reason, ticks by verdict."""
+    """Counts of a replay: readings by outcome or reason, ticks by verdict, ticks that were not judged."""
 
     readings: Counter[str] = field(default_factory=Counter)
     ticks: Counter[str] = field(default_factory=Counter)
     lost: int = 0
+    skipped: int = 0
 
     @property
     def judged(self) -> int:
@@ -43,6 +44,7 @@ def replay(
     grace_s: float | None = None,
     kept: Kept | None = None,
     distrust: Kept | None = None,
+    skipped: Sequence[tuple[float, float]] = (),
 ) -> Iterator[TickResult]:
     """Yield what the service would have made of recorded readings.
 
@@ -62,6 +64,8 @@ def replay(
         What was known of the meters when the recording began, as in `Commissioning`; None: nothing.
     distrust
         Who was not believed then, as in `Suspicions`; None: nobody.
+    skipped
+        First and last Unix time of ticks that the live service skipped, s: they are not judged here either.
 
     Raises
     ------
@@ -78,21 +82,36 @@ def replay(
         if reading is not None:
             # Where the readings tell the time, nothing else needs to, and a file need not say more.
             now = one.arrival if clock is Clock.WALL else 0.0
-            outcome, results = watch.take(reading, now)
+            outcome = watch.place(reading, now)
             tally.readings[outcome] += 1
-            yield from _counted(watch, [*results, *watch.due(now)], tally)
+            watch.reach(now)
+            yield from _counted(watch, _judged(watch, skipped), tally)
             refused = len(watch.aligner.refused())
             tally.readings[Outcome.ACCEPTED] -= refused
             tally.readings[Outcome.CLOCK_OFF] += refused
-    yield from _counted(watch, watch.flush(), tally)
-    tally.lost = watch.aligner.lost
+    watch.finish()
+    yield from _counted(watch, _judged(watch, skipped), tally)
+    tally.lost, tally.skipped = watch.aligner.lost, watch.skipped
 
 
-def _counted(watch: Watch, results: list[TickResult], tally: Tally) -> list[TickResult]:
+def _judged(watch: Watch, skipped: Sequence[tuple[float, float]]) -> Iterator[TickResult]:
+    """Judge the pending ticks; one that was skipped stays until the next one counts it."""
+    while watch.pending:
+        t = watch.pending[0].t
+        if not any(first <= t <= last for first, last in skipped):
+            yield watch.judge()
+        elif len(watch.pending) > 1:
+            watch.skip(1)
+        else:
+            return
+
+
+def _counted(watch: Watch, results: Iterator[TickResult], tally: Tally) -> list[TickResult]:
+    found = list(results)
     if watch.defect is not None:
         raise watch.defect
-    tally.ticks.update(str(result.report.verdict) for result in results)
-    return results
+    tally.ticks.update(str(result.report.verdict) for result in found)
+    return found
 
 
 def _checked(feeder: str, known: Known, recorded: Recorded, tally: Tally, clock: Clock) -> Reading | None:

@@ -8,18 +8,19 @@ strings and floats, so it can be kept, compared, sent and read from any thread.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import zip_longest
 from typing import Any
 
 import numpy as np
 
 from feeders.load import Site, volts
+from gridsec.arrays import Bools
 from gridsec.online import Cause, Decision, Estimate, Verdict
 from service.align import Tick
 from service.busbar import BUSBAR, UNKNOWN_BUSBAR, BusbarReport, busbar_report
 from service.reasons import reason_of
-from service.voltages import attack_volts, bus_volts, std_volts
+from service.voltages import Grounds, attack_volts, bus_volts, busbar_phases, grounds, std_volts
 
 __all__ = [
     "BUSBAR",
@@ -28,12 +29,55 @@ __all__ = [
     "ExplanationReport",
     "FeederReport",
     "InverterReport",
+    "LearningReport",
     "MeterReport",
+    "StalledMeter",
     "blind",
     "build",
     "finite",
     "to_json",
+    "with_learning",
 ]
+
+
+@dataclass(frozen=True, slots=True)
+class StalledMeter:
+    """A meter that is not learned after twice the expected time.
+
+    Attributes
+    ----------
+    meter
+        Id.
+    reason
+        Code of `gridsec.sequential.LearningReason`; None where no time was lost.
+    gathered_s
+        Time that counted, s.
+    """
+
+    meter: str
+    reason: str | None
+    gathered_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class LearningReport:
+    """Learning of the meters' fixed errors at one tick.
+
+    Attributes
+    ----------
+    states, reasons : (p,)
+        Codes of `gridsec.sequential.LearningState` and `LearningReason`, in the order of the feeder's file;
+        empty where the estimator does not learn.
+    expected_s
+        Time that learning takes if every tick counts, s; None where the estimator does not learn.
+    stalled
+        Meters not learned after twice that time.
+    """
+
+    states: tuple[str, ...] = ()
+    reasons: tuple[str | None, ...] = ()
+    expected_s: float | None = None
+    stalled: tuple[StalledMeter, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +114,10 @@ class MeterReport:
         The phase that it measures: a, b or c; None on a balanced feeder.
     v_min_volt, v_max_volt
         The voltage limits where it is, V: behind a transformer others than the busbar's; None: the feeder's.
+    learning_state, learning_reason
+        As in `LearningReport`; None where the estimator does not learn, or does not run.
+    model_only
+        The estimated values rest on no reading of this tick, see `voltages.Grounds`.
     """
 
     meter: str
@@ -87,6 +135,9 @@ class MeterReport:
     phase: str | None = None
     v_min_volt: float | None = None
     v_max_volt: float | None = None
+    learning_state: str | None = None
+    learning_reason: str | None = None
+    model_only: bool = False
 
     def limits(self, report: FeederReport) -> tuple[float, float]:
         """Return the lowest and the highest voltage allowed at the meter, V.
@@ -108,13 +159,14 @@ class CustomerReport:
     ----------
     customer
         Id as in the feeder's files.
-    v_volt_estimated, v_volt_std
+    v_volt_estimated, v_volt_std, model_only
         As in `MeterReport`.
     """
 
     customer: str
     v_volt_estimated: float | None
     v_volt_std: float | None
+    model_only: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,13 +180,15 @@ class InverterReport:
     meter
         The customer's meter; None without one.
     judged
-        Whether the estimator can tell: the data say enough of this inverter.
+        The estimator judges inverters, the data say enough of this one, and its values are not model only.
     suspect
         Whether the verdict names it as manipulated.
     q_kvar_estimated
         Reactive power that it injects, kvar.
     attack_kvar_estimated
         The part of it that its droop curve does not ask for, kvar; 0 if it is no suspect, None if not judged.
+    model_only
+        As in `MeterReport`.
     """
 
     customer: str
@@ -144,6 +198,7 @@ class InverterReport:
     suspect: bool
     q_kvar_estimated: float | None
     attack_kvar_estimated: float | None
+    model_only: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,8 +256,20 @@ class FeederReport:
         In three phases, the voltage of each phase of every bus, V; None for one that it does not have.
     busbar
         The busbar's own meter.
+    learning
+        Learning of the meters' fixed errors; None at a tick without a monitor.
     revision
         Of which tables, limits and times of the feeder this is, see `describe.revision`.
+    skipped
+        Number of ticks directly before this one that were not judged.
+    model_only
+        No value of the feeder rests on a reading of this tick, see `voltages.Grounds`.
+    model_only_phases
+        In three phases, those of a, b and c without such a reading.
+    bus_model_only
+        Of each entry of `bus_v_volt`, whether it is model only; empty: none is.
+    t_measured
+        Newest tick at which a value rested on a reading, Unix s; None: no such tick since the start.
     """
 
     feeder: str
@@ -221,7 +288,13 @@ class FeederReport:
     explanations: tuple[ExplanationReport, ...] = ()
     bus_phases: tuple[tuple[float | None, ...], ...] = ()
     busbar: BusbarReport = UNKNOWN_BUSBAR
+    learning: LearningReport | None = LearningReport()
     revision: str = ""
+    skipped: int = 0
+    model_only: bool = False
+    model_only_phases: tuple[str, ...] = ()
+    bus_model_only: tuple[bool, ...] = ()
+    t_measured: float | None = None
 
     @property
     def suspects(self) -> tuple[str, ...]:
@@ -233,6 +306,21 @@ class FeederReport:
 def finite(value: float) -> float | None:
     """Return a number that JSON can carry: None for NaN and infinities."""
     return float(value) if math.isfinite(value) else None
+
+
+def with_learning(report: FeederReport, learning: LearningReport) -> FeederReport:
+    """Return the report with the learning of its meters.
+
+    Parameters
+    ----------
+    report, learning
+        Of the same feeder and tick.
+    """
+    if not learning.states:
+        return replace(report, learning=learning)
+    each = zip(report.meters, learning.states, learning.reasons, strict=True)
+    meters = tuple(replace(m, learning_state=state, learning_reason=reason) for m, state, reason in each)
+    return replace(report, meters=meters, learning=learning)
 
 
 def build(site: Site, tick: Tick, max_attacked: int, estimate: Estimate, verdict: Verdict) -> FeederReport:
@@ -254,6 +342,8 @@ def build(site: Site, tick: Tick, max_attacked: int, estimate: Estimate, verdict
     v2 = estimate.v2 * (site.customer_volt / site.customer_nominal) ** 2  # of nominal, behind taps too
     numbers = np.column_stack((verdict.score, verdict.threshold, v[at], std[at], v2[at]))
     attack = attack_volts(site, tick, verdict)
+    rests_on = grounds(site, tick, estimate, verdict)
+    alone = rests_on.model_only(site)
     kinds = verdict.kinds or (None,) * len(site.meter_ids)
     allowed = _limits(site)
     meters = []
@@ -276,9 +366,10 @@ def build(site: Site, tick: Tick, max_attacked: int, estimate: Estimate, verdict
                 phase=_phase(site, k),
                 v_min_volt=allowed[k][0],
                 v_max_volt=allowed[k][1],
+                model_only=bool(alone[at[k]]),
             )
         )
-    one, phases = bus_volts(site, estimate.v2_bus)
+    one, phases, buses_alone = bus_volts(site, estimate.v2_bus, rests_on.measured)
     buses = zip(site.spanning.buses, one, strict=True)
     return _whole(
         site,
@@ -287,11 +378,15 @@ def build(site: Site, tick: Tick, max_attacked: int, estimate: Estimate, verdict
         verdict=(verdict.decision, verdict.cause, reason_of(site, tick, max_attacked, verdict)),
         meters=tuple(meters),
         buses=tuple((bus, finite(v)) for bus, v in buses),
-        customers=tuple(map(CustomerReport, site.feeder.customers, map(finite, v), map(finite, std))),
-        inverters=_inverters(site, estimate, verdict),
+        customers=tuple(
+            map(CustomerReport, site.feeder.customers, map(finite, v), map(finite, std), alone.tolist())
+        ),
+        inverters=_inverters(site, estimate, verdict, alone),
         explanations=_explanations(site, verdict),
         bus_phases=tuple(tuple(map(finite, row)) for row in phases) if phases.size else (),
         busbar=busbar_report(site, tick, estimate, verdict),
+        rests_on=rests_on,
+        buses_alone=tuple(buses_alone.tolist()),
     )
 
 
@@ -306,6 +401,8 @@ def blind(site: Site, tick: Tick, max_attacked: int, cause: Cause, reason: str) 
         Why there is no estimate.
     """
     allowed = _limits(site)
+    rests_on = grounds(site, tick)
+    alone = rests_on.model_only(site)
     meters = tuple(
         MeterReport(
             meter=meter,
@@ -322,21 +419,27 @@ def blind(site: Site, tick: Tick, max_attacked: int, cause: Cause, reason: str) 
             phase=_phase(site, k),
             v_min_volt=allowed[k][0],
             v_max_volt=allowed[k][1],
+            model_only=bool(alone[site.meters[k]]),
         )
         for k, (meter, reading) in enumerate(zip(site.meter_ids, tick.readings, strict=True))
     )
-    return _whole(
+    whole = _whole(
         site,
         tick,
         max_attacked,
         verdict=(Decision.UNDECIDED, cause, reason),
         meters=meters,
         buses=tuple((bus, None) for bus in site.spanning.buses),
-        customers=tuple(CustomerReport(customer, None, None) for customer in site.feeder.customers),
-        inverters=_inverters(site, None, None),
+        customers=tuple(
+            CustomerReport(customer, None, None, model)
+            for customer, model in zip(site.feeder.customers, alone.tolist(), strict=True)
+        ),
+        inverters=_inverters(site, None, None, alone),
         explanations=(),
         busbar=busbar_report(site, tick),
+        rests_on=rests_on,
     )
+    return replace(whole, learning=None)
 
 
 def _limits(site: Site) -> list[tuple[float, float]]:
@@ -353,18 +456,23 @@ def _phase(site: Site, meter: int) -> str | None:
     return phases if len(phases) == 1 else None
 
 
-def _inverters(site: Site, estimate: Estimate | None, verdict: Verdict | None) -> tuple[InverterReport, ...]:
-    """Every inverter; without a verdict, or one that does not judge inverters, nobody knows."""
+def _inverters(
+    site: Site, estimate: Estimate | None, verdict: Verdict | None, model_only: Bools
+) -> tuple[InverterReport, ...]:
+    """Every inverter; model-only values judge none, and leave an inverter named that is named."""
     base = site.feeder.base_kva
-    judged = verdict is not None and verdict.inverters.size > 0
+    judges = verdict is not None and verdict.inverters.size > 0
     out = []
-    for i, row in enumerate(site.tables.customers[int(c)] for c in site.droop.customer):
-        asked = verdict is not None and judged and not (verdict.unjudged.size and verdict.unjudged[i])
+    for i, customer in enumerate(site.droop.customer.tolist()):
+        row, alone = site.tables.customers[customer], bool(model_only[customer])
+        asked = verdict is not None and judges and not (verdict.unjudged.size and verdict.unjudged[i])
         named = verdict is not None and asked and bool(verdict.inverters[i])
-        wrong = base * verdict.inverter_attack[i] if verdict is not None and asked else math.nan
+        judged = asked and not alone
+        wrong = base * verdict.inverter_attack[i] if verdict is not None and judged else math.nan
         x = math.nan if estimate is None else base * estimate.x[i]
+        meter = row.meter or None
         out.append(
-            InverterReport(row.customer, row.bus, row.meter or None, asked, named, finite(x), finite(wrong))
+            InverterReport(row.customer, row.bus, meter, judged, named, finite(x), finite(wrong), alone)
         )
     return tuple(out)
 
@@ -394,15 +502,18 @@ def _whole(
     inverters: tuple[InverterReport, ...],
     explanations: tuple[ExplanationReport, ...],
     busbar: BusbarReport,
+    rests_on: Grounds,
     bus_phases: tuple[tuple[float | None, ...], ...] = (),
+    buses_alone: tuple[bool, ...] = (),
 ) -> FeederReport:
     limits, nominal = site.tables.meta.limits, site.tables.meta.voltage_volt
     decision, cause, reason = verdict
+    measured = rests_on.measured.tolist()
     return FeederReport(
         feeder=site.feeder.name,
         t=tick.t,
         verdict=decision,
-        reason=reason,
+        reason=f"{reason.removesuffix('.')}. {skipped_in_words(tick.skipped)}" if tick.skipped else reason,
         cause=cause,
         max_attacked=max_attacked,
         meters=meters,
@@ -415,7 +526,24 @@ def _whole(
         explanations=explanations,
         bus_phases=bus_phases,
         busbar=busbar,
+        skipped=tick.skipped,
+        model_only=not any(measured),
+        model_only_phases=tuple(
+            phase for phase, one in zip(busbar_phases(site), measured, strict=True) if phase and not one
+        ),
+        bus_model_only=buses_alone or (not any(measured),) * len(buses),
     )
+
+
+def skipped_in_words(count: int) -> str:
+    """Return the sentence about ticks that were not judged.
+
+    Parameters
+    ----------
+    count
+        Their number, 1 or more.
+    """
+    return "The tick before was not judged." if count == 1 else f"The {count} ticks before were not judged."
 
 
 def to_json(report: FeederReport) -> dict[str, Any]:
@@ -439,6 +567,10 @@ def to_json(report: FeederReport) -> dict[str, Any]:
         "reason": report.reason,
         "cause": str(report.cause),
         "max_attacked": report.max_attacked,
+        "skipped": report.skipped,
+        "model_only": report.model_only,
+        "model_only_phases": list(report.model_only_phases),
+        "t_measured": report.t_measured,
         "meters": [
             {
                 "meter": m.meter,
@@ -456,12 +588,20 @@ def to_json(report: FeederReport) -> dict[str, Any]:
                 "phase": m.phase,
                 "v_min_volt": m.limits(report)[0],
                 "v_max_volt": m.limits(report)[1],
+                "learning_state": m.learning_state,
+                "learning_reason": m.learning_reason,
+                "model_only": m.model_only,
             }
             for m in report.meters
         ],
         "busbar": report.busbar.to_json(),
         "customers": [
-            {"customer": c.customer, "v_volt_estimated": c.v_volt_estimated, "v_volt_std": c.v_volt_std}
+            {
+                "customer": c.customer,
+                "v_volt_estimated": c.v_volt_estimated,
+                "v_volt_std": c.v_volt_std,
+                "model_only": c.model_only,
+            }
             for c in report.customers
         ],
         "inverters": [
@@ -473,6 +613,7 @@ def to_json(report: FeederReport) -> dict[str, Any]:
                 "suspect": i.suspect,
                 "q_kvar_estimated": i.q_kvar_estimated,
                 "attack_kvar_estimated": i.attack_kvar_estimated,
+                "model_only": i.model_only,
             }
             for i in report.inverters
         ],
@@ -482,8 +623,15 @@ def to_json(report: FeederReport) -> dict[str, Any]:
             for e in report.explanations
         ],
         "buses": [
-            {"bus": bus, "v_volt": v, "v_phases": None if phases is None else list(phases)}
-            for (bus, v), phases in zip_longest(report.bus_v_volt, report.bus_phases)
+            {
+                "bus": bus,
+                "v_volt": v,
+                "v_phases": None if phases is None else list(phases),
+                "model_only": bool(alone),
+            }
+            for (bus, v), phases, alone in zip_longest(
+                report.bus_v_volt, report.bus_phases, report.bus_model_only
+            )
         ],
         "silent": [{"meter": meter, "seconds": finite(seconds)} for meter, seconds in report.silent],
         "v_min_volt": report.v_min_volt,

@@ -9,30 +9,44 @@ Nobody who watches waits for the database: see `keeper`.
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
 import structlog
 
 from feeders.load import Site
-from service.alarms import AlarmRules, close, restore
+from gridsec.errors import GridsecError
+from service.alarms import (
+    Alarm,
+    AlarmRules,
+    AlarmUnknown,
+    AlreadyAcknowledged,
+    RaisedAgain,
+    acknowledged,
+    close,
+    restore,
+)
 from service.alarms import to_json as alarm_json
 from service.align import Clock, Outcome
 from service.bus import Sample
+from service.catch_up import CatchUp
 from service.commissioning import Commissioning, Happened
 from service.commissioning import to_json as commissioning_json
 from service.crowd import some_of_each
 from service.errors import FeederUnknown
-from service.keeper import Apart, Keeper, alarm_key, at_once
+from service.keeper import Apart, Keeper, Wish, alarm_key, at_once
+from service.kept import Kept
 from service.metrics import Metrics
 from service.reading import HEAD_BYTES, BadReading, BadReason, Reading, beginning, head_of
 from service.report import FeederReport
 from service.report import to_json as report_json
-from service.store import Rejected, Store, StoreUnavailable
+from service.store import Rejected, Store
 from service.suspicions import Suspicions
 from service.watch import TickResult, Watch, align_rules, known_of
 from service.wire import Decoded, Wire
@@ -41,6 +55,8 @@ NOT_WATCHED = "the feeder is not watched any more"
 TOLD_TWICE = "another alarm tells the same"
 
 _log = structlog.get_logger("gridsec.runtime")
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +88,15 @@ class RuntimeConfig:
     max_feeders: int = 100
 
 
+@dataclass(frozen=True, slots=True)
+class Past:
+    """State of a feeder that a new monitor goes on from: alarms, commissioning, suspicions."""
+
+    alarms: tuple[Alarm, ...]
+    commission: Kept | None
+    distrust: Kept | None
+
+
 class Rounds:
     """All state of the service.
 
@@ -92,6 +117,10 @@ class Rounds:
         with the outcome, between two rounds.
     unloaded
         Feeders that are stored but cannot be loaded, and why.
+    clock
+        Monotonic time, s.
+    go_on
+        Asked between two payloads and between two ticks; a round ends early where it answers False.
     """
 
     def __init__(
@@ -104,6 +133,8 @@ class Rounds:
         stored: Callable[[], None],
         apart: Apart = at_once,
         unloaded: Mapping[str, str] | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        go_on: Callable[[], bool] = lambda: True,
     ) -> None:
         self.config = config
         self.store = store
@@ -111,38 +142,87 @@ class Rounds:
         self.watches: dict[str, Watch] = {}
         self.unloaded = dict(unloaded or {})
         self.reported: dict[str, float] = {}
-        self._wall, self._stored = wall, stored
+        self._wall, self._stored, self._continues = wall, stored, go_on
+        self._catch_up = CatchUp(clock, waits=config.clock is Clock.EVENTS)
         self.keeper = Keeper(store, self.metrics, stored, self._count_stored, apart)
         self._wire = Wire({}, config.prefix, config.max_payload)
         for site in sites:
             self.add(site)
 
-    def add(self, site: Site) -> Watch:
+    def add(self, site: Site, past: Past | None = None) -> Watch:
         """Begin to watch a feeder, or begin anew with other tables; its alarms stay.
 
         Parameters
         ----------
         site
             The feeder.
+        past
+            What it goes on from; None: from the database, read at once.
         """
         config, name = self.config, site.feeder.name
-        # Where the readings tell the time, that may be long ago; `advance` forgets what is too old.
-        latest = min([self._wall(), *(tick["t"] for tick in self.store.history(name, limit=1))])
-        stored = self.store.active(name, cleared_since=latest - AlarmRules().memory_s)
-        rules = align_rules(site, config.clock, max_skew_s=config.max_skew_s, grace_s=config.grace_s)
-        commissioning = Commissioning(site, self.store.commission(name))
-        suspicions = Suspicions(site, self.store.distrust(name))
-        book = restore(name, stored)
-        watch = Watch(site, rules, book, commissioning, suspicions)
+        past = past or self._past(name, self.store)
+        rules = align_rules(
+            site, config.clock, max_skew_s=config.max_skew_s, grace_s=config.grace_s, live=True
+        )
+        book = restore(name, past.alarms)
+        watch = Watch(
+            site, rules, book, Commissioning(site, past.commission), Suspicions(site, past.distrust)
+        )
         held = {alarm.id for alarm in book.alarms}
-        twice = [alarm for alarm in stored if alarm.id not in held]
+        twice = [alarm for alarm in past.alarms if alarm.id not in held]
         self.keeper.waiting.add(transitions=close(twice, self._wall(), TOLD_TWICE))
         self.watches = {**self.watches, name: watch}
         self.unloaded.pop(name, None)
         self._learn()
         return watch
 
-    def remove(self, name: str) -> None:
+    def _past(self, name: str, store: Store) -> Past:
+        # Where the readings tell the time, that may be long ago; `advance` forgets what is too old.
+        latest = min([self._wall(), *(tick["t"] for tick in store.history(name, limit=1))])
+        alarms = store.active(name, cleared_since=latest - AlarmRules().memory_s)
+        return Past(tuple(alarms), store.commission(name), store.distrust(name))
+
+    def put(self, site: Site, tables: Mapping[str, Any], installed: Callable[[Watch], None]) -> Future[None]:
+        """Store a feeder's tables and begin to watch it, or begin anew with other tables.
+
+        Parameters
+        ----------
+        site, tables
+            The feeder, and JSON of the columns of its files.
+        installed
+            Called with what watches it.
+
+        Raises
+        ------
+        StoreUnavailable
+            If that cannot be stored; the feeder stays as it was.
+        """
+        answer: Future[None] = Future()
+        name = site.feeder.name
+
+        def store(past: Past) -> None:
+            self.keeper.store(
+                Wish(put=(name, tables)),
+                _landing(answer, lambda: installed(self.add(site, self._go_on(name, past)))),
+                partial(_refuse, answer),
+            )
+
+        self.keep_states(at_once=True)
+        self.keeper.look(partial(self._past, name), _then(answer, store), partial(_refuse, answer))
+        return answer
+
+    def _go_on(self, name: str, stored: Past) -> Past:
+        """Return the state of a feeder: of one that is watched, ticks have come since it was stored."""
+        watch = self.watches.get(name)
+        if watch is None:
+            return stored
+        return Past(
+            watch.book.alarms,
+            watch.commissioning.now() or stored.commission,
+            watch.suspicions.now() or stored.distrust,
+        )
+
+    def remove(self, name: str) -> Future[None]:
         """Watch a feeder no more: its alarms are cleared, its tables forgotten, its history kept.
 
         Parameters
@@ -155,14 +235,29 @@ class Rounds:
         FeederUnknown, StoreUnavailable
             If there is none, or that cannot be stored; it is watched as before then.
         """
+        answer: Future[None] = Future()
         watch = self.watches.get(name)
         if watch is None and name not in self.unloaded:
             raise FeederUnknown(name)
-        standing = self.store.active(name) if watch is None else watch.book.active
-        t = self._wall() if watch is None or watch.book.t is None else watch.book.t
-        self.keeper.store_now(close(standing, t, NOT_WATCHED), without=name)
+
+        def store(standing: Iterable[Alarm]) -> None:
+            t = self._wall() if watch is None or watch.book.t is None else watch.book.t
+            self.keeper.store(
+                Wish(close(standing, t, NOT_WATCHED), without=name),
+                _landing(answer, partial(self._removed, name)),
+                partial(_refuse, answer),
+            )
+
+        if watch is None:
+            self.keeper.look(lambda db: db.active(name), _then(answer, store), partial(_refuse, answer))
+        else:
+            store(watch.book.active)
+        return answer
+
+    def _removed(self, name: str) -> None:
         self.unloaded.pop(name, None)
         self.watches = {other: kept for other, kept in self.watches.items() if other != name}
+        self.keeper.waiting.forget(name)
         self._learn()
         self.metrics.forget(name)
         if self.keeper.publisher is not None:
@@ -207,20 +302,13 @@ class Rounds:
             Whether there is a new report.
         """
         started = time.perf_counter()
-        results: list[TickResult] = []
-        bad: list[Rejected] = []
-        for sample in samples:
-            decoded = self._decode(sample)
-            bad.extend(self._note(problem, sample) for problem in decoded.bad)
-            for reading in decoded.readings:
-                results.extend(self._take(reading, sample, bad))
+        bad = self._place(samples)
         now, waiting = self._wall(), oldest()
         # No tick goes without readings that only wait here.
         until = now if waiting is None else min(now, waiting)
         for watch in self.watches.values():
-            skipped = watch.aligner.skipped
-            results.extend(self._guarded(watch, partial(watch.due, until)))
-            self.metrics.skipped.labels(watch.name).inc(watch.aligner.skipped - skipped)
+            self._guarded(watch, partial(watch.reach, until))
+        results = self._judge()
         entries, left_out = some_of_each(bad)
         self.keeper.waiting.add(rejected=entries)
         self.metrics.forgotten.labels("bad-reading").inc(left_out)
@@ -228,22 +316,72 @@ class Rounds:
             self.keeper.waiting.add(transitions=result.transitions, reports=(result.report,))
             self._count_tick(result.report)
             self.reported[result.report.feeder] = time.monotonic()
-        self.keep_states()
+        judged = {result.report.feeder for result in results}
+        self.keep_states(watch for name, watch in self.watches.items() if name in judged)
         self.keeper.commit()
         self._publish_estimates(results)
         if samples or results:
             self.metrics.cycle.observe(time.perf_counter() - started)
         return bool(results)
 
-    def keep_states(self, *, at_once: bool = False) -> None:
-        """Let what is known of the meters' errors, and who is not believed, be stored, where it is time.
+    @property
+    def behind(self) -> bool:
+        """Whether ticks that are due wait for the next round."""
+        return any(watch.pending for watch in self.watches.values())
+
+    def _place(self, samples: Iterable[Sample]) -> list[Rejected]:
+        """Decode and align samples without judging; return the readings that cannot be used."""
+        bad: list[Rejected] = []
+        outcomes: Counter[tuple[str, Outcome]] = Counter()
+        lost: dict[str, int] = {}
+        for sample in samples:
+            if not self._continues():
+                break
+            decoded = self._decode(sample)
+            bad.extend(self._note(problem, sample) for problem in decoded.bad)
+            for reading in decoded.readings:
+                watch = self.watches[reading.feeder]
+                lost.setdefault(watch.name, watch.aligner.lost)
+                outcome = self._guarded(watch, partial(watch.place, reading, sample.arrival))
+                if outcome is not None:
+                    outcomes[watch.name, outcome] += 1
+                if outcome is Outcome.CLOCK_OFF:
+                    bad.append(self._clock_off(reading, sample.arrival))
+                bad.extend(self._clock_off(refused, sample.arrival) for refused in watch.aligner.refused())
+        for (name, outcome), count in outcomes.items():
+            self.metrics.readings.labels(name, outcome).inc(count)
+        for name, before in lost.items():
+            self.metrics.lost.labels(name).inc(self.watches[name].aligner.lost - before)
+        return bad
+
+    def _judge(self) -> list[TickResult]:
+        """Judge the pending ticks within the time budget; skipped ones are counted."""
+        results: list[TickResult] = []
+
+        def judge(watch: Watch) -> None:
+            skipped = watch.skipped
+            result = self._guarded(watch, watch.judge)
+            if watch.skipped > skipped:
+                self.metrics.skipped.labels(watch.name).inc(watch.skipped - skipped)
+                self._catch_up.skipped(watch.name, watch.skipped - skipped)
+            if result is not None:
+                results.append(result)
+
+        self._catch_up.judge(self.watches.values(), judge, self._continues)
+        self._catch_up.calm()
+        return results
+
+    def keep_states(self, watches: Iterable[Watch] | None = None, *, at_once: bool = False) -> None:
+        """Queue the commissioning and the suspicions of feeders for the database, where they are due.
 
         Parameters
         ----------
+        watches
+            The feeders; None: all. Both change with judged ticks only.
         at_once
-            Also what could wait.
+            Also a commissioning that is not due yet.
         """
-        for watch in self.watches.values():
+        for watch in self.watches.values() if watches is None else watches:
             kept, happened = watch.commissioning.due(at_once=at_once)
             self.keeper.waiting.add(kept=(*kept, *watch.suspicions.due()), happened=happened)
             for one in happened:
@@ -266,34 +404,17 @@ class Rounds:
             head, key = head_of(sample.payload[:HEAD_BYTES]), beginning(sample.key)
             return Decoded(bad=(BadReading(BadReason.INTERNAL, (problem,), key, head=head),))
 
-    def _take(self, reading: Reading, sample: Sample, bad: list[Rejected]) -> list[TickResult]:
-        watch = self.watches[reading.feeder]
-        lost, skipped = watch.aligner.lost, watch.aligner.skipped
-
-        def take() -> list[TickResult]:
-            outcome, found = watch.take(reading, sample.arrival)
-            self.metrics.readings.labels(watch.name, outcome).inc()
-            if outcome is Outcome.CLOCK_OFF:
-                bad.append(self._clock_off(reading, sample.arrival))
-            return found
-
-        results = self._guarded(watch, take)
-        bad.extend(self._clock_off(refused, sample.arrival) for refused in watch.aligner.refused())
-        self.metrics.lost.labels(watch.name).inc(watch.aligner.lost - lost)
-        self.metrics.skipped.labels(watch.name).inc(watch.aligner.skipped - skipped)
-        return results
-
-    def _guarded(self, watch: Watch, run: Callable[[], list[TickResult]]) -> list[TickResult]:
+    def _guarded(self, watch: Watch, run: Callable[[], T]) -> T | None:
         """Let a defect in one feeder's chain stop that feeder, visibly, and no other."""
-        results: list[TickResult] = []
+        found: T | None = None
         try:
-            results = run()
+            found = run()
         except Exception as error:  # noqa: BLE001 - whatever it is, it must not blind the other feeders
             watch.break_down(error)
         if watch.defect is not None:
             _log.error("a feeder's monitor failed", feeder=watch.name, exc_info=watch.defect)
             watch.defect = None
-        return results
+        return found
 
     def _note(self, problem: BadReading, sample: Sample) -> Rejected:
         self.metrics.bad.labels(problem.feeder or "", problem.reason).inc(problem.count)
@@ -318,6 +439,7 @@ class Rounds:
         metrics.ticks.labels(name, report.verdict).inc()
         metrics.seen.labels(name).set(sum(meter.seen for meter in report.meters))
         metrics.suspects.labels(name).set(len(report.suspects))
+        metrics.count_learning(report)
         metrics.alarms.labels(name).set(len(self.watches[name].book.active))
 
     # ---------------------------------------------------------------- publishing
@@ -334,8 +456,10 @@ class Rounds:
 
     def acknowledge(
         self, alarm_id: str, who: str, comment: str, *, count: int | None = None
-    ) -> dict[str, Any]:
-        """Answer an alarm; it is on the disk when this returns.
+    ) -> Future[dict[str, Any]]:
+        """Answer an alarm. The result is the alarm, when it is on the disk; the book follows then.
+
+        The same answer to the same occurrence once more has the same result.
 
         Parameters
         ----------
@@ -347,30 +471,54 @@ class Rounds:
         Raises
         ------
         AlarmUnknown, RaisedAgain, AlreadyAcknowledged, StoreUnavailable
-            If it cannot be answered; nothing has changed then.
+            If it cannot be answered, here or as the result; nothing has changed then.
+        OutcomeUnknown
+            As the result, if it is stored now or later, or not at all.
         """
+        answer: Future[dict[str, Any]] = Future()
         t = self._wall()
-        for watch in self.watches.values():
-            if all(alarm.id != alarm_id for alarm in watch.book.alarms):
-                continue
-            before = watch.book
-            transitions = watch.acknowledge(alarm_id, who, comment, t, count=count)
-            try:
-                self.keeper.store_now(transitions)
-            except StoreUnavailable:
-                watch.book = before
-                raise
-            return alarm_json(transitions[-1].alarm)
-        if self.keeper.problem is not None:
-            raise StoreUnavailable(self.keeper.problem)
-        alarm = self.store.acknowledge(alarm_id, who, comment, t, count=count).alarm
-        self.keeper.publish(self.store.last_event, alarm)
-        self.keeper.commit()
-        self._stored()
-        return alarm_json(alarm)
 
-    def recommission(self, name: str, meters: Sequence[str], who: str, reason: str) -> dict[str, Any]:
-        """Learn meters' errors anew; it is on the disk when this returns.
+        def store(alarm: Alarm | None) -> None:
+            if alarm is None:
+                raise AlarmUnknown(alarm_id)
+            occurrence = alarm.count if count is None else count
+            if (alarm.acknowledged_by, alarm.comment, alarm.count) == (who, comment, occurrence):
+                answer.set_result(alarm_json(alarm))
+                return
+            transition = acknowledged(alarm, who, comment, t, count=count)
+
+            def landed() -> dict[str, Any]:
+                self._acknowledged(transition.alarm)
+                return alarm_json(transition.alarm)
+
+            self.keeper.store(Wish((transition,)), _landing(answer, landed), partial(_refuse, answer))
+
+        books = (alarm for watch in self.watches.values() for alarm in watch.book.alarms)
+        held = next((alarm for alarm in books if alarm.id == alarm_id), None)
+        if held is None:
+            self.keeper.look(lambda db: db.alarm(alarm_id), _then(answer, store), partial(_refuse, answer))
+        else:
+            store(held)
+        return answer
+
+    def _acknowledged(self, alarm: Alarm) -> None:
+        """Carry a stored acknowledgement over to the book, and to what was judged while it was stored."""
+        self.keeper.waiting.carry(alarm)
+        watch = self.watches.get(alarm.feeder)
+        if watch is not None and alarm.acknowledged_by is not None and alarm.t_acknowledged is not None:
+            try:
+                watch.acknowledge(
+                    alarm.id,
+                    alarm.acknowledged_by,
+                    alarm.comment or "",
+                    alarm.t_acknowledged,
+                    count=alarm.count,
+                )
+            except (AlarmUnknown, AlreadyAcknowledged, RaisedAgain):
+                _log.info("the acknowledged occurrence is over", feeder=alarm.feeder, id=alarm.id)
+
+    def recommission(self, name: str, meters: Sequence[str], who: str, reason: str) -> Future[dict[str, Any]]:
+        """Learn meters' errors anew. The result is the progress, when it is on the disk.
 
         Parameters
         ----------
@@ -380,23 +528,62 @@ class Rounds:
         Raises
         ------
         FeederUnknown, NothingToLearn, StoreUnavailable
-            If that cannot be; nothing has changed then.
+            If that cannot be, here or as the result; nothing has changed then.
+        OutcomeUnknown
+            As in `acknowledge`.
         """
+        answer: Future[dict[str, Any]] = Future()
         watch = self.watches.get(name)
         if watch is None:
             raise FeederUnknown(name)
         t = self._wall() if watch.book.t is None else watch.book.t
         take_back = watch.recommission(meters, t, who, reason)
         kept, happened = watch.commissioning.due()
+        kept, wanted = (*kept, *watch.suspicions.due()), happened[-1:]
+        take_back()
+
+        def landed() -> dict[str, Any]:
+            # Ticks have come since: begun anew from the present state, which is stored with the next batch.
+            watch.recommission(meters, t, who, reason)
+            kept, happened = watch.commissioning.due()
+            kept = (*kept, *watch.suspicions.due())
+            self.keeper.waiting.add(kept=kept, happened=happened[:-1])
+            for one in wanted:
+                _say(one)
+            self._count_learned(watch)
+            return commissioning_json(watch.commissioning.progress())
+
+        wish = Wish(kept=kept, happened=wanted)
+        self.keeper.store(wish, _landing(answer, landed), partial(_refuse, answer))
+        return answer
+
+
+def _then(answer: Future[Any], store: Callable[[T], None]) -> Callable[[T], None]:
+    """Return the second step of a command, errors of which are its result."""
+
+    def run(found: T) -> None:
         try:
-            self.keeper.store_now(kept=(*kept, *watch.suspicions.due()), happened=happened)
-        except StoreUnavailable:
-            take_back()
-            raise
-        for one in happened:
-            _say(one)
-        self._count_learned(watch)
-        return commissioning_json(watch.commissioning.progress())
+            store(found)
+        except GridsecError as error:
+            _refuse(answer, error)
+
+    return run
+
+
+def _landing(answer: Future[T], run: Callable[[], T]) -> Callable[[], None]:
+    """Return the last step of a command, which has its result unless that was unknown before."""
+
+    def landed() -> None:
+        result = run()
+        if not answer.done():
+            answer.set_result(result)
+
+    return landed
+
+
+def _refuse(answer: Future[Any], error: GridsecError) -> None:
+    if not answer.done():
+        answer.set_exception(error)
 
 
 def _say(happened: Happened) -> None:

@@ -2,6 +2,8 @@
 
 Rounds run one after the other in one worker thread, so that the event loop stays free for HTTP;
 acknowledgements, new feeders and finished designs are executed between them. Nothing else touches the state.
+With the wall clock that thread makes no call to the database: a command sends one, and its outcome is taken
+in between two later rounds.
 """
 
 from __future__ import annotations
@@ -11,9 +13,11 @@ import contextlib
 import time
 from collections import deque
 from collections.abc import AsyncGenerator, Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from typing import Any, TypeVar
+
+import structlog
 
 from feeders.estimators import Watcher
 from feeders.load import Site
@@ -27,15 +31,24 @@ from service.inbox import Inbox
 from service.keeper import Done, Publisher, at_once
 from service.report import FeederReport
 from service.rounds import Rounds, RuntimeConfig
-from service.store import Store, StoreUnavailable
-from service.watch import Phase
+from service.store import OutcomeUnknown, Store, StoreUnavailable
+from service.watch import Phase, Watch
 
 SAMPLES_PER_ROUND = 512
+"""Payloads of one round where senders wait. By the wall clock a round takes all that wait."""
+GATHER_S = 0.005
+"""Pause after a wake-up by readings, s: a round costs the same for one reading as for dozens."""
+LAST_COMMIT_S = 1.5
+"""Time for the last commit after `stop`, s: the service ends within 3 s."""
 IDLE_S = 1.0
 STUCK_S = 30.0
+COMMAND_S = 10.0
+"""Time limit of a command that needs the database, s: a write before it and its own."""
 STOPPING = "the service is stopping"
 
 T = TypeVar("T")
+
+_log = structlog.get_logger("gridsec.runtime")
 
 
 class Runtime:
@@ -71,6 +84,7 @@ class Runtime:
         settled: Callable[[], None] = lambda: None,
     ) -> None:
         self._wall, self._settled = wall, settled
+        self._stopping = False
         # Where the readings tell the time, nothing is late by waiting for the database.
         waits = config.clock is Clock.EVENTS
         self._rounds = Rounds(
@@ -81,14 +95,16 @@ class Runtime:
             stored=lambda: self._in_loop(partial(self._notify, "alarm")),
             apart=at_once if waits else self._write_apart,
             unloaded=unloaded,
+            go_on=lambda: not self._stopping,
         )
+        self._waits = waits
         self._given = frozenset(self._rounds.watches) if given is None else frozenset(given)
         self._inbox = Inbox(
             lambda: self._in_loop(self._wake.set),
             max_samples=config.max_samples,
             lossless=config.clock is Clock.EVENTS,
         )
-        self._commands: deque[tuple[Callable[[], Any], asyncio.Future[Any]]] = deque()
+        self._commands: deque[tuple[Callable[[], Future[Any]], asyncio.Future[Any]]] = deque()
         self._prepared: set[asyncio.Future[tuple[Site, Watcher]]] = set()
         self._subscribers: set[asyncio.Queue[str]] = set()
         self._outcomes: deque[Callable[[], None]] = deque()
@@ -96,7 +112,6 @@ class Runtime:
         self._writer = ThreadPoolExecutor(1, thread_name_prefix="gridsec-store")
         self._loop: asyncio.AbstractEventLoop | None = None
         self._wake = asyncio.Event()
-        self._stopping = False
         self._last_round: float | None = None
         self._died: str | None = None
 
@@ -126,22 +141,30 @@ class Runtime:
         return dropped
 
     async def run(self) -> None:
-        """Watch until `stop`."""
+        """Watch until `stop`.
+
+        Raises
+        ------
+        WriterLost
+            If another process may have written the database; nothing more is stored.
+        """
         self._loop = asyncio.get_running_loop()
         try:
-            await self._in_worker(self._rounds.begin)
+            await self._loop.run_in_executor(self._writer, self._rounds.begin)
             for watch in self._rounds.watches.values():
                 designs.begin(watch, lambda install: self._in_loop(partial(self._hand_over, install)))
             while not self._stopping:
+                self._check_writer()
                 await self._execute_commands()
-                samples = self._inbox.drain(SAMPLES_PER_ROUND)
+                samples = self._samples()
                 news = await self._in_worker(self._rounds.round, samples, self._inbox.oldest)
                 self._last_round = time.monotonic()
                 self._rounds.metrics.queue.set(len(self._inbox))
                 if news:
                     self._notify("state")
                 await self._pause()
-            await self._last_commit()
+            await self._end()
+            self._check_writer()
         except BaseException as error:
             self._died = f"{type(error).__name__}: {error}"
             raise
@@ -151,6 +174,10 @@ class Runtime:
                 answer.cancel()
             self._worker.shutdown(wait=False)
             self._writer.shutdown(wait=False)
+
+    def _check_writer(self) -> None:
+        if (lost := self.store.lost) is not None:
+            raise lost
 
     def stop(self) -> None:
         """End `run` and every subscription soon; called from the event loop."""
@@ -162,11 +189,20 @@ class Runtime:
         self._wake.set()
         self._notify("stop")
 
+    def _samples(self) -> list[Sample]:
+        """Take the samples of the next round; none while ticks of the last one wait."""
+        if not self._waits:
+            return self._inbox.drain(len(self._inbox))
+        return [] if self._rounds.behind else self._inbox.drain(SAMPLES_PER_ROUND)
+
     async def _pause(self) -> None:
         """Wait for samples, commands or the next tick."""
-        commands = self._commands and not self._rounds.keeper.storing
-        if self._stopping or len(self._inbox) or self._outcomes or commands:
+        commands = self._commands and self._rounds.keeper.takes_commands
+        if self._stopping or self._outcomes or commands or self._rounds.behind:
             await asyncio.sleep(0)
+            return
+        if len(self._inbox):
+            await asyncio.sleep(0.0 if self._waits else GATHER_S)
             return
         now = self._wall()
         wakes = [t for watch in self._rounds.watches.values() if (t := watch.aligner.wake()) is not None]
@@ -175,6 +211,8 @@ class Runtime:
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._wake.wait(), timeout)
         self._wake.clear()
+        if len(self._inbox) and not self._waits:
+            await asyncio.sleep(GATHER_S)
 
     async def _in_worker(self, run: Callable[..., T], *arguments: Any) -> T:
         return await asyncio.get_running_loop().run_in_executor(self._worker, run, *arguments)
@@ -194,6 +232,15 @@ class Runtime:
     def _take_in(self, outcome: Callable[[], None]) -> None:
         self._outcomes.append(outcome)
         self._wake.set()
+
+    async def _end(self) -> None:
+        """Store what is left, if the database answers in time."""
+        try:
+            await asyncio.wait_for(self._last_commit(), LAST_COMMIT_S)
+        except TimeoutError:
+            # No request is answered with success before its commit.
+            waiting = len(self._rounds.keeper.waiting)
+            _log.error("the database did not answer before the end", transitions=waiting, s=LAST_COMMIT_S)
 
     async def _last_commit(self) -> None:
         """Store what is left, after what is on its way."""
@@ -216,25 +263,48 @@ class Runtime:
 
     async def _execute_commands(self) -> None:
         await self._take_outcomes()
-        # Commands may need the database for themselves; a write that is on its way comes first.
-        while self._commands and not self._rounds.keeper.storing:
+        # One write is on its way at a time; one before a command comes first.
+        while self._commands and self._rounds.keeper.takes_commands:
             command, answer = self._commands.popleft()
             try:
-                result = await self._in_worker(command)
+                found = await self._in_worker(command)
             except GridsecError as error:
                 if not answer.done():
                     answer.set_exception(error)
             else:
-                if not answer.done():
-                    answer.set_result(result)
+                found.add_done_callback(partial(self._pass_on, answer))
 
-    async def _command(self, run: Callable[[], T]) -> T:
-        """Have something executed between two rounds."""
+    def _pass_on(self, answer: asyncio.Future[T], found: Future[T]) -> None:
+        """Give a command's result to the request that waits for it; called in any thread."""
+
+        def give() -> None:
+            if answer.done():
+                return
+            if (error := found.exception()) is not None:
+                answer.set_exception(error)
+            else:
+                answer.set_result(found.result())
+
+        self._in_loop(give)
+
+    async def _command(self, run: Callable[[], Future[T]]) -> T:
+        """Have something executed between two rounds, and wait for its result within a time limit."""
         self._go_on()
         answer: asyncio.Future[T] = asyncio.get_running_loop().create_future()
-        self._commands.append((run, answer))
+        entry = (run, answer)
+        self._commands.append(entry)
         self._wake.set()
-        return await answer
+        await asyncio.wait({answer}, timeout=COMMAND_S)
+        if answer.done():
+            return answer.result()
+        answer.cancel()
+        name = self.store.name
+        if entry in self._commands:
+            self._commands.remove(entry)
+            raise StoreUnavailable(f"{name}: the write before has not ended within {COMMAND_S:g} s")
+        raise OutcomeUnknown(
+            f"{name}: no answer within {COMMAND_S:g} s; whether it is stored is not known yet"
+        )
 
     def _go_on(self) -> None:
         if self._stopping:
@@ -251,8 +321,7 @@ class Runtime:
             install()
             self._settle()
 
-        self._commands.append((run, asyncio.get_running_loop().create_future()))
-        self._wake.set()
+        self._take_in(run)
 
     def _settle(self) -> None:
         if all(watch.phase is not Phase.DESIGNING for watch in self._rounds.watches.values()):
@@ -273,6 +342,7 @@ class Runtime:
                 "phase": str(watch.phase),
                 "problem": watch.problem or None,
                 "patience_s": watch.patience_s,
+                "ticks_skipped": watch.skipped,
                 "commissioning": str(watch.commissioning.progress().state),
             }
             for watch in self._rounds.watches.values()
@@ -411,15 +481,15 @@ class Runtime:
         prepared.add_done_callback(self._prepared.discard)
         site, finished = await prepared
 
-        def install() -> None:
-            self._make_room(name)
-            self._rounds.keep_states(at_once=True)
-            self._rounds.keeper.store_now()
-            self._rounds.store.put_feeder(name, tables)
-            designs.install(self._rounds.add(site), finished, "")
+        def installed(watch: Watch) -> None:
+            designs.install(watch, finished, "")
             self._settle()
 
-        await self._command(install)
+        def put() -> Future[None]:
+            self._make_room(name)
+            return self._rounds.put(site, tables, installed)
+
+        await self._command(put)
 
     def _make_room(self, name: str) -> None:
         """See whether one more feeder may be put."""
@@ -462,6 +532,8 @@ class Runtime:
         ------
         AlarmUnknown, RaisedAgain, AlreadyAcknowledged, StoreUnavailable
             If it cannot be answered; nothing has changed then.
+        OutcomeUnknown
+            If it is stored now or later, or not at all; the same answer again tells.
         """
         return await self._command(partial(self._rounds.acknowledge, alarm_id, who, comment, count=count))
 

@@ -102,6 +102,10 @@ class Suspicions:
         which = [not chosen or meter in chosen for meter in self._site.meter_ids]
         self.known, self._t = self.known.without(np.array(which, dtype=np.bool_)), t
 
+    def now(self) -> Kept | None:
+        """Return the present state as it is stored; None before the first tick."""
+        return None if self._t is None else encode_distrust(self._site, self._t, self.known)
+
     def due(self) -> tuple[Kept, ...]:
         """Return what is to be stored now, if it has changed; it counts as stored from here on."""
         if self._t is None or (self._stored is not None and self._stored.same(self.known)):

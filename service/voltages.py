@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 import numpy as np
 
 from feeders.load import Site, Snapshot, volts
 from gridsec.arrays import Bools, Floats
-from gridsec.network import InPhases
-from gridsec.online import Estimate, Verdict
+from gridsec.network import InPhases, hangs_on
+from gridsec.online import Cause, Estimate, Verdict
 from service.align import Tick
 
 Phase: TypeAlias = Literal["a", "b", "c"]
@@ -63,7 +64,64 @@ def busbar_phases(site: Site) -> tuple[Phase | None, ...]:
     return ("a", "b", "c") if isinstance(site.feeder, InPhases) else (None,)
 
 
-def bus_volts(site: Site, v2_bus: Floats) -> tuple[Floats, Floats]:
+@dataclass(frozen=True, slots=True, eq=False)
+class Grounds:
+    """Voltage readings of one tick that reconstructed values rest on, by phase of the busbar, (b,).
+
+    A value without one of these in its phase is *model only*: it follows from powers, the model and what the
+    estimator remembers. All buses of a phase are connected, so that one reading counts for all of them.
+
+    Attributes
+    ----------
+    meters : (b,)
+        At least one meter of the phase reports and is trusted.
+    busbar : (b,)
+        The busbar's meter reports the phase and is not named as manipulated.
+    """
+
+    meters: Bools
+    busbar: Bools
+
+    @property
+    def measured(self) -> Bools:
+        """Phases with at least one reading, (b,)."""
+        return self.meters | self.busbar
+
+    def model_only(self, site: Site) -> Bools:
+        """Return which customers' values are model only, (N,).
+
+        Parameters
+        ----------
+        site
+            The feeder.
+        """
+        return np.asarray(~(hangs_on(site.feeder) * self.measured).any(axis=1), dtype=np.bool_)
+
+
+def grounds(
+    site: Site, tick: Tick, estimate: Estimate | None = None, verdict: Verdict | None = None
+) -> Grounds:
+    """Return the readings that the values of a tick rest on.
+
+    Parameters
+    ----------
+    site, tick
+        The feeder, and what was known.
+    estimate, verdict
+        What the estimator says; None: there is no monitor, and each reading counts.
+    """
+    used = np.array([reading is not None for reading in tick.readings], dtype=np.bool_)
+    busbar = np.isfinite(np.broadcast_to(busbar_volt(site, tick), len(busbar_phases(site))))
+    if estimate is not None:
+        used &= estimate.trusted
+    if verdict is not None:
+        busbar = busbar & (verdict.cause is not Cause.NO_BUSBAR)
+        busbar = busbar & ~verdict.busbar if verdict.busbar.size else busbar
+    of_meters = hangs_on(site.feeder)[site.meters[used]].any(axis=0)
+    return Grounds(np.asarray(of_meters, dtype=np.bool_), busbar)
+
+
+def bus_volts(site: Site, v2_bus: Floats, measured: Bools) -> tuple[Floats, Floats, Bools]:
     """Return the voltage of every bus, V: in three phases that of the phase furthest from nominal.
 
     Parameters
@@ -72,6 +130,8 @@ def bus_volts(site: Site, v2_bus: Floats) -> tuple[Floats, Floats]:
         The feeder.
     v2_bus : (n,)
         Squared voltages as in `gridsec.online.Estimate`, pu.
+    measured : (b,)
+        Phases with a reading, see `Grounds`. The other phases of a bus count only where it has none of these.
 
     Returns
     -------
@@ -79,14 +139,18 @@ def bus_volts(site: Site, v2_bus: Floats) -> tuple[Floats, Floats]:
         Voltage of each bus, V.
     phases : (b + 1, 3) or (b + 1, 0)
         Voltage of each of its phases, V, NaN for one that it does not have; nothing on a balanced feeder.
+    model_only : (b + 1,)
+        The first is model only.
     """
     v = volts(site.base_volt, v2_bus)
     if not isinstance(site.feeder, InPhases):
-        return v, np.zeros((v.size, 0))
+        return v, np.zeros((v.size, 0)), np.full(v.size, not measured[0])
     phases = np.where(site.feeder.tree.phases, v.reshape(-1, 3), np.nan)
-    nominal = site.nominal_volt.reshape(-1, 3)
-    off = np.where(np.isnan(phases), -1.0, np.abs(phases - nominal))
-    return np.take_along_axis(phases, off.argmax(axis=1)[:, None], axis=1)[:, 0], phases
+    there = site.feeder.tree.phases & measured
+    among = np.where(there.any(axis=1, keepdims=True), there, site.feeder.tree.phases)
+    off = np.where(among, np.nan_to_num(np.abs(phases - site.nominal_volt.reshape(-1, 3)), nan=-0.5), -1.0)
+    one = np.take_along_axis(phases, off.argmax(axis=1)[:, None], axis=1)[:, 0]
+    return one, phases, np.asarray(~there.any(axis=1), dtype=np.bool_)
 
 
 def std_volts(site: Site, estimate: Estimate) -> Floats:

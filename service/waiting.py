@@ -11,10 +11,10 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
-from service.alarms import Change, Transition
+from service.alarms import Alarm, Change, Transition, carried
 from service.commissioning import Happened
 from service.kept import Kept, Matter
 from service.report import FeederReport
@@ -143,6 +143,29 @@ class Waiting:
         self._kept = {(item.feeder, item.matter): item for item in batch.kept} | self._kept
         self._happened.extendleft(reversed(batch.happened))
         self._bound()
+
+    def carry(self, answered: Alarm) -> None:
+        """Carry a stored acknowledgement over into the transitions that were gathered while it was stored.
+
+        Parameters
+        ----------
+        answered
+            The acknowledged alarm.
+        """
+        self._transitions = [replace(item, alarm=carried(item.alarm, answered)) for item in self._transitions]
+
+    def forget(self, feeder: str) -> None:
+        """Drop everything of a feeder: its removal, which is stored, is its last change.
+
+        Parameters
+        ----------
+        feeder
+            Its name.
+        """
+        self._transitions = [item for item in self._transitions if item.alarm.feeder != feeder]
+        self._reports = deque(item for item in self._reports if item.feeder != feeder)
+        self._kept = {key: item for key, item in self._kept.items() if item.feeder != feeder}
+        self._happened = deque(item for item in self._happened if item.feeder != feeder)
 
     def _bound(self) -> None:
         self._drop_oldest(self._reports, "report")

@@ -7,7 +7,8 @@ owns a `Watch` calls it from one place at a time.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections import deque
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -18,12 +19,12 @@ from feeders import estimators
 from feeders.load import Site, to_frame
 from gridsec.online import Cause
 from service import describe
-from service.alarms import AlarmBook, AlarmRules, Transition, acknowledge, advance
+from service.alarms import AlarmBook, AlarmRules, Transition, acknowledge, advance, hold
 from service.align import Aligner, AlignRules, Clock, Outcome, Tick, rules
 from service.commissioning import Commissioning
 from service.conditions import conditions
 from service.reading import Known, Reading
-from service.report import FeederReport, blind, build
+from service.report import FeederReport, blind, build, with_learning
 from service.suspicions import Suspicions
 from service.voltages import snapshot
 
@@ -65,7 +66,12 @@ def known_of(site: Site) -> Known:
 
 
 def align_rules(
-    site: Site, clock: Clock, *, max_skew_s: float | None = None, grace_s: float | None = None
+    site: Site,
+    clock: Clock,
+    *,
+    max_skew_s: float | None = None,
+    grace_s: float | None = None,
+    live: bool = False,
 ) -> AlignRules:
     """Return the times by which a feeder's readings are aligned.
 
@@ -73,11 +79,13 @@ def align_rules(
     ----------
     site
         The feeder.
-    clock, max_skew_s, grace_s
+    clock, max_skew_s, grace_s, live
         As in `align.rules`.
     """
     settings = site.tables.meta.monitor
-    return rules(settings.tick_s, settings.silence_s, clock=clock, max_skew_s=max_skew_s, grace_s=grace_s)
+    return rules(
+        settings.tick_s, settings.silence_s, clock=clock, max_skew_s=max_skew_s, grace_s=grace_s, live=live
+    )
 
 
 def alarm_rules(site: Site, times: AlignRules) -> AlarmRules:
@@ -132,6 +140,10 @@ class Watch:
         Whether there is a monitor, and if it failed, why.
     report
         The latest report, or None before the first tick.
+    pending
+        Ticks that are due and not judged, oldest first.
+    skipped
+        Ticks that were not judged.
     defect
         What made the monitor fail, until somebody has seen to it; None: nothing.
     """
@@ -154,6 +166,8 @@ class Watch:
         self.phase = Phase.DESIGNING
         self.problem = ""
         self.report: FeederReport | None = None
+        self.pending: deque[Tick] = deque()
+        self.skipped = 0
         self.defect: Exception | None = None
         self._alarm_rules = alarm_rules(site, rules)
         self._watcher: estimators.Watcher | None = None
@@ -207,8 +221,8 @@ class Watch:
         self.fail(f"{type(defect).__name__}: {defect}")
         self.defect = defect
 
-    def take(self, reading: Reading, now: float) -> tuple[Outcome, list[TickResult]]:
-        """Take one reading in.
+    def place(self, reading: Reading, now: float) -> Outcome:
+        """Align one reading; the ticks that become due are pending.
 
         Parameters
         ----------
@@ -216,21 +230,67 @@ class Watch:
             As in `Aligner.take`.
         """
         outcome, ticks = self.aligner.take(reading, now)
-        return outcome, self._run(ticks)
+        self.pending.extend(ticks)
+        return outcome
 
-    def due(self, now: float) -> list[TickResult]:
-        """Do what is due without a new reading.
+    def reach(self, now: float) -> None:
+        """Add the ticks that are due without a new reading to the pending ones.
 
         Parameters
         ----------
         now
             Wall time, Unix s.
         """
-        return self._run(self.aligner.due(now))
+        self.pending.extend(self.aligner.due(now))
 
-    def flush(self) -> list[TickResult]:
-        """Do what the readings so far allow: nothing more will come."""
-        return self._run(self.aligner.flush())
+    def skip(self, count: int) -> None:
+        """Drop the oldest pending ticks without judging them; the next one counts them.
+
+        Parameters
+        ----------
+        count
+            Their number, less than that of the pending ticks.
+        """
+        gone = sum(self.pending.popleft().skipped + 1 for _ in range(count))
+        following = self.pending[0]
+        self.pending[0] = replace(following, skipped=following.skipped + gone)
+
+    def judge(self) -> TickResult:
+        """Judge the oldest pending tick.
+
+        Raises
+        ------
+        IndexError
+            If no tick is pending.
+        """
+        tick = self.pending.popleft()
+        self.skipped += tick.skipped
+        return self._result(tick)
+
+    def take(self, reading: Reading, now: float) -> tuple[Outcome, list[TickResult]]:
+        """Align one reading and judge the ticks that become due.
+
+        Parameters
+        ----------
+        reading, now
+            As in `Aligner.take`.
+        """
+        return self.place(reading, now), self._judged()
+
+    def due(self, now: float) -> list[TickResult]:
+        """Judge the ticks that are due without a new reading.
+
+        Parameters
+        ----------
+        now
+            Wall time, Unix s.
+        """
+        self.reach(now)
+        return self._judged()
+
+    def finish(self) -> None:
+        """Add all ticks that the time has reached to the pending ones: nothing more will come."""
+        self.pending.extend(self.aligner.flush())
 
     def acknowledge(
         self, alarm_id: str, who: str, comment: str, t: float, *, count: int | None = None
@@ -267,22 +327,32 @@ class Watch:
 
         return take_back
 
-    def _run(self, ticks: Iterable[Tick]) -> list[TickResult]:
-        return [self._result(tick) for tick in ticks]
+    def _judged(self) -> list[TickResult]:
+        return [self.judge() for _ in range(len(self.pending))]
 
     def _result(self, tick: Tick) -> TickResult:
         """Judge a tick; a defect costs the answer to it, and no alarm of the ticks before."""
+        book = self.book
+        if tick.skipped:
+            book = hold(book, tick.t - tick.skipped * self.aligner.rules.tick_s)
         for _ in range(2):  # watched, and given up
             try:
-                report = replace(self._judge(tick), revision=self.revision)
-                book, transitions = advance(self.book, self._alarm_rules, conditions(report), report.t)
+                report = self._complete(self._judge(tick))
+                after, transitions = advance(book, self._alarm_rules, conditions(report), report.t)
             except Exception as error:  # noqa: BLE001 - whatever it is, ticks before and after have their answers
                 self.break_down(error)
             else:
-                self.report, self.book = report, book
+                self.report, self.book = report, after
                 return TickResult(report, transitions)
-        self.report = replace(self._judge(tick), revision=self.revision)
+        self.report = self._complete(self._judge(tick))
         return TickResult(self.report, ())
+
+    def _complete(self, report: FeederReport) -> FeederReport:
+        """The report with the revision of its feeder, and the newest tick that rests on a reading."""
+        last = None if self.report is None else self.report.t_measured
+        # After the clock was set back, an earlier time of measurement would lie in the future.
+        measured = (last if last is None or last <= report.t else None) if report.model_only else report.t
+        return replace(report, revision=self.revision, t_measured=measured)
 
     def _judge(self, tick: Tick) -> FeederReport:
         if self._watcher is None:
@@ -299,4 +369,5 @@ class Watch:
         self._state, estimate, verdict = self._watcher.step(self._state, frame)
         self.commissioning.follow(self._state, tick.t)
         self.suspicions.follow(self._state, tick.t)
-        return build(self.site, tick, self.max_attacked, estimate, verdict)
+        report = build(self.site, tick, self.max_attacked, estimate, verdict)
+        return with_learning(report, self.commissioning.report())

@@ -176,7 +176,7 @@ def test_the_index_has_every_page() -> None:
     assert [page for page in pages if f"]({page.relative_to(DOCS)})" not in index] == []
 
 
-# What the papers number. Figures 1.1, 1.2 and 6.1 of lee2018 belong to chapters that state nothing.
+# What the papers number. Figures 1.1 and 1.2 of lee2018 belong to its introduction.
 NUMBERED = {
     "chong2020": """
         Assumption 1, 2; Definition 1; Theorem 1, 2; Proposition 1; Corollary 1; Figure 1, 2; (1) to (20)
@@ -192,7 +192,7 @@ NUMBERED = {
         2.2.4, 2.2.6, 2.2.8, 2.2.16, 2.2.17, 5.1.1, 5.2.1; Corollary 2.2.5, 2.2.13 to 2.2.15, 3.1.5,
         3.1.12, 5.4.2; Proposition 2.2.2, 2.2.3, 2.2.10, 3.1.1 to 3.1.4, 3.1.6 to 3.1.11, 3.1.13, 3.2.1 to
         3.2.4, 3.3.1, 3.3.2, 4.3.1, 5.1.2 to 5.1.7; Remark 2.2.1 to 2.2.3, 3.2.1, 4.4.1, 4.4.2, 5.2.1 to
-        5.2.3, 5.3.1, 5.4.1; Table 5.1; Figure 4.1 to 4.12, 5.1 to 5.4; (2.1.1) to (2.1.4), (2.2.1) to
+        5.2.3, 5.3.1, 5.4.1; Table 5.1; Figure 4.1 to 4.12, 5.1 to 5.4, 6.1; (2.1.1) to (2.1.4), (2.2.1) to
         (2.2.21), (3.1.1) to (3.1.6), (3.2.1) to (3.2.6), (4.1.1), (4.1.2), (4.2.1) to (4.2.10), (4.3.1)
         to (4.3.16), (4.5.1), (4.5.2), (5.1.1) to (5.1.5), (5.2.1) to (5.2.8), (5.3.1) to (5.3.5), (5.4.1)
         to (5.4.5)

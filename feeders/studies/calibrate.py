@@ -8,11 +8,10 @@ docs/theory-studies.md, Calibration.
 from __future__ import annotations
 
 import hashlib
-import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -20,18 +19,10 @@ import pandas as pd
 from feeders.equipment import digest, find
 from feeders.schema import write
 from feeders.studies import calibrate_tables
-from feeders.studies.calibrate_corrections import Correction, Kind, apply, as_filed, left
+from feeders.studies.calibrate_corrections import Correction, Kind, apply
 from feeders.studies.calibrate_readings import Frames, blind, frames
-from feeders.studies.calibrate_search import (
-    LENGTH_SPREAD,
-    SHORTEST,
-    Round,
-    State,
-    Verdict,
-    compare,
-    correction,
-    prepare,
-)
+from feeders.studies.calibrate_search import LENGTH_SPREAD, Round, State, Verdict, compare, prepare
+from feeders.studies.calibrate_steps import Search, read
 from feeders.studies.journal import Journal, Progress, Where
 from gridsec.errors import refuse
 
@@ -39,12 +30,8 @@ if TYPE_CHECKING:
     from feeders.load import Site
     from feeders.load_phases import ThreePhaseSite
     from feeders.recording import Recording
-    from feeders.schema import FeederTables
 
 __all__ = ["Calibrate", "OtherFeeder", "calibrate", "wrong_numbers"]
-
-MOST_ERRORS: Final = 24
-"""After so many errors the files are another feeder's."""
 
 
 class OtherFeeder(ValueError):
@@ -203,10 +190,11 @@ def calibrate(
     unread = given.unread if site.tables.in_phases else ""
     files = State(site.tables, (*exclude, *blind(site, unread)), unread=unread)
     with Journal(journal, subject) as kept:
-        now, verdict, found = _searched(files, fitted, weighed, risk, kept)
+        found = Search(files, fitted, weighed, risk, kept).run()
+    now = found.now
     lines, ids = calibrate_tables.lines(now, tolerance, kinds)
-    wrongs = [_read(row["correction"]) for row in found]
-    rows, sure = calibrate_tables.final(found, wrongs, lines, ids)
+    wrongs = [read(row["correction"]) for row in found.rows]
+    rows, sure = calibrate_tables.final(found.rows, wrongs, lines, ids)
     return Calibrate(
         feeder=site.feeder.name,
         digest=site.digest,
@@ -215,7 +203,7 @@ def calibrate(
         risk=risk,
         meters=calibrate_tables.meters(now, risk),
         lines=lines,
-        customers=calibrate_tables.customers(now, verdict, wrongs, risk, kinds),
+        customers=calibrate_tables.customers(now, found.said, wrongs, risk, kinds),
         loads=calibrate_tables.loads(now),
         errors=calibrate_tables.errors(now),
         proposals=rows,
@@ -240,69 +228,6 @@ def wrong_numbers(risk: float, tolerance: float) -> list[str]:
     return problems
 
 
-def _searched(
-    files: State,
-    fitted: Callable[[State], Round],
-    weighed: Callable[[Round], Verdict],
-    risk: float,
-    kept: Journal,
-) -> tuple[Round, Verdict, list[dict[str, Any]]]:
-    """One error after the other, until the readings speak for none; with the last round and what it said."""
-    state, found = files, list[dict[str, Any]]()
-    been = [files]
-    for step in range(MOST_ERRORS + 1):
-        now = fitted(state)
-        said: list[Verdict] = []
-
-        def work(now: Round = now, said: list[Verdict] = said) -> dict[str, Any] | None:
-            said.append(weighed(now))
-            return _best(now, said[0], risk, files.tables)
-
-        row = kept.get(f"error {step}", work)
-        if row is None or step == MOST_ERRORS:
-            break
-        wrong = _read(row["correction"])
-        if wrong.kind is Kind.METER:
-            # What its readings may have been taken for until now is forgotten: all begins again without it.
-            state = replace(files, excluded=(*state.excluded, *wrong.names))
-            found = [*(each for each in found if each["correction"]["kind"] == Kind.METER), row]
-        elif any(state.after(wrong).same(before) for before in been):
-            # The readings speak for each of two places once the other one is taken for right.
-            found = [_doubted(each, wrong) for each in found]
-            break
-        else:
-            state = state.after(wrong)
-            found = _together(found, row, files.tables, now.net.site.bus_of_file)
-        been.append(state)
-    return now, said[0] if said else weighed(now), found
-
-
-def _together(
-    found: list[dict[str, Any]], row: dict[str, Any], files: FeederTables, bus_of_file: Mapping[str, int]
-) -> list[dict[str, Any]]:
-    """Errors that do not contradict each other: of a customer's place the last one holds.
-
-    Its gain includes that of those it replaces. One that leads back to what the files say is none.
-    """
-    wrong, gain, rest = _read(row["correction"]), row["log_factor"], []
-    for each in found:
-        earlier = _read(each["correction"])
-        kept = left(earlier, wrong)
-        if kept is None:
-            gain += each["log_factor"]
-        else:
-            rest.append(each if kept == earlier else each | {"correction": asdict(kept)})
-    return rest if as_filed(files, wrong, bus_of_file) else [*rest, row | {"log_factor": gain}]
-
-
-def _doubted(row: dict[str, Any], wrong: Correction) -> dict[str, Any]:
-    """An error that cannot be told from another one, if it is about the same customers."""
-    told = _read(row["correction"])
-    if (told.kind, told.names) != (wrong.kind, wrong.names):
-        return row
-    return row | {"alternatives": [*row["alternatives"], calibrate_tables.told(wrong)]}
-
-
 def _quiet(done: int, total: int) -> None:
     """Tell nobody."""
 
@@ -319,40 +244,3 @@ def _subject(site: Site | ThreePhaseSite, given: Frames, risk: float, tolerance:
         "risk": risk,
         "tolerance": tolerance,
     }
-
-
-def _best(now: Round, said: Verdict, risk: float, files: FeederTables) -> dict[str, Any] | None:
-    """The error that the readings speak for most; None where they speak for none."""
-    if said.any < math.log(1.0 / risk):
-        return None
-    best = int(said.kept[0])
-    guess, g, h = said.guesses[best], float(said.found.g[best]), float(said.found.h[best])
-    shift = g / (h + LENGTH_SPREAD**-2) if guess.kind is Kind.LENGTH else 0.0
-    wrong = correction(now, guess, max(1.0 + shift, SHORTEST))
-    others = [correction(now, said.guesses[k]) for k in said.kept[1:]]
-    if wrong.kind is Kind.PHASE:
-        # It may as well be on one of which there is no voltage to compare with.
-        others += [replace(wrong, phases=phase) for phase in now.state.unread]
-    return {
-        "correction": asdict(wrong),
-        "estimate": g / h if h > 0.0 else 0.0,
-        "std": h**-0.5 if h > 0.0 else math.inf,
-        "log_factor": float(said.found.log_factor[best]),
-        "confidence": float(said.confidence[best]),
-        # Swaps build on each other; a place is compared with that in the files.
-        "now": calibrate_tables.present(now.state.tables if wrong.kind is Kind.SWAP else files, wrong),
-        "since": guess.since,
-        "until": guess.until,
-        "alternatives": [calibrate_tables.told(other) for other in others],
-    }
-
-
-def _read(row: dict[str, Any]) -> Correction:
-    return Correction(
-        Kind(row["kind"]),
-        tuple(row["names"]),
-        row["bus"],
-        row["phases"],
-        row["factor"],
-        tuple(row["lines"]),
-    )

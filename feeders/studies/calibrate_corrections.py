@@ -47,7 +47,8 @@ class Correction:
     names
         The customer, both customers of a swap, the meter, or the lines; all customers on a lateral.
     bus, phases
-        Where the customer is.
+        Place of the customer. In an exchange `phases` has one letter for each name and then for each line;
+        otherwise all of them are on the same phases.
     factor
         On the lines' length.
     lines
@@ -61,6 +62,18 @@ class Correction:
     phases: str = ""
     factor: float = 1.0
     lines: tuple[str, ...] = ()
+
+    @property
+    def exchange(self) -> bool:
+        """Exchange of the phases of two customers or laterals: each has a letter of its own."""
+        return self.kind is Kind.PHASE and len(self.phases) > 1
+
+    @property
+    def on(self) -> tuple[dict[str, str], dict[str, str]]:
+        """Phases of each name and of each line, for a correction of phases."""
+        n = len(self.names)
+        each = self.phases if self.exchange else (self.phases,) * (n + len(self.lines))
+        return dict(zip(self.names, each, strict=False)), dict(zip(self.lines, each[n:], strict=True))
 
 
 def apply(tables: FeederTables, wrong: Correction) -> FeederTables:
@@ -80,8 +93,9 @@ def apply(tables: FeederTables, wrong: Correction) -> FeederTables:
         return replace(tables, lines=tuple(rows))
     customers = {row.customer: row for row in tables.customers}
     if wrong.kind is Kind.PHASE:
-        customers |= {name: replace(customers[name], phases=wrong.phases) for name in wrong.names}
-        lines = (_on(row, wrong.phases) if row.line in wrong.lines else row for row in tables.lines)
+        on, lines_on = wrong.on
+        customers |= {name: replace(customers[name], phases=phases) for name, phases in on.items()}
+        lines = (_on(row, lines_on[row.line]) if row.line in lines_on else row for row in tables.lines)
         return replace(tables, lines=tuple(lines), customers=tuple(customers.values()))
     one = customers[wrong.names[0]]
     if wrong.kind is Kind.SWAP:
@@ -131,12 +145,27 @@ def left(earlier: Correction, later: Correction) -> Correction | None:
         Both about one feeder; of a customer's place the later one holds.
     """
     if later.kind is Kind.BUS and set(earlier.names) <= set(later.names) and earlier.lines:
-        return replace(earlier, lines=())  # nobody is left whose readings speak for them
+        # No customer is left on the lateral to confirm the phase of its lines.
+        return _without_lines(earlier)
     if earlier.kind is not later.kind or later.kind not in PLACES:
         return earlier
-    names = tuple(name for name in earlier.names if name not in later.names)
-    lines = tuple(name for name in earlier.lines if name not in later.lines)
-    return replace(earlier, names=names, lines=lines) if names else None
+    on, lines_on = earlier.on
+    on = {name: phases for name, phases in on.items() if name not in later.names}
+    lines_on = {name: phases for name, phases in lines_on.items() if name not in later.lines}
+    return _of_phases(earlier, on, lines_on) if on else None
+
+
+def _without_lines(earlier: Correction) -> Correction:
+    return _of_phases(earlier, earlier.on[0], {})
+
+
+def _of_phases(earlier: Correction, on: dict[str, str], lines_on: dict[str, str]) -> Correction:
+    """The correction of these names and lines alone."""
+    phases = earlier.phases
+    if earlier.exchange:
+        phases = "".join((*on.values(), *lines_on.values()))
+        phases = phases if len(set(phases)) > 1 else phases[:1]
+    return replace(earlier, names=tuple(on), lines=tuple(lines_on), phases=phases)
 
 
 def as_filed(tables: FeederTables, wrong: Correction, bus_of_file: Mapping[str, int]) -> bool:
@@ -157,5 +186,6 @@ def as_filed(tables: FeederTables, wrong: Correction, bus_of_file: Mapping[str, 
     if wrong.kind is not Kind.PHASE:
         return False
     lines = {row.line: row for row in tables.lines}
-    phases = {rows[name].phases for name in wrong.names} | {lines[name].phases for name in wrong.lines}
-    return phases == {wrong.phases}
+    on, lines_on = wrong.on
+    here = all(rows[name].phases == phases for name, phases in on.items())
+    return here and all(lines[name].phases == phases for name, phases in lines_on.items())

@@ -12,7 +12,7 @@ import numpy as np
 from feeders.load import Site, find, from_tables
 from feeders.load_phases import ThreePhaseSite, spanned
 from feeders.studies.bases import line_rows
-from feeders.studies.calibrate_laterals import Lateral, laterals
+from feeders.studies.calibrate_laterals import Lateral, alone, laterals
 from gridsec import phases as three
 from gridsec.arrays import Bools, Floats, Ints, Phasors
 from gridsec.droop import voltage_curve
@@ -70,6 +70,8 @@ class Network:
         What readings see of it.
     laterals
         Its single-phase laterals.
+    parts
+        The same, and single-phase customers at buses of several phases: all whose phase may be wrong.
     """
 
     site: Site | ThreePhaseSite
@@ -79,6 +81,7 @@ class Network:
     place: Ints
     places: Places
     laterals: tuple[Lateral, ...]
+    parts: tuple[Lateral, ...]
 
     @property
     def meter_of(self) -> dict[int, int]:
@@ -139,14 +142,15 @@ def network(tables: FeederTables) -> Network:
     """
     site = _site(tables)
     feeder, rows = _merged(_model(site), tuple((row,) for row in line_rows(site)))
-    single: tuple[Lateral, ...] = ()
+    single, parts = tuple[Lateral, ...](), tuple[Lateral, ...]()
     if isinstance(feeder, ThreePhaseFeeder):
         place, ends = np.argwhere(feeder.phases), _branches(feeder)
         single = laterals(feeder, rows, place)
+        parts = (*single, *alone(feeder, [row.phases for row in tables.customers], place))
     else:
         place = np.column_stack([np.arange(len(feeder.buses)), np.zeros(len(feeder.buses))]).astype(np.intp)
         ends = lines(feeder)[0]
-    return Network(site, feeder, rows, ends, place, _places(site, feeder, place), single)
+    return Network(site, feeder, rows, ends, place, _places(site, feeder, place), single, parts)
 
 
 Model = Feeder | MeshedFeeder | ThreePhaseFeeder

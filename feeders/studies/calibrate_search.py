@@ -26,6 +26,7 @@ from gridsec.studies.calibrate_noise import LoadErrors, Whitening, increments, l
 if TYPE_CHECKING:
     from feeders.schema import FeederTables
     from feeders.studies.calibrate_feeder import Network, Powers
+    from feeders.studies.calibrate_laterals import Lateral
     from feeders.studies.calibrate_readings import Frames
 
 __all__ = ["Guess", "Round", "State", "Verdict", "compare", "concerned", "correction", "prepare"]
@@ -59,13 +60,17 @@ class Guess:
     kind
         What it is.
     subject
-        Customer, customer and customer of a swap, meter, or branch; by index in the present network.
+        Customer, customer and customer of a swap, meter, or branch; by index in the present network. Of an
+        exchange of phases the first part, by index into `Network.parts`.
     other
-        The second customer, the bus of the merged tree, the lateral, or nothing: -1.
+        The second customer, the bus of the merged tree, the lateral, or nothing: -1. Of an exchange the
+        second part.
     phases
-        Phases of the customer.
+        Phases of the customer; of an exchange those of both parts, one letter each.
     lateral
         Whether `other` is a lateral, which is on these phases with all its customers.
+    exchange
+        Two customers or laterals have each other's phase.
     since, until
         When the meter's error is different, Unix s.
     """
@@ -75,6 +80,7 @@ class Guess:
     other: int = -1
     phases: str = ""
     lateral: bool = False
+    exchange: bool = False
     since: float = np.nan
     until: float = np.nan
 
@@ -255,12 +261,17 @@ def compare(
     tell(len(chunks), len(chunks))
     names = ("g", "h", "log_factor")
     g, h, factor = (np.concatenate([np.empty(0), *(getattr(part, n) for part in parts)]) for n in names)
-    kind = np.array([list(Kind).index(guess.kind) for guess in guesses], dtype=np.intp)
+    kind = np.array([_family(guess) for guess in guesses], dtype=np.intp)
     exact = factor.copy()
     for k in _close(now, guesses, factor):
         exact[k] = _exactly(now, frames, guesses[k])
     weighed = weigh(exact, kind, risk)
     return Verdict(guesses, Evidence(g, h, exact), weighed.confidence, weighed.any, weighed.kept)
+
+
+def _family(guess: Guess) -> int:
+    """Group of hypotheses that share one prior weight: exchanges of phases are a group beside single ones."""
+    return len(Kind) if guess.exchange else list(Kind).index(guess.kind)
 
 
 _MOVES: Final = (Kind.BUS, Kind.PHASE, Kind.SWAP)
@@ -292,7 +303,14 @@ def concerned(now: Round, guess: Guess) -> list[int]:
     """
     if guess.lateral:
         return list(map(int, now.net.laterals[guess.other].customers))
+    if guess.exchange:
+        return [int(customer) for part in _sides(now.net, guess) for customer in part.customers]
     return [guess.subject, guess.other] if guess.kind is Kind.SWAP else [guess.subject]
+
+
+def _sides(net: Network, guess: Guess) -> tuple[Lateral, Lateral]:
+    """Both parts of an exchange."""
+    return net.parts[guess.subject], net.parts[guess.other]
 
 
 Chunk = tuple[list[Guess], Callable[[], Floats], float]
@@ -353,7 +371,20 @@ def _phases(net: Network, trusted: list[int], read: Collection[str]) -> list[Gue
             seen = np.intersect1d(net.site.meters[trusted], lateral.customers).tolist()
             others = [phase for phase in lateral.others if phase in read and seen]
             out += [Guess(Kind.PHASE, seen[0], k, phase, lateral=True) for phase in others]
+        out += _exchanges(net, trusted)
     return out
+
+
+def _exchanges(net: Network, trusted: list[int]) -> list[Guess]:
+    """Pairs of single-phase customers, or of laterals, with each other's phase in the files."""
+    read = net.site.meters[trusted]
+    asked = [k for k, part in enumerate(net.parts) if np.isin(part.customers, read).any()]
+    pairs = ((a, b, net.parts[a], net.parts[b]) for a, b in combinations(asked, 2))
+    return [
+        Guess(Kind.PHASE, a, b, other.phase + one.phase, exchange=True)
+        for a, b, one, other in pairs
+        if other.phase in one.others and one.phase in other.others
+    ]
 
 
 def _swaps(net: Network, trusted: list[int]) -> list[Guess]:
@@ -367,8 +398,11 @@ def _moves(now: Round, guesses: list[Guess]) -> Floats:
     out = np.empty((*series.y.shape, len(guesses)))
     for h, guess in enumerate(guesses):
         if guess.lateral:
-            one = net.laterals[guess.other]
-            out[:, :, h] = net.places.rephased(series, one.customers, one.place, one.others[guess.phases])
+            out[:, :, h] = net.places.rephased(series, [net.laterals[guess.other].to(guess.phases)])
+            continue
+        if guess.exchange:
+            both = zip(_sides(net, guess), guess.phases, strict=True)
+            out[:, :, h] = net.places.rephased(series, [part.to(phase) for part, phase in both])
             continue
         if guess.kind is Kind.SWAP:
             W = net.places.weight
@@ -414,11 +448,21 @@ def correction(now: Round, guess: Guess, factor: float = 1.0) -> Correction:
         return Correction(
             guess.kind, tuple(tables.lines[k].line for k in net.lines[guess.subject]), factor=factor
         )
-    if guess.lateral:
-        one = net.laterals[guess.other]
-        customers = tuple(tables.customers[k].customer for k in one.customers.tolist())
-        lines = tuple(tables.lines[k].line for k in one.lines)
-        return Correction(guess.kind, customers, phases=guess.phases, lines=lines)
+    if guess.lateral or guess.exchange:
+        parts = _sides(net, guess) if guess.exchange else (net.laterals[guess.other],)
+        names = [[tables.customers[k].customer for k in part.customers.tolist()] for part in parts]
+        lines = [[tables.lines[k].line for k in part.lines] for part in parts]
+        on = "".join(
+            phase * len(some)
+            for all_ in (names, lines)
+            for some, phase in zip(all_, guess.phases, strict=True)
+        )
+        return Correction(
+            guess.kind,
+            tuple(name for some in names for name in some),
+            phases=on if guess.exchange else guess.phases,
+            lines=tuple(name for some in lines for name in some),
+        )
     name = tables.customers[guess.subject].customer
     if guess.kind is Kind.SWAP:
         return Correction(guess.kind, (name, tables.customers[guess.other].customer))

@@ -180,11 +180,21 @@ def _proposed(wrong: Correction, row: dict[str, Any]) -> str:
         return f"its error is another from {when[0]} to {when[1]} UTC"
     if wrong.kind is Kind.LENGTH:
         return f"{wrong.factor:.3g} times as long"
+    if wrong.exchange:
+        return "phases exchanged"
     return {Kind.BUS: wrong.bus, Kind.PHASE: wrong.phases}.get(wrong.kind, "meters exchanged")
 
 
 def _who(wrong: Correction) -> str:
-    """Whom an error is about; of a lateral its first line, and who is on it."""
+    """Subject of an error; of a lateral its first line and its customers."""
+    if wrong.exchange:
+        on, lines_on = wrong.on
+        parts = []
+        for phase in dict.fromkeys(on.values()):
+            names = _some([name for name, own in on.items() if own == phase])
+            first = next((line for line, own in lines_on.items() if own == phase), "")
+            parts.append(f"{first} with {names}" if first else names)
+        return " and ".join(parts)
     if wrong.lines:
         return f"{wrong.lines[0]} with {_some(wrong.names)}"
     return " and ".join(wrong.names[:2])
@@ -195,6 +205,9 @@ def present(tables: FeederTables, wrong: Correction) -> str:
     rows = {row.customer: row for row in tables.customers}
     if wrong.kind is Kind.BUS:
         return rows[wrong.names[0]].bus
+    if wrong.exchange:
+        first = {phases: name for name, phases in reversed(wrong.on[0].items())}
+        return " and ".join(rows[first[phases]].phases for phases in dict.fromkeys(wrong.on[0].values()))
     if wrong.lines:
         return next(row.phases for row in tables.lines if row.line == wrong.lines[0])
     if wrong.kind is Kind.PHASE:
@@ -209,6 +222,8 @@ def told(wrong: Correction) -> str:
     who = _who(wrong)
     if wrong.kind is Kind.BUS:
         return f"{who} at {wrong.bus}"
+    if wrong.exchange:
+        return f"{who} with exchanged phases"
     if wrong.kind is Kind.PHASE:
         return f"{who} on {wrong.phases}"
     return {Kind.SWAP: f"{who} swapped", Kind.LENGTH: f"length of {who}"}.get(
@@ -227,8 +242,12 @@ def customers(
     others: dict[int, list[tuple[float, str]]] = {}
     for guess, factor in zip(said.guesses, said.found.log_factor, strict=True):
         for customer in concerned(now, guess) if guess.kind in PLACES else ():
-            bus = net.feeder.buses[net.feeder.bus[customer] if guess.lateral else guess.other]
-            place = f"{bus} {guess.phases}" if guess.kind is Kind.PHASE else bus
+            stays = guess.lateral or guess.exchange
+            bus = net.feeder.buses[net.feeder.bus[customer] if stays else guess.other]
+            on = guess.phases
+            if guess.exchange:
+                on = guess.phases[customer not in net.parts[guess.subject].customers]
+            place = f"{bus} {on}" if guess.kind is Kind.PHASE else bus
             others.setdefault(customer, []).append((float(factor), place))
     out = []
     for k, row in enumerate(now.state.tables.customers):

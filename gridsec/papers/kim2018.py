@@ -70,7 +70,9 @@ def _constant_claims(model: System, made: HighGainDesign) -> list[Claim]:
         rounded_up("eps, rest of the threshold", place, 4.74e-4, decay.epsilon, unit=1e-6),
         number("decay rate theta / 8, 1/s", place, 4.0, decay.rate, unit=1.0),
         rounded_up("Delta > Delta_1 + Delta_2, s", place, 8.37, sum(settling(decay, Z_BOUND)), unit=0.01),
-        at_most("theta* of Lemma 1 (theta = 32 is used)", "Lemma 1", THETA, star),
+        at_most(
+            "theta from which on Lemma 1 is proven here (sufficient; 32 is used)", "Lemma 1", THETA, star
+        ),
         at_most("largest entry of z", place, Z_BOUND, size),
         at_most("Lip^(Phi)", place, LIP_PHI, lip_phi().upper),
         number("largest Lip^ of the left inverses", place, LIP_INVERSE, inverse, unit=1.0),

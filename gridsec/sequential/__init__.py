@@ -9,9 +9,10 @@ switching between them. What the readings then deviate from it is explained by l
 way that neighbours share, by meters' errors, and, where these do not suffice, by as few liars as possible.
 """
 
-from gridsec.sequential.commission import Commission, from_arrays, to_arrays
+from gridsec.sequential.commission import Commission, Learning, LearningReason, from_arrays, to_arrays
 from gridsec.sequential.design import SequentialDesign, SequentialOptions, design
 from gridsec.sequential.distrust import Distrust, distrusted, nobody, restore
+from gridsec.sequential.learning import LearningProgress, LearningState, progress
 from gridsec.sequential.loads import LoadDoubt
 from gridsec.sequential.state import SequentialState, init, renew
 from gridsec.sequential.step import step
@@ -19,6 +20,10 @@ from gridsec.sequential.step import step
 __all__ = [
     "Commission",
     "Distrust",
+    "Learning",
+    "LearningProgress",
+    "LearningReason",
+    "LearningState",
     "LoadDoubt",
     "SequentialDesign",
     "SequentialOptions",
@@ -28,6 +33,7 @@ __all__ = [
     "from_arrays",
     "init",
     "nobody",
+    "progress",
     "renew",
     "restore",
     "step",

@@ -177,14 +177,37 @@ def aligned(  # who says what, and how far that may be off
     honest
         How far all else may be off.
     """
-    plant, (at, Q) = design.plant, now.trusting()
+    at, Q = now.trusting()
     v = Q @ design.hangs_on[at] / np.maximum(weight(design, now), np.finfo(np.float64).tiny)
+    error = busbar_errors(design.plant, honest.powers.v0_squared, design.sigmas[0])
+    return np.abs(m[at] @ v) <= room(design, at, v, fixed, honest) + error
+
+
+def room(design: SequentialDesign, at: Ints, v: Floats, fixed: Floats, honest: Honest) -> Floats:
+    """Largest sums ``v^T m`` over honest errors at their ends, without the busbar's meter, (k,), squared pu.
+
+        |2 v^T R| dp + 2 |v^T X| dq + |v|^T (fixed + jitter)
+
+    Parameters
+    ----------
+    design
+        The design.
+    at : (t,)
+        Some meters.
+    v : (t, k)
+        Their weights.
+    fixed : (p,)
+        Largest honest fixed error of each meter, with that of the model, squared pu.
+    honest
+        How far all else may be off.
+    """
+    plant = design.plant
     injected = plant.droop.per_customer(honest.injected, design.customers)
     errors = np.concatenate(honest.powers.errors(plant, injected))
-    room = np.abs(v).T @ (fixed + design.sigmas[0] * np.sqrt(design.white))[at]
+    out = np.abs(v).T @ (fixed + design.sigmas[0] * np.sqrt(design.white))[at]
     for k, one in enumerate(v.T):
-        room[k] += np.abs(design.effects.along(plant.meters[at], one)) @ errors
-    return np.abs(m[at] @ v) <= room + busbar_errors(plant, honest.powers.v0_squared, design.sigmas[0])
+        out[k] += np.abs(design.effects.along(plant.meters[at], one)) @ errors
+    return np.asarray(out)
 
 
 def follow(  # noqa: PLR0917  # what was thought, what it says, and what the others say

@@ -25,6 +25,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from enum import StrEnum
 from functools import cached_property
 from typing import Any
 
@@ -36,6 +37,24 @@ from gridsec.network import one_busbar
 from gridsec.sequential.conditional import invert
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.search import Recent
+
+
+class LearningReason(StrEnum):
+    """Reason why a tick adds nothing to the learning of a meter; the order is that of `Learning.lost_s`."""
+
+    SILENT = "silent"
+    SUSPECTED = "suspected"
+    OTHERS_SUSPECTED = "others-suspected"
+    NO_BUSBAR = "no-busbar"
+    UNREAD_POWERS = "unread-powers"
+    LOAD_BEYOND_DECLARED = "load-beyond-declared"
+    ACTIVE_UNCERTAINTY = "active-uncertainty"
+    REACTIVE_UNCERTAINTY = "reactive-uncertainty"
+
+
+REASONS = tuple(LearningReason)
+COUNTED = -1
+"""In place of an index of `REASONS`: the tick counts."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,24 +105,30 @@ class Learned:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Learning:
-    """What was gathered so far. p meters.
+    """Sums and times of a commissioning. p meters, r reasons.
 
     Attributes
     ----------
     total : (p,)
         Sum of each meter's residuals while it was trusted, squared pu.
     count : (p,)
-        How many they are.
+        Number of these residuals.
     time_s : (p,)
         Time over which they were gathered, s.
     since : (p,)
-        Since when the meter is learned, Unix s; NaN for those that only say what the loads do.
+        Start of the meter's learning, Unix s; NaN for meters that only witness the loads.
+    watched_s : (p,)
+        Time of all ticks since then, s. Pauses of the frames are not in it.
+    lost_s : (r, p)
+        Time of the ticks that brought learning no further, s, by reason in the order of `REASONS`.
     """
 
     total: Floats
     count: Ints
     time_s: Floats
     since: Floats
+    watched_s: Floats
+    lost_s: Floats
 
     @property
     def open(self) -> Bools:
@@ -150,7 +175,14 @@ def begin(which: Bools, t: float) -> Learning:
         Unix time, s.
     """
     p = which.size
-    return Learning(np.zeros(p), np.zeros(p, dtype=np.intp), np.zeros(p), np.where(which, t, np.nan))
+    return Learning(
+        total=np.zeros(p),
+        count=np.zeros(p, dtype=np.intp),
+        time_s=np.zeros(p),
+        since=np.where(which, t, np.nan),
+        watched_s=np.zeros(p),
+        lost_s=np.zeros((len(REASONS), p)),
+    )
 
 
 def fresh(design: SequentialDesign, t: float) -> Commission:
@@ -198,7 +230,7 @@ def renew(design: SequentialDesign, before: Commission, which: Bools, t: float) 
     return Commission(learned, learning)
 
 
-def gather(before: Learning, residual: Floats, use: Bools, h: float) -> Learning:
+def gather(before: Learning, residual: Floats, use: Bools, h: float, why: Ints | None = None) -> Learning:
     """Take one tick in.
 
     Parameters
@@ -211,9 +243,19 @@ def gather(before: Learning, residual: Floats, use: Bools, h: float) -> Learning
         Meters that are trusted and have a reading.
     h
         Time since the last tick, s.
+    why : (p,)
+        Index of `REASONS` where the tick brings learning no further, else `COUNTED`; None: all `COUNTED`.
     """
+    lost_s = before.lost_s
+    if why is not None and any_of(why != COUNTED):
+        lost_s = lost_s + h * np.equal.outer(np.arange(len(REASONS)), why)
     return Learning(
-        before.total + np.where(use, residual, 0.0), before.count + use, before.time_s + h * use, before.since
+        total=before.total + np.where(use, residual, 0.0),
+        count=before.count + use,
+        time_s=before.time_s + h * use,
+        since=before.since,
+        watched_s=before.watched_s + h,
+        lost_s=lost_s,
     )
 
 
@@ -336,11 +378,15 @@ def _share(one: Floats, other: Floats) -> Floats:
     return np.asarray(np.clip(total / (a * b), 0.0, 1.0))
 
 
-_KNOWN, _GATHERED = (tuple(f.name for f in fields(kind)) for kind in (Learned, Learning))
+_KNOWN = tuple(f.name for f in fields(Learned))
+_GATHERED = ("total", "count", "time_s", "since")
+# Texts of earlier versions lack these.
+_WATCHED = "watched_s"
+_LOST = tuple(f"lost_s.{reason}" for reason in REASONS)
 
 
 def to_arrays(commission: Commission) -> dict[str, Floats]:
-    """What has to be kept to go on later, as arrays of p numbers by name.
+    """Persistent form of a commissioning: arrays of p numbers by name.
 
     Parameters
     ----------
@@ -351,7 +397,10 @@ def to_arrays(commission: Commission) -> dict[str, Floats]:
     none = np.zeros(learned.at.size, dtype=np.bool_)
     learning = commission.learning or begin(none, 0.0)
     known = {name: getattr(learned, name) for name in _KNOWN}
-    return known | {name: np.asarray(getattr(learning, name), dtype=np.float64) for name in _GATHERED}
+    gathered = {
+        name: np.asarray(getattr(learning, name), dtype=np.float64) for name in (*_GATHERED, _WATCHED)
+    }
+    return known | gathered | dict(zip(_LOST, learning.lost_s, strict=True))
 
 
 def from_arrays(design: SequentialDesign, arrays: Mapping[str, Floats]) -> Commission:
@@ -374,8 +423,16 @@ def from_arrays(design: SequentialDesign, arrays: Mapping[str, Floats]) -> Commi
     learned = Learned(*(arrays[name] for name in _KNOWN))
     if not any_of(np.isfinite(arrays["since"])):
         return Commission(learned, None)
-    count = arrays["count"].astype(np.intp)
-    return Commission(learned, Learning(arrays["total"], count, arrays["time_s"], arrays["since"]))
+    time_s = arrays["time_s"]
+    learning = Learning(
+        total=arrays["total"],
+        count=arrays["count"].astype(np.intp),
+        time_s=time_s,
+        since=arrays["since"],
+        watched_s=arrays.get(_WATCHED, time_s),
+        lost_s=np.stack([arrays.get(name, np.zeros_like(time_s)) for name in _LOST]),
+    )
+    return Commission(learned, learning)
 
 
 # Numbers may have been rounded on their way.
@@ -384,10 +441,10 @@ _ROUNDED = 1.0 + 1e-9
 
 def _problems(design: SequentialDesign, arrays: Mapping[str, Floats]) -> list[str]:
     """Everything that is wrong with arrays."""
-    p, names = design.allowed.size, {*_KNOWN, *_GATHERED}
-    problems = [f"{name} is missing" for name in sorted(names - arrays.keys())]
-    problems += [f"{name} is not known" for name in sorted(arrays.keys() - names)]
-    shapes = {name: arrays[name].shape for name in sorted(names & arrays.keys())}
+    p, needed, times = design.allowed.size, {*_KNOWN, *_GATHERED}, {_WATCHED, *_LOST}
+    problems = [f"{name} is missing" for name in sorted(needed - arrays.keys())]
+    problems += [f"{name} is not known" for name in sorted(arrays.keys() - needed - times)]
+    shapes = {name: arrays[name].shape for name in sorted((needed | times) & arrays.keys())}
     problems += [
         f"{name} has the shape {shape}, not ({p},)" for name, shape in shapes.items() if shape != (p,)
     ]
@@ -396,8 +453,12 @@ def _problems(design: SequentialDesign, arrays: Mapping[str, Floats]) -> list[st
     widest, at, since = design.allowed * _ROUNDED, arrays["at"], arrays["since"]
     count, time_s = arrays["count"], arrays["time_s"]
     idle = np.isnan(since) & (not design.options.commission_s > 0)
-    # Comparisons with NaN are false: whatever is no number breaks its rule.
+    # Comparisons with NaN are false: NaN breaks every rule.
     rules = {
+        **{
+            f"{name} is not a time": np.isfinite(arrays[name]) & (arrays[name] >= 0)
+            for name in sorted(times & arrays.keys())
+        },
         "bias is beyond the class": np.abs(arrays["bias"]) <= widest,
         "variance is not within that of the class": (arrays["variance"] >= 0)
         & (arrays["variance"] <= design.fixed * _ROUNDED),

@@ -103,7 +103,8 @@ def conclude(
     differs = _differs(design, busbar, estimate)
     said = _unvouched(design, heard.busbar, live, differs, said)
     open_ = _open(design, state, said)
-    decision, cause, reason = _beside_meters(design, inverters, differs, amounts, tick.rivals, open_, said)
+    said = _beside_meters(design, inverters, differs, amounts, tick.rivals, open_, said)
+    decision, cause, reason = _unexplained(tick.seen.misfit, said)
     verdict = Verdict(
         decision,
         cause,
@@ -247,6 +248,23 @@ def _unvouched(
         f"at least {2 * most + 1} are needed to tell {most} manipulated from the others."
     )
     return Decision.UNDECIDED, Cause.TOO_FEW_METERS, sentence
+
+
+def _unexplained(misfit: tuple[bool, ...], said: _Said) -> _Said:
+    """The answer, unless the trusted meters are inconsistent on a scale and no search explains it."""
+    decision, cause, reason = said
+    if not any(misfit):
+        return said
+    if decision is Decision.ATTACKED:
+        return decision, cause, f"{reason} The other meters, taken together, still disagree with the feeder."
+    # Silence hides no evidence.
+    if cause not in (Cause.AGREEMENT, Cause.SILENT_METERS):
+        return said
+    sentence = (
+        "The meters, taken together, disagree with the feeder by more than chance, though none of them does "
+        "by itself."
+    )
+    return Decision.UNDECIDED, Cause.MISFIT, sentence
 
 
 def _open(design: SequentialDesign, state: SequentialState, said: _Said) -> tuple[Explanation, ...]:

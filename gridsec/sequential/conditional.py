@@ -136,6 +136,11 @@ class Fit:
         at = indices(self.trusted)
         return at, self.inverse if len(self.inverse) == at.size else submatrix(self.inverse, at, at)
 
+    @property
+    def count(self) -> int:
+        """Number of trusted meters."""
+        return int(np.count_nonzero(self.trusted))
+
     def total(self) -> float:
         """Sum of what is left open at every bus."""
         if self.left is None:

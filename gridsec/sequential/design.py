@@ -149,10 +149,14 @@ class SequentialDesign:
         Variance of what its meter says from tick to tick, squared pu^2.
     lengths : (s,)
         Ticks of each scale.
+    every : (s,)
+        Ticks from one look at each scale to the next.
     confirmed : (s,)
         Ticks that evidence on each scale must last before anybody is named.
+    tails : (s,)
+        Probability that one test of one look exceeds its limit by chance, for the false-alarm rate asked for.
     sigmas : (s,)
-        Standard deviations beyond which an offset is evidence, for the false-alarm rate asked for.
+        Standard deviations beyond which an offset is evidence: the two-sided Gaussian quantiles of `tails`.
     suspect
         Standard deviations beyond which a search suspects; an accusation costs the square of it.
     white, fixed : (p,)
@@ -200,7 +204,9 @@ class SequentialDesign:
     busbar: float
     flicker: float
     lengths: tuple[int, ...]
+    every: tuple[int, ...]
     confirmed: Ints
+    tails: tuple[float, ...]
     sigmas: tuple[float, ...]
     suspect: float
     white: Floats
@@ -284,7 +290,9 @@ def design(
     fixed = slope**2 * accuracy.class_fraction**2 / 3.0 + 0.5 * rounded**2
     known = prior(plant.feeder, plant.feeder.bus[meters], doubt, busbar=busbar, inverters=injections)
     suspect = -float(ndtri(0.5 * options.suspect / meters.size))
-    sigmas = tuple(_sigmas(options.alarms_per_year, plant, n, step_s, lengths) for n in lengths)
+    every = _every(lengths)
+    tails = tuple(_tail(options.alarms_per_year, plant, n * step_s, len(lengths)) for n in every)
+    sigmas = tuple(-float(ndtri(tail / 2.0)) for tail in tails)
     return SequentialDesign(
         plant=plant,
         names=tuple(plant.feeder.customers[c] for c in meters),
@@ -296,7 +304,9 @@ def design(
         busbar=busbar,
         flicker=slope**2 * (accuracy.busbar_jitter**2 + accuracy.busbar_resolution**2 / 12.0),
         lengths=lengths,
+        every=every,
         confirmed=2 + np.array(lengths) // 6,
+        tails=tails,
         sigmas=sigmas,
         suspect=suspect,
         white=white,
@@ -383,19 +393,27 @@ def _lengths(scales_s: tuple[float, ...], step_s: float) -> tuple[int, ...]:
     return tuple(sorted({max(1, round(scale / step_s)) for scale in scales_s}))
 
 
-# Besides the scales, stuck meters and replays have their share of the false alarms.
+# A long mean hardly changes from tick to tick: every scale but the shortest has this many looks per length.
+_LOOKS = 8
+
+
+def _every(lengths: tuple[int, ...]) -> tuple[int, ...]:
+    """Ticks from one look at each scale to the next; the shortest scale answers at every tick."""
+    return (1, *(max(1, round(length / _LOOKS)) for length in lengths[1:]))
+
+
+# Stuck meters and replays have a share of the false alarms each, as every scale has.
 _REPEATS = 2
 
 
-def _sigmas(rate: float, plant: Plant, length: int, step_s: float, lengths: tuple[int, ...]) -> float:
-    """Two-sided Gaussian limit such that all scales together exceed it `rate` times a year by chance.
+def _tail(rate: float, plant: Plant, look_s: float, scales: int) -> float:
+    """Probability of one test such that the union bound over all tests of a year is `rate`.
 
-    Means over `length` ticks are new once in that time; between, they hardly change. The busbar is judged as
-    the meters are.
+    A look at a scale every `look_s` seconds tests each meter, each phase of the busbar, and the misfit of all
+    trusted meters. Each of the scales and of the two tests of repetition has an equal share of the rate.
     """
-    meters = plant.meters.size + hangs_on(plant.feeder).shape[1]
-    tests = meters * (len(lengths) + _REPEATS) * YEAR_S / (step_s * length)
-    return -float(ndtri(min(rate / tests, 0.5) / 2.0))
+    tests = plant.meters.size + hangs_on(plant.feeder).shape[1] + 1
+    return min(float(rate * look_s / (YEAR_S * tests * (scales + _REPEATS))), 0.5)
 
 
 def _shapes(plant: Plant, effects: Effects, rate: float, step_s: float, lengths: tuple[int, ...]) -> Shapes:

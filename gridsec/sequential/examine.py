@@ -8,14 +8,15 @@ docs/theory-sequential.md, sections 3 to 5.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, all_of, any_of
+from gridsec.arrays import Bools, Floats, all_of, any_of, indices
+from gridsec.frames import busbar_errors
 from gridsec.sequential.bounds import Powers
-from gridsec.sequential.busbar import Doubt, Honest, aligned, opposed, weight
+from gridsec.sequential.busbar import Doubt, Honest, aligned, opposed, room, weight
 from gridsec.sequential.conditional import Fit, Prior, drop, judge
+from gridsec.sequential.consistency import inconsistent
 from gridsec.sequential.decoder import Accused, Evidence
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.explain import Search
@@ -38,6 +39,8 @@ class Examined:
         By scale, as in the state; a view is None where the scale was not looked at.
     found
         The likeliest explanation that a search came to, and the others, by scale.
+    misfit : (s,)
+        Scales whose trusted meters were inconsistent at the last look, after the search.
     busbar
         The phase of the busbar whose meter lies, and the scale that found it: then nothing else counts, and
         the tick has to begin anew without it.
@@ -48,11 +51,10 @@ class Examined:
     wholes: tuple[Fit | None, ...]
     views: tuple[View | None, ...]
     found: dict[int, Found]
+    misfit: tuple[bool, ...]
     busbar: tuple[int, int] | None = None
 
 
-# A long scale hardly changes from tick to tick: it is looked at this many times per length.
-_LOOKS = 8
 # For so many ticks it is asked at each who could be honest, after that once in so many.
 _AGAIN = 8
 
@@ -78,11 +80,12 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats, hon
     after: list[Fit | None] = []
     wholes = list(state.wholes)
     found: dict[int, Found] = {}
+    misfit = list(state.misfit)
     scales = Scales(design, state.doubts, state.window, state.learned, model)
-    for s, length in enumerate(design.lengths):
+    for s, every in enumerate(design.every):
         before = fits[s]
         stale = before is None or (not trust.calm and any_of(before.trusted & ~trust.trusted))
-        if tick % _every(length) and not stale:
+        if tick % every and not stale:
             views.append(None)
             after.append(before)
             continue
@@ -93,19 +96,23 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats, hon
             found[s], trust = _decoded(design, here, now, trust, s)
         else:
             wholes[s] = _whole(wholes[s], before, now, here)
-            over = any_of(view.over & trust.trusted)
-            over = over or _due(design, trust, view, s, tick, searched=bool(found))
-            # Once something is beyond chance, less is suspected too.
-            sigmas = min(design.suspect, design.sigmas[s]) if over else design.sigmas[s]
-            doubt = Doubt(sigmas, model, state.doubts.busbar[s])
-            phases = opposed(design, doubt, now, view.judged)
-            phases = phases if over else _beyond(design, here, now, honest, phases)
+            due = _due(design, trust, view, s, tick, searched=bool(found))
+            alone = due or any_of(view.over & trust.trusted)
+            left = inconsistent(now, view.judged, model, design.tails[s])
+            # A misfit that no search explains is searched again from time to time only.
+            again = left and (not misfit[s] or tick % _AGAIN == 0)
+            over = alone or (again and not _all_alike(design, here, now, view, honest))
+            misfit[s] = left
+            phases = [] if alone else _phases(design, scales, s, now, view, honest)
             if over or phases:
                 search = Search(design, scales, tuple(wholes), trust, s)
+                # Once something is beyond chance, less is suspected too.
+                phases = search.opposed(now, view.judged) if alone else phases
                 outcome, believed = search(now, view) if over else (search.likeliest(now, view), trust)
-                outcome, liar = _without_busbar(search, outcome, now, (doubt, honest.powers), phases)
+                outcome, liar = _without_busbar(search, outcome, now, honest.powers, phases)
                 if liar is not None:
-                    return Examined(state.trust, fits, state.wholes, (None,) * len(fits), {}, (liar, s))
+                    none = (None,) * len(fits)
+                    return Examined(state.trust, fits, state.wholes, none, {}, state.misfit, (liar, s))
                 # Where no meter was beyond chance nobody is suspected for what is said of the busbar.
                 if over:
                     found[s], trust = outcome, believed
@@ -114,14 +121,19 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats, hon
             now = found[s].best.fit
             view = view_of(design, here, found[s].best.judged)
             weight(design, now)
+            misfit[s] = design.decoder is None and inconsistent(now, view.judged, model, design.tails[s])
         if not calm:
-            # A scale that has caught somebody and does not know enough, yet or any more, stands by it.
-            owed = (trust.owed > 0) & (trust.scale == s)
-            stands = np.where(view.enough, view.still, trust.still[s]) | owed
-            trust.bad[s], trust.still[s] = view.over & ~trust.trusted, stands & ~trust.trusted
+            _note(trust, view, s)
         views.append(view)
         after.append(now)
-    return Examined(trust, tuple(after), tuple(wholes), tuple(views), found)
+    return Examined(trust, tuple(after), tuple(wholes), tuple(views), found, tuple(misfit))
+
+
+def _note(trust: Trust, view: View, s: int) -> None:
+    """Write the evidence of a scale; one with too few readings keeps its earlier detection."""
+    owed = (trust.owed > 0) & (trust.scale == s)
+    stands = np.where(view.enough, view.still, trust.still[s]) | owed
+    trust.bad[s], trust.still[s] = view.over & ~trust.trusted, stands & ~trust.trusted
 
 
 # Meters up to which it is kept what all of them said: 4 MB for each scale, and what they rest on.
@@ -147,26 +159,46 @@ def _own(trust: Trust) -> Trust:
     return replace(trust, bad=trust.bad.copy(), still=trust.still.copy())
 
 
-def _beyond(design: SequentialDesign, here: Scale, now: Fit, honest: Honest, phases: list[int]) -> list[int]:
-    """Phases of the busbar where honest errors that are all alike do not explain what the meters say."""
+def _all_alike(design: SequentialDesign, here: Scale, now: Fit, view: View, honest: Honest) -> bool:
+    """Whether honest errors at their ends, all in the direction Q m, explain the misfit ``m^T Q m``."""
+    at = indices(now.trusted)
+    v = view.judged.weights[at, None]
+    error = busbar_errors(design.plant, honest.powers.v0_squared, design.sigmas[0])
+    busbar = np.abs(v.T @ design.hangs_on[at]) @ np.atleast_1d(error)
+    fixed = here.limits.model + here.limits.allowed
+    return bool(view.judged.misfit <= (room(design, at, v, fixed, honest) + busbar)[0])
+
+
+def _phases(  # noqa: PLR0917  # the scale, and what it rests on
+    design: SequentialDesign, scales: Scales, s: int, now: Fit, view: View, honest: Honest
+) -> list[int]:
+    """Phases of the busbar that the meters contradict by more than honest errors that are all alike."""
+    here, doubt = scales[s], Doubt(design.sigmas[s], scales.model, scales.doubts.busbar[s])
+    phases = opposed(design, doubt, now, view.judged)
     if not phases:
         return phases
     could = aligned(design, now, here.m, here.limits.model + here.limits.allowed, honest)
     return [phase for phase in phases if not could[phase]]
 
 
-def _disputed(search: Search, best: Solution, beyond: tuple[Doubt, Powers], phases: list[int]) -> list[int]:
-    """Phases whose busbar those whom an explanation believes contradict too, or where it accuses many."""
+def _disputed(search: Search, best: Solution, powers: Powers, phases: list[int]) -> list[int]:
+    """Phases of which the busbar's meter may be what an explanation accuses other meters for.
+
+    Its trusted meters contradict it too, it accuses many meters of the phase, or, in three phases, a few.
+    """
     if not phases:
         return phases
-    design, here, (doubt, powers) = search.design, search.here, beyond
+    design, here = search.design, search.here
+    doubt = search.doubt
     accused = here.enough & ~best.trusted
     if np.count_nonzero(accused) > design.most:
         return phases
     bent = powers.bent(design.plant, _claimed(search, best))
     left = opposed(design, replace(doubt, model=doubt.model + bent), best.fit, best.judged)
-    many = _MANY * (accused @ design.hangs_on) > here.enough @ design.hangs_on
-    return [phase for phase in phases if phase in left or many[phase]]
+    suspects = accused @ design.hangs_on
+    few = (suspects > 0) & (suspects <= _CLOSE) & (suspects.size > 1)
+    open_ = few | (_MANY * suspects > here.enough @ design.hangs_on)
+    return [phase for phase in phases if phase in left or open_[phase]]
 
 
 def _claimed(search: Search, best: Solution) -> Bools:
@@ -178,12 +210,13 @@ def _claimed(search: Search, best: Solution) -> Bools:
     return out & (search.book.std[: design.customers] > design.options.hidden_power)
 
 
-# More than one in so many must be accused on a phase before its busbar's meter is doubted by that alone.
-_MANY = 3
+# More than one in so many must be accused on a phase before its busbar's meter is doubted by that alone, or
+# no more than this: one wrong busbar meter looks like some wrong meters close to it.
+_MANY, _CLOSE = 3, 8
 
 
 def _without_busbar(
-    search: Search, found: Found, now: Fit, beyond: tuple[Doubt, Powers], phases: list[int]
+    search: Search, found: Found, now: Fit, powers: Powers, phases: list[int]
 ) -> tuple[Found, int | None]:
     """What was found, and the phase of the busbar of which it is far likelier that its meter lies.
 
@@ -191,7 +224,7 @@ def _without_busbar(
     can be told apart where the others do without.
     """
     design, here = search.design, search.scales[search.s]
-    phases = _disputed(search, found.best, beyond, phases)
+    phases = _disputed(search, found.best, powers, phases)
     if not phases:
         return found, None
     each = [search.beside_busbar(now, phase) for phase in phases]
@@ -199,14 +232,20 @@ def _without_busbar(
     suspects = [int(np.count_nonzero(here.enough & ~one.trusted)) for one in (each[best], found.best)]
     if suspects[0] > max(design.most, suspects[1]):
         return found, None
-    worse, like = each[best].cost - found.best.cost, 2.0 * float(np.log(design.options.like))
+    like = 2.0 * float(np.log(design.options.like))
+    lying = replace(each[best], cost=each[best].cost - search.relief(found.best, each[best]))
+    worse = lying.cost - found.best.cost
+    vouching = (here.enough & each[best].trusted) @ design.hangs_on[:, phases[best]]
+    if vouching < design.most:
+        # All meters that speak against it may be manipulated themselves.
+        return replace(found, others=(*found.others, lying)), None
     if worse < -like:
         # A false power may look the same: it need not be as unlikely as to accuse somebody of it.
         power = search.beside_powers(now)
-        if power.cost > each[best].cost + like:
+        if power.cost > lying.cost + like:
             return found, phases[best]
-        return replace(found, others=(*found.others, each[best], power)), None
-    return replace(found, others=(*found.others, each[best])) if worse <= like else found, None
+        return replace(found, others=(*found.others, lying, power)), None
+    return replace(found, others=(*found.others, lying)) if worse <= like else found, None
 
 
 def ended(
@@ -262,17 +301,11 @@ def _due(design: SequentialDesign, trust: Trust, view: View, s: int, tick: int, 
         return False
     since = trust.age + 1 - design.confirmed[trust.scale]
     about = ~trust.trusted & ~trust.named & view.over & (since >= 0)
-    first = (since < max(_every(design.lengths[s]), _AGAIN)) | ~trust.bad[s]
+    first = (since < max(design.every[s], _AGAIN)) | ~trust.bad[s]
     if any_of(about & first) or (tick % _AGAIN == 0 and any_of(about)):
         return True
     last = len(design.lengths) - 1
     return s == last and tick % design.lengths[last] == 0 and not searched
-
-
-@cache
-def _every(length: int) -> int:
-    """Ticks from one look at a scale to the next."""
-    return max(1, round(length / _LOOKS))
 
 
 def _decoded(design: SequentialDesign, here: Scale, now: Fit, trust: Trust, s: int) -> tuple[Found, Trust]:

@@ -7,14 +7,18 @@ docs/theory-sequential.md, sections 3 to 5.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
+from scipy.linalg import lapack
 
-from gridsec.arrays import Bools, Floats, Ints, any_of, indices
+from gridsec.arrays import Bools, Floats, Ints, any_of, indices, submatrix
 from gridsec.network import by_place
 from gridsec.sequential import search
 from gridsec.sequential.blocks import misfit_without, sound, without
+from gridsec.sequential.busbar import Doubt, opposed
 from gridsec.sequential.conditional import Fit, Judged, fit, judge, misfit
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.dictionary import Dictionary
@@ -30,8 +34,8 @@ _FEW = 32
 _CLOSE = 8
 # Correlation from which on two meters are moved by the same loads.
 _TOGETHER = 0.5
-# Groups are believed one after the other at most so many times; a start may accuse this many times the most.
-_TURNS, _MUCH = 6, 1.5
+# Rounds in which groups are believed one after the other.
+_TURNS = 6
 # And so many times that the number of meters to the third, times that, is no more than this: two seconds.
 _EFFORT = 4e9
 # Beside so many sets of liars false powers are looked for where nothing else explains the readings.
@@ -40,6 +44,12 @@ _BESIDE = 3
 _NEAR = 8.0
 # A fit of more meters helps where there are so many times as many wanted as it rests on beside these.
 _PART = 2
+# Neighbourhoods are looked for around this many meters, and have at most this many.
+_SEEDS, _STREET = 32, 64
+# Meters up to which neighbourhoods are looked for: each start takes a matrix of 8 bytes x meters^2, 4 MB.
+_MOST = 724
+# A group of similar size has at most this many times as many members.
+_SIMILAR = 2
 # Standard deviations of chi-square that chance may add; what all of a group may be off by, squared pu.
 _CHANCE, _ANY_LIE = 4.0, 0.2
 
@@ -87,6 +97,7 @@ class Search:
         self.accused = tuple(suspicion for suspicion in trust.accused if suspicion[1] > s)
         self.turned: list[Explanation] = []
         self.covering: dict[int, Fit | None] = {}
+        self.disputed = False
         self.left: dict[tuple[bytes, tuple[int, ...]], list[float]] = {}
 
     def __call__(self, now: Fit, view: View) -> tuple[Found, Trust]:
@@ -135,7 +146,7 @@ class Search:
                 beside = self._descend(self._fit(trusted), self.keep, self.book, fresh=True)
                 found = likelier(found, Found(beside))
         best = found.best
-        for other in self._turned(best):
+        for other in chain(self._turned(best), self._streets(best)):
             free = likelier(free, Found(other))
         if free is not None:
             unknown = any_of(self.owed & self._trusted(free.best))
@@ -143,6 +154,28 @@ class Search:
             first, second = (free, found) if better else (found, free)
             found = Found(first.best, (second.best.bare(), *first.others, *second.others))
         return found
+
+    @property
+    def doubt(self) -> Doubt:
+        """Limits of the busbar's meter on this scale during a search."""
+        return Doubt(self.here.limits.sigmas, self.scales.model, self.scales.doubts.busbar[self.s])
+
+    def opposed(self, now: Fit, judged: Judged) -> list[int]:
+        """Phases of the busbar whose meter the trusted meters contradict, or did before some were suspected.
+
+        Parameters
+        ----------
+        now, judged
+            The trusted meters, and what they say.
+        """
+        doubt = self.doubt
+        out = opposed(self.design, doubt, now, judged)
+        self.disputed = bool(out)
+        # On a balanced feeder all meters speak against a wrong busbar, in a phase only some.
+        if self.design.hangs_on.shape[1] > 1 and any_of(self.here.enough & ~now.trusted & ~self.trust.named):
+            every = self._fit(self.here.enough & ~(self.trust.named & ~now.trusted))
+            out = sorted({*out, *opposed(self.design, doubt, every, judge(every, self.here.m))})
+        return out
 
     def beside_busbar(self, now: Fit, phase: int) -> Explanation:
         """The likeliest explanation in which the busbar's meter lies.
@@ -214,7 +247,9 @@ class Search:
 
     def _believing(self, best: Solution, group: Ints) -> list[Solution]:
         """The nearest explanation in which a group that `best` accuses is honest; none if that is absurd."""
-        here, prior, loose, most = self.here, self.here.prior, best.fit.loose, self.design.most
+        here, prior, loose = self.here, self.here.prior, best.fit.loose
+        # As many meters stay trusted as may be manipulated.
+        most = int(np.count_nonzero(here.enough)) - self.design.most
         if np.count_nonzero(self._contradict(group[group.size // 2], loose)) > most:
             return []
         among = np.zeros_like(best.trusted)
@@ -225,15 +260,57 @@ class Search:
             return []
         judged = judge(fit(prior, here.noise, among, loose), here.m)
         start = among | (best.trusted & (np.abs(judged.offset) <= here.limits.of(judged.std)))
-        if np.count_nonzero(here.enough & ~start) > _MUCH * most:
+        if np.count_nonzero(here.enough & ~start) > most:
             return []
         now = fit(prior, here.noise, start, loose) if loose.shape[1] else self._fit(start)
         other = self._descend(now, np.zeros_like(among), innocent=group, fresh=True)
         return [self._after(best, other)] if self._admissible(other) else []
 
+    def _streets(self, best: Solution) -> Iterator[Solution]:
+        """Explanations that begin by accusing the neighbourhoods that gain most.
+
+        A whole street that is off alike is consistent within itself: dropping any one of its meters gains
+        little, so a descent accuses its honest neighbours. With b = Q m and G = Q of a group,
+        dropping the group gains ``b^T G^-1 b`` at once, which one Cholesky factor tells of all groups of
+        the k meters nearest to a meter.
+        """
+        here, trust = self.here, self.trust
+        # Evidence that lasts long enough by this tick; before that no meter is named.
+        lasting = ~trust.trusted & ~trust.named & (trust.age + 1 >= self.design.confirmed[trust.scale])
+        if here.enough.size > _MOST or not any_of(here.enough & ~best.trusted & (lasting | self.disputed)):
+            return
+        every = self._fit(here.enough)
+        weights, (at, Q) = every.weights(here.m), every.trusting()
+        largest = min(self.design.most, _STREET, at.size - 1)
+        if largest < 1:
+            return
+        b, between = weights[at], here.prior.among(at)
+        std = np.sqrt(np.maximum(between.diagonal(), np.finfo(np.float64).tiny))
+        prices = np.array([search.price(at.size, k) for k in range(1, largest + 1)])
+        groups: list[tuple[float, Ints]] = []
+        for j in np.argsort(-(b * b) / Q.diagonal())[:_SEEDS].tolist():
+            near = np.argsort(-between[j] / std, kind="stable")[:largest]
+            root, failed = lapack.dpotrf(submatrix(Q, near, near), lower=True, clean=True)
+            if failed:
+                continue
+            gain = np.cumsum(lapack.dtrtrs(root, b[near], lower=True)[0] ** 2) - prices
+            k = int(gain.argmax())
+            groups.append((float(gain[k]), at[near[: k + 1]]))
+        del every, Q
+        covered, left = np.zeros_like(here.enough), _BESIDE
+        for gained, group in sorted(groups, key=lambda each: -each[0]):
+            if not left or gained <= 0.0:
+                return
+            if np.count_nonzero(covered[group]) * 2 > group.size:
+                continue
+            covered[group], left = True, left - 1
+            start = here.enough.copy()
+            start[group] = False
+            yield self._descend(self._fit(start), np.zeros_like(start), fresh=True)
+
     def _admissible(self, found: Explanation) -> bool:
-        """Whether no more meters are accused than can be told apart."""
-        return bool(np.count_nonzero(self.here.enough & ~found.trusted) <= self.design.most)
+        """Whether as many meters stay trusted as may be manipulated."""
+        return bool(np.count_nonzero(self.here.enough & found.trusted) >= self.design.most)
 
     def _closer(self, group: Ints, other: Solution) -> Explanation:
         """One that believes the group on less evidence against the rest: what might be the case."""
@@ -291,8 +368,27 @@ class Search:
                 cost = self._beside(best, other, ours, self._misfits(other))
             if other.cost - best.cost <= _NEAR * like:
                 cost = min(cost, self._swapped(best, other))
-            out[who] = replace(other, cost=cost)
+            out[who] = replace(other, cost=cost - self.relief(best, other))
         return tuple(out.values())
+
+    def relief(self, best: Explanation, other: Explanation) -> float:
+        """Part of another explanation's cost that does not count beside the best one.
+
+        The surcharge on accusing more meters than can be told apart keeps the estimate on the side of the
+        majority. It is no evidence against a majority that is manipulated: it does not count against an
+        explanation that accuses a group of similar size.
+        """
+        live = self.here.enough
+        ours, theirs = (int(np.count_nonzero(live & ~each.trusted)) for each in (best, other))
+        fewer, more = sorted((ours + len(best.loosened), theirs + len(other.loosened)))
+        if more > _SIMILAR * fewer:
+            return 0.0
+        size, most = int(np.count_nonzero(live)), self.design.most
+
+        def surcharge(suspects: int) -> float:
+            return search.price(size, suspects, most) - search.price(size, suspects)
+
+        return surcharge(theirs) - surcharge(ours)
 
     def _swapped(self, best: Solution, other: Explanation) -> float:
         """What a rival costs where groups change sides and either group tells one lie; infinite elsewhere.

@@ -114,6 +114,8 @@ class SequentialState:
         What the trusted meters say on each scale; None where no meter can be judged yet.
     wholes : (s,)
         Fits of all that reported, or of more, from when they were trusted; None where none is kept.
+    misfit : (s,)
+        Scales whose trusted meters were inconsistent at the last look, after the search.
     released
         What they say where the powers of the others are not believed; None where all are.
     doubts
@@ -147,6 +149,7 @@ class SequentialState:
     trust: Trust
     fits: tuple[Fit | None, ...]
     wholes: tuple[Fit | None, ...]
+    misfit: tuple[bool, ...]
     released: Released | None
     doubts: Doubts
     learning: Learning | None
@@ -210,6 +213,7 @@ def init(
         ),
         fits=(None,) * s,
         wholes=(None,) * s,
+        misfit=(False,) * s,
         released=None,
         doubts=no_doubts(design),
         learning=known.learning,

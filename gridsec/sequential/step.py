@@ -10,6 +10,7 @@ from gridsec.arrays import Bools, Floats, Ints, all_of, any_of
 from gridsec.frames import NO_VOLTAGE, nothing_new
 from gridsec.network import bus_voltages, by_place, model_error_bound, over_places
 from gridsec.online import Estimate, Explanation, Frame, Verdict
+from gridsec.sequential import learning
 from gridsec.sequential.bounds import Lag, Powers, follow
 from gridsec.sequential.bounds import start as begin
 from gridsec.sequential.busbar import Honest
@@ -131,10 +132,11 @@ def _answer(design: SequentialDesign, look: _Look, frame: Frame) -> tuple[Sequen
         trust=seen.trust,
         fits=seen.fits,
         wholes=seen.wholes,
+        misfit=seen.misfit,
         doubts=look.doubts,
         curves=_curves(design, look, frame, seen),
         kinds=_kinds(design, look, seen, window, v2, own),
-        learning=_gathered(design, look, seen.trust, frame.t - state.t),
+        learning=_gathered(design, look, frame, seen.trust),
     )
     tick = Tick(frame, heard, look.q, look.v2_bus, look.transient, seen, rivals)
     after, estimate, verdict = conclude(design, after, tick)
@@ -289,42 +291,35 @@ def _own(design: SequentialDesign, p: Floats, q: Floats) -> Floats:
     return np.asarray(shapes.active * p[meters] + shapes.reactive * q[meters])
 
 
-def _gathered(design: SequentialDesign, look: _Look, trust: Trust, h: float) -> Learning | None:
-    """What is known so far of the meters' fixed errors."""
-    before = look.state.learning
-    # While more than meters is suspected, what the others read is not their own error.
-    if before is None or not look.state.ticks or trust.accused:
-        return before
-    use = look.heard.live & trust.trusted
-    if look.doubts.priors[0] is not design.prior:
-        use &= _known(design, look.doubts)
+def _gathered(design: SequentialDesign, look: _Look, frame: Frame, trust: Trust) -> Learning | None:
+    """Sums and times of the commissioning after this frame."""
+    state = look.state
+    if state.learning is None or not state.ticks:
+        return state.learning
+    this = learning.Tick(frame, look.heard.live, trust.trusted, bool(trust.accused), look.doubts)
+    use, why = learning.counts(design, state.learning, this)
+    h = frame.t - state.t
     # A pause of the frames is no time in which anything was heard.
-    return gather(before, look.residual, use, h if h <= _PAUSE * design.step_s else design.step_s)
+    return gather(
+        state.learning, look.residual, use, h if h <= _PAUSE * design.step_s else design.step_s, why
+    )
 
 
 def _learned(design: SequentialDesign, state: SequentialState) -> SequentialState:
     """Rely on what was gathered of the meters' fixed errors, once that was for long enough."""
-    trust, learning = state.trust, state.learning
-    if learning is None:
+    trust, gathered = state.trust, state.learning
+    if gathered is None or trust.accused:
         return state
-    ready = ripe(design, learning) & trust.trusted
+    ready = ripe(design, gathered) & trust.trusted
     # Whoever is named has no say; suspects that report may yet turn out to be right.
     if not any_of(ready) or not all_of(trust.trusted | trust.named | (state.window.counts[-1] == 0)):
         return state
-    known = learn(design, state.learned, learning, ready, state.t)
+    known = learn(design, state.learned, gathered, ready, state.t)
     window = shift(state.window, state.learned.bias - known.learned.bias)
     fits = (None,) * len(state.fits)
     return changed(state, learning=known.learning, learned=known.learned, window=window, fits=fits)
 
 
-def _known(design: SequentialDesign, doubts: Doubts) -> Bools:
-    """Where what is not known is about as large as learning supposes, (p,)."""
-    variance, at = doubts.priors[0].variance, design.prior.meters
-    return np.asarray(variance[at] <= _WIDER**2 * design.prior.variance[at])
-
-
-# Voltages known this many times less well than the design supposes say nothing of a meter's own error.
-_WIDER = 2.0
 # Ticks without a frame after which there was a pause.
 _PAUSE = 60.0
 # The model's error is bounded anew every so many ticks, and where powers change a voltage by so many times

@@ -26,7 +26,7 @@ docs/theory-studies.md, Calibration.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -115,31 +115,31 @@ class Places:
                 away += np.outer(power[:, customer], gain)
         return away
 
-    def rephased(self, series: Series, customers: Ints, one: int, other: int) -> Floats:
-        """How the meters' squared voltages change when a single-phase lateral is on another phase, (T, p).
+    def rephased(self, series: Series, parts: Sequence[tuple[Ints, int, int]]) -> Floats:
+        """Change of the meters' squared voltages when parts of one phase are on another phase, (T, p).
 
-        The customers' powers leave the place where the lateral begins and come to another phase of its
-        bus. The drop along the lateral stays, and so do the ratios of its bases.
+        The customers' powers leave the place that feeds a part and come to another phase of its bus. The drop
+        along the part stays, and so do the ratios of its bases. Several parts change together.
 
         Parameters
         ----------
         series
             Voltages and powers.
-        customers
-            All on the lateral.
-        one, other
-            The places above its first line, as it is and on the other phase.
+        parts
+            Of each part all its customers, the place that feeds it, and the place on the other phase.
         """
         W = self.read(self.weight[self.meters])
         shift: Floats = np.zeros_like(series.places)
-        for matrix, power in ((self.active, series.p), (self.reactive, series.q)):
-            shift += np.outer(power[:, customers].sum(axis=1), matrix[:, other] - matrix[:, one])
+        for customers, one, other in parts:
+            for matrix, power in ((self.active, series.p), (self.reactive, series.q)):
+                shift += np.outer(power[:, customers].sum(axis=1), matrix[:, other] - matrix[:, one])
         away = shift @ W.T
-        on = np.flatnonzero(np.isin(self.meters, customers))
-        was = series.places @ W[on].T
-        rise = series.places[:, other] + shift[:, other] - series.places[:, one]
-        base = (self.volt[other] / self.volt[one]) ** 2
-        away[:, on] = base * (was + np.outer(rise, W[on].sum(axis=1))) - was
+        for customers, one, other in parts:
+            on = np.flatnonzero(np.isin(self.meters, customers))
+            was = series.places @ W[on].T
+            rise = series.places[:, other] + shift[:, other] - series.places[:, one]
+            base = (self.volt[other] / self.volt[one]) ** 2
+            away[:, on] = base * (was + np.outer(rise, W[on].sum(axis=1))) - was
         return np.asarray(away)
 
 

@@ -9,10 +9,21 @@ connections of their own which cannot write. Every commit is on the disk when `c
 (`synchronous=FULL`, `synchronous_commit=on`).
 
 All methods block; from asynchronous code, call them in a thread. They are safe to call from any thread.
+A call to PostgreSQL has a time limit. `OutcomeUnknown` is a commit without an answer; `Store.commit` with the
+same key again tells or repeats it. After `WriterLost` a store writes nothing more.
 """
 
 from service.history import HistoryRules
-from service.store.records import Event, Rejected, StoreUnavailable
+from service.store.records import Event, OutcomeUnknown, Rejected, StoreUnavailable, WriterLost
 from service.store.writes import BAD_READINGS_KEPT, Store
 
-__all__ = ["BAD_READINGS_KEPT", "Event", "HistoryRules", "Rejected", "Store", "StoreUnavailable"]
+__all__ = [
+    "BAD_READINGS_KEPT",
+    "Event",
+    "HistoryRules",
+    "OutcomeUnknown",
+    "Rejected",
+    "Store",
+    "StoreUnavailable",
+    "WriterLost",
+]

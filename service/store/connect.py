@@ -5,22 +5,26 @@ from __future__ import annotations
 import fcntl
 import os
 import sqlite3
+import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 from urllib.parse import quote
 
 import sqlalchemy as sa
 from sqlalchemy.dialects import postgresql, sqlite
 
-from service.store.records import StoreUnavailable
+from service.store.records import OutcomeUnknown, StoreUnavailable, WriterLost
+from service.store.schema import WRITER
+
+if TYPE_CHECKING:
+    from service.store.postgresql import WriterSession
 
 WAIT_S = 5.0
-"""How long to wait for a connection or for the writer before us to end, s."""
+"""Wait for a free connection of the readers, s."""
 BUSY_S = 0.5
-"""How long a commit waits for somebody who locks the database; whoever watches must not wait longer, s."""
-_ADVISORY_LOCK = 0x6772_6964_7365_6300
+"""Wait of a commit for another process that locks an SQLite file, s."""
 
 
 class Connections:
@@ -37,6 +41,8 @@ class Connections:
         The address without its password.
     insert
         The family's INSERT, which knows ON CONFLICT.
+    lost
+        Why nothing more may be written, or None.
 
     Raises
     ------
@@ -50,6 +56,9 @@ class Connections:
         self._path: Path | None = None
         self._lock_path: Path | None = None
         self._file: tuple[int, int] | None = None
+        self._session: WriterSession | None = None
+        self._owner = uuid.uuid4().hex
+        self.lost: WriterLost | None = None
         try:
             parsed = sa.make_url(url)
         except sa.exc.ArgumentError as error:
@@ -61,7 +70,9 @@ class Connections:
         self.insert: Any = sqlite.insert if family == "sqlite" else postgresql.insert
         try:
             with self._guard("open"):
-                self._engines = self._open_sqlite(parsed) if family == "sqlite" else _open_postgresql(parsed)
+                self._engines = (
+                    self._open_sqlite(parsed) if family == "sqlite" else self._open_postgresql(parsed)
+                )
         except StoreUnavailable:
             self.close()
             raise
@@ -81,13 +92,114 @@ class Connections:
         Parameters
         ----------
         doing
-            What cannot be done, should it fail.
+            The verb of the message, should it fail.
+
+        Raises
+        ------
+        WriterLost
+            If another process may have written since this one opened the database.
+        OutcomeUnknown
+            If the connection broke during the commit.
+        StoreUnavailable
+            If nothing was written.
         """
-        with self._guard(doing):
-            self._in_place()
+        with self._guard(doing), self._begin(self._check_owner) as connection:
+            yield connection
+
+    @contextmanager
+    def opening(self) -> Iterator[sa.Connection]:
+        """Begin the first transaction of the writer; `own` must be called in it."""
+        with self._guard("open"), self._begin(lambda _: None) as connection:
+            yield connection
+        if self._session is not None:
+            self._session.opened()
+
+    def own(self, connection: sa.Connection) -> None:
+        """Become the one that may write.
+
+        Parameters
+        ----------
+        connection
+            A transaction of the writer.
+        """
+        connection.execute(WRITER.delete())
+        connection.execute(WRITER.insert().values(owner=self._owner, commits=0, checks=0))
+
+    @property
+    def beat_s(self) -> float | None:
+        """Interval at which `beat` is due, s; None if the lock needs no heartbeat."""
+        if self._session is None:
+            return None
+        from service.store.postgresql import BEAT_S
+
+        return BEAT_S
+
+    def beat(self) -> None:
+        """Keep the session that holds the lock, or note its loss."""
+        if self._session is not None and self._session.up:
+            with self.write("keep the session of"):
+                pass
+
+    @contextmanager
+    def _begin(self, check: Callable[[sa.Connection], None]) -> Iterator[sa.Connection]:
+        if self.lost is not None:
+            raise WriterLost(str(self.lost))
+        self._in_place()
+        try:
             self._locked()
-            with self._engines[0].begin() as connection:
+            with self._begun(check) as connection:
                 yield connection
+                try:
+                    connection.commit()
+                except sa.exc.DBAPIError as error:
+                    if not error.connection_invalidated:
+                        raise
+                    self._note(error)
+                    raise OutcomeUnknown(
+                        f"{self.name}: the connection broke during a commit ({_text(error)}); whether it is "
+                        "stored is not known yet"
+                    ) from error
+        except WriterLost as error:
+            self.lost = WriterLost(f"cannot write {self.name}: {error}")
+            raise self.lost from error
+        except sa.exc.DBAPIError as error:
+            self._note(error)
+            raise
+
+    def _note(self, error: sa.exc.DBAPIError) -> None:
+        if self._session is not None:
+            self._session.note(error)
+
+    def _begun(self, check: Callable[[sa.Connection], None], *, again: bool = True) -> sa.Connection:
+        """Return a connection in a transaction; once more if it turns out to be closed."""
+        connection = self._engines[0].connect()
+        try:
+            connection.begin()
+            check(connection)
+        except sa.exc.DBAPIError as error:
+            connection.close()
+            self._note(error)
+            if not (again and self._closed_before(error)):
+                raise
+        except BaseException:
+            connection.close()
+            raise
+        else:
+            return connection
+        return self._begun(check, again=False)
+
+    @staticmethod
+    def _closed_before(error: sa.exc.DBAPIError) -> bool:
+        """Whether a call failed at once, because its connection had been closed."""
+        if not error.connection_invalidated:
+            return False
+        from service.store.postgresql import NoAnswer
+
+        return not isinstance(error.orig, NoAnswer)
+
+    def _check_owner(self, connection: sa.Connection) -> None:
+        if connection.scalar(sa.select(WRITER.c.owner)) != self._owner:
+            raise WriterLost("another process has opened it to write since")
 
     @contextmanager
     def read(self) -> Iterator[sa.Connection]:
@@ -112,16 +224,14 @@ class Connections:
             return
         held = os.fstat(self._lock_file.fileno())
         if _place(self._lock_path) != (held.st_dev, held.st_ino):
-            raise OSError(f"{self._lock_path} has been removed or replaced, and others may write; restart")
+            raise WriterLost(f"{self._lock_path} has been removed or replaced, and others may write")
 
     @contextmanager
     def _guard(self, doing: str) -> Iterator[None]:
         try:
             yield
         except (sa.exc.SQLAlchemyError, sqlite3.Error, OSError) as error:
-            cause = getattr(error, "orig", None) or error
-            text = " ".join(str(cause).split()) or type(cause).__name__
-            raise StoreUnavailable(f"cannot {doing} {self.name}: {text}") from error
+            raise StoreUnavailable(f"cannot {doing} {self.name}: {_text(error)}") from error
 
     def _open_sqlite(self, url: sa.URL) -> tuple[sa.Engine, sa.Engine]:
         if not url.database or url.database == ":memory:":
@@ -162,6 +272,12 @@ class Connections:
         )
         return writer, reader
 
+    def _open_postgresql(self, url: sa.URL) -> tuple[sa.Engine, sa.Engine]:
+        from service.store.postgresql import WriterSession, engines
+
+        self._session = WriterSession()
+        return engines(url, self._session)
+
 
 def _place(path: Path) -> tuple[int, int] | None:
     try:
@@ -171,31 +287,7 @@ def _place(path: Path) -> tuple[int, int] | None:
     return found.st_dev, found.st_ino
 
 
-def _open_postgresql(url: sa.URL) -> tuple[sa.Engine, sa.Engine]:
-    if url.get_driver_name() != "psycopg":
-        url = url.set(drivername="postgresql+psycopg")
-    # A server that has vanished from the network must not hold us for as long as TCP would.
-    wait = {"connect_timeout": int(WAIT_S), "tcp_user_timeout": int(WAIT_S * 1e3)}
-    writer = sa.create_engine(
-        url,
-        pool_size=1,
-        max_overflow=0,
-        pool_pre_ping=True,
-        connect_args={**wait, "options": f"-c synchronous_commit=on -c lock_timeout={int(WAIT_S * 1e3)}"},
-    )
-
-    def lock(connection: Any, _record: object) -> None:
-        # Held for as long as the connection lives: the one writer.
-        with connection.cursor() as cursor:
-            cursor.execute("SELECT pg_advisory_lock(%s)", (_ADVISORY_LOCK,))
-        connection.commit()
-
-    sa.event.listen(writer, "connect", lock)
-    reader = sa.create_engine(
-        url,
-        pool_size=4,
-        pool_timeout=WAIT_S,
-        pool_pre_ping=True,
-        connect_args={**wait, "options": "-c default_transaction_read_only=on"},
-    )
-    return writer, reader
+def _text(error: BaseException) -> str:
+    """Return the words of the database in one line."""
+    cause = getattr(error, "orig", None) or error
+    return " ".join(str(cause).split()) or type(cause).__name__

@@ -12,6 +12,14 @@ class StoreUnavailable(GridsecError):
     """The database cannot be opened, read or written; the message says which one and why."""
 
 
+class OutcomeUnknown(StoreUnavailable):
+    """The connection broke while a transaction was committed: it is stored as a whole, or not at all."""
+
+
+class WriterLost(StoreUnavailable):
+    """The lock of the one writer is lost: another process may have written, and this one must end."""
+
+
 @dataclass(frozen=True, slots=True)
 class Event:
     """One stored transition. `seq` rises by the order of commits and is never used twice."""

@@ -107,6 +107,16 @@ COMMISSION_EVENT = sa.Table(
     sqlite_autoincrement=True,
 )
 
+WRITER = sa.Table(
+    "writer",
+    META,
+    # Which opened store may write; the key of its last commit; its checks.
+    sa.Column("owner", sa.String(32), nullable=False),
+    sa.Column("commits", sa.BigInteger, nullable=False),
+    sa.Column("checks", sa.BigInteger, nullable=False),
+)
+"""One row. A store whose `owner` has been replaced writes nothing more."""
+
 
 def _add_commissioning(connection: sa.Connection) -> None:
     for table in (COMMISSION, COMMISSION_EVENT):
@@ -139,7 +149,16 @@ def _add_digest(connection: sa.Connection) -> None:
     connection.exec_driver_sql("CREATE UNIQUE INDEX history_layout_by_digest ON history_layout (digest)")
 
 
-MIGRATIONS: tuple[Callable[[sa.Connection], None], ...] = (_add_commissioning, _add_distrust, _add_digest)
+def _add_writer(connection: sa.Connection) -> None:
+    WRITER.create(connection)
+
+
+MIGRATIONS: tuple[Callable[[sa.Connection], None], ...] = (
+    _add_commissioning,
+    _add_distrust,
+    _add_digest,
+    _add_writer,
+)
 """Step k leads from schema version k + 1 to k + 2. A new database starts at the newest version."""
 
 

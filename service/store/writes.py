@@ -11,14 +11,14 @@ from typing import Any
 import sqlalchemy as sa
 import structlog
 
-from service.alarms import AlarmUnknown, Transition, acknowledged, to_json
+from service.alarms import Transition, to_json
 from service.commissioning import Happened
 from service.history import HistoryRules, Mark, mark, pack, rows, worth_keeping
 from service.kept import Kept, Matter
 from service.report import FeederReport
 from service.store.connect import Connections
 from service.store.reads import Reader
-from service.store.records import Rejected, StoreUnavailable
+from service.store.records import Rejected, StoreUnavailable, WriterLost
 from service.store.schema import (
     ALARM,
     BAD,
@@ -30,7 +30,7 @@ from service.store.schema import (
     HISTORY,
     LAYOUT,
     OUTBOX,
-    VERSION,
+    WRITER,
     digest,
     migrate,
 )
@@ -38,6 +38,10 @@ from service.store.schema import (
 BAD_READINGS_KEPT = 1000
 _PAYLOAD_KEPT = 256
 _PRUNE_EVERY = 500
+_PRUNED_AT_ONCE = 5000
+"""Rows of the history that one transaction forgets at most: ten times those that come until the next."""
+ALONE_S = 5.0
+"""Wait of a write for the one before it, s."""
 _STEADY_S = 86_400.0
 """Nothing is forgotten before a feeder has reported for so long."""
 _log = structlog.get_logger("gridsec.store")
@@ -67,14 +71,20 @@ class Store(Reader):
         self._lock = threading.RLock()
         self._marks: dict[str, Mark] = {}
         self._since_prune: dict[str, int] = {}
+        self._closed = threading.Event()
         try:
-            with self._connections.write("open") as connection:
+            with self._connections.opening() as connection:
                 migrate(connection, self.name)
+                self._connections.own(connection)
                 newest = connection.scalar(sa.select(sa.func.max(EVENT.c.seq)))
         except BaseException:
             self._connections.close()
             raise
         self._last_event = int(newest or 0)
+        if (beat_s := self._connections.beat_s) is not None:
+            threading.Thread(
+                target=self._beat, args=(beat_s,), name="gridsec-store-beat", daemon=True
+            ).start()
 
     def __enter__(self) -> Store:
         """Return itself."""
@@ -86,8 +96,30 @@ class Store(Reader):
 
     def close(self) -> None:
         """Let go of the database. Closing twice is fine."""
-        with self._lock:
+        self._closed.set()
+        alone = self._lock.acquire(timeout=ALONE_S)
+        try:
             self._connections.close()
+        finally:
+            if alone:
+                self._lock.release()
+
+    @property
+    def lost(self) -> WriterLost | None:
+        """Why this store writes nothing more, or None; costs nothing."""
+        return self._connections.lost
+
+    def _beat(self, every_s: float) -> None:
+        """Keep the writer's session. A call that is under way keeps it, too."""
+        while not self._closed.wait(every_s):
+            if self._lock.acquire(blocking=False):
+                try:
+                    if not self._closed.is_set():
+                        self._connections.beat()
+                except StoreUnavailable as error:
+                    _log.warning("the writer's session is broken", problem=str(error))
+                finally:
+                    self._lock.release()
 
     @property
     def last_event(self) -> int:
@@ -95,8 +127,20 @@ class Store(Reader):
         return self._last_event
 
     @contextmanager
+    def _alone(self) -> Iterator[None]:
+        """Wait for the write before, within a time limit."""
+        if not self._lock.acquire(timeout=ALONE_S):
+            raise StoreUnavailable(
+                f"cannot write {self.name}: the write before has not ended within {ALONE_S:g} s"
+            )
+        try:
+            yield
+        finally:
+            self._lock.release()
+
+    @contextmanager
     def _write(self) -> Iterator[sa.Connection]:
-        with self._connections.write() as connection:
+        with self._alone(), self._connections.write() as connection:
             yield connection
 
     def commit(
@@ -108,6 +152,8 @@ class Store(Reader):
         kept: Iterable[Kept] = (),
         happened: Iterable[Happened] = (),
         without: str | None = None,
+        put: tuple[str, Mapping[str, Any]] | None = None,
+        key: int | None = None,
     ) -> tuple[int, ...]:
         """Store what a tick brought, in one transaction; it is on the disk when this returns.
 
@@ -125,6 +171,11 @@ class Store(Reader):
             former.
         without
             Forget the tables of this feeder, and what was learned and believed of its meters.
+        put
+            A feeder and the JSON of the columns of its files, in place of those it had.
+        key
+            A positive number of this commit, different from that of the commit before. After
+            `OutcomeUnknown` the same call with the same key stores it, or tells that it is stored.
 
         Returns
         -------
@@ -133,60 +184,39 @@ class Store(Reader):
 
         Raises
         ------
+        OutcomeUnknown
+            If the connection broke during the commit.
         StoreUnavailable
             If nothing was stored.
         """
         transitions, rejected = tuple(transitions), tuple(rejected)
         kept, happened = tuple(kept), tuple(happened)
-        with self._lock:
+        with self._alone():
             marks = dict(self._marks)
             worthy = [report for report in reports if self._worth(marks, report)]
-            if not (transitions or worthy or rejected or kept or happened or without):
+            if not (transitions or worthy or rejected or kept or happened or without or put):
                 return ()
-            with self._write() as connection:
-                numbers = tuple(self._put_transition(connection, item) for item in transitions)
-                for report in worthy:
-                    self._put_history(connection, report)
-                if rejected:
-                    _put_rejected(connection, rejected)
-                for item in kept:
-                    self._put_kept(connection, item)
-                if happened:
-                    connection.execute(COMMISSION_EVENT.insert(), [_happened(item) for item in happened])
-                if without is not None:
-                    connection.execute(FEEDER.delete().where(FEEDER.c.name == without))
-                    for table in _KEPT.values():
-                        connection.execute(table.delete().where(table.c.feeder == without))
+            with self._connections.write() as connection:
+                if key is not None and _stored_before(connection, key):
+                    newer = sa.select(EVENT.c.seq).where(EVENT.c.seq > self._last_event)
+                    numbers = tuple(connection.scalars(newer.order_by(EVENT.c.seq)))
+                else:
+                    numbers = tuple(self._put_transition(connection, item) for item in transitions)
+                    for report in worthy:
+                        self._put_history(connection, report)
+                    if rejected:
+                        _put_rejected(connection, rejected)
+                    for item in kept:
+                        self._put_kept(connection, item)
+                    if happened:
+                        connection.execute(COMMISSION_EVENT.insert(), [_happened(item) for item in happened])
+                    if without is not None:
+                        _forget_feeder(connection, without)
+                    if put is not None:
+                        self._put_feeder(connection, *put)
             self._marks = marks
             self._last_event = max((self._last_event, *numbers))
             return numbers
-
-    def acknowledge(
-        self, alarm_id: str, who: str, comment: str, t: float, *, count: int | None = None
-    ) -> Transition:
-        """Answer an alarm that no book holds any more.
-
-        For an alarm of a running book use `alarms.acknowledge` and `commit`, or the book will not know.
-
-        Parameters
-        ----------
-        alarm_id, who, comment, t
-            Which alarm, who answers it, with what words, and when (Unix s).
-        count
-            Which occurrence; None: whichever it is.
-
-        Raises
-        ------
-        AlarmUnknown, RaisedAgain, AlreadyAcknowledged
-            If there is no such alarm, it has come back since, or somebody was faster.
-        """
-        with self._lock:
-            alarm = self.alarm(alarm_id)
-            if alarm is None:
-                raise AlarmUnknown(alarm_id)
-            transition = acknowledged(alarm, who, comment, t, count=count)
-            self.commit((transition,))
-            return transition
 
     def outbox_done(self, numbers: Iterable[int]) -> None:
         """Forget outbox entries that have been published.
@@ -198,45 +228,19 @@ class Store(Reader):
         """
         rows = [{"number": number} for number in numbers]
         if rows:
-            with self._lock, self._write() as connection:
+            with self._write() as connection:
                 connection.execute(OUTBOX.delete().where(OUTBOX.c.seq == sa.bindparam("number")), rows)
 
-    def put_feeder(self, name: str, tables: Mapping[str, Any]) -> None:
-        """Keep the tables of a feeder, in place of those it had.
-
-        Parameters
-        ----------
-        name, tables
-            The feeder, and JSON of the columns of its files.
-        """
-        row = {"name": name, "tables": json.dumps(tables, allow_nan=False)}
-        statement = self._connections.insert(FEEDER).values(row)
-        with self._lock, self._write() as connection:
-            connection.execute(statement.on_conflict_do_update(index_elements=["name"], set_=row))
-
-    def check(self, *, wait: bool = True) -> None:
+    def check(self) -> None:
         """Write something and see.
-
-        Parameters
-        ----------
-        wait
-            Wait for whoever is writing at the moment. Without that, somebody who is writing is as good as a
-            check of our own, and however many ask, none of them holds up a commit.
 
         Raises
         ------
         StoreUnavailable
             If the database cannot be written.
         """
-        if not self._lock.acquire(blocking=wait):
-            return
-        try:
-            with self._write() as connection:
-                # SQLite writes nothing where nothing changes.
-                for change in (1, -1):
-                    connection.execute(VERSION.update().values(version=VERSION.c.version + change))
-        finally:
-            self._lock.release()
+        with self._write() as connection:
+            connection.execute(WRITER.update().values(checks=WRITER.c.checks + 1))
 
     def writable(self) -> bool:
         """Whether the database can be written now; `check` says why not."""
@@ -275,6 +279,11 @@ class Store(Reader):
         number = int(connection.execute(EVENT.insert().values(event).returning(EVENT.c.seq)).scalar_one())
         connection.execute(OUTBOX.insert().values(seq=number))
         return number
+
+    def _put_feeder(self, connection: sa.Connection, name: str, tables: Mapping[str, Any]) -> None:
+        row = {"name": name, "tables": json.dumps(tables, allow_nan=False)}
+        statement = self._connections.insert(FEEDER).values(row)
+        connection.execute(statement.on_conflict_do_update(index_elements=["name"], set_=row))
 
     def _put_kept(self, connection: sa.Connection, kept: Kept) -> None:
         row = {"feeder": kept.feeder, "t": kept.t, "data": kept.text}
@@ -317,7 +326,9 @@ class Store(Reader):
         if before is not None:
             # Of whom nothing has come since the start is watched no more; his time goes on with ours.
             whose |= h.feeder.not_in([*self._marks, report.feeder])
-        connection.execute(HISTORY.delete().where(whose, h.t < report.t - keep))
+        # At most so much as fits well within the time limit of a call.
+        oldest = sa.select(h.feeder, h.t).where(whose, h.t < report.t - keep).limit(_PRUNED_AT_ONCE)
+        connection.execute(HISTORY.delete().where(sa.tuple_(h.feeder, h.t).in_(oldest)))
 
     def _layout(self, connection: sa.Connection, report: FeederReport) -> int:
         meters = json.dumps([meter.meter for meter in rows(report)])
@@ -326,6 +337,18 @@ class Store(Reader):
         if known is None:
             known = connection.execute(LAYOUT.insert().values(row).returning(LAYOUT.c.id)).scalar_one()
         return int(known)
+
+
+def _stored_before(connection: sa.Connection, key: int) -> bool:
+    """Whether the last commit had this key; the transaction has it from here on."""
+    changed = connection.execute(WRITER.update().values(commits=key).where(WRITER.c.commits != key))
+    return changed.rowcount == 0
+
+
+def _forget_feeder(connection: sa.Connection, name: str) -> None:
+    connection.execute(FEEDER.delete().where(FEEDER.c.name == name))
+    for table in _KEPT.values():
+        connection.execute(table.delete().where(table.c.feeder == name))
 
 
 def _happened(item: Happened) -> dict[str, Any]:

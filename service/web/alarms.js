@@ -9,10 +9,19 @@ const KIND = {
   "voltage-limit": "Voltage limit",
   "data-loss": "Data loss",
   undecided: "Undecided",
+  "learning-stalled": "Learning stalled",
 };
+const LISTED = 5; // Meters of one alarm that its text names.
 const PAGE = 50;
 const EVERY_MS = 5000;
 const SOON_MS = 200;
+
+// Meters of stalled learning when the alarm was raised.
+function stalled({ learning = [] }) {
+  if (!learning.length) return "";
+  const more = learning.length > LISTED ? ` and ${learning.length - LISTED} more` : "";
+  return `. Meters: ${learning.slice(0, LISTED).map((m) => m.meter).join(", ")}${more}`;
+}
 
 export class Alarms {
   constructor({ onPick, onLink }) {
@@ -184,7 +193,7 @@ export class Alarms {
     const e = alarm.evidence;
     const numbers = isKnown(e.v_volt_reported) && alarm.kind === "meter-manipulated"
       ? `${volt(e.v_volt_reported)} reported, ${volt(e.v_volt_estimated)} reconstructed (${signed(e.v_volt_reported - e.v_volt_estimated)} V${e.kind ? `, ${e.kind}` : ""})`
-      : alarm.reason;
+      : `${alarm.reason}${stalled(e)}`;
     const subject = alarm.customer ?? alarm.meter;
     const where = subject ? `${subject} · ${alarm.feeder}` : alarm.feeder;
     const since = alarm.state === "cleared"

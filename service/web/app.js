@@ -132,7 +132,10 @@ function take(report) {
 }
 
 const point = (t, m) => ({
-  t, reported: m.v_volt_reported, estimated: m.v_volt_estimated, half: isKnown(m.v_volt_std) ? 3 * m.v_volt_std : null,
+  t,
+  reported: m.v_volt_reported,
+  estimated: m.model_only ? null : m.v_volt_estimated,
+  half: !m.model_only && isKnown(m.v_volt_std) ? 3 * m.v_volt_std : null,
 });
 
 // --------------------------------------------------------------- the verdict
@@ -167,7 +170,7 @@ function verdict() {
     })),
     ...report.silent.map((s) => chip(s.meter, "silent", `${s.meter} silent ${isKnown(s.seconds) ? duration(s.seconds) : ""}`)));
   const several = diagram.level === null;
-  const real = report.meters.map((m) => (several ? m.v2_pu_estimated : m.v_volt_estimated)).filter(isKnown);
+  const real = report.meters.filter((m) => !m.model_only).map((m) => (several ? m.v2_pu_estimated : m.v_volt_estimated)).filter(isKnown);
   const [low, high] = [Math.min(...real), Math.max(...real)].map((v) => (several ? Math.sqrt(v).toFixed(3) : bare(v)));
   const range = real.length ? `${low} – ${high} ${several ? "pu" : "V"}` : "–";
   const fact = (name, value) => el("div", {}, el("dt", { text: name }), el("dd", { text: value }));
@@ -181,11 +184,16 @@ function verdict() {
 
 // ------------------------------------------------- can it still be believed?
 
+// Since when no value rests on a reading.
+function unmeasured(report) {
+  return isKnown(report.t_measured) ? `no data since ${clock(report.t_measured)}` : "no data yet";
+}
+
 function fresh() {
   const age = page.heard === null ? null : (performance.now() - page.heard) / 1000;
   const waiting = page.report === null;
   const stale = age !== null && age > page.feeder.patience_s;
-  const state = !page.linked ? "lost" : stale ? "stale" : page.refused ? "refused" : waiting ? "connecting" : "live";
+  const state = !page.linked ? "lost" : stale ? "stale" : page.refused ? "refused" : waiting ? "connecting" : page.report.model_only ? "nodata" : "live";
   const shown = state === "live" && !page.alarmsLinked ? "alarms" : state;
   const words = {
     live: "live",
@@ -194,6 +202,7 @@ function fresh() {
     alarms: "connection lost for alarms",
     lost: age === null ? "connection lost" : `connection lost, data ${duration(age)} old`,
     stale: `data stale, ${duration(age ?? 0)} old`,
+    nodata: waiting ? "" : unmeasured(page.report),
   };
   byId("link").dataset.state = shown;
   byId("link").lastElementChild.textContent = words[shown];
@@ -201,14 +210,21 @@ function fresh() {
   byId("main").dataset.alarms = page.alarmsLinked && state !== "lost" && state !== "stale" ? "yes" : "no";
   const believable = state === "live";
   byId("main").dataset.fresh = believable ? "yes" : "no";
-  if (!believable && !waiting) {
+  if (state === "nodata") {
+    // The model goes on without readings; its voltages must not look like measured ones.
+    byId("decision").textContent = "NO DATA";
+    byId("verdict").dataset.verdict = "none";
+    byId("sign").setAttribute("d", SIGNS.none);
+    byId("reason").textContent = `${words.nodata.replace("n", "N")}. Voltages shown are those of the model alone. ${page.report.reason}`;
+    document.title = `NO DATA – ${page.feeder.title || page.feeder.name} – gridsec`;
+  } else if (!believable && !waiting) {
     // An old answer must not look like an answer.
     byId("decision").textContent = "NO LIVE DATA";
     byId("verdict").dataset.verdict = "none";
     byId("sign").setAttribute("d", SIGNS.none);
     byId("reason").textContent = `Nothing new for ${duration(age)}. Last verdict, at ${clock(page.report.t)}: ${page.report.verdict}.`;
     document.title = `NO LIVE DATA – ${page.feeder.title || page.feeder.name} – gridsec`;
-  } else if (byId("decision").textContent === "NO LIVE DATA") {
+  } else if (!waiting && byId("decision").textContent.startsWith("NO ")) {
     verdict();
   }
 }
@@ -247,7 +263,8 @@ function detail() {
   const mine = (item) => item.customer === customer.customer;
   const known = page.report.customers?.find(mine);
   const inverter = page.report.inverters?.find(mine);
-  const now = { meter, inverter, v: diagram.voltAt(customer), std: known?.v_volt_std ?? meter?.v_volt_std };
+  const alone = diagram.alone(customer);
+  const now = { meter, inverter, alone, v: diagram.voltAt(customer), std: known?.v_volt_std ?? meter?.v_volt_std };
   const own = commissioning.of(customer.meter);
   byId("replaced").hidden = own === null;
   showDetail(page.feeder, customer, { ...now, own, report: page.report }, page.past.get(customer.meter) ?? []);
@@ -261,7 +278,7 @@ function table() {
   const customer = new Map(page.feeder.layout.customers.map((c) => [c.meter, c.customer]));
   const ratio = (m) => m.score / m.threshold;
   const rank = (m) => (m.suspect ? 1e9 : 0) + (m.seen ? ratio(m) || 0 : 1e6);
-  const busbar = page.report.busbar?.judged ? [page.report.busbar] : [];
+  const busbar = page.report.busbar?.judged || page.report.busbar?.suspect ? [page.report.busbar] : [];
   const rows = [...page.report.meters, ...busbar].sort((a, b) => rank(b) - rank(a)).map((m) => {
     const now = status(m, limits, page.report);
     return el("tr", { "data-status": now.key },
@@ -269,8 +286,8 @@ function table() {
         ? el("button", { type: "button", class: "plain", text: m.meter, on: { click: () => select(customer.get(m.meter)) } })
         : el("span", { text: m.meter })),
       el("td", { class: "num", text: bare(m.v_volt_reported) }),
-      el("td", { class: "num", text: bare(m.v_volt_estimated) }),
-      el("td", { class: "num", text: signed(isKnown(m.v_volt_reported) && isKnown(m.v_volt_estimated) ? m.v_volt_reported - m.v_volt_estimated : null) }),
+      el("td", { class: "num", text: m.model_only && isKnown(m.v_volt_estimated) ? `model ${bare(m.v_volt_estimated)}` : bare(m.v_volt_estimated) }),
+      el("td", { class: "num", text: signed(!m.model_only && isKnown(m.v_volt_reported) && isKnown(m.v_volt_estimated) ? m.v_volt_reported - m.v_volt_estimated : null) }),
       el("td", { class: "num", text: bare(isKnown(m.score) ? ratio(m) : null, 2) }),
       el("td", {}, el("span", { class: "state", "data-status": now.key, text: now.text })));
   });

@@ -4,6 +4,16 @@ import { byId, getJson, isKnown, signed } from "./dom.js";
 
 const API = "/api/v1/feeders";
 const EVERY_MS = 60000;
+const REASON = {
+  silent: "no readings",
+  suspected: "meter suspected",
+  "others-suspected": "others suspected",
+  "no-busbar": "no busbar voltage",
+  "unread-powers": "powers not read",
+  "load-beyond-declared": "load beyond declared",
+  "active-uncertainty": "active power uncertain",
+  "reactive-uncertainty": "reactive power uncertain",
+};
 
 function hours(seconds) {
   const h = seconds / 3600;
@@ -11,6 +21,19 @@ function hours(seconds) {
 }
 
 const day = (t) => new Date(t * 1000).toLocaleDateString();
+
+const words = (reason) => REASON[reason] ?? reason;
+
+// Sentence on the meters that are behind schedule, with their number for each reason, the most frequent first.
+function delays(meters) {
+  const late = meters.filter((m) => m.learning_state === "stalled" || m.learning_reason);
+  if (!late.length) return "";
+  const count = new Map();
+  for (const m of late) count.set(m.learning_reason, (count.get(m.learning_reason) ?? 0) + 1);
+  const why = [...count].sort(([, a], [, b]) => b - a).map(([reason, n]) => `${reason ? words(reason) : "reason unknown"} (${n})`);
+  const stalled = late.filter((m) => m.learning_state === "stalled").length;
+  return ` Delayed: ${late.length}${stalled ? `, stalled: ${stalled}` : ""}. Reasons: ${why.join(", ")}.`;
+}
 
 export class Commissioning {
   constructor({ onChange }) {
@@ -51,7 +74,7 @@ export class Commissioning {
     const open = k.meters.filter((m) => m.state === "learning").length;
     const who = open === k.meters.length ? "meters" : `${open} of ${k.meters.length} meters`;
     const held = k.held ? " Waiting until no meter is suspected." : "";
-    return `Learning ${who}, ${hours(k.gathered_s)} of ${hours(k.needed_s)} h.${held}${note}`;
+    return `Learning ${who}, ${hours(k.gathered_s)} of ${hours(k.needed_s)} h.${delays(k.meters)}${held}${note}`;
   }
 
   // Label, value and remark for the panel of a meter; null where nothing is learned.
@@ -59,7 +82,9 @@ export class Commissioning {
     const found = this.known?.meters.find((m) => m.meter === meter);
     if (!found) return null;
     if (found.state === "learning") {
-      return ["Own error", "not known yet", `${hours(found.gathered_s)} of ${hours(this.known.needed_s)} h heard`];
+      const why = found.learning_reason ? `: ${words(found.learning_reason)}` : "";
+      const time = `${hours(found.gathered_s)} of ${hours(this.known.needed_s)} h heard`;
+      return ["Own error", "not known yet", `${time}, ${found.learning_state}${why}`];
     }
     const since = isKnown(found.learned_at) ? `, learned on ${day(found.learned_at)}` : "";
     return ["Own error", `${signed(found.error_volt, 2)} V`, `± ${found.error_volt_std.toFixed(2)} V${since}`];

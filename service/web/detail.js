@@ -65,7 +65,7 @@ function row(label, value, extra) {
   return [el("dt", { text: label }), el("dd", {}, el("b", { text: value }), extra ? el("span", { class: "quiet", text: ` ${extra}` }) : null)];
 }
 
-export function showDetail(feeder, customer, { meter, inverter, v, std, own, report }, points) {
+export function showDetail(feeder, customer, { meter, inverter, alone, v, std, own, report }, points) {
   const nominal = nominals(feeder).get(customer.bus);
   const share = nominal / feeder.v_nominal_volt;
   const limits = { low: share * feeder.v_min_volt, high: share * feeder.v_max_volt };
@@ -78,7 +78,7 @@ export function showDetail(feeder, customer, { meter, inverter, v, std, own, rep
   const half = isKnown(std) ? 3 * std : null;
   const list = el("dl", { class: "numbers" });
   if (meter) list.append(...row("Meter says", volt(meter.v_volt_reported, 2), pu(meter.v_volt_reported)));
-  list.append(...row("Reconstructed", volt(v, 2), `${half === null ? "" : `± ${half.toFixed(2)} V, `}${pu(v)}`));
+  list.append(...row(alone ? "Model only, no reading" : "Reconstructed", volt(v, 2), `${half === null ? "" : `± ${half.toFixed(2)} V, `}${pu(v)}`));
   if (half !== null) list.append(...row("Standard deviation", volt(std, 2)));
   if (own) list.append(...row(...own));
   if (meter?.suspect) list.append(...row("Manipulation", `${signed(meter.attack_volt_estimated, 2)} V`, meter.kind ?? ""));

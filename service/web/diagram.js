@@ -256,9 +256,11 @@ export class Diagram {
     this.report = report;
     this.meters = new Map(report.meters.map((meter) => [meter.meter, meter]));
     this.volts = new Map(report.buses.map((bus) => [bus.bus, bus.v_volt]));
+    this.modelled = new Set(report.buses.filter((bus) => bus.model_only).map((bus) => bus.bus));
+    this.customersModelled = new Set((report.customers ?? []).filter((c) => c.model_only).map((c) => c.customer));
     this.phases = new Map(report.buses.map((bus) => [bus.bus, bus.v_phases]));
-    const parts = [...this.volts].map(([bus, v]) => this.part(bus, v)).filter(isKnown);
-    parts.push(...report.meters.map((m) => m.v2_pu_estimated).filter(isKnown).map(Math.sqrt));
+    const parts = [...this.volts].filter(([bus]) => !this.modelled.has(bus)).map(([bus, v]) => this.part(bus, v)).filter(isKnown);
+    parts.push(...report.meters.filter((m) => !m.model_only).map((m) => m.v2_pu_estimated).filter(isKnown).map(Math.sqrt));
     if (this.scale.fit(parts, this.level)) this.rescale();
     this.paint();
     this.hover(this.hovered);
@@ -274,6 +276,12 @@ export class Diagram {
     return isKnown(v) ? v / this.nominal.get(bus) : NaN;
   }
 
+  // The voltage of a customer rests on no reading.
+  alone(customer) {
+    const meter = this.meters.get(customer.meter);
+    return meter ? meter.model_only : this.customersModelled.has(customer.customer) || this.modelled.has(customer.bus);
+  }
+
   voltAt(customer) {
     const meter = this.meters.get(customer.meter);
     if (isKnown(meter?.v_volt_estimated)) return meter.v_volt_estimated;
@@ -285,7 +293,7 @@ export class Diagram {
     if (!this.report || !this.customers) return;
     const { buses } = this.feeder.layout;
     for (const { path, bus } of this.lines) {
-      const color = this.scale.color(this.part(buses[bus], this.volts.get(buses[bus])));
+      const color = this.modelled.has(buses[bus]) ? null : this.scale.color(this.part(buses[bus], this.volts.get(buses[bus])));
       path.classList.toggle("unknown", color === null);
       path.style.stroke = color ?? "";
     }
@@ -296,7 +304,8 @@ export class Diagram {
       const v = this.voltAt(part.customer);
       part.group.setAttribute("data-status", now.key);
       part.shape.setAttribute("d", SHAPE[now.key]);
-      part.shape.style.fill = PLAIN.has(now.key) ? "" : (this.scale.color(this.part(part.customer.bus, v)) ?? "");
+      const alone = this.alone(part.customer);
+      part.shape.style.fill = alone || PLAIN.has(now.key) ? "" : (this.scale.color(this.part(part.customer.bus, v)) ?? "");
       part.sign.textContent = SIGN[now.key] ?? "";
       const loud = now.key === "suspect";
       // Neighbours that both have something to say must not say it in the same place.
@@ -308,13 +317,13 @@ export class Diagram {
       part.note.textContent = loud
         ? signed(meter.attack_volt_estimated)
         : part.labels ? (name.length > 8 ? `${name.slice(0, 7)}…` : name) : "";
-      part.group.setAttribute("aria-label", `${named(part.customer)}: ${now.text}, reconstructed ${volt(v)}`);
+      part.group.setAttribute("aria-label", `${named(part.customer)}: ${now.text}, ${alone ? "model only" : "reconstructed"} ${volt(v)}`);
       part.group.classList.toggle("selected", id === this.selected);
     }
     const busbar = this.report.busbar ?? {};
     if (this.busbarName) {
       const mark = busbar.suspect ? "◆ " : "";
-      this.busbarName.textContent = `${mark}Busbar (${buses[0]}): ${volt(this.volts.get(buses[0]))}`;
+      this.busbarName.textContent = `${mark}Busbar (${buses[0]}): ${volt(this.volts.get(buses[0]))}${this.modelled.has(buses[0]) ? " (model only)" : ""}`;
       this.busbarName.classList.toggle("suspect", Boolean(busbar.suspect));
     }
     this.liar.toggleAttribute("hidden", !busbar.suspect);
@@ -357,7 +366,7 @@ export class Diagram {
       ...(part.customer.phase ? [el("span", { text: `phase ${part.customer.phase}` })] : []),
       el("span", { class: "state", "data-status": now.key, text: now.text }),
       el("span", { text: `meter says ${volt(meter?.v_volt_reported)}` }),
-      el("span", { text: `reconstructed ${volt(this.voltAt(part.customer))}` }),
+      el("span", { text: `${this.alone(part.customer) ? "model only" : "reconstructed"} ${volt(this.voltAt(part.customer))}` }),
     );
     const card = this.tip.parentElement.getBoundingClientRect();
     const spot = part.group.getBoundingClientRect();

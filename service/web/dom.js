@@ -53,6 +53,7 @@ export function status(meter, limits, report) {
   // The busbar's meter has no score, and says itself whether it was judged.
   const judged = meter.judged ?? (known(score) && known(threshold));
   if (known(score) && known(threshold) && score > threshold) return { key: "doubtful", text: "doubtful" };
+  if (meter.model_only) return { key: "unjudged", text: "not judged" };
   if (known(v) && v > (meter.v_max_volt ?? limits.high)) return { key: "high", text: "above limit" };
   if (known(v) && v < (meter.v_min_volt ?? limits.low)) return { key: "low", text: "below limit" };
   if (!judged || !known(v) || !vouches(report)) return { key: "unjudged", text: "not judged" };

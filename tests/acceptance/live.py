@@ -176,10 +176,10 @@ class Fleet:
                 self.put(reading)
             yield sample, self._estimate_at(sample.t)
 
-    def pour(self, samples: Sequence[Tick], ahead: int = 8) -> list[dict[str, Any]]:
+    def pour(self, samples: Sequence[Tick], ahead: int = 4) -> list[dict[str, Any]]:
         """Publish many ticks, some ahead of what has been heard, and return their states, up to the last one.
 
-        Not all at once: estimates are dropped when there are more than the network takes. The last tick
+        Not all at once: estimates are dropped beyond the 64 KiB that the sockets hold. The last tick
         must be complete: where the readings tell the time, an incomplete one stays open.
         """
         states = []

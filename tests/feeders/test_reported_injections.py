@@ -46,7 +46,8 @@ def test_honest_errors_at_their_ends_never_accuse_an_inverter(name: str, step_s:
                     frame = to_frame(world.site, world.snapshot({}, wrong))  # type: ignore[arg-type]
                     assert np.isfinite(frame.q_net[world.site.meters]).all()
                     state, estimate, verdict = sequential.step(made, state, frame)
-                    assert verdict.cause in {Cause.AGREEMENT, Cause.SETTLING}
+                    # Honest errors are taken for independent: all at their ends, they are a misfit.
+                    assert verdict.cause in {Cause.AGREEMENT, Cause.SETTLING, Cause.MISFIT}
                     true = (world.now.v_volt / world.volt) ** 2
                     assert (np.abs(estimate.v2 - true) <= estimate.bound).all()
 
@@ -66,13 +67,15 @@ def test_all_are_told_of_whoever_else_lies(count: int, liar: int | None) -> None
         state, _, verdict = watcher.step(state, frame)
     assert verdict.decision is (Decision.UNDECIDED if liar is None else Decision.ATTACKED)
     assert np.flatnonzero(verdict.suspects).tolist() == ([] if liar is None else [liar])
-    assert all((way.meters == verdict.suspects).all() for way in verdict.explanations)
+    # A manipulated majority of the six meters may explain the readings besides, with the named meter in it.
+    assert all(way.meters[verdict.suspects].all() for way in verdict.explanations)
     named = set(site.droop.customer[verdict.inverters].tolist())
     told = [
         named | set(site.droop.customer[way.inverters].tolist()) | set(np.flatnonzero(way.powers).tolist())
         for way in verdict.explanations
     ]
-    assert all(each == owners for each in told or [named])
+    few = [each for each, way in zip(told, verdict.explanations, strict=True) if way.meters.sum() <= count]
+    assert all(each == owners for each in few or [named])
     assert all(site.feeder.customers[owner] in verdict.reason for owner in owners)
     if told:
         assert sum(way.probability for way in verdict.explanations) == pytest.approx(1.0, abs=0.05)

@@ -140,6 +140,7 @@ class SmallService:
         self.rules = AlarmRules()
         self.books = {name: AlarmBook(name) for name in self.villages}
         self.learning: set[str] = set()
+        self.stalled: dict[str, str] = {}
         self.note = ""
         self.heard: dict[str, float] = {}
         self.delay_s = 0.0
@@ -203,6 +204,7 @@ class SmallService:
             "since": T0 - 18_000.0 if open_ones else None, "expected": T0 + 68_400.0 if open_ones else None,
             "learned_at": None if len(open_ones) == len(village.meters) else T0 - 9e5,
             "held": False, "restored": True, "note": self.note,
+            "expected_s": 86_401.0, "stalled": len(self.stalled),
             "meters": [
                 {
                     "meter": m, "state": "learning" if m in open_ones else "learned",
@@ -213,6 +215,11 @@ class SmallService:
                     "error_volt": 0.0 if m in open_ones else 0.41,
                     "error_volt_std": 0.67 if m in open_ones else 0.09,
                     "allowed_volt": 1.15 if m in open_ones else 0.27,
+                    "learning_state": "stalled" if m in self.stalled
+                    else "learning" if m in open_ones else "learned",
+                    "learning_reason": self.stalled.get(m),
+                    "watched_s": 18_000.0 if m in open_ones else None,
+                    "lost_s": {},
                 }
                 for m in village.meters
             ],

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import psycopg
@@ -48,6 +51,24 @@ class Cluster:
 
     def stop(self) -> None:
         self.run("pg_ctl", "-D", self.data, "-w", "-m", "immediate", "stop")
+
+    def processes(self) -> list[int]:
+        """Return the ids of the server's processes, the postmaster first."""
+        postmaster = int((self.data / "postmaster.pid").read_text().split()[0])
+        children = Path(f"/proc/{postmaster}/task/{postmaster}/children").read_text()
+        return [postmaster, *map(int, children.split())]
+
+    @contextmanager
+    def frozen(self) -> Iterator[None]:
+        """Stop all processes of the server with SIGSTOP until the block ends."""
+        stopped = self.processes()
+        try:
+            for pid in stopped:
+                os.kill(pid, signal.SIGSTOP)
+            yield
+        finally:
+            for pid in stopped:
+                os.kill(pid, signal.SIGCONT)
 
     def database(self) -> str:
         name = f"t{uuid.uuid4().hex}"

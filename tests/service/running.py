@@ -115,7 +115,9 @@ class InProcess:
 
 
 @contextmanager
-def service(folder: Path, feeders: Iterable[str] = (FEEDER,), **given: Any) -> Iterator[InProcess]:
+def service(
+    folder: Path, feeders: Iterable[str] = (FEEDER,), *, wall: Callable[[], float] = time.time, **given: Any
+) -> Iterator[InProcess]:
     """Run a service until the block ends."""
     zenoh = f"tcp/127.0.0.1:{free_port()}"
     chosen = settings(
@@ -136,7 +138,7 @@ def service(folder: Path, feeders: Iterable[str] = (FEEDER,), **given: Any) -> I
 
     def run() -> None:
         try:
-            asyncio.run(serve(chosen, announce=announce, signals=False))
+            asyncio.run(serve(chosen, announce=announce, signals=False, wall=wall))
         except Exception as error:  # noqa: BLE001 - handed over to the test
             found["error"] = error
             up.set()

@@ -56,7 +56,7 @@ def test_state_is_the_report(setup: Setup) -> None:
     meter = {
         *("meter", "bus", "seen", "suspect", "score", "threshold", "v_volt_reported", "v_volt_estimated"),
         *("v_volt_std", "v2_pu_estimated", "attack_volt_estimated", "kind", "phase"),
-        *("v_min_volt", "v_max_volt"),
+        *("v_min_volt", "v_max_volt", "model_only", "learning_state", "learning_reason"),
     }
     assert contract | {"customers", "inverters", "explanations"} <= set(response.json())
     assert all(set(item) == meter for item in response.json()["meters"])
@@ -163,7 +163,7 @@ def test_an_alarm_and_its_fields(setup: Setup) -> None:
     assert contract <= set(alarm)
     assert set(alarm["evidence"]) == {
         *("score", "threshold", "v_volt_reported", "v_volt_estimated", "attack_volt_estimated"),
-        *("kind", "attack_kvar_estimated", "explanations"),
+        *("kind", "attack_kvar_estimated", "explanations", "learning"),
     }
     assert alarm["customer"] is None
     assert (alarm["kind"], alarm["meter"], alarm["state"]) == ("meter-manipulated", "H3", "raised")

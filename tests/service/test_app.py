@@ -318,7 +318,7 @@ def test_a_stored_feeder_that_cannot_be_loaded_any_more_is_shown_until_somebody_
             tables[name] = to_json(load("kerber-landnetz").tables)
             tables[name]["feeder"]["name"] = name
             limits = {**tables[name]["feeder"]["limits"], "v_min_pu": "x"}
-            store.put_feeder(name, {**tables[name], "feeder": {**tables[name]["feeder"], "limits": limits}})
+            store.commit(put=(name, {**tables[name], "feeder": {**tables[name]["feeder"], "limits": limits}}))
             store.commit([raised(an_alarm(k, feeder=name))])
     with service(tmp_path, clock="events") as live:
         until(lambda: "designed" not in live.http.get("/readyz").text, "the designs")

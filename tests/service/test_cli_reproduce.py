@@ -78,6 +78,23 @@ def test_what_should_be_met_and_is_not_fails(
     assert error == "gridsec: not met: another (Table 3): 0.000474, ours 0.00049\n"
 
 
+def test_a_reason_that_several_claims_share_is_printed_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first = statement("first", "(1)", "yes", "no", "the recipe gives zero")
+    second = statement("second", "(2)", "yes", "yes", "by thresholds of this project")
+    third = statement("third", "(3)", "yes", "no", "the recipe gives zero")
+    monkeypatch.setitem(sys.modules, "gridsec.papers.kim2018", outcomes((first, second, third)))  # type: ignore[arg-type]  # as above
+    code, told, _ = run(monkeypatch, capsys, "kim2018", "--out", str(tmp_path))
+    assert code == 0
+    assert [row(told, what)[0] for what in ("first", "second", "third")] == [
+        "differs (1)",
+        "met (2)",
+        "differs (1)",
+    ]
+    assert told.count("the recipe gives zero") == 1
+
+
 def test_without_matplotlib_the_numbers_come_and_the_figures_are_missed_aloud(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import re
 import sqlite3
 import subprocess
 import sys
@@ -22,13 +23,14 @@ from feeders.load import Site, from_tables, load
 from feeders.scenario import Reading, Scenario, by_arrival, simulate
 from feeders.schema import write
 from gridsec.attack import Scaling
-from gridsec.sequential import Commission, to_arrays
+from gridsec.sequential import Commission, LearningReason, LearningState, to_arrays
+from service.alarms import Alarm, AlarmKind, AlarmState, Severity
 from service.align import Clock
 from service.bus import BusConfig, Sample
 from service.commissioning import Commissioning, NothingToLearn, Stage, Step
 from service.ingest import Meters
 from service.replay import Tally, replay
-from service.report import to_json
+from service.report import LearningReport, StalledMeter, to_json
 from service.rounds import Rounds, RuntimeConfig
 from service.runtime import Runtime
 from service.simulate import Pace, key_of, payload_of, play
@@ -342,7 +344,7 @@ def test_a_replaced_meter_is_learned_anew_and_the_others_stay(tmp_path: Path) ->
         named = [k for k, meter in enumerate(report.meters) if meter.suspect]
         assert named == [4], "replaced without a word, it counts as manipulated"
         who = slow.meter_ids[4]
-        answer = live.recommission(FEEDER, [who], "Ada", "new meter")
+        answer = live.recommission(FEEDER, [who], "Ada", "new meter").result()
         assert {m["meter"]: m["state"] for m in answer["meters"]}[who] == "learning"
         feed(live, samples(readings, 7 * hours, 13 * hours))
         new = known(live).learned
@@ -370,7 +372,7 @@ def test_what_cannot_be_stored_is_not_begun(site: Site, honest: list[Reading], t
         other = sqlite3.connect(path, isolation_level=None)
         other.execute("BEGIN IMMEDIATE")
         with pytest.raises(StoreUnavailable):
-            live.recommission(FEEDER, [], "Ada", "all new")
+            live.recommission(FEEDER, [], "Ada", "all new").result()
         other.close()
         assert same(known(live), before)
         live.keeper.problem = None
@@ -383,9 +385,9 @@ def test_before_the_first_tick_and_where_nothing_is_learned(site: Site, tmp_path
     with Store(f"sqlite:///{tmp_path}/s.db") as store:
         live = rounds(store, site, install=False)
         with pytest.raises(NothingToLearn, match="no monitor yet"):
-            live.recommission(FEEDER, [], "Ada", "new")
+            live.recommission(FEEDER, [], "Ada", "new").result()
         live.watches[FEEDER].install(design(site))
-        live.recommission(FEEDER, ["m03"], "Ada", "new")
+        live.recommission(FEEDER, ["m03"], "Ada", "new").result()
         begun = known(live)
         assert begun.learning is not None
         assert begun.learning.open.all()
@@ -394,6 +396,108 @@ def test_before_the_first_tick_and_where_nothing_is_learned(site: Site, tmp_path
         assert never.progress().state is Stage.OFF
         with pytest.raises(NothingToLearn, match="commission_s is 0"):
             never.renew(None, [], START, "Ada", "new")
+
+
+# ------------------------------------------------------------------- stalled
+
+
+def learning_counts(live: Rounds) -> dict[str, float]:
+    """Metrics of learning that are not zero, by state and by reason."""
+    pattern = re.compile(rf'gridsec_meters_learning(?:_delayed)?{{feeder="{FEEDER}",\w+="([\w-]+)"}} (\S+)')
+    found = pattern.findall(live.metrics.exposition().decode())
+    assert len(found) == len(LearningState) + len(LearningReason)
+    return {name: float(value) for name, value in found if float(value)}
+
+
+def test_a_stalled_meter_raises_an_alarm_that_ends_when_the_meter_is_learned(
+    site: Site, tmp_path: Path
+) -> None:
+    """Learning takes 61 s: a tick without an interval and 60 more. The alarm is held without a monitor."""
+    late, begin, end = site.meter_ids[4], 160.0, 230.0
+    scenario = Scenario(seed=1, start=START, duration_s=end)
+    readings = [r for r in by_arrival(simulate(site, scenario)) if r.meter != late or r.t >= START + begin]
+    url = f"sqlite:///{tmp_path}/s.db"
+
+    def stalled(store: Store) -> list[Alarm]:
+        return [a for a in store.alarms()[0] if a.kind is AlarmKind.LEARNING_STALLED]
+
+    with Store(url) as store:
+        live = rounds(store, site)
+        feed(live, samples(readings, 0, 120))
+        assert stalled(store) == []
+        feed(live, samples(readings, 120, 140))
+        (alarm,) = stalled(store)
+        assert (alarm.state, alarm.severity, alarm.meter) == (AlarmState.RAISED, Severity.MINOR, None)
+        begun = store.commission_events(FEEDER)[0].t
+        assert (alarm.t_event, alarm.t_raised) == (begun + 122.0, begun + 124.0)
+        assert alarm.reason == (
+            "1 of 13 meters are not learned after twice the expected time of 61 s: silent (1)"
+        )
+        assert alarm.evidence.learning == (StalledMeter(late, "silent", 0.0),)
+        report = live.watches[FEEDER].report
+        assert report is not None
+        shown = to_json(report)["meters"]
+        assert [m["learning_state"] for m in shown].count("learned") == 12
+        assert (shown[4]["learning_state"], shown[4]["learning_reason"]) == ("stalled", "silent")
+        progress = live.watches[FEEDER].commissioning.progress()
+        assert (progress.expected_s, progress.stalled) == (61.0, 1)
+        one = progress.meters[4]
+        assert one.watched_s == report.t - begun
+        assert one.lost_s == {"silent": one.watched_s}
+        assert learning_counts(live) == {"learned": 12.0, "stalled": 1.0, "silent": 1.0}
+        live.keep_states(at_once=True)
+        live.keeper.commit(at_once=True)
+    with Store(url) as store:
+        live = rounds(store, site, install=False)
+        feed(live, samples(readings, 140, 155))
+        blind = live.watches[FEEDER].report
+        assert blind is not None
+        assert blind.learning is None
+        assert stalled(store) == [alarm]
+        live.watches[FEEDER].install(design(site))
+        feed(live, samples(readings, 155, begin + 50))
+        assert stalled(store) == [alarm]
+        feed(live, samples(readings, begin + 50, end))
+        (ended,) = stalled(store)
+        learned = known(live).learned.at[4]
+        assert learned == pytest.approx(START + begin + NEEDED, abs=2.0)
+        assert (ended.id, ended.state) == (alarm.id, AlarmState.CLEARED)
+        assert ended.t_cleared == learned + 5.0
+        assert learning_counts(live) == {"learned": 13.0}
+        live.metrics.count_learning(replace(report, learning=None))
+        assert learning_counts(live) == {"learned": 13.0}
+        live.metrics.count_learning(replace(report, learning=LearningReport()))
+        assert learning_counts(live) == {}
+        live.metrics.forget(FEEDER)
+        assert "gridsec_meters_learning{" not in live.metrics.exposition().decode()
+        assert "gridsec_meters_learning_delayed{" not in live.metrics.exposition().decode()
+
+
+def test_a_text_of_an_earlier_version_goes_on(site: Site, honest: list[Reading], tmp_path: Path) -> None:
+    """Without the times that later versions keep: the time that counted stays."""
+    path = tmp_path / "s.db"
+    with Store(f"sqlite:///{path}") as store:
+        live = rounds(store, site)
+        feed(live, samples(honest, 0, 20))
+        live.keep_states(at_once=True)
+        live.keeper.commit(at_once=True)
+        before, kept = known(live), store.commission(FEEDER)
+    assert kept is not None
+    content = json.loads(kept.text)
+    later = [name for name in content["arrays"] if name == "watched_s" or name.startswith("lost_s.")]
+    assert len(later) == 9
+    for name in later:
+        del content["arrays"][name]
+    with sqlite3.connect(path) as raw:
+        raw.execute("UPDATE commission SET data = ?", (json.dumps(content),))
+    raw.close()
+    with Store(f"sqlite:///{path}") as store:
+        progress = rounds(store, site).watches[FEEDER].commissioning.progress()
+        assert (progress.restored, progress.note) == (True, "")
+        assert before.learning is not None
+        assert [m.gathered_s for m in progress.meters] == before.learning.time_s.tolist()
+        assert [m.watched_s for m in progress.meters] == before.learning.time_s.tolist()
+        assert {m.learning_state for m in progress.meters} == {"learning"}
 
 
 # ----------------------------------------------------------------- over HTTP
@@ -425,13 +529,23 @@ def test_rest_tells_what_was_learned(live: InProcess) -> None:
         assert abs(meter["error_volt"]) <= 0.005 * 1.03 * 230.94 * 1.01
         assert 0.0 < meter["error_volt_std"] < 1.0
         assert 0.0 < meter["allowed_volt"] <= 0.005 * 1.03 * 230.94 * 1.01
+        assert (meter["learning_state"], meter["learning_reason"]) == ("learned", None)
+        assert (meter["watched_s"], meter["lost_s"]) == (None, {})
+    assert (found["expected_s"], found["stalled"]) == (NEEDED + 1.0, 0)
     one = live.get(f"/api/v1/feeders/{FEEDER}/meters/m03")
     assert one["commissioning"] == found["meters"][2]
+    assert (one["learning_state"], one["learning_reason"]) == ("learned", None)
+    state = live.get(f"/api/v1/feeders/{FEEDER}/state")
+    assert {m["learning_state"] for m in state["meters"]} == {"learned"}
+    assert live.metric("gridsec_meters_learning", feeder=FEEDER, state="learned") == 13.0
+    assert live.metric("gridsec_meters_learning", feeder=FEEDER, state="stalled") == 0.0
+    assert live.metric("gridsec_meters_learning_delayed", feeder=FEEDER, reason="silent") == 0.0
     assert live.metric("gridsec_meters_learned", feeder=FEEDER) == 13.0
     listed = {row["name"]: row["commissioning"] for row in live.get("/api/v1/feeders")["feeders"]}
     assert listed == {FEEDER: "learned", "bank": "off"}
     off = live.get("/api/v1/feeders/bank/commissioning")
     assert (off["state"], off["meters"], off["estimator"]) == ("off", [], "exact-bank")
+    assert (off["expected_s"], off["stalled"]) == (None, 0)
 
 
 def _post(live: InProcess, body: Any, feeder: str = FEEDER) -> httpx.Response:
@@ -449,6 +563,8 @@ def test_rest_begins_a_replaced_meter_anew(live: InProcess) -> None:
     assert changed == ["m03"]
     assert (after["meters"][2]["error_volt"], after["meters"][2]["learned_at"]) == (0.0, None)
     assert after["expected"] == after["t"] + NEEDED
+    assert (after["meters"][2]["learning_state"], after["meters"][2]["learning_reason"]) == ("waiting", None)
+    assert (after["meters"][2]["watched_s"], after["meters"][2]["lost_s"]) == (0.0, {})
     events = live.get(f"/api/v1/feeders/{FEEDER}/commissioning/events")["events"]
     assert [(e["change"], e["who"], e["reason"], e["meters"]) for e in events[-1:]] == [
         ("recommissioned", "Ada", "m03 replaced", ["m03"])

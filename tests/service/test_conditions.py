@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterable
 from dataclasses import replace
@@ -9,9 +10,20 @@ from dataclasses import replace
 import pytest
 
 from gridsec.online import Cause
-from service.alarms import AlarmKind, Condition, Evidence, Severity, conditions
-from service.report import BUSBAR
-from tests.service.reports import inverter, meter, report, with_inverters
+from service.alarms import (
+    AlarmBook,
+    AlarmKind,
+    AlarmRules,
+    Condition,
+    Evidence,
+    Severity,
+    advance,
+    conditions,
+)
+from service.alarms import from_json as alarm_from_json
+from service.alarms import to_json as alarm_json
+from service.report import BUSBAR, LearningReport, StalledMeter, with_learning
+from tests.service.reports import FEEDER, inverter, meter, report, with_inverters
 
 UNDECIDED_CAUSES = [cause for cause in Cause if cause not in (Cause.AGREEMENT, Cause.RESIDUALS)]
 
@@ -182,3 +194,55 @@ def test_undecided_for_want_of_readings_is_told_unless_data_loss_tells_all_of_it
     found = conditions(report(*meters, cause=cause, silent=tuple((name, 12.0) for name in silent)))
     (undecided,) = (c for c in found if c.kind is AlarmKind.UNDECIDED)
     assert (undecided.known, undecided.unheard) == (not covered, True)
+
+
+# ------------------------------------------------------------------- learning
+
+STALLED = (StalledMeter("m2", "silent", 30.0), StalledMeter("m3", "no-busbar", 0.0))
+
+
+def test_stalled_meters_are_one_condition_of_the_feeder() -> None:
+    """With the number of meters for each reason, and the meters as evidence."""
+    now = report(meter("m1"), meter("m2"), meter("m3"))
+    learning = LearningReport(
+        ("learned", "stalled", "stalled"), (None, "silent", "no-busbar"), 86_401.0, STALLED
+    )
+    (found,) = conditions(with_learning(now, learning))
+    assert (found.kind, found.subject, found.known) == (AlarmKind.LEARNING_STALLED, None, True)
+    assert found.severity is Severity.MINOR
+    assert found.evidence == Evidence(learning=STALLED)
+    assert found.reason == (
+        "2 of 3 meters are not learned after twice the expected time of 86401 s: no-busbar (1), silent (1)"
+    )
+
+
+def test_a_stalled_meter_without_lost_time_has_words_for_it() -> None:
+    learning = LearningReport(("stalled",), (None,), 61.0, (StalledMeter("m1", None, 20.0),))
+    (found,) = conditions(with_learning(report(meter("m1")), learning))
+    assert found.reason.endswith(": no time lost (1)")
+
+
+@pytest.mark.parametrize("state", ["waiting", "learning", "learned"])
+def test_learning_on_schedule_is_no_condition(state: str) -> None:
+    assert conditions(with_learning(report(meter("m1")), LearningReport((state,), (None,), 61.0))) == []
+
+
+def test_without_a_monitor_learning_is_unknown() -> None:
+    """In contrast to an estimator that does not learn, where it is known that none is stalled."""
+    assert conditions(report(meter("m1"))) == []
+    (found,) = conditions(replace(report(meter("m1")), learning=None))
+    assert (found.kind, found.known) == (AlarmKind.LEARNING_STALLED, False)
+
+
+def test_an_alarm_keeps_its_stalled_meters_in_its_text() -> None:
+    learning = LearningReport(("stalled",) * 2, ("silent", "no-busbar"), 61.0, STALLED)
+    now = with_learning(report(meter("m2"), meter("m3")), learning)
+    book, _ = advance(AlarmBook(FEEDER), AlarmRules(on_delay_s=0.0), conditions(now), now.t)
+    (alarm,) = book.active
+    assert alarm.evidence.learning == STALLED
+    text = json.dumps(alarm_json(alarm))
+    assert alarm_from_json(json.loads(text)) == alarm
+    # Alarms of earlier versions have no such field.
+    old = json.loads(text)
+    del old["evidence"]["learning"]
+    assert alarm_from_json(old).evidence.learning == ()

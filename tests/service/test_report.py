@@ -136,6 +136,9 @@ def test_json_is_plain_and_has_no_nan(site: Site) -> None:
     assert found["explanations"] == []
     wanted = {
         "kind",
+        "learning_reason",
+        "learning_state",
+        "model_only",
         "phase",
         "v_min_volt",
         "v_max_volt",

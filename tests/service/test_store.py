@@ -14,8 +14,6 @@ from service.alarms import (
     Alarm,
     AlarmKind,
     AlarmState,
-    AlarmUnknown,
-    AlreadyAcknowledged,
     Change,
     Severity,
     Transition,
@@ -72,15 +70,11 @@ def test_a_transaction_is_all_or_nothing(store: Store) -> None:
 def test_events_know_who_and_why(store: Store) -> None:
     alarm = an_alarm()
     store.commit([raised(alarm)])
-    item = store.acknowledge(alarm.id, "Ada", "on my way", T0 + 3)
-    assert item.alarm.state is AlarmState.ACKNOWLEDGED
+    item = acknowledged(alarm, "Ada", "on my way", T0 + 3)
+    store.commit([item])
     (_, event) = store.events(alarm.id)
     assert (event.change, event.who, event.comment) == (Change.ACKNOWLEDGED, "Ada", "on my way")
     assert event.alarm == item.alarm == store.alarm(alarm.id)
-    with pytest.raises(AlreadyAcknowledged, match="Ada"):
-        store.acknowledge(alarm.id, "Grace", "", T0 + 4)
-    with pytest.raises(AlarmUnknown):
-        store.acknowledge("0" * 25 + "9", "Grace", "", T0 + 4)
 
 
 @both
@@ -89,7 +83,7 @@ def test_everything_survives_closing(url: str) -> None:
     answer = acknowledged(alarm, "Ada", "", T0 + 1)
     with Store(url) as one:
         one.commit([raised(alarm), answer], reports=[a_report(T0)], rejected=[Rejected(T0, "k", "r", b"x")])
-        one.put_feeder("village", {"meta": {"name": "village"}})
+        one.commit(put=("village", {"meta": {"name": "village"}}))
     with Store(url) as two:
         assert two.alarm(alarm.id) == answer.alarm
         assert two.last_event == 2
@@ -191,6 +185,7 @@ def test_history_keeps_a_grid_and_every_change(url: str) -> None:
             "meter": "m1",
             "seen": True,
             "suspect": True,
+            "model_only": False,
             "v_volt_reported": 230.0,
             "v_volt_estimated": 229.5,
             "score": 1e-4,
@@ -305,9 +300,9 @@ def test_bad_readings_that_cannot_be_kept_hold_up_no_alarm(store: Store) -> None
 @both
 def test_feeders_are_replaced_by_name(store: Store) -> None:
     assert store.feeders() == {}
-    store.put_feeder("village", {"lines": [1.5, None, "ü"]})
-    store.put_feeder("town", {})
-    store.put_feeder("village", {"lines": []})
+    store.commit(put=("village", {"lines": [1.5, None, "ü"]}))
+    store.commit(put=("town", {}))
+    store.commit(put=("village", {"lines": []}))
     assert store.feeders() == {"town": {}, "village": {"lines": []}}
 
 

@@ -161,7 +161,7 @@ def test_a_replaced_meter_is_believed(site: Site, lying: list[Reading], left: Pa
     with Store(f"sqlite:///{left}") as store:
         live, _ = watching(store, site)
         feed(live, samples(lying, END, END + ticks))
-        live.recommission(FEEDER, [LIARS[1]], "Ada", "new meter")
+        live.recommission(FEEDER, [LIARS[1]], "Ada", "new meter").result()
     with Store(f"sqlite:///{left}") as store:
         live, told = watching(store, site)
         feed(live, samples(lying, END + ticks, END + ticks + 4))
@@ -174,7 +174,7 @@ def test_what_could_not_be_stored_is_not_forgotten(site: Site, left: Path) -> No
         other = sqlite3.connect(left, isolation_level=None)
         other.execute("BEGIN IMMEDIATE")
         with pytest.raises(StoreUnavailable):
-            live.recommission(FEEDER, [], "Ada", "all new")
+            live.recommission(FEEDER, [], "Ada", "all new").result()
         other.close()
         assert np.isfinite(live.watches[FEEDER].suspicions.known.scale_s).sum() == len(LIARS)
 

@@ -440,12 +440,23 @@ def test_two_nominal_voltages_have_one_scale(site_of: Callable[..., Site], villa
             v_volt_estimated=float(volt * parts.get(meter.meter, 1.0)),
             v_volt_std=0.1,
             v2_pu_estimated=parts.get(meter.meter, 1.0) ** 2,
+            model_only=False,
         )
         for meter, volt in zip(report.meters, nominal, strict=True)
     )
     buses = tuple((bus, float(volt)) for bus, volt in zip(two.feeder.buses, two.nominal_volt, strict=True))
     site = site_of(real(village, two))
-    site.service.tick(replace(report, verdict=Decision.CLEAN, meters=meters, bus_v_volt=buses))
+    site.service.tick(
+        replace(
+            report,
+            verdict=Decision.CLEAN,
+            meters=meters,
+            bus_v_volt=buses,
+            model_only=False,
+            bus_model_only=(),
+            t_measured=T0,
+        )
+    )
     page = site.open(reduced_motion="reduce")
     expect(page.locator("#decision")).to_have_text("CLEAN")
     assert fill_of(page, "dairy") == fill_of(page, "a1-east")
@@ -507,3 +518,31 @@ def test_nothing_comes_from_elsewhere() -> None:
     for file in web.iterdir():
         text = file.read_text(encoding="utf-8").replace("http://www.w3.org/2000/svg", "")
         assert not foreign.search(text), file
+
+
+@pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
+def test_values_of_the_model_alone_do_not_look_measured(site: Site, size: dict[str, int]) -> None:
+    def silence(t: float, measured: float | None) -> None:
+        report = site.village.report(t, silent=tuple(site.village.meters), cause=Cause.TOO_FEW_METERS)
+        meters = tuple(replace(meter, model_only=True) for meter in report.meters)
+        alone = (True,) * len(report.bus_v_volt)
+        site.service.tick(
+            replace(report, meters=meters, model_only=True, bus_model_only=alone, t_measured=measured)
+        )
+
+    silence(T0, None)
+    page = site.open(size)
+    link, decision = page.locator("#link"), page.locator("#decision")
+    expect(link).to_have_text("no data yet")
+    expect(decision).to_have_text("NO DATA")
+    expect(page.locator("#facts")).to_contain_text("Real voltages–")
+    expect(customer(page, "H3")).to_have_attribute("aria-label", re.compile("silent, model only"))
+    expect(page.locator(".wire:not(.unknown)")).to_have_count(0)
+    site.tick(T0 + 1)
+    expect(link).to_have_text("live")
+    expect(decision).to_have_text("CLEAN")
+    expect(page.locator(".wire.unknown")).to_have_count(0)
+    silence(T0 + 2, T0 + 1)
+    expect(link).to_have_text(re.compile(r"no data since .*\d\d:\d\d:\d\d"))
+    expect(link).to_have_attribute("data-state", "nodata")
+    expect(page.locator("#reason")).to_contain_text("those of the model alone")

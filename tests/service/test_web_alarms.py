@@ -10,7 +10,14 @@ from playwright.sync_api import APIResponse, Route, expect
 
 from gridsec.online import Cause
 from service.alarms import AlarmState, Change, Transition
-from service.report import BusbarReport, CustomerReport, InverterReport
+from service.report import (
+    BusbarReport,
+    CustomerReport,
+    InverterReport,
+    LearningReport,
+    StalledMeter,
+    with_learning,
+)
 from tests.service.asking import T0
 from tests.service.looking import DESKTOP, PHONE, Site, customer
 from tests.service.stored import an_alarm, raised
@@ -124,7 +131,7 @@ def test_what_is_learned_of_the_meters_and_a_replaced_one(site: Site) -> None:
     page.locator("#renew-form .primary").click()
     expect(page.locator("#renew")).to_be_hidden()
     expect(page.locator("#commissioning")).to_have_text("Learning 1 of 13 meters, 5 of 24 h.")
-    expect(panel).to_contain_text("not known yet 5 of 24 h heard")
+    expect(panel).to_contain_text("not known yet 5 of 24 h heard, learning")
     (event,) = site.service.store.commission_events("village")
     assert (event.who, event.reason, event.meters) == ("Ada <b>", "new <i>meter", ("H3",))
 
@@ -137,6 +144,34 @@ def test_a_commissioning_that_begins_anew_says_why(site: Site) -> None:
     expect(page.locator("#commissioning")).to_have_text(
         "Learning meters, 5 of 24 h. Begun anew: the feeder has changed since (<b>lines)."
     )
+
+
+def test_stalled_learning_is_shown_with_its_reasons_and_its_alarm(site: Site) -> None:
+    why = {"H2": "silent", "H3": "no-busbar", "H5": "no-busbar"}
+    site.service.learning.update(["H1", *why])
+    site.service.stalled.update(why)
+    learning = LearningReport(
+        tuple("stalled" if m in why else "learned" for m in site.village.meters),
+        tuple(map(why.get, site.village.meters)),
+        86_401.0,
+        tuple(StalledMeter(m, reason, 0.0) for m, reason in why.items()),
+    )
+    for k in range(4):
+        site.service.tick(with_learning(site.village.report(T0 + k), learning))
+    page = site.open()
+    expect(page.locator("#commissioning")).to_have_text(
+        "Learning 4 of 13 meters, 5 of 24 h. Delayed: 3, stalled: 3. "
+        "Reasons: no busbar voltage (2), no readings (1)."
+    )
+    customer(page, "H3").click()
+    panel = page.locator("#detail-card")
+    expect(panel).to_contain_text("not known yet 5 of 24 h heard, stalled: no busbar voltage")
+    page.select_option("#alarm-kind", "learning-stalled")
+    alarm = page.locator(".alarm")
+    expect(alarm).to_have_count(1)
+    expect(alarm).to_contain_text("Learning stalled")
+    expect(alarm).to_contain_text("minor")
+    expect(alarm).to_contain_text("no-busbar (2), silent (1). Meters: H2, H3, H5")
 
 
 def test_the_second_operator_hears_who_was_first(site: Site) -> None:

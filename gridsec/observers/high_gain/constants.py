@@ -107,7 +107,9 @@ def decay_kim(n: int, theta: float, noise: float) -> Decay:
 
 
 def decay_lee(n: int, theta: float, noise: float, *, printed: bool = False) -> Decay:
-    """Constants of lee2018: no noise in the analysis, rate theta / 4, a given floor for the noise.
+    """Bound in the form of lee2018 (5.2.8): rate theta / 4, a given floor in place of noise.
+
+    The dissertation says that some eta(theta) exists, without a formula.
 
     Parameters
     ----------
@@ -116,8 +118,8 @@ def decay_lee(n: int, theta: float, noise: float, *, printed: bool = False) -> D
     noise
         delta of Remark 5.4.1, the floor of the bound.
     printed
-        The value that gives the dissertation's 168 misses a factor sqrt(n) that passing from
-        Euclidean to largest-entry norm costs; True reproduces it, without a proof.
+        False: `eta = sqrt(n l2 / l1) theta^{n-1}`, by the steps of kim2018's appendix without noise. True:
+        without the factor sqrt(n). This gives the printed 168, has no derivation, and is inferred here.
 
     References
     ----------
@@ -229,14 +231,18 @@ def _margin_by_norm(slopes: Slopes, theta: float) -> float:
 
 
 def smallest_theta(slopes: Slopes, *, most: float = 1e6, tolerance: float = 1e-6) -> float:
-    """Smallest theta >= 1 from which on `margin` was positive at every theta tried; infinite if none.
+    """Smallest theta >= 1 that satisfies Theorem 1; every larger theta satisfies it too. Infinite if none.
 
-    A geometric grid from `most` downwards, then bisection on the last interval.
+    Below the diagonal `D_jk = theta^{k-j} s_jk` shrinks with theta. With zero in its range the set of all D
+    shrinks as well, so that `margin` rises. A range without zero is widened to zero.
+
+    The number is sufficient for Lemma 1, not necessary: (6) can hold at a smaller theta.
 
     Parameters
     ----------
     slopes
-        Ranges of the derivatives.
+        Ranges of the derivatives. An entry above the diagonal, which no uniformly observable system has,
+        makes the answer infinite.
     most
         Largest theta to consider, 1/s.
     tolerance
@@ -244,22 +250,25 @@ def smallest_theta(slopes: Slopes, *, most: float = 1e6, tolerance: float = 1e-6
 
     References
     ----------
-    kim2018, theta* of Lemma 1.
+    docs/theory-high-gain.md, section 2; kim2018, Lemma 1, states that some theta* exists.
     """
-    if margin(slopes, most) <= 0.0:
+    if np.any(np.triu(slopes.low, 1)) or np.any(np.triu(slopes.high, 1)):
         return np.inf
-    high = most
-    for low in np.geomspace(most, 1.0, 121)[1:]:
-        if margin(slopes, float(low)) <= 0.0:
-            break
-        high = float(low)
-    else:
+    lower = np.tril(np.ones_like(slopes.low, dtype=np.bool_), -1)
+    wide = Slopes(
+        np.where(lower, np.minimum(slopes.low, 0.0), slopes.low),
+        np.where(lower, np.maximum(slopes.high, 0.0), slopes.high),
+        slopes.proven,
+    )
+    if margin(wide, 1.0) > 0.0:
         return 1.0
-    bad = float(low)
-    while high - bad > tolerance * high:
-        middle = 0.5 * (bad + high)
-        bad, high = (bad, middle) if margin(slopes, middle) > 0.0 else (middle, high)
-    return high
+    if margin(wide, most) <= 0.0:
+        return np.inf
+    bad, good = 1.0, most
+    while good - bad > tolerance * good:
+        middle = sqrt(bad * good)
+        bad, good = (bad, middle) if margin(wide, middle) > 0.0 else (middle, good)
+    return good
 
 
 def settling(decay: Decay, z_bound: float) -> tuple[float, float]:

@@ -265,5 +265,14 @@ def test_a_lateral_on_another_phase_is_what_the_power_flow_says(bus: str) -> Non
     for phase, place in lateral.others.items():
         after = moments(on(tables, dict.fromkeys(buses, phase))).v_volt
         change = (after**2 - given.v_volt**2) / net.places.unit**2
-        found = net.places.rephased(now, lateral.customers, lateral.place, place)
+        found = net.places.rephased(now, [(lateral.customers, lateral.place, place)])
         np.testing.assert_allclose(found, change, atol=0.1 * np.abs(change).max())
+
+
+def test_exchanged_phases_of_two_laterals_are_one_proposal() -> None:
+    wrong = on(street(), {"s2": "c", "s4": "a"})
+    found = calibrate(three_phase(wrong), days())
+    assert found.proposals["kind"].tolist() == ["phase"]
+    assert found.proposals["proposed"].tolist() == ["phases exchanged"]
+    assert found.proposals["verdict"].tolist() == ["proposed"]
+    assert corrected(wrong, found) == street()

@@ -143,6 +143,44 @@ def test_smallest_theta_separates_good_from_bad() -> None:
     assert smallest_theta(bad) == np.inf
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_the_inequality_holds_at_every_theta_above_the_smallest(seed: int) -> None:
+    """Also where a range leaves zero out: the eigenvalues at corners and random slopes, on a fine grid."""
+    rng = np.random.default_rng(seed)
+    n = 2 + seed % 2
+    low = np.tril(rng.uniform(-3.0, 1.0, (n, n)))
+    ranges = Slopes(low, low + np.tril(rng.uniform(0.0, 3.0, (n, n))), proven=True)
+    least, base = smallest_theta(ranges), riccati(n, 1.0)
+    assert 1.0 <= least < np.inf
+    for theta in np.concatenate([np.linspace(least, 3.0 * least, 41), np.geomspace(3.0 * least, 1e5, 20)]):
+        assert margin(ranges, float(theta)) > 0.0
+        for part in (*rng.uniform(size=(10, n, n)), *rng.integers(0, 2, (10, n, n))):
+            D = np.tril(ranges.low + part * (ranges.high - ranges.low))
+            D = D * theta ** np.subtract.outer(-np.arange(n), -np.arange(n)).astype(float)
+            form = 0.5 * theta * base - base @ D - D.T @ base
+            assert np.linalg.eigvalsh(form)[0] > -1e-12 * theta
+
+
+def test_the_smallest_theta_is_sufficient_and_not_necessary() -> None:
+    """kim2018's example at theta = 3.5, below 4.0: (6) without noise holds for all slopes in range.
+
+    V' <= -(theta / 2 + margin) V, and kim2018's rate theta / 8 needs V' <= -(theta / 4) V only.
+    """
+    ranges = Slopes(np.array([[0.0, 0.0], [-2.0, -3.0]]), np.zeros((2, 2)), proven=True)
+    theta = 3.5
+    assert theta < smallest_theta(ranges)
+    assert -theta / 4.0 <= margin(ranges, theta) < 0.0
+    rng, bound = np.random.default_rng(0), decay_kim(2, theta, 0.0)
+    step = 0.1
+    for _ in range(200):
+        e, t = rng.choice([-1.0, 1.0], 2), 0.0
+        for _ in range(60):
+            D = np.array([[0.0, 0.0], [rng.choice([-2.0, 0.0]), rng.choice([-3.0, 0.0])]])
+            e = expm(step * (shift(2) - np.outer(gain(2, theta), [1.0, 0.0]) + D)) @ e
+            t += step
+            assert np.abs(e).max() <= float(bound.bound(np.array(1.0), np.array(t)))
+
+
 def test_settling_times_meet_18_with_equality() -> None:
     made, size = decay_kim(3, 12.0, 1e-5), 1.7
     first, second = settling(made, size)

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 from gridsec import bank as banks
-from gridsec.certificates import reactance
 from gridsec.feeder import lindistflow, squared_voltages
-from gridsec.gains import circle_matrix, margin
+from gridsec.gains import circle_matrix
 from gridsec.lmi import circle
 from gridsec.lure import advance, close_loop, equilibrium, known_input
 from gridsec.papers import chong2020
+from gridsec.papers.chong2020 import DESIGNS, Design
 from gridsec.papers.claims import Reproduction
 from tests.gridsec.papers.made import made
+
+both = pytest.mark.parametrize("of", DESIGNS)
 
 
 @pytest.fixture(scope="module")
@@ -27,21 +30,30 @@ def result() -> Reproduction:
 class TestSetting:
     def test_every_claim_is_met_or_explained(self, result: Reproduction) -> None:
         assert not result.unexplained
-        assert [claim.where for claim in result.unmet] == ["(8) (erratum)"]
+        assert [claim.where for claim in result.unmet] == ["(8) (erratum)", "(8) (erratum)"]
+
+    @pytest.mark.parametrize("where", ["(8)", "(20)", "Theorem 2", "(8) (erratum)"])
+    def test_every_statement_about_the_estimate_has_a_row_for_each_design(
+        self, result: Reproduction, where: str
+    ) -> None:
+        rows = [claim.what for claim in result.claims if claim.where == where]
+        assert ["L, K of (12)" in what for what in rows] == [True, False]
+        assert ["L = 0, K = E_J" in what for what in rows] == [False, True]
 
     def test_the_figure_shows_the_claims(self, result: Reproduction) -> None:
         (figure,) = result.figures
         voltages, state, squared, chosen = figure.panels
         for panel in (state, squared):
-            selected, envelope = panel.lines
-            assert np.all(selected.y <= envelope.y)
-            assert selected.y[-1] < -8.0
+            for selected, envelope in (panel.lines[:2], panel.lines[2:]):
+                assert np.all(selected.y <= envelope.y)
+                assert selected.y[-1] < -8.0
         true, reported, back = voltages.lines[:3]
         assert np.abs(true.y[-1] - back.y[-1]) < 1e-7
         assert not np.isfinite(reported.y[-1]), "the drifting meter leaves the axes"
         # The set {1, 3, 4} without both liars is chosen once the rest has settled.
         masks = banks.subsets(5, 2, most=100).masks()
-        assert np.flatnonzero(masks[int(chosen.lines[0].y[-1])]).tolist() == [0, 2, 3]
+        for line in chosen.lines:
+            assert np.flatnonzero(masks[int(line.y[-1])]).tolist() == [0, 2, 3]
 
     def test_the_reactance_matrix_of_the_line(self) -> None:
         """H as printed in section VII: sums of X_0 … X_min, and X' on the diagonal."""
@@ -51,38 +63,95 @@ class TestSetting:
         expected = -2.0 * (main * (np.minimum(i[:, None], i) + 1) + drop * np.eye(4))
         np.testing.assert_allclose(of.lure.H, expected, rtol=1e-12)
 
-    def test_the_run_against_the_bank_of_the_service(self) -> None:
+    @both
+    def test_the_run_against_the_bank_of_the_service(self, of: Design) -> None:
         """The same banks, held readings, small steps: `bank.step` follows the continuous-time run."""
-        of = chong2020.setting(3)
-        masks = banks.subsets(3, 1, most=100).masks()
+        at, those = chong2020.setting(3), chong2020.observers(of, 3, 1)
         rng = np.random.default_rng(1)
         x, start = rng.uniform(-0.05, 0.05, 3), rng.uniform(-0.05, 0.05, (6, 3))
 
         def alpha(t: float) -> np.ndarray:
             return np.array([0.0, 0.03 * np.cos(t), 0.0])
 
-        run = chong2020.observe(of, 1, alpha, x=x, start=start, times=np.linspace(0.0, 4.0, 41))
-        bank = banks.design(of.lure, 1, gains=banks.direct_gains(of.lure, masks))
+        run = chong2020.observe(at, those, alpha, x=x, start=start, times=np.linspace(0.0, 4.0, 41))
+        bank = those.bank
         seen, h, truth = np.ones(3, dtype=bool), 0.005, x
-        state = banks.init(bank, np.zeros(3), of.w, seen)
+        state = banks.init(bank, np.zeros(3), at.w, seen)
         state = type(state)(start, seen, state.prepared)  # type: ignore[call-arg, arg-type]
         for k in range(800):
             # Readings of the middle of each step make the held input second order.
-            half = advance(of.lure, truth, of.w, h / 2)
-            y = chong2020.reported(of.lure.H @ half + of.w, 1.0, alpha((k + 0.5) * h))
-            state = banks.step(bank, state, y, of.w, seen, h)
-            truth = advance(of.lure, half, of.w, h / 2)
+            half = advance(at.lure, truth, at.w, h / 2)
+            y = chong2020.reported(at.lure.H @ half + at.w, 1.0, alpha((k + 0.5) * h))
+            state = banks.step(bank, state, y, at.w, seen, h)
+            truth = advance(at.lure, half, at.w, h / 2)
         np.testing.assert_allclose(truth, run.x[-1], atol=1e-6)
         np.testing.assert_allclose(state.x, run.estimates[-1], atol=2e-5)  # type: ignore[union-attr]
         np.testing.assert_allclose(banks.consistency(bank, state), run.pi[-1], atol=4e-5)
 
-    def test_honest_observers_stay_within_a_third_of_the_envelope(self) -> None:
-        run, state, _ = chong2020.under_attack()
+    @both
+    def test_the_run_against_one_observer_at_a_time(self, of: Design) -> None:
+        """(11) and (17) written out entry by entry, one set J after the other, with its own solver."""
+        at = chong2020.setting()
+        run, _, _ = chong2020.under_attack(of)
+        masks = banks.subsets(5, 2, most=100).masks()
+        tau, knots, levels = at.droop.tau, 1.0 - at.droop.v[:, ::-1] ** 2, at.droop.q[:, ::-1]
+        H, w = at.lure.H, at.w
+
+        def gain(J: list[int]) -> tuple[np.ndarray, np.ndarray]:
+            if of == "direct":
+                return np.zeros((5, len(J))), np.eye(5)[:, J]
+            one = chong2020.solutions()[tuple(J)]
+            return one.L, one.K
+
+        def curve(i: int, z: float) -> float:
+            return float(np.interp(z, knots[i], levels[i]))
+
+        for index in (0, 4, 12):  # {3, 4, 5} and {1, 3, 4} of the large sets, {3} of the small ones
+            J = np.flatnonzero(masks[index]).tolist()
+            L, K = gain(J)
+
+            def field(
+                t: float, s: np.ndarray, J: list[int] = J, L: np.ndarray = L, K: np.ndarray = K
+            ) -> list[float]:
+                x, hat = s[:5], s[5:]
+                z = [float(w[i] + H[i] @ x) for i in range(5)]
+                # Meter 2 reads 0.04 + 0.02 t too much, meter 5 0.08 sin t, in per unit of the voltage.
+                shift = [0.0, 0.04 + 0.02 * t, 0.0, 0.0, 0.08 * np.sin(t)]
+                y = [1.0 - (np.sqrt(1.0 - z[j]) + shift[j]) ** 2 for j in range(5)]
+                gap = [y[j] - float(w[j] + H[j] @ hat) for j in J]
+                zeta = [float(w[i] + H[i] @ hat + K[i] @ gap) for i in range(5)]
+                plant = [(curve(i, z[i]) - x[i]) / tau[i] for i in range(5)]
+                return plant + [(curve(i, zeta[i]) - hat[i]) / tau[i] + float(L[i] @ gap) for i in range(5)]
+
+            start = np.concatenate([run.x[0], run.estimates[0, index]])
+            alone = solve_ivp(
+                field, (0.0, 5.0), start, "DOP853", run.t[:51], rtol=1e-9, atol=1e-12, max_step=0.1
+            )
+            np.testing.assert_allclose(alone.y[:5].T, run.x[:51], atol=2e-7)
+            np.testing.assert_allclose(alone.y[5:].T, run.estimates[:51, index], atol=2e-7)
+
+    @both
+    def test_honest_observers_stay_within_a_third_of_the_envelope(self, of: Design) -> None:
+        run, state, _ = chong2020.under_attack(of)
         masks = banks.subsets(5, 2, most=100).masks()
         honest = ~masks[:, [1, 4]].any(axis=1)
         error = np.abs(run.estimates[:, honest] - run.x[:, None]).max(axis=(1, 2))
         assert np.all(error <= state / 3.0)
         assert np.all(run.error <= state)
+
+    @both
+    def test_the_proof_of_each_honest_observer_falls_at_its_rate(self, of: Design) -> None:
+        """`V = e^T P e` of the integrated error, set by set: V(t) <= exp(-2 rate t) V(0)."""
+        run, _, _ = chong2020.under_attack(of)
+        those = chong2020.observers(of)
+        honest = np.flatnonzero(~those.bank.masks[:, [1, 4]].any(axis=1))
+        assert len(honest) == 4  # {1, 3, 4}, {1}, {3}, {4}
+        for index in honest:
+            e = run.estimates[:, index] - run.x
+            V = np.einsum("ti,ij,tj->t", e, those.P[index], e)
+            late = 1e-10 * V[0] < V  # below, the error of the integration counts
+            assert np.all(V[late] <= V[0] * np.exp(-2.0 * those.rate[index] * run.t[late]) * (1.0 + 1e-6))
+            assert late.sum() > 100
 
 
 class TestErrata:
@@ -223,20 +292,50 @@ class TestErrata:
         assert np.all(gap <= both + 1e-9)
         assert gap[-1] < 0.03 * gap[0]
 
-    def test_8_needs_the_errors_of_all_observers(self) -> None:
-        run = chong2020.exact_start()
+    @both
+    def test_8_needs_the_errors_of_all_observers(self, of: Design) -> None:
+        run = chong2020.exact_start(of)
         masks = banks.subsets(3, 1, most=100).masks()
         assert run.error[0] == 0.0
         assert np.flatnonzero(masks[run.chosen[0]]).tolist() == [0, 1]
         assert run.error.max() > 0.02
         # Corrected: the largest initial error of all observers.
-        of = chong2020.setting(3)
-        assert np.all(run.error <= chong2020.envelope(reactance(of.lure), run.estimates[0] - run.x[0], run.t))
+        those = chong2020.observers(of, 3, 1)
+        assert np.all(run.error <= chong2020.envelope(those, run.estimates[0] - run.x[0], run.t))
 
     def test_corollary_1_holds_when_corrected(self) -> None:
-        """One design by the corrected (12), for the smallest set, verified; the rest is a claim."""
-        of = chong2020.setting()
-        made = circle(of.lure, [3], rate=0.25, noise=2e-4, load=np.full(5, 2e-3))
-        assert margin(of.lure, made.J, made) > 0.0
-        rest = equilibrium(of.lure, of.w, tol=1e-12, max_iter=200)
+        """The corrected (12) for all 31 sets, without the column of load errors, block by block.
+
+        Oracle: A = -1 / tau, G = 1 / tau and H as section VII prints them, and the slope bounds of (18).
+        """
+        at, found = chong2020.setting(), chong2020.solutions()
+        assert sorted(found) == sorted(J for k in range(1, 6) for J in combinations(range(5), k))
+        inverse = np.diag(1.0 / at.droop.tau)
+        shared = 0.03 * (np.minimum.outer(np.arange(5), np.arange(5)) + 1) + 0.01 * np.eye(5)
+        H = -2.0 * shared / 1.587
+        for J, one in found.items():
+            P, Lam, k = one.P, np.diag(one.Lambda), len(J)
+            assert np.linalg.eigvalsh(P)[0] > 0.0
+            assert min(*one.Lambda, one.mu, one.nu) > 0.0
+            inner = P @ (-inverse - one.L @ H[list(J)])
+            weight = one.nu * np.linalg.eigvalsh(H.T @ H)[0] * np.eye(5)  # nu I of (12)
+            blocks = np.block(
+                [
+                    [
+                        inner + inner.T + 2.0 * chong2020.RATE * P + weight,
+                        P @ inverse + (H - one.K @ H[list(J)]).T @ Lam,
+                        -P @ one.L,
+                    ],
+                    [np.zeros((5, 5)), -2.0 * Lam @ np.diag(1.0 / at.droop.slope), -Lam @ one.K],
+                    # mu belongs to noise in units of METER_ERROR.
+                    [np.zeros((k, 10)), -one.mu / chong2020.METER_ERROR**2 * np.eye(k)],
+                ]
+            )
+            whole = np.triu(blocks) + np.triu(blocks, 1).T
+            scale = 1.0 / np.sqrt(-np.diagonal(whole))
+            assert np.linalg.eigvalsh(scale[:, None] * whole * scale)[-1] < 0.0, J
+            # No observer ignores its meters, and none of the bank is direct injection.
+            assert np.abs(one.K[list(J), range(k)]).min() > 0.5, J
+            assert np.abs(one.L).max() > 1e-3 or k > 3, J
+        rest = equilibrium(at.lure, at.w, tol=1e-12, max_iter=200)
         assert np.all(rest > 0.01), "the setting works on the ramps of its curves"

@@ -208,7 +208,10 @@ def test_nearest_point_inverses_see_attacks_that_the_printed_factor_hides() -> N
     assert error[run.t > 3.0].max() < 1e-4
 
 
-def test_erratum_168_misses_a_factor_on_the_way_but_holds() -> None:
+def test_168_is_proven_though_the_formula_inferred_from_it_is_not() -> None:
+    """4 theta sqrt(l2 / l1) = 167.6 is in neither paper; kim2018 prints sqrt(2 n l2 / l1) theta^(n - 1)."""
+    golden = (3.0 + np.sqrt(5.0)) / 2.0
+    assert 4.0 * decay_lee(2, 16.0, 0.0, printed=True).eta == pytest.approx(4.0 * 16.0 * golden)
     printed = decay_lee(2, 16.0, 0.0, printed=True).eta
     by_norms = decay_lee(2, 16.0, 0.0).eta
     assert by_norms == pytest.approx(np.sqrt(2.0) * printed)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.integrate import dblquad
 
 from gridsec import sequential
-from gridsec.arrays import Bools, Floats
+from gridsec.arrays import Bools, Floats, Ints
 from gridsec.online import Frame
 from gridsec.sequential import Commission, SequentialDesign, SequentialOptions
 from gridsec.sequential.commission import (
@@ -52,10 +52,16 @@ def one(k: int) -> Bools:
     return which
 
 
+def summed(total: Floats, count: Ints, time_s: Floats, since: Floats) -> Learning:
+    """What was gathered at ticks that all counted."""
+    start = begin(np.ones(P, dtype=np.bool_), 0.0)
+    return replace(start, total=total, count=count, time_s=time_s, since=since, watched_s=time_s)
+
+
 def learned(design: SequentialDesign, rng: np.random.Generator) -> Commission:
     every = np.ones(P, dtype=np.bool_)
     count = np.full(P, 3600)
-    gathered = Learning(rng.normal(size=P) * 0.002 * count, count, np.full(P, 3600.0), np.zeros(P))
+    gathered = summed(rng.normal(size=P) * 0.002 * count, count, np.full(P, 3600.0), np.zeros(P))
     known = conclude(design, nothing(design), gathered, every, 3600.0)
     assert known.learning is None
     return known
@@ -119,7 +125,7 @@ def test_what_is_left_of_lasting_errors_is_in_the_standard_deviation(lasting: fl
     for _ in range(draws):
         own, lasts = np.sqrt(design.fixed) * rng.normal(size=P), root @ rng.normal(size=P)
         errors.append(lasts - L @ inverse @ (own + lasts + rest @ rng.normal(size=P)))
-    gathered = Learning(np.zeros(P), np.full(P, count), np.full(P, 3600.0), np.zeros(P))
+    gathered = summed(np.zeros(P), np.full(P, count), np.full(P, 3600.0), np.zeros(P))
     found = conclude(design, nothing(design), gathered, every, 3600.0).learned
     np.testing.assert_allclose(found.hidden, np.diag(L - L @ inverse @ L), rtol=1e-6, atol=1e-14)
     np.testing.assert_allclose(found.hidden, np.var(errors, axis=0), rtol=0.1, atol=1e-14)
@@ -137,7 +143,7 @@ def lasting_errors() -> tuple[SequentialDesign, Learned, Floats]:
     options = SequentialOptions(commission_s=3600.0, scales_s=(0.0, 60.0))
     design = sequential.design(plant, doubt=doubt, step_s=1.0, options=options)
     others, count = np.flatnonzero(~one(2)), np.where(one(2), 0, 3600)
-    gathered = Learning(np.zeros(P), count, count.astype(np.float64), np.zeros(P))
+    gathered = summed(np.zeros(P), count, count.astype(np.float64), np.zeros(P))
     known = conclude(design, nothing(design), gathered, ~one(2), 3600.0).learned
     S, B = design.prior.between, np.diag(design.fixed)
     means = np.hstack([np.linalg.cholesky(S), np.sqrt(B), np.zeros((P, P))])
@@ -195,7 +201,7 @@ def test_honest_meters_with_coarse_registers_are_not_suspected_once_learned() ->
     doubt = LoadDoubt(np.full(P, 1e-4), np.full(P, 1e-4), 600.0)
     design = sequential.design(plant, doubt=doubt, step_s=1.0, options=options)
     every, none, rng = np.ones(P, dtype=np.bool_), np.zeros(P), np.random.default_rng(6)
-    gathered = Learning(none, np.full(P, 3600), np.full(P, 3600.0), none)
+    gathered = summed(none, np.full(P, 3600), np.full(P, 3600.0), none)
     known = conclude(design, nothing(design), gathered, every, 0.0).learned
     state = sequential.init(design, 0.0, known, None)
     # The truth is 230 V everywhere, and by their own errors one meter is rounded up and the others are down.
@@ -228,7 +234,7 @@ def test_nothing_beyond_the_class_is_learned() -> None:
     """Whoever lies by more than the class all the while is no honest meter with that error."""
     design = prepared()
     every, count = np.ones(P, dtype=np.bool_), np.full(P, 10**6)
-    gathered = Learning(one(1) * 1.0 * count, count, np.full(P, 1e7), np.zeros(P))
+    gathered = summed(one(1) * 1.0 * count, count, np.full(P, 1e7), np.zeros(P))
     known = conclude(design, nothing(design), gathered, every, 1e7)
     assert known.learned.bias[1] == design.allowed[1]
     assert (np.abs(known.learned.bias) <= design.allowed).all()

@@ -120,7 +120,7 @@ def test_a_meters_score_is_that_of_the_scale_that_speaks_most_against_it(design:
             else None
             for o, a, e, here in zip(offset, limit, enough, there, strict=True)
         )
-        seen = Examined(sequential.init(design, 0.0).trust, (None,) * 4, (None,) * 4, views, {})
+        seen = Examined(sequential.init(design, 0.0).trust, (None,) * 4, (None,) * 4, views, {}, (False,) * 4)
         score, threshold, judged = _worst(design, seen, 12)
         for j in range(12):
             by = [s for s in range(4) if there[s] and enough[s, j]]

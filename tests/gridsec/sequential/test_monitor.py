@@ -264,8 +264,9 @@ class TestDesign:
         rng = np.random.default_rng(32)
         made = prepare(make_plant(rng))
         assert made.lengths == (1, 5, 15, 60)
-        looks = [(9 + 1) * 365.25 * 86400.0 / length for length in made.lengths]
+        assert made.every == (1, 1, 2, 8)
+        looks = [(9 + 1 + 1) * 365.25 * 86400.0 / every for every in made.every]
         rate = sum(n * erfc(z / sqrt(2.0)) for n, z in zip(looks, made.sigmas, strict=True))
-        # Stuck meters and replays have a share each, as every scale has; the busbar is judged as meters are.
+        # Stuck meters and replays have a share each, as every scale has; busbar and misfit are tests, too.
         assert rate == pytest.approx(4.0 / 6.0, rel=1e-6)
         assert prepare(make_plant(rng), step_s=900.0).lengths == (1,)

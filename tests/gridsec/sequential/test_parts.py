@@ -14,7 +14,7 @@ from gridsec.arrays import Floats
 from gridsec.droop import fleet
 from gridsec.feeder import lindistflow
 from gridsec.sequential import LoadDoubt, SequentialOptions, curves, design
-from gridsec.sequential.commission import Learning, begin, conclude, gather, nothing
+from gridsec.sequential.commission import begin, conclude, gather, nothing
 from gridsec.sequential.drive import Free, drive
 from gridsec.sequential.loads import injection_doubt, prior
 from gridsec.sequential.windows import empty, forget, push, shift
@@ -190,7 +190,8 @@ class TestCommissioning:
         count = np.array([900, 900, 900, 0, 450, 900, 900, 900])
         mean = rng.normal(size=8) * 0.004
         heard = count > 0
-        gathered = Learning(mean * count, count, np.where(heard, 3600.0, 0.0), np.full(8, 100.0))
+        start, time_s = begin(np.ones(8, dtype=bool), 100.0), np.where(heard, 3600.0, 0.0)
+        gathered = replace(start, total=mean * count, count=count, time_s=time_s)
         known = conclude(made, nothing(made), gathered, np.ones(8, dtype=bool), 4000.0)
         found = known.learned
         rho = 600.0 / 3600.0

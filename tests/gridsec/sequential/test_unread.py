@@ -23,7 +23,7 @@ WHO = np.array([3])
 
 
 @pytest.mark.parametrize("back", [30, 999])
-@pytest.mark.parametrize("size", [0.0012, 0.0015])
+@pytest.mark.parametrize("size", [0.0013, 0.0015])
 def test_a_busbar_that_moves_unread_acquits_nobody(size: float, back: int) -> None:
     """All residuals move with it, of liars as of everybody: that is no end of a manipulation."""
 

@@ -161,7 +161,14 @@ def test_what_was_found_before_a_defect_is_not_lost(
 
     monkeypatch.setattr(Watcher, "step", breaks)
     with Store(f"sqlite:///{path}") as store:
-        live = Rounds(RuntimeConfig(clock=Clock.WALL), store, [site], wall=lambda: wall, stored=lambda: None)
+        live = Rounds(
+            RuntimeConfig(clock=Clock.WALL),
+            store,
+            [site],
+            wall=lambda: wall,
+            stored=lambda: None,
+            clock=lambda: 0.0,
+        )
         live.keeper.publisher = outlet = Outlet()
         live.watches[FEEDER].install(design(site))
         live.begin()
@@ -191,7 +198,14 @@ def test_alarms_of_before_a_defect_in_the_alarms_reach_the_database(
     monkeypatch.setattr("service.watch.conditions", breaks)
     wall = START - 0.5
     with Store(f"sqlite:///{path}") as store:
-        live = Rounds(RuntimeConfig(clock=Clock.WALL), store, [site], wall=lambda: wall, stored=lambda: None)
+        live = Rounds(
+            RuntimeConfig(clock=Clock.WALL),
+            store,
+            [site],
+            wall=lambda: wall,
+            stored=lambda: None,
+            clock=lambda: 0.0,
+        )
         live.keeper.publisher = outlet = Outlet()
         live.watches[FEEDER].install(design(site))
         live.begin()

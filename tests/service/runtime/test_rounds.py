@@ -135,7 +135,7 @@ def test_a_database_that_goes_away_and_comes_back_loses_nothing(
         assert live.watches[FEEDER].book.alarms
         assert outlet.estimates[-1]["t"] >= START + 28
         with pytest.raises(StoreUnavailable):
-            live.acknowledge(live.watches[FEEDER].book.alarms[0].id, "Ada", "")
+            live.acknowledge(live.watches[FEEDER].book.alarms[0].id, "Ada", "").result()
         assert all(a.state is not AlarmState.ACKNOWLEDGED for a in live.watches[FEEDER].book.alarms)
         other.close()
         live.round(after)
@@ -292,16 +292,16 @@ def test_a_deleted_feeder_leaves_cleared_alarms_and_its_history(
     outlet = Outlet()
     with Store(f"sqlite:///{path}") as store:
         live = rounds(store, site, outlet)
-        store.put_feeder(FEEDER, {})
+        store.commit(put=(FEEDER, {}))
         live.round(until(attacked, 15.0)[0])
         other = locked()
         with pytest.raises(StoreUnavailable):
-            live.remove(FEEDER)
+            live.remove(FEEDER).result()
         assert FEEDER in live.watches
         assert len(live.watches[FEEDER].book.active) == 2
         other.close()
         live.keeper.commit(at_once=True)
-        live.remove(FEEDER)
+        live.remove(FEEDER).result()
         assert (live.watches, store.feeders(), store.active(FEEDER)) == ({}, {}, [])
         alarms = store.alarms()[0]
         assert {alarm.state for alarm in alarms} == {AlarmState.CLEARED}
@@ -313,7 +313,7 @@ def test_a_deleted_feeder_leaves_cleared_alarms_and_its_history(
         live.round(until(attacked, 15.0)[1][:1])
         assert store.rejected()[0].reason.startswith("unknown-feeder")
         with pytest.raises(FeederUnknown):
-            live.remove(FEEDER)
+            live.remove(FEEDER).result()
 
 
 def test_alarms_of_a_feeder_that_was_left_out_are_cleared_at_the_start(
@@ -324,7 +324,7 @@ def test_alarms_of_a_feeder_that_was_left_out_are_cleared_at_the_start(
         first, second = store.active(FEEDER)
         elsewhere = replace(first, id="0" * 26, feeder="elsewhere")
         store.outbox_done(store.commit([Transition(elsewhere, Change.RAISED, START)]))
-        store.put_feeder("elsewhere", {"tables": "of another version, which cannot be loaded"})
+        store.commit(put=("elsewhere", {"tables": "of another version, which cannot be loaded"}))
     outlet = Outlet()
     with Store(f"sqlite:///{path}") as store:
         live = Rounds(RuntimeConfig(), store, [], wall=lambda: START + 60, stored=lambda: None)
@@ -360,7 +360,7 @@ def test_of_two_alarms_that_tell_the_same_none_stands_for_ever(site: Site, path:
     def unloaded(store: Store) -> None:
         why = {FEEDER: "of another version"}
         live = Rounds(RuntimeConfig(), store, [], wall=lambda: START, stored=lambda: None, unloaded=why)
-        live.remove(FEEDER)
+        live.remove(FEEDER).result()
 
     def left_out(store: Store) -> None:
         Rounds(RuntimeConfig(), store, [], wall=lambda: START, stored=lambda: None).begin()
@@ -407,13 +407,13 @@ def test_acknowledgements(site: Site, attacked: list[Sample], path: Path) -> Non
         live = rounds(store, site, outlet)
         live.round(until(attacked, 15.0)[0])
         first, second = (a.id for a in store.active(FEEDER))
-        assert live.acknowledge(first, "Ada", "on my way")["acknowledged_by"] == "Ada"
+        assert live.acknowledge(first, "Ada", "on my way").result()["acknowledged_by"] == "Ada"
         with pytest.raises(AlreadyAcknowledged):
-            live.acknowledge(first, "Bob", "")
+            live.acknowledge(first, "Bob", "").result()
         with pytest.raises(RaisedAgain):
-            live.acknowledge(second, "Bob", "", count=2)
+            live.acknowledge(second, "Bob", "", count=2).result()
         with pytest.raises(AlarmUnknown):
-            live.acknowledge("0" * 26, "Ada", "")
+            live.acknowledge("0" * 26, "Ada", "").result()
         live.round(until(attacked, 15.0)[1])
     with Store(f"sqlite:///{path}") as store:
         # The feeder is not watched any more: the store alone knows its alarm.
@@ -424,8 +424,8 @@ def test_acknowledgements(site: Site, attacked: list[Sample], path: Path) -> Non
         assert known is not None
         assert known.state is AlarmState.CLEARED
         with pytest.raises(RaisedAgain):
-            live.acknowledge(second, "Bob", "", count=2)
-        assert live.acknowledge(second, "Bob", "", count=1)["acknowledged_by"] == "Bob"
+            live.acknowledge(second, "Bob", "", count=2).result()
+        assert live.acknowledge(second, "Bob", "", count=1).result()["acknowledged_by"] == "Bob"
         assert outlet.events[-1][0]["acknowledged_by"] == "Bob"
 
 

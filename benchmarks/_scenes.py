@@ -1,0 +1,320 @@
+"""Scenes of the benchmarks about stealthy lies and false accusations: feeders, honest errors, learned meters.
+
+The truth is AC power flow with the droop inverters in closed loop. Loads, generation and the busbar vary as
+in `feeders.variation` without tap steps; meters have the errors that the feeder's files state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from functools import lru_cache
+
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import breadth_first_order, depth_first_order, dijkstra
+
+from feeders.doubts import unread
+from feeders.estimators import SEQUENTIAL, Watcher, design
+from feeders.load import Site, from_tables, load
+from feeders.scenario import START, Scenario
+from feeders.schema import CustomerRow, FeederMeta, FeederTables, LineRow
+from feeders.trials import LoadError, Meters, Trial, Truth, frames
+from feeders.variation import Variation
+from gridsec.arrays import Bools, Floats, Ints
+from gridsec.attack import Attack
+from gridsec.network import InPhases
+from gridsec.online import Frame
+from gridsec.sequential import SequentialDesign, SequentialState, init, step
+from gridsec.sequential.commission import Learned
+
+ONSET_S = 20.0
+"""Honest seconds before a manipulation."""
+WATCHED_S = 90.0
+"""Seconds of a manipulation."""
+LEARN_S = 6.0 * 3600.0
+"""Time over which fixed errors are learned, s."""
+LEARN_STEP_S = 300.0
+"""Tick of the learning run, s: 72 readings leave 0.006 % of a meter's jitter."""
+UNREAD = 0.05
+"""Share of the customers without a power reading, at least one customer."""
+PROFILE_S = 13.9 * 86_400.0
+"""Length of the summer's profiles, s."""
+_LEAST_OHM = 1e-6
+"""Resistance of a fused line in distances, ohm: a graph has no edge of weight zero."""
+
+
+class Model(StrEnum):
+    """Knowledge of the powers."""
+
+    MATCHED = "matched"
+    """Registers and power factors err as the files say; the monitor knows these limits."""
+    LOADS = "loads"
+    """Errors of 0.6 kW and 0.2 kvar, correlation time 600 s, known as such."""
+    UNREAD = "unread"
+    """As MATCHED, but `UNREAD` of the customers report a voltage and no power."""
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """One honest world.
+
+    Attributes
+    ----------
+    feeder
+        A feeder of the project, or "street-N-K" and "phases-N-K": random number K of N customers.
+    model
+        Knowledge of the powers.
+    learned
+        Whether fixed errors of the meters are learned.
+    seed
+        Chooses everything random.
+    """
+
+    feeder: str
+    model: Model
+    learned: bool
+    seed: int
+
+
+@lru_cache(maxsize=32)
+def site(feeder: str) -> Site:
+    """The feeder of a setting."""
+    if feeder.startswith(("street-", "phases-")):
+        kind, customers, number = feeder.split("-")
+        return from_tables(random_tables(int(customers), int(number), phases=kind == "phases"))
+    return load(feeder)
+
+
+@lru_cache(maxsize=32)
+def _trial(feeder: str, model: Model, step_s: float) -> tuple[Trial, Site]:
+    """A trial of a feeder, and its stated site."""
+    errors = LoadError() if model is Model.LOADS else None
+    variation = Variation(tap_step_pu=0.0)
+    trial = Trial(site(feeder), step_s=step_s, load_error=errors, meters=Meters.SITE, variation=variation)
+    return trial, trial.stated
+
+
+@lru_cache(maxsize=32)
+def watcher(feeder: str, model: Model, *, step_s: float = 1.0, commission_s: float = 0.0) -> Watcher:
+    """The default monitor of a feeder."""
+    _, stated = _trial(feeder, model, step_s)
+    meta = stated.tables.meta
+    settings = replace(meta.monitor, estimator=SEQUENTIAL, commission_s=commission_s)
+    return design(from_tables(replace(stated.tables, meta=replace(meta, monitor=settings))))
+
+
+def without_powers(setting: Setting) -> Bools:
+    """Customers without a power reading, (N,)."""
+    count = len(site(setting.feeder).tables.customers)
+    out = np.zeros(count, dtype=np.bool_)
+    if setting.model is Model.UNREAD:
+        random = np.random.default_rng([setting.seed, 5])
+        out[random.choice(count, max(1, round(UNREAD * count)), replace=False)] = True
+    return out
+
+
+def play(
+    setting: Setting,
+    duration_s: float,
+    *,
+    attacks: tuple[Attack, ...] = (),
+    busbar: tuple[Attack, ...] = (),
+    step_s: float = 1.0,
+    start: float = START,
+) -> Iterator[tuple[Frame, Truth]]:
+    """Frames and truth of a setting.
+
+    Parameters
+    ----------
+    setting
+        The honest world.
+    duration_s, step_s, start
+        Length and tick, s, and the first tick, Unix s.
+    attacks, busbar
+        Manipulations of the meters and of the busbar's meter.
+    """
+    trial, stated = _trial(setting.feeder, setting.model, step_s)
+    trial = replace(trial, seed=setting.seed, duration_s=duration_s)
+    scenario: Scenario = replace(
+        trial.scenario,
+        start=start,
+        profile_s=moment(setting) + start - START,
+        attacks=attacks,
+        busbar_attacks=busbar,
+    )
+    silent, nothing = without_powers(setting), unread(stated)
+    for frame, truth in frames(trial, scenario, stated=stated):
+        yield (_without(frame, nothing, silent) if silent.any() else frame), truth
+
+
+def _without(frame: Frame, nothing: Frame, silent: Bools) -> Frame:
+    names = ("p", "p_error", "q", "q_error")
+    return replace(frame, **{k: np.where(silent, getattr(nothing, k), getattr(frame, k)) for k in names})
+
+
+def moment(setting: Setting) -> float:
+    """Position of START within the profiles, s."""
+    return float(np.random.default_rng([setting.seed, 146]).uniform(0.0, PROFILE_S))
+
+
+def start(setting: Setting) -> tuple[SequentialDesign, SequentialState]:
+    """The monitor and its state before the first frame."""
+    made: SequentialDesign = watcher(setting.feeder, setting.model).design
+    known = learned(setting) if setting.learned else None
+    return made, init(made, START, known)
+
+
+@lru_cache(maxsize=64)
+def learned(setting: Setting) -> Learned:
+    """Fixed errors learned over the six honest hours before START, tick `LEARN_STEP_S`.
+
+    Raises
+    ------
+    RuntimeError
+        If the monitor names a meter in these hours, or learns nothing though all powers are read.
+    """
+    return learn(setting, LEARN_STEP_S)
+
+
+def learn(setting: Setting, step_s: float) -> Learned:
+    """As `learned`, for another tick, s."""
+    made = watcher(setting.feeder, setting.model, step_s=step_s, commission_s=LEARN_S).design
+    begin = START - LEARN_S - 2.0 * step_s
+    state = init(made, begin)
+    for frame, _ in play(setting, START - begin, step_s=step_s, start=begin):
+        state, _, verdict = step(made, state, frame)
+        if verdict.suspects.any():
+            raise RuntimeError(f"{setting}: a meter is named while errors are learned")
+    # Without all powers some meters, or all, are not learned; that is the state after these hours.
+    if state.learning is not None and setting.model is not Model.UNREAD:
+        raise RuntimeError(f"{setting}: nothing is learned")
+    return state.learned
+
+
+# --- places -------------------------------------------------------------------------------------
+
+
+def neighbours(where: Site, first: int) -> Ints:
+    """Meters in the order of their electrical distance from one, (p,).
+
+    Parameters
+    ----------
+    where
+        The feeder.
+    first
+        Index of a meter.
+    """
+    graph, at = _graph(where)
+    distance = dijkstra(graph, directed=False, indices=at[first])
+    return np.argsort(distance[at], kind="stable").astype(np.intp)
+
+
+def street(where: Site) -> Ints:
+    """Meters in depth-first order from the busbar, (p,): connected runs are streets and laterals."""
+    graph, at = _graph(where)
+    order, _ = depth_first_order(graph, 0, directed=False)
+    rank = np.empty(graph.shape[0])
+    rank[order] = np.arange(order.size)
+    return np.argsort(rank[at], kind="stable").astype(np.intp)
+
+
+def beyond(where: Site) -> list[Ints]:
+    """Meters behind every bus, the largest sets first; the busbar's own is left out."""
+    graph, at = _graph(where)
+    order, before = breadth_first_order(graph, 0, directed=False)
+    below: list[set[int]] = [set() for _ in range(graph.shape[0])]
+    for j, bus in enumerate(at):
+        below[bus].add(j)
+    for bus in order[:0:-1]:
+        below[before[bus]] |= below[bus]
+    found = {tuple(sorted(below[bus])) for bus in order[1:]}
+    some = sorted((one for one in found if one), key=lambda one: (-len(one), one))
+    return [np.array(one, dtype=np.intp) for one in some]
+
+
+def _graph(where: Site) -> tuple[csr_array, Ints]:
+    """Resistances between buses, the busbar first, and the bus of each meter."""
+    tables = where.tables
+    closed = [line for line in tables.lines if line.closed]
+    names = dict.fromkeys([tables.meta.busbar])
+    for line in closed:
+        names |= dict.fromkeys([line.from_bus, line.to_bus])
+    number = {name: k for k, name in enumerate(names)}
+    ends = np.array([(number[line.from_bus], number[line.to_bus]) for line in closed])
+    ohm = np.array([max(line.r_ohm, _LEAST_OHM) for line in closed])
+    graph = csr_array((ohm, (ends[:, 0], ends[:, 1])), shape=(len(number),) * 2)
+    at = np.array([number[tables.customers[c].bus] for c in where.meters], dtype=np.intp)
+    return graph, at
+
+
+def phase_of(where: Site) -> Ints:
+    """Phase of each meter, (p,); 0 for all on a balanced feeder."""
+    if not isinstance(where.feeder, InPhases):
+        return np.zeros(where.meters.size, dtype=np.intp)
+    rows = where.tables.customers
+    return np.array(["abc".index(rows[c].phases) for c in where.meters], dtype=np.intp)
+
+
+# --- random feeders -----------------------------------------------------------------------------
+
+
+def random_tables(customers: int, number: int, *, phases: bool) -> FeederTables:
+    """A random tree: forked mains, services, an inverter at every third customer.
+
+    In three phases every customer has one of them, drawn with unequal odds, behind a service of that phase;
+    mains have return paths of four times their resistance.
+
+    Parameters
+    ----------
+    customers
+        Their number.
+    number
+        Chooses the feeder.
+    phases
+        Whether it is one in three phases.
+    """
+    random = np.random.default_rng([number, customers, 42])
+    mains = max(2, customers // 3 if phases else 2 * customers // 3)
+    lines, names = [], ["bb"]
+    # About 4 % at 4 kW for each customer over half of the mains.
+    scale = _DROP * _VOLT**2 / (_KW * 1e3 * customers * mains / 4.0) * (1.0 if phases else 3.0)
+    for k in range(mains):
+        above = names[int(random.integers(max(0, len(names) - 3), len(names)))]
+        r = float(scale * random.uniform(0.5, 1.5))
+        x = float(r * random.uniform(0.25, 0.5))
+        zero = {"r0_ohm": 4.0 * r, "x0_ohm": 3.0 * x} if phases else {}
+        lines.append(LineRow(f"l{k}", above, f"n{k}", r, x, **zero))
+        names.append(f"n{k}")
+    odds, rows = random.dirichlet([4.0, 4.0, 4.0]), []
+    for c in range(customers):
+        phase = "abc"[int(random.choice(3, p=odds))] if phases else "abc"
+        at = names[int(random.integers(0 if c == 0 else 1, len(names)))]
+        r = float(random.uniform(0.005, 0.03))
+        lines.append(LineRow(f"s{c}", at, f"c{c}", r, 0.15 * r, phases=phase))
+        solar = c % 3 == 0
+        peak = float(random.uniform(3.0, 8.0))
+        rows.append(
+            CustomerRow(
+                f"load-{c}",
+                f"c{c}",
+                peak,
+                phases=phase,
+                meter=f"m{c}",
+                pv_kw=4.14 if solar else 0.0,
+                inverter_kva=4.6 if solar else 0.0,
+                droop="ieee1547-b" if solar else "",
+            )
+        )
+    meta = FeederMeta(format=1, name="random", voltage_volt=_VOLT, busbar="bb")
+    return FeederTables(meta, tuple(lines), tuple(rows))
+
+
+_VOLT, _DROP, _KW = 230.0, 0.04, 4.0
+
+
+def squared_to_shift(where: Site, y: Floats, lie: Floats) -> Floats:
+    """Displacement of readings, pu of nominal, that moves squared readings y, pu, by a lie, (p,)."""
+    of_nominal = (where.customer_volt / where.customer_nominal)[where.meters]
+    return np.asarray(of_nominal * (np.sqrt(np.maximum(y + lie, 0.0)) - np.sqrt(y)))

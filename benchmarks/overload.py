@@ -1,0 +1,317 @@
+"""Sustained rate of single readings, behaviour at three times that rate, and recovery.
+
+    python -m benchmarks.overload [feeders] [other source tree]
+
+The real service runs as a process with copies of the Kerber suburban network, 146 meters and the busbar
+each. A zenoh client publishes single JSON readings, and the figures come from `/metrics`. The rate rises by
+a quarter per stage of 6 s, from one reading per meter and second on. The sustained rate is that of the last
+stage in which at least 95 % of the ticks due had a verdict, CLEAN or ATTACKED. Then follow 8 s at three
+times that rate, and at most 10 s at one reading per meter and second. Recovery ends when every meter is seen
+and every verdict is CLEAN. The share of `keep_states` is processor time of the judging thread in stage one.
+
+Limits: the recovery takes at most 10 s, and during the overload a feeder is judged every 5 s on average.
+With another source tree the same is measured there first, and the ratios are printed. About two minutes per
+source tree.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import re
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from itertools import count
+from pathlib import Path
+
+import httpx
+
+from benchmarks._arguments import arguments
+from feeders.load import Site, load
+from feeders.meters import BUSBAR
+from feeders.scenario import Scenario, simulate
+from feeders.schema import write
+from service.bus import BusConfig
+from service.ingest import Meters
+from service.simulate import key_of
+
+FEEDER = "kerber-vorstadtnetz"
+STAGE_S, SETTLE_S, OVERLOAD_S, RECOVERY_S = 6.0, 2.0, 8.0, 10.0
+"""Lengths of a stage, of its part that is not measured, of the overload, and the longest recovery, s."""
+GROWTH, OVERLOAD = 1.25, 3.0
+"""Ratio of the rates of two stages, and of the overload to the sustained rate."""
+STAGES = 12
+DECIDED = 0.95
+"""Share of the ticks due that have a verdict at a sustained rate."""
+JUDGED_EVERY_S = 5.0
+"""Longest mean time between two judged ticks of a feeder during the overload, s."""
+START_S, STOP_S = 120.0, 10.0
+SECONDS = 60
+"""Simulated seconds; the sender repeats them with other noise."""
+NOISE_VOLT = 0.02
+
+
+@dataclass(frozen=True)
+class Load:
+    """What all meters send: keys, and for each simulated second the fields besides the time."""
+
+    keys: tuple[str, ...]
+    fields: tuple[tuple[tuple[float, float | None], ...], ...]
+
+
+@dataclass(frozen=True)
+class Service:
+    """A running service, and where it writes its totals."""
+
+    process: subprocess.Popen[bytes]
+    http: httpx.Client
+    zenoh: str
+    totals: Path
+    feeders: int
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage: readings per second sent and used, shares of the ticks due, share of the meters seen."""
+
+    offered: float
+    used: float
+    judged: float
+    decided: float
+    seen: float
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One source tree: readings per second, share of `keep_states`, the overload, and the recovery in s."""
+
+    sustained: float
+    keep_states: float
+    overload: Stage
+    recovery_s: float
+
+
+def free_ports(number: int) -> list[int]:
+    """Ports that are free on the loopback interface."""
+    sockets = [socket.socket() for _ in range(number)]
+    for one in sockets:
+        one.bind(("127.0.0.1", 0))
+    ports = [int(one.getsockname()[1]) for one in sockets]
+    for one in sockets:
+        one.close()
+    return ports
+
+
+def load_of(site: Site, names: Sequence[str]) -> Load:
+    """Simulate one feeder, and let all its copies send the same."""
+    samples = list(simulate(site, Scenario(seed=1, duration_s=float(SECONDS), dt_s=1.0)))
+    meters = (*site.meter_ids, BUSBAR)
+    keys = tuple(key_of(name, meter) for name in names for meter in meters)
+    rows = []
+    for sample in samples:
+        by_meter = {reading.meter: (reading.v_volt, reading.p_kw) for reading in sample.readings}
+        rows.append(tuple(by_meter[meter] for meter in meters))
+    return Load(keys, tuple(rows))
+
+
+@contextmanager
+def running(tree: Path, folder: Path, names: Sequence[str]) -> Iterator[Service]:
+    """Run the service of a source tree until the block ends."""
+    http, zenoh = free_ports(2)
+    totals, log = folder / "totals.json", folder / "service.log"
+    script = Path(__file__).with_name("_overload_service.py")
+    command = [sys.executable, str(script), str(totals)]
+    for name in names:
+        command += ["--feeder", str(folder / name)]
+    command += ["--http", f"127.0.0.1:{http}", "--zenoh-listen", f"tcp/127.0.0.1:{zenoh}"]
+    command += ["--database", f"sqlite:///{folder / f'{tree.name}.db'}"]
+    environment = {**os.environ, "PYTHONPATH": str(tree)}
+    with log.open("wb") as out, httpx.Client(base_url=f"http://127.0.0.1:{http}", timeout=30.0) as client:
+        process = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, env=environment, cwd=tree)
+        try:
+            end = time.monotonic() + START_S
+            while not _ready(client):
+                if process.poll() is not None or time.monotonic() > end:
+                    raise SystemExit(f"the service did not start:\n{log.read_text()[-2000:]}")
+                time.sleep(0.1)
+            yield Service(process, client, f"tcp/127.0.0.1:{zenoh}", totals, len(names))
+        finally:
+            process.terminate()
+            try:
+                process.wait(STOP_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+
+def _ready(client: httpx.Client) -> bool:
+    try:
+        return client.get("/readyz").status_code == 200
+    except httpx.TransportError:
+        return False
+
+
+class Sender(threading.Thread):
+    """Publishes the load in turn at `rate` readings per second until `ended` is set."""
+
+    def __init__(self, load: Load, zenoh: str, rate: float) -> None:
+        super().__init__(daemon=True)
+        self.load, self.zenoh, self.rate = load, zenoh, rate
+        self.sent = 0
+        self.ended = threading.Event()
+
+    def run(self) -> None:
+        """Publish."""
+        dice = random.Random(1)
+        width = len(self.load.fields[0])
+        with Meters(BusConfig("client", connect=(self.zenoh,)), "gridsec") as meters:
+            begun = due = time.monotonic()
+            for number in count():
+                if self.ended.is_set():
+                    return
+                now = time.monotonic()
+                if now < due:
+                    time.sleep(due - now)
+                # What could not be sent in time is not made up for.
+                due = max(due, now - 0.1) + 1.0 / self.rate
+                place = number % len(self.load.keys)
+                row = self.load.fields[int(now - begun) % len(self.load.fields)]
+                v_volt, p_kw = row[place % width]
+                more = "" if p_kw is None else f',"p_kw":{p_kw}'
+                v_volt += dice.uniform(-NOISE_VOLT, NOISE_VOLT)
+                payload = f'{{"t":{time.time():.3f},"v_volt":{v_volt:.4f}{more}}}'
+                meters.put(self.load.keys[place], payload.encode())
+                self.sent += 1
+
+
+_LINE = re.compile(r"^(gridsec_\w+?)(?:\{(.*)\})? (\S+)$")
+
+
+def metrics(service: Service) -> Counter[str]:
+    """Sums over all feeders; ticks by verdict."""
+    found: Counter[str] = Counter()
+    for line in service.http.get("/metrics").text.splitlines():
+        match = _LINE.match(line)
+        if match is None or match[1].endswith(("_bucket", "_created")):
+            continue
+        verdict = re.search(r'verdict="(\w+)"', match[2] or "")
+        found[match[1] + (f" {verdict[1]}" if verdict else "")] += float(match[3])  # type: ignore[assignment]
+    return found
+
+
+def stage(service: Service, sender: Sender, load: Load, rate: float, seconds: float) -> Stage:
+    """Send at a rate and measure after `SETTLE_S`."""
+    sender.rate = rate
+    time.sleep(SETTLE_S)
+    sent, before, begun = sender.sent, metrics(service), time.monotonic()
+    seen = []
+    while time.monotonic() < begun + seconds - SETTLE_S:
+        time.sleep(0.5)
+        seen.append(metrics(service)["gridsec_meters_seen"])
+    after, lasted = metrics(service), time.monotonic() - begun
+    more = after - before
+    due = lasted * service.feeders
+    decided = more["gridsec_ticks_total clean"] + more["gridsec_ticks_total attacked"]
+    meters = service.feeders * (len(load.fields[0]) - 1)
+    return Stage(
+        (sender.sent - sent) / lasted,
+        more["gridsec_readings_total"] / lasted,
+        (decided + more["gridsec_ticks_total undecided"]) / due,
+        decided / due,
+        sum(seen) / len(seen) / meters,
+    )
+
+
+def recovery(service: Service, names: Sequence[str], meters: int) -> float:
+    """Time until every meter is seen and every verdict is CLEAN, s; infinite if beyond the limit."""
+    begun = time.monotonic()
+    while time.monotonic() < begun + RECOVERY_S:
+        feeders = {one["name"]: one for one in service.http.get("/api/v1/feeders").json()["feeders"]}
+        clean = all(feeders[name].get("verdict") == "clean" for name in names)
+        if clean and metrics(service)["gridsec_meters_seen"] == meters * len(names):
+            return time.monotonic() - begun
+        time.sleep(0.2)
+    return float("inf")
+
+
+def measure(tree: Path, folder: Path, names: Sequence[str], load: Load) -> Outcome:
+    """Measure one source tree."""
+    base = float(len(load.keys))
+    print(f"{tree}: {len(names)} feeders, {len(load.keys)} sources", flush=True)
+    print("sent/s  used/s  judged  decided  seen", flush=True)
+    with running(tree, folder, names) as service:
+        sender = Sender(load, service.zenoh, base)
+        sender.start()
+        try:
+            time.sleep(STAGE_S)
+            sustained, share = 0.0, _totals(service)
+            for number in range(STAGES):
+                found = stage(service, sender, load, base * GROWTH**number, STAGE_S)
+                _print(found)
+                if number == 0:
+                    share = {name: total - share[name] for name, total in _totals(service).items()}
+                if found.decided < DECIDED:
+                    break
+                sustained = found.offered
+            overload = stage(service, sender, load, OVERLOAD * max(sustained, base), OVERLOAD_S)
+            _print(overload)
+            sender.rate = base
+            recovery_s = recovery(service, names, len(load.fields[0]) - 1)
+        finally:
+            sender.ended.set()
+            sender.join(STOP_S)
+    kept = share["keep_states"] / share["round"]
+    print(f"sustained {sustained:.0f}/s, keep_states {kept:.1%}, recovery {recovery_s:.1f} s", flush=True)
+    return Outcome(sustained, kept, overload, recovery_s)
+
+
+def _print(found: Stage) -> None:
+    shares = f"{found.judged:7.2f} {found.decided:8.2f} {found.seen:5.2f}"
+    print(f"{found.offered:6.0f} {found.used:7.0f} {shares}", flush=True)
+
+
+def _totals(service: Service) -> dict[str, float]:
+    service.totals.unlink(missing_ok=True)
+    service.process.send_signal(signal.SIGUSR1)
+    end = time.monotonic() + STOP_S
+    while not service.totals.exists():
+        if time.monotonic() > end:
+            raise SystemExit("the service does not write its totals")
+        time.sleep(0.01)
+    totals: dict[str, float] = json.loads(service.totals.read_text())
+    return totals
+
+
+def main() -> int:
+    """Measure, compare, and check the limits."""
+    asked = arguments(__doc__, feeders=10, against="")
+    site = load(FEEDER)
+    names = [f"feeder-{k:03d}" for k in range(asked.feeders)]
+    own = Path(__file__).parents[1]
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        for name in names:
+            tables = site.tables
+            write(replace(tables, meta=replace(tables.meta, name=name)), folder / name)
+        said = load_of(site, names)
+        before = measure(Path(asked.against).resolve(), folder, names, said) if asked.against else None
+        now = measure(own, folder, names, said)
+    if before is not None:
+        print(f"sustained rate, ratio to {asked.against}: {now.sustained / max(before.sustained, 1.0):.2f}")
+        print(f"share of keep_states: {before.keep_states:.1%} before, {now.keep_states:.1%} now")
+    judged = now.overload.judged * JUDGED_EVERY_S >= 1.0
+    return int(not (now.recovery_s <= RECOVERY_S and judged))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
