@@ -82,6 +82,8 @@ class AlignRules:
         Who says what time it is.
     backlog
         Ticks formed after one step of the time; older ones are skipped and counted.
+    skips_empty
+        After such a step all ticks are skipped if none of them has a usable reading.
     """
 
     tick_s: float
@@ -92,6 +94,7 @@ class AlignRules:
     silence_s: float
     clock: Clock = Clock.WALL
     backlog: int = BACKLOG_TICKS
+    skips_empty: bool = False
 
     def __post_init__(self) -> None:
         times = (self.tick_s, self.max_age_s, self.max_skew_s, self.silence_s)
@@ -127,9 +130,10 @@ def rules(
     grace_s
         None: half a tick, at most a minute.
     live
-        By the wall clock at most `LEAP_TICKS` missed ticks are formed.
+        By the wall clock at most `LEAP_TICKS` missed ticks are formed, and none if no reading serves them.
     """
     lead_s = min(0.1 * tick_s, 1.0)
+    leaps = live and clock is Clock.WALL
     max_age_s = 2.5 * tick_s if tick_s <= BRIDGED_TICK_S else tick_s - lead_s
     return AlignRules(
         tick_s=tick_s,
@@ -140,7 +144,8 @@ def rules(
         # Nobody is silent before two ticks have gone by without a reading; the silent are not waited for.
         silence_s=max(silence_s, tick_s + max_age_s),
         clock=clock,
-        backlog=LEAP_TICKS if live and clock is Clock.WALL else BACKLOG_TICKS,
+        backlog=LEAP_TICKS if leaps else BACKLOG_TICKS,
+        skips_empty=leaps,
     )
 
 
@@ -215,6 +220,7 @@ class Aligner:
         self._waiting: set[str | None] = set()
         self._next: int | None = None
         self._first: int | None = None
+        self._resumed = -math.inf
         self._refused: list[Reading] = []
         self._now: float | None = None
         self._latest = -math.inf
@@ -386,7 +392,9 @@ class Aligner:
         first = self._number()
         behind = math.floor(now / self.rules.tick_s) - first
         if behind > self.rules.backlog:
-            self._skip(first, first + behind - self.rules.backlog)
+            self._skip(first, self._resume(first + behind))
+            # A skipped tick is no evidence of silence: it was not formed.
+            self._resumed = self._time(first + behind)
         while True:
             t = self._time(self._number())
             if now < t or (self._waiting and now < t + self.rules.grace_s):
@@ -409,8 +417,16 @@ class Aligner:
             self._turn_to(self._number() + 1)
             yield tick
 
+    def _resume(self, now: int) -> int:
+        """Number of the first tick to form after a step of the time to tick number `now`."""
+        first = now - self.rules.backlog
+        newest = [source.held[-1] for source in self._sources.values() if source.held]
+        starts = ((max(first, self._serves(reading)), reading.t) for reading in newest)
+        serving = any(n < now and self._time(n) - t < self.rules.max_age_s for n, t in starts)
+        return first if serving or not self.rules.skips_empty else now
+
     def _skip(self, first: int, following: int) -> None:
-        """Go on with the tick `following`; sources are as silent as if the skipped ticks had been formed."""
+        """Go on with the tick `following`; readings serve as if the skipped ticks had been formed."""
         for source in self._sources.values():
             for reading, later in zip_longest(source.held, source.held[1:]):
                 begin = max(first, self._serves(reading))
@@ -426,6 +442,7 @@ class Aligner:
 
     def _begin(self, now: float) -> None:
         self._first = math.ceil(now / self.rules.tick_s)
+        self._resumed = -math.inf
         self._skipped = 0
         self._turn_to(self._first)
 
@@ -457,6 +474,8 @@ class Aligner:
 
     def _silent_for(self, source: _Source, last: float, t: float) -> float:
         """Return for how long a source has been silent at t, s, if `last` was its last; 0 if it is not."""
+        if t - self._resumed <= self.rules.silence_s:
+            return 0.0
         since = min(last, source.last_heard)
         if since == -math.inf and self._first is not None:
             since = self._time(self._first)

@@ -291,8 +291,9 @@ class Server:
 
     def __init__(self, service: SmallService, port: int = 0) -> None:
         self.service = service
+        self.api = create_api(service, ["grid.example"])
         config = uvicorn.Config(
-            create_api(service, ["grid.example"]),
+            self.api,
             host="127.0.0.1",
             port=port,
             log_level="critical",

@@ -227,11 +227,35 @@ def test_a_long_gap_is_skipped_and_counted() -> None:
     a = aligner()
     w = Wall(a, T0 - 0.5)
     w.all_at(T0)
-    w.at(T0 + 10 * BACKLOG_TICKS)
+    w.at(T0 + 10 * BACKLOG_TICKS + 0.6)
     assert len(w.ticks) <= BACKLOG_TICKS + 2
     assert sum(tick.skipped for tick in w.ticks) == 10 * BACKLOG_TICKS - BACKLOG_TICKS - 1
     assert w.ticks[-1].t == T0 + 10 * BACKLOG_TICKS
     assert all(b.t > a_.t for a_, b in zip(w.ticks, w.ticks[1:], strict=False))
+
+
+def test_skipped_ticks_are_no_evidence_of_silence() -> None:
+    w = Wall(Aligner(METERS, rules(1.0, 10.0, live=True)), T0 - 0.5)
+    for k in range(20):
+        w.all_at(T0 + k)
+    leap = T0 + 7200.0
+    for k in range(9):
+        w.all_at(leap + k, skip=("d",))
+    assert not any(tick.silent for tick in w.ticks)
+    for k in range(9, 20):
+        w.all_at(leap + k, skip=("d",))
+    ((meter, seconds),) = w.ticks[-1].silent
+    assert (meter, seconds) == ("d", w.ticks[-1].t - (T0 + 19.0))
+
+
+@pytest.mark.parametrize("ahead_s", [0.0, 7200.0])
+def test_silence_counts_again_after_a_leap_and_back(ahead_s: float) -> None:
+    w = Wall(Aligner(METERS, rules(1.0, 10.0, live=True)), T0 - 0.5)
+    w.all_at(T0)
+    w.all_at(T0 + ahead_s + 1.0)
+    for k in range(20):
+        w.all_at(T0 + 2.0 + k, skip=("d",))
+    assert [meter for meter, _ in w.ticks[-1].silent] == ["d"]
 
 
 @pytest.mark.parametrize("back_s", [30.0, 3600.0, 1e6])

@@ -11,7 +11,6 @@ import fastapi.routing
 import pytest
 
 from gridsec.online import Cause
-from service import api
 from service.alarms import Change, Transition
 from service.report import to_json as report_json
 from tests.service.asking import T0, Setup, Stream, is_problem
@@ -106,8 +105,8 @@ def test_a_slow_client_costs_nothing_and_loses_nothing(setup: Setup) -> None:
     assert seen == list(range(1, 302))
 
 
-def test_streams_are_counted(setup: Setup, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(api, "MAX_STREAMS", 2)
+def test_streams_are_counted(setup: Setup) -> None:
+    setup.server.api.state.max_streams = 2
     one, two = Stream(setup, "/alarms/stream"), Stream(setup, "/feeders/village/stream")
     assert one.next()["comment"] == two.next()["comment"] == "connected"
     is_problem(setup.get("/alarms/stream"), 503)
