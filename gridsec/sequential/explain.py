@@ -8,11 +8,12 @@ docs/theory-sequential.md, sections 3 to 5.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
-from itertools import chain
+from dataclasses import dataclass, replace
+from itertools import chain, product
 
 import numpy as np
 from scipy.linalg import lapack
+from scipy.special import binom
 
 from gridsec.arrays import Bools, Floats, Ints, any_of, indices, submatrix
 from gridsec.network import by_place
@@ -48,10 +49,21 @@ _PART = 2
 _SEEDS, _STREET = 32, 64
 # Meters up to which neighbourhoods are looked for: each start takes a matrix of 8 bytes x meters^2, 4 MB.
 _MOST = 724
+# Groups that are off by one amount each, in one explanation.
+_PARTS = 2
 # A group of similar size has at most this many times as many members.
 _SIMILAR = 2
 # Standard deviations of chi-square that chance may add; what all of a group may be off by, squared pu.
 _CHANCE, _ANY_LIE = 4.0, 0.2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Group:
+    """A neighbourhood off by one amount: its meters (p,), what the amount gains, and what it costs."""
+
+    meters: Bools
+    gain: float
+    charge: float
 
 
 class Search:
@@ -110,7 +122,8 @@ class Search:
         """
         found = self.likeliest(now, view)
         rivals = (*found.others, *self.turned, *self._instead(found.best))
-        return replace(found, others=self._compared(found.best, rivals)), self._believe(found.best)
+        others = (*self._compared(found.best, rivals), *self._alike_groups(found.best))
+        return replace(found, others=others), self._believe(found.best)
 
     def likeliest(self, now: Fit, view: View) -> Found:
         """What is found, before rivals are looked for and compared.
@@ -194,6 +207,9 @@ class Search:
         there = adapt(None, wide, now.trusted, self.scales.loosened(trust.accused))
         lying = Search(design, scales, self.wholes, trust, self.s)
         best = lying.likeliest(there, view_of(design, wide, judge(there, wide.m))).best
+        # Meters that are suspected only beside an honest busbar meter are trusted again.
+        honest = lying._descend(lying._fit(wide.enough), np.zeros_like(wide.enough), fresh=True)
+        best = min(best, honest, key=lambda one: one.cost)
         charge = search.price(int(np.count_nonzero(self.here.enough)), 1)
         loosened = (*best.loosened, self.book.std.size + phase)
         return Explanation(best.trusted, loosened, best.charge + charge, best.cost + charge)
@@ -274,10 +290,8 @@ class Search:
         dropping the group gains ``b^T G^-1 b`` at once, which one Cholesky factor tells of all groups of
         the k meters nearest to a meter.
         """
-        here, trust = self.here, self.trust
-        # Evidence that lasts long enough by this tick; before that no meter is named.
-        lasting = ~trust.trusted & ~trust.named & (trust.age + 1 >= self.design.confirmed[trust.scale])
-        if here.enough.size > _MOST or not any_of(here.enough & ~best.trusted & (lasting | self.disputed)):
+        here = self.here
+        if not self._about_to_be_named(best):
             return
         every = self._fit(here.enough)
         weights, (at, Q) = every.weights(here.m), every.trusting()
@@ -307,6 +321,88 @@ class Search:
             start = here.enough.copy()
             start[group] = False
             yield self._descend(self._fit(start), np.zeros_like(start), fresh=True)
+
+    def _about_to_be_named(self, best: Solution) -> bool:
+        """True where the evidence against an accused meter has lasted, or the busbar meter is disputed."""
+        here, trust = self.here, self.trust
+        lasting = ~trust.trusted & ~trust.named & (trust.age + 1 >= self.design.confirmed[trust.scale])
+        return here.enough.size <= _MOST and any_of(here.enough & ~best.trusted & (lasting | self.disputed))
+
+    def _alike_groups(self, best: Solution) -> Iterator[Explanation]:
+        """Explanations in which one neighbourhood, or two, are off by one amount each.
+
+        Such a group is one hypothesis, not one for each of its meters: it costs ``2 ln(p M)`` for its centre
+        and its size of at most M meters, and ``2 ln binom(k, e)`` for e honest ones among its k. Its meters
+        keep telling their differences.
+        """
+        if not self._about_to_be_named(best):
+            return
+        base = self.here.enough & ~self.trust.named
+        taken: list[Bools] = []
+        for first in self._neighbourhoods(self._fit(base), best):
+            if len(taken) == _BESIDE:
+                return
+            if any(
+                2 * np.count_nonzero(each & first.meters) > np.count_nonzero(first.meters) for each in taken
+            ):
+                continue
+            taken.append(first.meters)
+            end, other = self._off_alike(best, base, [first])
+            yield other
+            for second in self._neighbourhoods(end.fit, best)[: _PARTS - 1]:
+                yield self._off_alike(best, base, [first, second])[1]
+
+    def _neighbourhoods(self, every: Fit, best: Solution) -> list[_Group]:
+        """Groups of nearest meters that gain more than they cost, best first.
+
+        With the sums b of Q m and q of Q over a group, its amount gains ``b^2 / q``. Groups are taken whole,
+        and without accused meters: one meter that differs from all around it stands against its street.
+        """
+        (at, Q), prior = every.trusting(), self.here.prior
+        largest = min(self.design.most, _STREET, at.size - 1)
+        if largest < 2:
+            return []
+        b, between, place = every.weights(self.here.m)[at], prior.among(at), prior.meters[at]
+        std = np.sqrt(np.maximum(between.diagonal(), np.finfo(np.float64).tiny))
+        whole, believed = np.ones(at.size, dtype=np.bool_), best.trusted[at]
+        count = np.arange(1, largest + 1)
+        centre = 2.0 * np.log(at.size * self.design.most)
+        out: list[_Group] = []
+        for j in np.argsort(-(b * b) / Q.diagonal())[:_SEEDS].tolist():
+            # By correlation a stretch of a street comes first, by covariance all that is behind one bus.
+            for likeness, some in product((between[j] / std, between[j]), (whole, believed)):
+                near = np.argsort(-likeness, kind="stable")[: largest + 1]
+                part = some[near].astype(np.float64)
+                sums = np.cumsum(np.cumsum(submatrix(Q, near, near) * np.multiply.outer(part, part), 0), 1)
+                gain = np.cumsum(b[near] * part) ** 2 / np.maximum(sums.diagonal(), np.finfo(np.float64).tiny)
+                size = np.cumsum(part)[:-1]
+                charge = centre + 2.0 * np.log(binom(count, size))
+                # Meters of one bus cannot be told apart by a direction of buses.
+                net = np.where((place[near[1:]] == place[near[:-1]]) | (size < 2.0), 0.0, gain[:-1] - charge)
+                k = int(net.argmax())
+                if net[k] > 0.0:
+                    among = np.zeros_like(every.trusted)
+                    among[at[near[: k + 1]]] = some[near[: k + 1]]
+                    out.append(_Group(among, float(gain[k]), float(charge[k])))
+        return sorted(out, key=lambda one: one.charge - one.gain)
+
+    def _off_alike(self, best: Solution, base: Bools, groups: list[_Group]) -> tuple[Solution, Explanation]:
+        """The search that begins with groups off by one amount each, and its explanation on all scales."""
+        here = self.here
+        directions = np.zeros((here.prior.variance.size, len(groups)))
+        for k, group in enumerate(groups):
+            directions[here.prior.meters[group.meters], k] = _ANY_LIE
+        loosened = self.scales.loosened(self.accused)
+        loose = directions if loosened is None else np.hstack([loosened, directions])
+        end = self._descend(fit(here.prior, here.noise, base, loose), here.enough & ~base, fresh=True)
+        dropped = int(np.count_nonzero(here.enough & ~end.trusted))
+        alike = np.where(end.trusted[:, None], directions[here.prior.meters], 0.0)
+        kept, charge = np.asarray(alike.any(axis=1)), sum(group.charge for group in groups)
+        other = Explanation(end.trusted & ~kept, (), charge, 0.0)
+        theirs = self._misfits(other, kept, alike)
+        worse = max(his - own for his, own in zip(theirs, self._misfits(best), strict=True))
+        price = charge + search.price(self.keep.size, dropped, self.design.most)
+        return end, replace(other, cost=best.cost + price - self._prices(best) + worse)
 
     def _admissible(self, found: Explanation) -> bool:
         """Whether as many meters stay trusted as may be manipulated."""

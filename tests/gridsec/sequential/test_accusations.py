@@ -9,8 +9,9 @@ from benchmarks.accusations import Run, cell, run
 # Seeds with an honest meter accused before its mend come first.
 RUNS = [
     *(("majority", seed) for seed in (1, 2, 4, 14, 17, 18, 35)),
-    *(("phases-busbar", seed) for seed in (0,)),
-    *(("phases-lateral", seed) for seed in (18, 29)),
+    *(("phases-busbar", seed) for seed in (0, 33, 35, 36)),
+    *(("phases-lateral", seed) for seed in (1, 18, 29, 77, 93)),
+    *(("drift", seed) for seed in (4, 38)),
     *(("contiguous-low", seed) for seed in (0, 1, 2)),
     *(("false-power", seed) for seed in (0, 1, 2)),
 ]

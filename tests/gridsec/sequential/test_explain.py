@@ -142,6 +142,52 @@ def test_a_third_of_a_street_is_named() -> None:
         assert named == liars
 
 
+def test_a_group_off_by_one_amount_gains_by_definition() -> None:
+    design = two_streets()
+    m, _ = draw(design, 3, 0.02)
+    hunt, now, view = prepared(design, m)
+    every = design.prior.between + np.diag(design.white)
+    best = hunt.likeliest(now, view).best
+    found = hunt._neighbourhoods(now, best)
+    assert any((group.meters & ~best.trusted).any() for group in found)
+    assert not all((group.meters & ~best.trusted).any() for group in found)
+    for group in found:
+        alike = 1e2 * group.meters
+        with_amount = m @ np.linalg.solve(every + np.multiply.outer(alike, alike), m)
+        assert group.gain == pytest.approx(m @ np.linalg.solve(every, m) - with_amount, rel=1e-4)
+        assert group.gain > group.charge >= 2.0 * np.log(m.size * design.most) - 1e-9
+    net = [group.gain - group.charge for group in found]
+    assert net == sorted(net, reverse=True)
+
+
+def test_a_street_off_alike_is_a_rival_at_the_price_of_one_hypothesis() -> None:
+    """The far street but for two is off by one amount: the search accuses the two, the rival the rest."""
+    design, count = two_streets(), NEAR + FAR
+    rng = np.random.default_rng(6)
+    root = np.linalg.cholesky(design.prior.between + 1e-14 * np.eye(count))
+    m = root @ rng.normal(size=count) + np.sqrt(design.white) * rng.normal(size=count)
+    design = replace(design, most=FAR)
+    group = np.arange(NEAR, count - 2)
+    m[group] -= 0.02
+    hunt, _, _ = prepared(design, m)
+    base = np.ones(count, dtype=np.bool_)
+    best = hunt._descend(hunt._fit(~np.isin(np.arange(count), [count - 2, count - 1])), ~base)
+    first = next(
+        one
+        for one in hunt._neighbourhoods(hunt._fit(base), best)
+        if set(group) == set(np.flatnonzero(one.meters))
+    )
+    charge = 2.0 * float(np.log(count * FAR))
+    assert first.charge == pytest.approx(charge)
+    _, other = hunt._off_alike(best, base, [first])
+    alike = np.where(np.isin(np.arange(count), group), 0.2, 0.0)
+    every = design.prior.between + np.diag(design.white) + np.multiply.outer(alike, alike)
+    assert np.array_equal(np.flatnonzero(~other.trusted), group)
+    left = m @ np.linalg.solve(every, m)
+    # Each scale has seen one reading, so all scales agree.
+    assert other.cost == pytest.approx(left + charge, rel=1e-6)
+
+
 def test_one_amount_for_a_group_by_definition() -> None:
     design, rng = two_streets(), np.random.default_rng(9)
     m, _ = draw(design, 3, 0.02)
