@@ -1,0 +1,529 @@
+"""Errors of a feeder's files that explain the readings as well as a manipulation does.
+
+The readings of a window are compared under two hypotheses. H_a: each accused meter is off by an offset, a
+slope and a gain of its own. H_b: customers and their meters are at other places than the files say. With e
+the squared voltages read minus those of the files, T blocks by p meters, and d what the change of places
+adds to them,
+
+    H_a: e_j = c_j + s_j t + g_j m_j + n for accused j,    H_b: e = d + n,
+
+where m_j is the voltage of the model and n has the covariance of loads and meters. H_b has no free number: it
+must explain the size of the deviation as well as its changes with the loads. A window whose loads do not
+change decides nothing.
+
+References
+----------
+docs/theory-sequential.md, Errors of the files.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from typing import Final
+
+import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.stats import chi2
+
+from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints
+from gridsec.feeder import Feeder
+from gridsec.mesh import Meshed
+from gridsec.network import InPhases, Network, bus_voltages, linear, one_busbar
+from gridsec.online import Frame
+from gridsec.phases import PhasedFeeder
+from gridsec.plant import Plant
+
+__all__ = ["DataError", "DataErrorDesign", "DataErrorKind", "Window", "begin", "design", "follow"]
+
+BLOCK_S: Final = 60.0
+"""Least duration of a block, s: the mean of a minute hides jitter and keeps the changes of the loads."""
+
+FEWEST_BLOCKS: Final = 10
+"""Blocks before the first comparison: ten minutes of one-second readings."""
+
+MOST_BLOCKS: Final = 60
+"""Blocks of the window: one hour of one-second readings, 15 hours of quarter-hours."""
+
+MOST_PLACES: Final = 1500
+"""Places of customers up to which the comparison runs: its two matrices have 36 MB then."""
+
+MOST_ACCUSED: Final = 12
+"""Accused meters with places of their own to try, the furthest off first: it bounds the time of a block."""
+
+COMPARED: Final = 16
+"""Changes of places that are compared on all meters, the most promising at the moved ones first."""
+
+RISK: Final = 1e-4
+"""Probability of a hint by chance, and of a misfit beyond its limit if the hint is right."""
+
+COMMON: Final = 0.5
+"""Share of the variance of unknown powers that all customers have in common, as in `feeders.doubts`."""
+
+MODEL_STD: Final = 2e-4
+"""Error of the power flow that is not of the loads, squared pu: what the loss correction leaves."""
+
+FAR_SIGMAS: Final = 4.0
+"""Standard deviations beyond which a change of places does not explain an accused meter."""
+
+
+class DataErrorKind(StrEnum):
+    """Kind of an error of the files."""
+
+    PHASE = "phase"
+    EXCHANGED_PHASES = "exchanged-phases"
+    EXCHANGED_METERS = "exchanged-meters"
+    BUS = "bus"
+
+
+@dataclass(frozen=True, slots=True)
+class DataError:
+    """An error of the files that explains accused meters. p meters, N customers, n places.
+
+    Attributes
+    ----------
+    kind
+        Kind.
+    customers
+        Indices of the customers at other places than the files say: one or two.
+    places
+        Place of each of them that explains the readings, as in `gridsec.network`.
+    meters
+        Indices of the accused meters that it explains.
+    """
+
+    kind: DataErrorKind
+    customers: tuple[int, ...]
+    places: tuple[int, ...]
+    meters: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DataErrorDesign:
+    """Sensitivities between all places that customers may have. N customers, C places.
+
+    Attributes
+    ----------
+    plant
+        Feeder, inverters and meters.
+    places : (C,)
+        Places, ascending.
+    at : (N,)
+        Index of each customer's place in `places`.
+    unit : (C,)
+        1 pu of each place, V: customers are exchanged only between equal ones.
+    active, reactive : (C, C)
+        From a power at one place to the squared voltage at another, pu.
+    block_s
+        Duration of a block, s.
+    """
+
+    plant: Plant
+    places: Ints
+    at: Ints
+    unit: Floats
+    active: Floats
+    reactive: Floats
+    block_s: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rows:
+    """Means of blocks. T blocks, p meters, N customers, C places.
+
+    Attributes
+    ----------
+    t : (T,)
+        Time of each block, s.
+    y : (T, p)
+        Squared voltages read, pu; NaN without a reading.
+    p, q : (T, N)
+        Injections, pu.
+    p_var, q_var : (T, N)
+        Variances of their errors, squared pu.
+    model : (T, C)
+        Squared voltages of the files' model, pu.
+    count : (T,)
+        Number of frames.
+    accused : (T, p)
+        Meters accused within the block.
+    """
+
+    t: Floats
+    y: Floats
+    p: Floats
+    q: Floats
+    p_var: Floats
+    q_var: Floats
+    model: Floats
+    count: Floats
+    accused: Bools
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sums:
+    """Sums over the frames of the block that is not complete."""
+
+    block: int
+    count: int
+    y: Floats
+    heard: Floats
+    powers: Floats  # (4, N): p, q and the variances of their errors
+    v0: Floats
+    accused: Bools
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Window:
+    """Readings since meters are accused, and what they say. Empty while no meter is.
+
+    Attributes
+    ----------
+    rows
+        Complete blocks, at most `MOST_BLOCKS`; None before the first one.
+    error
+        Error of the files that explains accused meters; None: none does.
+    t
+        Time of the last frame, s; None without one.
+    """
+
+    rows: Rows | None = None
+    error: DataError | None = None
+    t: float | None = None
+    sums: _Sums | None = field(default=None, repr=False)
+    since_accused: int = 0
+
+
+def begin() -> Window:
+    """Return the empty window."""
+    return Window()
+
+
+def design(plant: Plant, base_volt: Floats, step_s: float) -> DataErrorDesign | None:
+    """Prepare the comparison; None beyond `MOST_PLACES`.
+
+    Parameters
+    ----------
+    plant
+        Feeder, inverters and meters.
+    base_volt : (n,)
+        1 pu of every place, V.
+    step_s
+        Interval between frames, s.
+    """
+    feeder = plant.feeder
+    places = np.unique(np.concatenate((feeder.bus, _other_phases(feeder))))
+    if places.size > MOST_PLACES:
+        return None
+    model = linear(_at(feeder, places))
+    return DataErrorDesign(
+        plant=plant,
+        places=frozen_ints(places),
+        at=frozen_ints(np.searchsorted(places, feeder.bus)),
+        unit=frozen(base_volt[places]),
+        active=frozen(2.0 * model.R),
+        reactive=frozen(2.0 * model.X),
+        block_s=max(BLOCK_S, step_s),
+    )
+
+
+def _other_phases(feeder: Network) -> Ints:
+    """Places on all phases of the customers' buses, the busbar apart."""
+    if not isinstance(feeder, InPhases):
+        return feeder.bus
+    buses = np.unique(feeder.bus // 3)
+    at, phase = np.nonzero(feeder.tree.phases[buses])
+    return np.asarray(3 * buses[at] + phase)
+
+
+def _at(feeder: Network, places: Ints) -> Network:
+    """The feeder with one customer at each of these places."""
+    ids = tuple(map(str, places.tolist()))
+    if isinstance(feeder, Feeder):
+        return replace(feeder, bus=places, customers=ids)
+    if not isinstance(feeder, InPhases):
+        return replace(feeder, tree=replace(feeder.tree, bus=places, customers=ids))
+    connected = np.equal.outer(places % 3, np.arange(3))
+    tree = replace(feeder.tree, bus=places // 3, connected=connected, customers=ids)
+    return PhasedFeeder(tree) if isinstance(feeder, PhasedFeeder) else replace(feeder, tree=tree)
+
+
+def follow(design: DataErrorDesign, window: Window, frame: Frame, x: Floats, accused: Bools) -> Window:
+    """Take one frame into the window; compare at the end of each block.
+
+    Parameters
+    ----------
+    design, window
+        The preparation, and the window so far.
+    frame
+        Everything known at one tick. One that is not later than the last begins the window anew.
+    x : (m,)
+        Estimated injections of the inverters, pu.
+    accused : (p,)
+        Meters named as manipulated at this tick, or part of one of several explanations.
+    """
+    if window.t is not None and frame.t <= window.t:
+        window = Window()
+    if window.t is None and not accused.any():
+        return window
+    block = math.floor(frame.t / design.block_s)
+    if window.sums is not None and window.sums.block != block:
+        window = _closed(design, window, window.sums)
+        if window.since_accused > MOST_BLOCKS:
+            return Window()
+    v0 = frame.v0_phases if isinstance(design.plant.feeder, InPhases) else np.array([frame.v0_squared])
+    if v0 is None or not np.isfinite(v0).all():
+        return replace(window, t=frame.t)
+    return replace(window, t=frame.t, sums=_added(design, window.sums, frame, block, x=x, v0=v0, accused=accused))
+
+
+def _added(
+    design: DataErrorDesign, sums: _Sums | None, frame: Frame, block: int, *, x: Floats, v0: Floats, accused: Bools
+) -> _Sums:
+    heard = frame.seen & np.isfinite(frame.y)
+    reports = np.isfinite(frame.q_net)
+    q = np.where(reports, frame.q_net, frame.q + design.plant.droop.per_customer(x, frame.q.size))
+    q_error = np.where(reports, frame.q_net_error, frame.q_error)
+    powers = np.array([frame.p, q, _variance(frame.p_error, frame.p_std), _variance(q_error, frame.q_std)])
+    now = _Sums(block, 1, np.where(heard, frame.y, 0.0), heard.astype(np.float64), powers, v0, accused)
+    if sums is None:
+        return now
+    return _Sums(
+        block,
+        sums.count + 1,
+        sums.y + now.y,
+        sums.heard + now.heard,
+        sums.powers + powers,
+        sums.v0 + v0,
+        sums.accused | accused,
+    )
+
+
+def _variance(half_width: Floats, std: Floats | None) -> Floats:
+    """Variance of a uniform error, or the stated one."""
+    uniform = half_width**2 / 3.0
+    return uniform if std is None else np.where(np.isnan(std), uniform, std**2)
+
+
+def _closed(design: DataErrorDesign, window: Window, sums: _Sums) -> Window:
+    """The window with one more complete block."""
+    count = float(sums.count)
+    p, q, p_var, q_var = sums.powers / count
+    feeder, v0 = design.plant.feeder, sums.v0 / count
+    busbar = v0 if isinstance(feeder, InPhases) else float(v0[0])
+    with np.errstate(all="ignore"):  # absurd powers give no finite voltages, and no comparison
+        model = bus_voltages(feeder, p, q, busbar, steps=_LOSS_STEPS)[design.places]
+        y = sums.y / sums.heard
+    t = np.array([(sums.block + 0.5) * design.block_s])
+    now = Rows(t, *(each[None] for each in (y, p, q, p_var, q_var, model)), np.array([count]), sums.accused[None])
+    rows = now if window.rows is None else _joined(window.rows, now)
+    since = 0 if sums.accused.any() else window.since_accused + 1
+    return Window(rows, compare(design, rows), window.t, None, since)
+
+
+_LOSS_STEPS: Final = 2
+
+
+def _joined(rows: Rows, more: Rows) -> Rows:
+    parts = (np.concatenate((getattr(rows, name), getattr(more, name)))[-MOST_BLOCKS:] for name in Rows.__slots__)
+    return Rows(*parts)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Scene:
+    """A window that can be compared. T blocks, k meters heard in all of them."""
+
+    design: DataErrorDesign
+    rows: Rows
+    meters: Ints  # (k,)
+    at: Ints  # (k,) their places
+    e: Floats  # (T, k)
+    accused: Bools  # (k,)
+    fixed: Floats  # (k, k) covariance of the means
+    varying: Floats  # (k, k) covariance of the changes
+
+
+def compare(design: DataErrorDesign, rows: Rows) -> DataError | None:
+    """Return the error of the files that explains accused meters at least as well as a manipulation does.
+
+    Parameters
+    ----------
+    design, rows
+        The preparation, and the blocks of a window.
+    """
+    scene = _scene(design, rows)
+    if scene is None or not scene.accused.any():
+        return None
+    moves = list(_moves(scene))
+    limit = 2.0 * math.log(max(len(moves), 1) / RISK)
+    best, found = 0.0, None
+    for move in _promising(scene, moves):
+        gain, meters = _gain(scene, move, limit)
+        if meters and gain > best:
+            best, found = gain, DataError(move.kind, move.customers, move.places(design), meters)
+    return found
+
+
+def _scene(design: DataErrorDesign, rows: Rows) -> _Scene | None:
+    """The blocks and meters without gaps; None if they are too few."""
+    plant = design.plant
+    heard = np.isfinite(rows.y)
+    k = np.flatnonzero(heard.mean(axis=0) >= _HEARD)
+    whole = heard[:, k].all(axis=1) & np.isfinite(rows.model).all(axis=1)
+    if np.count_nonzero(whole) < FEWEST_BLOCKS:
+        return None
+    rows = Rows(*(getattr(rows, name)[whole] for name in Rows.__slots__))
+    at = design.at[plant.meters[k]]
+    e = rows.y[:, k] - rows.model[:, at]
+    loads = _load_covariance(design, rows, at)
+    accuracy = plant.accuracy
+    v2 = rows.model[:, at].mean(axis=0)
+    jitter = 4.0 * v2 * (accuracy.jitter[k] ** 2 + accuracy.resolution[k] ** 2 / 12.0) * (1.0 / rows.count).mean()
+    busbar = 4.0 * (accuracy.busbar_jitter**2 + accuracy.busbar_resolution**2 / 12.0) * (1.0 / rows.count).mean()
+    together = one_busbar(plant.feeder, design.places[at], design.places[at])
+    varying = loads + np.diag(jitter + MODEL_STD**2) + busbar * together
+    fixed = varying + np.diag(4.0 / 3.0 * v2**2 * accuracy.class_fraction[k] ** 2)
+    fixed += 4.0 / 3.0 * accuracy.busbar_class**2 * together
+    return _Scene(design, rows, k, at, e, rows.accused[:, k].any(axis=0), fixed, varying)
+
+
+_HEARD: Final = 0.8
+"""Share of blocks with a reading below which a meter is left out."""
+
+
+def _load_covariance(design: DataErrorDesign, rows: Rows, at: Ints) -> Floats:
+    """Covariance (k, k) of the errors that the powers' errors make at some places, squared pu^2."""
+    out = np.zeros((at.size, at.size))
+    for matrix, variance in ((design.active, rows.p_var), (design.reactive, rows.q_var)):
+        effect = matrix[np.ix_(at, design.at)] * np.sqrt(variance.mean(axis=0))
+        total = effect.sum(axis=1)
+        out += (1.0 - COMMON) * effect @ effect.T + COMMON * np.multiply.outer(total, total)
+    return out
+
+
+@dataclass(frozen=True, slots=True)
+class _Move:
+    """Customers at other places, indices into `DataErrorDesign.places`."""
+
+    kind: DataErrorKind
+    customers: tuple[int, ...]
+    to: tuple[int, ...]
+
+    def places(self, design: DataErrorDesign) -> tuple[int, ...]:
+        return tuple(int(design.places[k]) for k in self.to)
+
+
+def _moves(scene: _Scene) -> Iterator[_Move]:
+    """All single errors of the files at the accused meters that are furthest off."""
+    design, seen = scene.design, set[tuple[tuple[int, int], ...]]()
+    off = np.abs(scene.e.mean(axis=0)) / np.sqrt(np.diagonal(scene.fixed))
+    far = sorted(np.flatnonzero(scene.accused).tolist(), key=lambda j: -off[j])[:MOST_ACCUSED]
+    for customer in design.plant.meters[scene.meters[far]].tolist():
+        for move in _of_customer(design, customer):
+            key = tuple(sorted(zip(move.customers, move.to, strict=True)))
+            if key not in seen:
+                seen.add(key)
+                yield move
+
+
+def _of_customer(design: DataErrorDesign, i: int) -> Iterator[_Move]:
+    here, feeder = int(design.at[i]), design.plant.feeder
+    place = int(design.places[here])
+    index = {int(q): k for k, q in enumerate(design.places)}
+    level = np.flatnonzero(design.unit == design.unit[here]).tolist()
+    phases = 3 if isinstance(feeder, InPhases) else 1
+    for k in level:
+        other = int(design.places[k])
+        if other == place or other < phases:
+            continue
+        if other // phases == place // phases:
+            yield _Move(DataErrorKind.PHASE, (i,), (k,))
+        elif other % phases == place % phases:
+            yield _Move(DataErrorKind.BUS, (i,), (k,))
+    metered = set(design.plant.meters.tolist())
+    for j, k in enumerate(design.at.tolist()):
+        other = int(design.places[k])
+        if k == here or design.unit[k] != design.unit[here]:
+            continue
+        if other % phases != place % phases:
+            mine = index.get(place - place % phases + other % phases)
+            its = index.get(other - other % phases + place % phases)
+            if mine is not None and its is not None:
+                yield _Move(DataErrorKind.EXCHANGED_PHASES, (i, j), (mine, its))
+        if j in metered:
+            yield _Move(DataErrorKind.EXCHANGED_METERS, (i, j), (k, here))
+
+
+def _shift(scene: _Scene, move: _Move, which: Ints) -> Floats:
+    """d: what a change of places adds to the voltages of the model at some of the meters, (T, w)."""
+    design, rows = scene.design, scene.rows
+    customer = design.plant.meters[scene.meters[which]]
+    now = scene.at[which].copy()
+    for i, k in zip(move.customers, move.to, strict=True):
+        now[customer == i] = k
+    out = rows.model[:, now] - rows.model[:, scene.at[which]]
+    for i, k in zip(move.customers, move.to, strict=True):
+        for matrix, power in ((design.active, rows.p), (design.reactive, rows.q)):
+            out += np.multiply.outer(power[:, i], matrix[now, k] - matrix[now, design.at[i]])
+    return np.asarray(out)
+
+
+def _promising(scene: _Scene, moves: list[_Move]) -> list[_Move]:
+    """The changes of places that bring the moved meters nearest to the model, best first."""
+    customer = scene.design.plant.meters[scene.meters]
+    row = {int(i): k for k, i in enumerate(customer)}
+    variance = np.diagonal(scene.fixed)
+
+    def better(move: _Move) -> float:
+        which = np.array([row[i] for i in move.customers if i in row], dtype=np.intp)
+        e = scene.e[:, which]
+        return float((((e - _shift(scene, move, which)) ** 2 - e**2) / variance[which]).sum())
+
+    return sorted(moves, key=better)[:COMPARED]
+
+
+def _gain(scene: _Scene, move: _Move, limit: float) -> tuple[float, tuple[int, ...]]:
+    """By how much a change of places explains more than a manipulation, and the accused meters explained."""
+    every = np.arange(scene.meters.size)
+    rest = scene.e - _shift(scene, move, every)
+    mean = rest.mean(axis=0)
+    far = np.abs(mean) > FAR_SIGMAS * np.sqrt(np.diagonal(scene.fixed))
+    moved = np.isin(scene.design.plant.meters[scene.meters], move.customers)
+    use = np.flatnonzero(~(far & scene.accused & ~moved))
+    explained = scene.accused[use]
+    fixed, varying = (np.linalg.cholesky(m[np.ix_(use, use)]) for m in (scene.fixed, scene.varying))
+    most = float(chi2.isf(RISK, use.size))
+    if _squared(fixed, mean[None, use]) > most:
+        return 0.0, ()
+    left = _squared(varying, (rest - mean)[:, use])
+    if left / len(rest) > most:
+        return 0.0, ()
+    gain = _manipulated(scene, use, varying) - left - limit
+    return gain, tuple(scene.meters[use[explained]].tolist())
+
+
+def _squared(factor: Floats, rest: Floats) -> float:
+    return float((solve_triangular(factor, rest.T, lower=True) ** 2).sum())
+
+
+def _manipulated(scene: _Scene, use: Ints, factor: Floats) -> float:
+    """Misfit of the changes with a slope and a gain of each accused meter fitted."""
+    at = np.flatnonzero(scene.accused[use])
+    e = scene.e[:, use] - scene.e[:, use].mean(axis=0)
+    T, k = e.shape
+    slope = scene.rows.t - scene.rows.t.mean()
+    slope = slope / np.abs(slope).max()
+    model = scene.rows.model[:, scene.at[use[at]]]
+    model = model - model.mean(axis=0)
+    scale = np.abs(model).max(axis=0)
+    model = model / np.where(scale > 0.0, scale, 1.0)
+    columns = np.zeros((2 * at.size, T, k))
+    for n, j in enumerate(at.tolist()):
+        columns[2 * n, :, j] = slope
+        columns[2 * n + 1, :, j] = model[:, n]
+    white = solve_triangular(factor, e.T, lower=True).ravel()
+    basis = np.stack([solve_triangular(factor, each.T, lower=True).ravel() for each in columns], axis=1)
+    fitted, *_ = np.linalg.lstsq(basis, white, rcond=None)
+    return float(((white - basis @ fitted) ** 2).sum())
