@@ -26,17 +26,16 @@ from typing import Final
 
 import numpy as np
 from scipy.linalg import solve_triangular
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints
 from gridsec.feeder import Feeder
-from gridsec.mesh import Meshed
 from gridsec.network import InPhases, Network, bus_voltages, linear, one_busbar
-from gridsec.online import Frame
+from gridsec.online import Frame, Verdict
 from gridsec.phases import PhasedFeeder
 from gridsec.plant import Plant
 
-__all__ = ["DataError", "DataErrorDesign", "DataErrorKind", "Window", "begin", "design", "follow"]
+__all__ = ["DataError", "DataErrorDesign", "DataErrorKind", "Window", "accused", "begin", "design", "follow"]
 
 BLOCK_S: Final = 60.0
 """Least duration of a block, s: the mean of a minute hides jitter and keeps the changes of the loads."""
@@ -47,8 +46,8 @@ FEWEST_BLOCKS: Final = 10
 MOST_BLOCKS: Final = 60
 """Blocks of the window: one hour of one-second readings, 15 hours of quarter-hours."""
 
-MOST_PLACES: Final = 1500
-"""Places of customers up to which the comparison runs: its two matrices have 36 MB then."""
+MOST_PLACES: Final = 750
+"""Places of customers up to which the comparison runs: its two matrices have 9 MB then."""
 
 MOST_ACCUSED: Final = 12
 """Accused meters with places of their own to try, the furthest off first: it bounds the time of a block."""
@@ -229,6 +228,20 @@ def design(plant: Plant, base_volt: Floats, step_s: float) -> DataErrorDesign | 
     )
 
 
+def accused(verdict: Verdict) -> Bools:
+    """Return the meters that a verdict accuses, (p,): named, or part of one of several explanations.
+
+    Parameters
+    ----------
+    verdict
+        Of one tick.
+    """
+    out = verdict.suspects.copy()
+    for explanation in verdict.explanations:
+        out |= explanation.meters
+    return out
+
+
 def _other_phases(feeder: Network) -> Ints:
     """Places on all phases of the customers' buses, the busbar apart."""
     if not isinstance(feeder, InPhases):
@@ -258,13 +271,14 @@ def follow(design: DataErrorDesign, window: Window, frame: Frame, x: Floats, acc
     design, window
         The preparation, and the window so far.
     frame
-        Everything known at one tick. One that is not later than the last begins the window anew.
+        Everything known at one tick. One that is not later than the last, or later than the last by more
+        than a window, begins the window anew.
     x : (m,)
         Estimated injections of the inverters, pu.
     accused : (p,)
-        Meters named as manipulated at this tick, or part of one of several explanations.
+        From `accused`.
     """
-    if window.t is not None and frame.t <= window.t:
+    if window.t is not None and not window.t < frame.t <= window.t + MOST_BLOCKS * design.block_s:
         window = Window()
     if window.t is None and not accused.any():
         return window
@@ -276,11 +290,20 @@ def follow(design: DataErrorDesign, window: Window, frame: Frame, x: Floats, acc
     v0 = frame.v0_phases if isinstance(design.plant.feeder, InPhases) else np.array([frame.v0_squared])
     if v0 is None or not np.isfinite(v0).all():
         return replace(window, t=frame.t)
-    return replace(window, t=frame.t, sums=_added(design, window.sums, frame, block, x=x, v0=v0, accused=accused))
+    return replace(
+        window, t=frame.t, sums=_added(design, window.sums, frame, block, x=x, v0=v0, accused=accused)
+    )
 
 
 def _added(
-    design: DataErrorDesign, sums: _Sums | None, frame: Frame, block: int, *, x: Floats, v0: Floats, accused: Bools
+    design: DataErrorDesign,
+    sums: _Sums | None,
+    frame: Frame,
+    block: int,
+    *,
+    x: Floats,
+    v0: Floats,
+    accused: Bools,
 ) -> _Sums:
     heard = frame.seen & np.isfinite(frame.y)
     reports = np.isfinite(frame.q_net)
@@ -317,18 +340,57 @@ def _closed(design: DataErrorDesign, window: Window, sums: _Sums) -> Window:
         model = bus_voltages(feeder, p, q, busbar, steps=_LOSS_STEPS)[design.places]
         y = sums.y / sums.heard
     t = np.array([(sums.block + 0.5) * design.block_s])
-    now = Rows(t, *(each[None] for each in (y, p, q, p_var, q_var, model)), np.array([count]), sums.accused[None])
+    now = Rows(
+        t=t,
+        y=y[None],
+        p=p[None],
+        q=q[None],
+        p_var=p_var[None],
+        q_var=q_var[None],
+        model=model[None],
+        count=np.array([count]),
+        accused=sums.accused[None],
+    )
     rows = now if window.rows is None else _joined(window.rows, now)
     since = 0 if sums.accused.any() else window.since_accused + 1
-    return Window(rows, compare(design, rows), window.t, None, since)
+    return Window(rows, compare(design, rows, window.error), window.t, None, since)
 
 
 _LOSS_STEPS: Final = 2
 
 
 def _joined(rows: Rows, more: Rows) -> Rows:
-    parts = (np.concatenate((getattr(rows, name), getattr(more, name)))[-MOST_BLOCKS:] for name in Rows.__slots__)
-    return Rows(*parts)
+    """Rows and later ones, at most `MOST_BLOCKS` of them."""
+
+    def both(one: Floats, other: Floats) -> Floats:
+        return np.concatenate((one, other))[-MOST_BLOCKS:]
+
+    return Rows(
+        t=both(rows.t, more.t),
+        y=both(rows.y, more.y),
+        p=both(rows.p, more.p),
+        q=both(rows.q, more.q),
+        p_var=both(rows.p_var, more.p_var),
+        q_var=both(rows.q_var, more.q_var),
+        model=both(rows.model, more.model),
+        count=both(rows.count, more.count),
+        accused=np.concatenate((rows.accused, more.accused))[-MOST_BLOCKS:],
+    )
+
+
+def _some(rows: Rows, which: Bools) -> Rows:
+    """The chosen rows."""
+    return Rows(
+        rows.t[which],
+        rows.y[which],
+        rows.p[which],
+        rows.q[which],
+        rows.p_var[which],
+        rows.q_var[which],
+        rows.model[which],
+        rows.count[which],
+        rows.accused[which],
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -345,13 +407,15 @@ class _Scene:
     varying: Floats  # (k, k) covariance of the changes
 
 
-def compare(design: DataErrorDesign, rows: Rows) -> DataError | None:
+def compare(design: DataErrorDesign, rows: Rows, held: DataError | None = None) -> DataError | None:
     """Return the error of the files that explains accused meters at least as well as a manipulation does.
 
     Parameters
     ----------
     design, rows
         The preparation, and the blocks of a window.
+    held
+        Error found before: it stays unless another one is likelier by more than chance.
     """
     scene = _scene(design, rows)
     if scene is None or not scene.accused.any():
@@ -359,11 +423,17 @@ def compare(design: DataErrorDesign, rows: Rows) -> DataError | None:
     moves = list(_moves(scene))
     limit = 2.0 * math.log(max(len(moves), 1) / RISK)
     best, found = 0.0, None
-    for move in _promising(scene, moves):
+    for move in _promising(scene, moves, held):
+        error = DataError(move.kind, move.customers, move.places(design), ())
         gain, meters = _gain(scene, move, limit)
-        if meters and gain > best:
-            best, found = gain, DataError(move.kind, move.customers, move.places(design), meters)
+        stays = held is not None and error == replace(held, meters=())
+        if meters and gain > 0.0 and gain + _STAYS * stays > best:
+            best, found = gain + _STAYS * stays, replace(error, meters=meters)
     return found
+
+
+_STAYS: Final = -2.0 * math.log(RISK)
+"""Twice the log-likelihood by which another error must be likelier than the one found before."""
 
 
 def _scene(design: DataErrorDesign, rows: Rows) -> _Scene | None:
@@ -371,22 +441,26 @@ def _scene(design: DataErrorDesign, rows: Rows) -> _Scene | None:
     plant = design.plant
     heard = np.isfinite(rows.y)
     k = np.flatnonzero(heard.mean(axis=0) >= _HEARD)
-    whole = heard[:, k].all(axis=1) & np.isfinite(rows.model).all(axis=1)
+    whole = np.asarray(heard[:, k].all(axis=1) & np.isfinite(rows.model).all(axis=1))
     if np.count_nonzero(whole) < FEWEST_BLOCKS:
         return None
-    rows = Rows(*(getattr(rows, name)[whole] for name in Rows.__slots__))
+    rows = _some(rows, whole)
     at = design.at[plant.meters[k]]
     e = rows.y[:, k] - rows.model[:, at]
     loads = _load_covariance(design, rows, at)
     accuracy = plant.accuracy
     v2 = rows.model[:, at].mean(axis=0)
-    jitter = 4.0 * v2 * (accuracy.jitter[k] ** 2 + accuracy.resolution[k] ** 2 / 12.0) * (1.0 / rows.count).mean()
-    busbar = 4.0 * (accuracy.busbar_jitter**2 + accuracy.busbar_resolution**2 / 12.0) * (1.0 / rows.count).mean()
+    jitter = (
+        4.0 * v2 * (accuracy.jitter[k] ** 2 + accuracy.resolution[k] ** 2 / 12.0) * (1.0 / rows.count).mean()
+    )
+    busbar = (
+        4.0 * (accuracy.busbar_jitter**2 + accuracy.busbar_resolution**2 / 12.0) * (1.0 / rows.count).mean()
+    )
     together = one_busbar(plant.feeder, design.places[at], design.places[at])
     varying = loads + np.diag(jitter + MODEL_STD**2) + busbar * together
     fixed = varying + np.diag(4.0 / 3.0 * v2**2 * accuracy.class_fraction[k] ** 2)
     fixed += 4.0 / 3.0 * accuracy.busbar_class**2 * together
-    return _Scene(design, rows, k, at, e, rows.accused[:, k].any(axis=0), fixed, varying)
+    return _Scene(design, rows, k, at, e, np.asarray(rows.accused[:, k].any(axis=0)), fixed, varying)
 
 
 _HEARD: Final = 0.8
@@ -470,9 +544,10 @@ def _shift(scene: _Scene, move: _Move, which: Ints) -> Floats:
     return np.asarray(out)
 
 
-def _promising(scene: _Scene, moves: list[_Move]) -> list[_Move]:
-    """The changes of places that bring the moved meters nearest to the model, best first."""
-    customer = scene.design.plant.meters[scene.meters]
+def _promising(scene: _Scene, moves: list[_Move], held: DataError | None) -> list[_Move]:
+    """The changes of places that bring the moved meters nearest to the model, and the one found before."""
+    design = scene.design
+    customer = design.plant.meters[scene.meters]
     row = {int(i): k for k, i in enumerate(customer)}
     variance = np.diagonal(scene.fixed)
 
@@ -481,7 +556,11 @@ def _promising(scene: _Scene, moves: list[_Move]) -> list[_Move]:
         e = scene.e[:, which]
         return float((((e - _shift(scene, move, which)) ** 2 - e**2) / variance[which]).sum())
 
-    return sorted(moves, key=better)[:COMPARED]
+    first = sorted(moves, key=better)[:COMPARED]
+    if held is None:
+        return first
+    before = (held.kind, held.customers, held.places)
+    return first + [m for m in moves if m not in first and (m.kind, m.customers, m.places(design)) == before]
 
 
 def _gain(scene: _Scene, move: _Move, limit: float) -> tuple[float, tuple[int, ...]]:
@@ -493,8 +572,8 @@ def _gain(scene: _Scene, move: _Move, limit: float) -> tuple[float, tuple[int, .
     moved = np.isin(scene.design.plant.meters[scene.meters], move.customers)
     use = np.flatnonzero(~(far & scene.accused & ~moved))
     explained = scene.accused[use]
-    fixed, varying = (np.linalg.cholesky(m[np.ix_(use, use)]) for m in (scene.fixed, scene.varying))
-    most = float(chi2.isf(RISK, use.size))
+    fixed, varying = (_factor(m[np.ix_(use, use)]) for m in (scene.fixed, scene.varying))
+    most = float(chdtri(use.size, RISK))
     if _squared(fixed, mean[None, use]) > most:
         return 0.0, ()
     left = _squared(varying, (rest - mean)[:, use])
@@ -502,6 +581,11 @@ def _gain(scene: _Scene, move: _Move, limit: float) -> tuple[float, tuple[int, .
         return 0.0, ()
     gain = _manipulated(scene, use, varying) - left - limit
     return gain, tuple(scene.meters[use[explained]].tolist())
+
+
+def _factor(covariance: Floats) -> Floats:
+    """Lower Cholesky factor."""
+    return np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
 
 
 def _squared(factor: Floats, rest: Floats) -> float:
