@@ -7,9 +7,9 @@ adds to them,
 
     H_a: e_j = c_j + s_j t + g_j m_j + n for accused j,    H_b: e = d + n,
 
-where m_j is the voltage of the model and n has the covariance of loads and meters. H_b has no free number: it
-must explain the size of the deviation as well as its changes with the loads. A window whose loads do not
-change decides nothing.
+where m_j is the voltage of the model and n has the covariance of loads and meters. The slopes and the gains
+of H_a are used where they pay for themselves, ln T each. H_b has no free number: it must explain the size of
+the deviation as well as its changes with the loads. A window whose loads do not change decides nothing.
 
 References
 ----------
@@ -31,7 +31,7 @@ from scipy.special import chdtri
 from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints
 from gridsec.feeder import Feeder
 from gridsec.network import InPhases, Network, bus_voltages, linear, one_busbar
-from gridsec.online import Frame, Verdict
+from gridsec.online import Frame, PowerOrigin, Verdict
 from gridsec.phases import PhasedFeeder
 from gridsec.plant import Plant
 
@@ -52,8 +52,11 @@ MOST_PLACES: Final = 750
 MOST_ACCUSED: Final = 12
 """Accused meters with places of their own to try, the furthest off first: it bounds the time of a block."""
 
-COMPARED: Final = 16
+COMPARED: Final = 32
 """Changes of places that are compared on all meters, the most promising at the moved ones first."""
+
+SOLVED: Final = 4
+"""Changes of places whose power flow is solved with losses, the most likely of the linear model first."""
 
 RISK: Final = 1e-4
 """Probability of a hint by chance, and of a misfit beyond its limit if the hint is right."""
@@ -142,6 +145,10 @@ class Rows:
         Injections, pu.
     p_var, q_var : (T, N)
         Variances of their errors, squared pu.
+    read : (T, N)
+        Active power is a reading.
+    v0 : (T, b)
+        Squared busbar voltage, pu; one, or those of three phases.
     model : (T, C)
         Squared voltages of the files' model, pu.
     count : (T,)
@@ -156,9 +163,33 @@ class Rows:
     q: Floats
     p_var: Floats
     q_var: Floats
+    read: Bools
+    v0: Floats
     model: Floats
     count: Floats
     accused: Bools
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Mean:
+    """Sums of a power and of the variance of its error, (2, N) each: of readings, and of all frames."""
+
+    told: Floats
+    told_count: Floats  # (N,)
+    every: Floats
+
+    @staticmethod
+    def of(power: Floats, variance: Floats, told: Bools) -> _Mean:
+        both = np.array([power, variance])
+        return _Mean(np.where(told, both, 0.0), told.astype(np.float64), both)
+
+    def plus(self, other: _Mean) -> _Mean:
+        return _Mean(self.told + other.told, self.told_count + other.told_count, self.every + other.every)
+
+    def value(self, count: int) -> Floats:
+        """Power and variance (2, N): of the readings where there is one, for a lost one is no change."""
+        some = self.told_count > 0.0
+        return np.where(some, self.told / np.where(some, self.told_count, 1.0), self.every / count)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,7 +200,8 @@ class _Sums:
     count: int
     y: Floats
     heard: Floats
-    powers: Floats  # (4, N): p, q and the variances of their errors
+    p: _Mean
+    q: _Mean
     v0: Floats
     accused: Bools
 
@@ -253,7 +285,7 @@ def _other_phases(feeder: Network) -> Ints:
 
 def _at(feeder: Network, places: Ints) -> Network:
     """The feeder with one customer at each of these places."""
-    ids = tuple(map(str, places.tolist()))
+    ids = tuple(map(str, range(places.size)))
     if isinstance(feeder, Feeder):
         return replace(feeder, bus=places, customers=ids)
     if not isinstance(feeder, InPhases):
@@ -309,8 +341,17 @@ def _added(
     reports = np.isfinite(frame.q_net)
     q = np.where(reports, frame.q_net, frame.q + design.plant.droop.per_customer(x, frame.q.size))
     q_error = np.where(reports, frame.q_net_error, frame.q_error)
-    powers = np.array([frame.p, q, _variance(frame.p_error, frame.p_std), _variance(q_error, frame.q_std)])
-    now = _Sums(block, 1, np.where(heard, frame.y, 0.0), heard.astype(np.float64), powers, v0, accused)
+    read = np.ones(q.size, dtype=np.bool_) if frame.p_origin is None else frame.p_origin == PowerOrigin.READ
+    now = _Sums(
+        block,
+        1,
+        np.where(heard, frame.y, 0.0),
+        heard.astype(np.float64),
+        _Mean.of(frame.p, _variance(frame.p_error, frame.p_std), read),
+        _Mean.of(q, _variance(q_error, frame.q_std), reports),
+        v0,
+        accused,
+    )
     if sums is None:
         return now
     return _Sums(
@@ -318,7 +359,8 @@ def _added(
         sums.count + 1,
         sums.y + now.y,
         sums.heard + now.heard,
-        sums.powers + powers,
+        sums.p.plus(now.p),
+        sums.q.plus(now.q),
         sums.v0 + v0,
         sums.accused | accused,
     )
@@ -332,13 +374,10 @@ def _variance(half_width: Floats, std: Floats | None) -> Floats:
 
 def _closed(design: DataErrorDesign, window: Window, sums: _Sums) -> Window:
     """The window with one more complete block."""
-    count = float(sums.count)
-    p, q, p_var, q_var = sums.powers / count
-    feeder, v0 = design.plant.feeder, sums.v0 / count
-    busbar = v0 if isinstance(feeder, InPhases) else float(v0[0])
-    with np.errstate(all="ignore"):  # absurd powers give no finite voltages, and no comparison
-        model = bus_voltages(feeder, p, q, busbar, steps=_LOSS_STEPS)[design.places]
-        y = sums.y / sums.heard
+    (p, p_var), (q, q_var), v0 = sums.p.value(sums.count), sums.q.value(sums.count), sums.v0 / sums.count
+    model = _solved(design.plant.feeder, p, q, v0)[design.places]
+    with np.errstate(all="ignore"):
+        y = sums.y / sums.heard  # NaN without a reading
     t = np.array([(sums.block + 0.5) * design.block_s])
     now = Rows(
         t=t,
@@ -347,8 +386,10 @@ def _closed(design: DataErrorDesign, window: Window, sums: _Sums) -> Window:
         q=q[None],
         p_var=p_var[None],
         q_var=q_var[None],
+        read=(sums.p.told_count > 0.0)[None],
+        v0=v0[None],
         model=model[None],
-        count=np.array([count]),
+        count=np.array([float(sums.count)]),
         accused=sums.accused[None],
     )
     rows = now if window.rows is None else _joined(window.rows, now)
@@ -356,7 +397,15 @@ def _closed(design: DataErrorDesign, window: Window, sums: _Sums) -> Window:
     return Window(rows, compare(design, rows, window.error), window.t, None, since)
 
 
-_LOSS_STEPS: Final = 2
+def _solved(feeder: Network, p: Floats, q: Floats, v0: Floats) -> Floats:
+    """Squared voltages of all places with losses, (n,); not finite for absurd powers."""
+    busbar = v0 if isinstance(feeder, InPhases) else float(v0[0])
+    with np.errstate(all="ignore"):
+        return bus_voltages(feeder, p, q, busbar, steps=_LOSS_STEPS)
+
+
+_LOSS_STEPS: Final = 3
+"""Corrections of the linear power flow: the third changes less than a meter can show."""
 
 
 def _joined(rows: Rows, more: Rows) -> Rows:
@@ -372,6 +421,8 @@ def _joined(rows: Rows, more: Rows) -> Rows:
         q=both(rows.q, more.q),
         p_var=both(rows.p_var, more.p_var),
         q_var=both(rows.q_var, more.q_var),
+        read=np.concatenate((rows.read, more.read))[-MOST_BLOCKS:],
+        v0=both(rows.v0, more.v0),
         model=both(rows.model, more.model),
         count=both(rows.count, more.count),
         accused=np.concatenate((rows.accused, more.accused))[-MOST_BLOCKS:],
@@ -387,6 +438,8 @@ def _some(rows: Rows, which: Bools) -> Rows:
         rows.q[which],
         rows.p_var[which],
         rows.q_var[which],
+        rows.read[which],
+        rows.v0[which],
         rows.model[which],
         rows.count[which],
         rows.accused[which],
@@ -424,11 +477,10 @@ def compare(design: DataErrorDesign, rows: Rows, held: DataError | None = None) 
     limit = 2.0 * math.log(max(len(moves), 1) / RISK)
     best, found = 0.0, None
     for move in _promising(scene, moves, held):
-        error = DataError(move.kind, move.customers, move.places(design), ())
-        gain, meters = _gain(scene, move, limit)
-        stays = held is not None and error == replace(held, meters=())
-        if meters and gain > 0.0 and gain + _STAYS * stays > best:
-            best, found = gain + _STAYS * stays, replace(error, meters=meters)
+        gain, meters = _gain(scene, move.shifted(scene), move.customers, limit)
+        stays = _STAYS * move.same(design, held)
+        if meters and gain > 0.0 and gain + stays > best:
+            best, found = gain + stays, DataError(move.kind, move.customers, move.places(design), meters)
     return found
 
 
@@ -441,10 +493,11 @@ def _scene(design: DataErrorDesign, rows: Rows) -> _Scene | None:
     plant = design.plant
     heard = np.isfinite(rows.y)
     k = np.flatnonzero(heard.mean(axis=0) >= _HEARD)
-    whole = np.asarray(heard[:, k].all(axis=1) & np.isfinite(rows.model).all(axis=1))
+    read = rows.read.mean(axis=0) >= _HEARD
+    whole = heard[:, k].all(axis=1) & rows.read[:, read].all(axis=1) & np.isfinite(rows.model).all(axis=1)
     if np.count_nonzero(whole) < FEWEST_BLOCKS:
         return None
-    rows = _some(rows, whole)
+    rows = _some(rows, np.asarray(whole))
     at = design.at[plant.meters[k]]
     e = rows.y[:, k] - rows.model[:, at]
     loads = _load_covariance(design, rows, at)
@@ -464,7 +517,7 @@ def _scene(design: DataErrorDesign, rows: Rows) -> _Scene | None:
 
 
 _HEARD: Final = 0.8
-"""Share of blocks with a reading below which a meter is left out."""
+"""Share of blocks with a reading below which a meter is left out, and a power counts as unread."""
 
 
 def _load_covariance(design: DataErrorDesign, rows: Rows, at: Ints) -> Floats:
@@ -486,7 +539,23 @@ class _Move:
     to: tuple[int, ...]
 
     def places(self, design: DataErrorDesign) -> tuple[int, ...]:
+        """Places of the customers, as in `DataError`."""
         return tuple(int(design.places[k]) for k in self.to)
+
+    def same(self, design: DataErrorDesign, error: DataError | None) -> bool:
+        """The change of places is that of an error."""
+        now = (self.kind, self.customers, self.places(design))
+        return error is not None and now == (error.kind, error.customers, error.places)
+
+    def shifted(self, scene: _Scene) -> Floats:
+        """d: what the change adds to the voltages of all meters, losses included, (T, k)."""
+        design, rows = scene.design, scene.rows
+        places = design.places[design.at]
+        places[list(self.customers)] = self.places(design)
+        feeder = _at(design.plant.feeder, places)
+        there = places[design.plant.meters[scene.meters]]
+        each = zip(rows.p, rows.q, rows.v0, strict=True)
+        return np.array([_solved(feeder, p, q, v0)[there] for p, q, v0 in each]) - rows.model[:, scene.at]
 
 
 def _moves(scene: _Scene) -> Iterator[_Move]:
@@ -545,42 +614,53 @@ def _shift(scene: _Scene, move: _Move, which: Ints) -> Floats:
 
 
 def _promising(scene: _Scene, moves: list[_Move], held: DataError | None) -> list[_Move]:
-    """The changes of places that bring the moved meters nearest to the model, and the one found before."""
-    design = scene.design
-    customer = design.plant.meters[scene.meters]
+    """The most likely changes of places by the linear model, and the one found before."""
+    customer = scene.design.plant.meters[scene.meters]
     row = {int(i): k for k, i in enumerate(customer)}
-    variance = np.diagonal(scene.fixed)
 
-    def better(move: _Move) -> float:
+    def at_moved(move: _Move) -> float:
         which = np.array([row[i] for i in move.customers if i in row], dtype=np.intp)
         e = scene.e[:, which]
-        return float((((e - _shift(scene, move, which)) ** 2 - e**2) / variance[which]).sum())
+        fixed, varying = np.diagonal(scene.fixed)[which], np.diagonal(scene.varying)[which]
+        rest = e - _shift(scene, move, which)
+        return _alone(rest, fixed, varying) - _alone(e, fixed, varying)
 
-    first = sorted(moves, key=better)[:COMPARED]
-    if held is None:
-        return first
-    before = (held.kind, held.customers, held.places)
-    return first + [m for m in moves if m not in first and (m.kind, m.customers, m.places(design)) == before]
+    def everywhere(move: _Move) -> float:
+        shift = _shift(scene, move, np.arange(scene.meters.size))
+        return -_gain(scene, shift, move.customers, 0.0, sure=False)[0]
+
+    first = sorted(moves, key=at_moved)[:COMPARED]
+    solved = sorted(first, key=everywhere)[:SOLVED]
+    return solved + [move for move in moves if move not in solved and move.same(scene.design, held)]
 
 
-def _gain(scene: _Scene, move: _Move, limit: float) -> tuple[float, tuple[int, ...]]:
-    """By how much a change of places explains more than a manipulation, and the accused meters explained."""
-    every = np.arange(scene.meters.size)
-    rest = scene.e - _shift(scene, move, every)
+def _alone(rest: Floats, fixed: Floats, varying: Floats) -> float:
+    """Misfit of meters taken apart: of their means, and of the changes."""
+    mean = rest.mean(axis=0)
+    return float((mean**2 / fixed).sum() + ((rest - mean) ** 2 / varying).sum())
+
+
+def _gain(
+    scene: _Scene, shift: Floats, customers: tuple[int, ...], limit: float, *, sure: bool = True
+) -> tuple[float, tuple[int, ...]]:
+    """Misfit that a change of places saves beside a manipulation, and the accused meters explained.
+
+    With `sure` a change that leaves a misfit beyond its limit explains none. Errors of the loads may last for
+    the whole window: a block's misfit is compared with the limit of one block.
+    """
+    rest = scene.e - shift
     mean = rest.mean(axis=0)
     far = np.abs(mean) > FAR_SIGMAS * np.sqrt(np.diagonal(scene.fixed))
-    moved = np.isin(scene.design.plant.meters[scene.meters], move.customers)
+    moved = np.isin(scene.design.plant.meters[scene.meters], customers)
     use = np.flatnonzero(~(far & scene.accused & ~moved))
     explained = scene.accused[use]
     fixed, varying = (_factor(m[np.ix_(use, use)]) for m in (scene.fixed, scene.varying))
     most = float(chdtri(use.size, RISK))
-    if _squared(fixed, mean[None, use]) > most:
-        return 0.0, ()
-    left = _squared(varying, (rest - mean)[:, use])
-    if left / len(rest) > most:
+    of_mean, left = _squared(fixed, mean[None, use]), _squared(varying, (rest - mean)[:, use])
+    if sure and (of_mean > most or left > most * len(rest)):
         return 0.0, ()
     gain = _manipulated(scene, use, varying) - left - limit
-    return gain, tuple(scene.meters[use[explained]].tolist())
+    return gain if sure else gain - of_mean, tuple(scene.meters[use[explained]].tolist())
 
 
 def _factor(covariance: Floats) -> Floats:
@@ -593,21 +673,24 @@ def _squared(factor: Floats, rest: Floats) -> float:
 
 
 def _manipulated(scene: _Scene, use: Ints, factor: Floats) -> float:
-    """Misfit of the changes with a slope and a gain of each accused meter fitted."""
+    """Least misfit of the changes where accused meters have slopes, gains, both or none; ln T for each."""
     at = np.flatnonzero(scene.accused[use])
     e = scene.e[:, use] - scene.e[:, use].mean(axis=0)
     T, k = e.shape
-    slope = scene.rows.t - scene.rows.t.mean()
-    slope = slope / np.abs(slope).max()
-    model = scene.rows.model[:, scene.at[use[at]]]
-    model = model - model.mean(axis=0)
-    scale = np.abs(model).max(axis=0)
-    model = model / np.where(scale > 0.0, scale, 1.0)
-    columns = np.zeros((2 * at.size, T, k))
-    for n, j in enumerate(at.tolist()):
-        columns[2 * n, :, j] = slope
-        columns[2 * n + 1, :, j] = model[:, n]
+    slope, model = scene.rows.t[:, None] + np.zeros(at.size), scene.rows.model[:, scene.at[use[at]]]
+    columns = np.zeros((2, at.size, T, k))
+    for part, values in enumerate((slope, model)):
+        change = values - values.mean(axis=0)
+        size = np.abs(change).max(axis=0)
+        columns[part, np.arange(at.size), :, at] = (change / np.where(size > 0.0, size, 1.0)).T
     white = solve_triangular(factor, e.T, lower=True).ravel()
-    basis = np.stack([solve_triangular(factor, each.T, lower=True).ravel() for each in columns], axis=1)
-    fitted, *_ = np.linalg.lstsq(basis, white, rcond=None)
-    return float(((white - basis @ fitted) ** 2).sum())
+    basis = np.array(
+        [[solve_triangular(factor, one.T, lower=True).ravel() for one in part] for part in columns]
+    )
+
+    def left(parts: list[int]) -> float:
+        some = basis[parts].reshape(-1, white.size).T
+        fitted, *_ = np.linalg.lstsq(some, white, rcond=None)
+        return float(((white - some @ fitted) ** 2).sum()) + some.shape[1] * math.log(T)
+
+    return min(left(parts) for parts in ([], [0], [1], [0, 1]))
