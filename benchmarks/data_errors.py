@@ -36,16 +36,17 @@ from feeders.load import Site, Snapshot, from_tables, plant, to_frame
 from feeders.meters import Channel, MeterErrors
 from feeders.scenario import START, Scenario, simulate, snapshots
 from feeders.schema import FeederTables
-from gridsec.attack import Attack, Bias, Drift, Random, Scaling, Stuck
+from gridsec.attack import Attack, Bias, Drift, Random, Replay, Scaling, Stuck
 from gridsec.studies import data_errors
 
 FEEDERS: Final = ("cigre-lv:3", "kerber-landnetz:3", "simbench-lv-rural1:3", "cigre-lv", "simbench-lv-rural1")
 FILES: Final = ("phases", "phase", "meters", "bus")
-ATTACKS: Final = ("bias", "scale", "ramp", "dither", "slow dither", "stuck")
+ATTACKS: Final = ("bias", "scale", "ramp", "dither", "slow dither", "stuck", "replay")
 SHARES: Final = ("one", "third")
 STEP_S: Final = 10.0
 DURATION_S: Final = 3600.0
 ONSET_S: Final = 60.0
+REPLAYED_S: Final = 6.0 * 3600.0
 TWO_WEEKS_S: Final = 13.9 * 86_400.0
 
 SIZES: Final = (0.015, 0.08)
@@ -107,6 +108,8 @@ def attack(site: Site, kind: str, share: str, seed: int) -> tuple[Attack, ...]:
             return (Drift(at, on, off, size / DURATION_S, np.abs(size)),)
         case "stuck":
             return (Stuck(at, on, off),)
+        case "replay":
+            return (Replay(at, on, off, REPLAYED_S),)
     hold = STEP_S if kind == "dither" else 300.0
     return (Random(at, on, off, np.zeros(k), np.abs(size), hold, seed),)
 

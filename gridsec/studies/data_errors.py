@@ -47,7 +47,8 @@ MOST_BLOCKS: Final = 60
 """Blocks of the window: one hour of one-second readings, 15 hours of quarter-hours."""
 
 MOST_PLACES: Final = 750
-"""Places of customers up to which the comparison runs: its two matrices have 9 MB then."""
+"""Places up to which the comparison runs: its two matrices have 9 MB then. In feeders of more places those of
+customers' buses are the candidates."""
 
 MOST_ACCUSED: Final = 12
 """Accused meters with places of their own to try, the furthest off first: it bounds the time of a block."""
@@ -233,7 +234,7 @@ def begin() -> Window:
 
 
 def design(plant: Plant, base_volt: Floats, step_s: float) -> DataErrorDesign | None:
-    """Prepare the comparison; None beyond `MOST_PLACES`.
+    """Prepare the comparison; None if the customers' buses have more than `MOST_PLACES` places.
 
     Parameters
     ----------
@@ -245,7 +246,9 @@ def design(plant: Plant, base_volt: Floats, step_s: float) -> DataErrorDesign | 
         Interval between frames, s.
     """
     feeder = plant.feeder
-    places = np.unique(np.concatenate((feeder.bus, _other_phases(feeder))))
+    places = _places(feeder, np.arange(len(feeder.buses) // _phases(feeder)))
+    if places.size > MOST_PLACES:
+        places = _places(feeder, np.unique(feeder.bus // _phases(feeder)))
     if places.size > MOST_PLACES:
         return None
     model = linear(_at(feeder, places))
@@ -274,11 +277,15 @@ def accused(verdict: Verdict) -> Bools:
     return out
 
 
-def _other_phases(feeder: Network) -> Ints:
-    """Places on all phases of the customers' buses, the busbar apart."""
+def _phases(feeder: Network) -> int:
+    """Number of places of a bus."""
+    return 3 if isinstance(feeder, InPhases) else 1
+
+
+def _places(feeder: Network, buses: Ints) -> Ints:
+    """Places of some buses, ascending: in three phases those of the phases that they have."""
     if not isinstance(feeder, InPhases):
-        return feeder.bus
-    buses = np.unique(feeder.bus // 3)
+        return buses
     at, phase = np.nonzero(feeder.tree.phases[buses])
     return np.asarray(3 * buses[at] + phase)
 
@@ -576,10 +583,10 @@ def _of_customer(design: DataErrorDesign, i: int) -> Iterator[_Move]:
     place = int(design.places[here])
     index = {int(q): k for k, q in enumerate(design.places)}
     level = np.flatnonzero(design.unit == design.unit[here]).tolist()
-    phases = 3 if isinstance(feeder, InPhases) else 1
+    phases = _phases(feeder)
     for k in level:
         other = int(design.places[k])
-        if other == place or other < phases:
+        if other == place:
             continue
         if other // phases == place // phases:
             yield _Move(DataErrorKind.PHASE, (i,), (k,))
