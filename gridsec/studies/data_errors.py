@@ -30,6 +30,7 @@ from scipy.special import chdtri
 
 from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints
 from gridsec.feeder import Feeder
+from gridsec.mesh import PhasedMesh
 from gridsec.network import InPhases, Network, bus_voltages, linear, one_busbar
 from gridsec.online import Frame, PowerOrigin, Verdict
 from gridsec.phases import PhasedFeeder
@@ -382,7 +383,7 @@ def _variance(half_width: Floats, std: Floats | None) -> Floats:
 def _closed(design: DataErrorDesign, window: Window, sums: _Sums) -> Window:
     """The window with one more complete block."""
     (p, p_var), (q, q_var), v0 = sums.p.value(sums.count), sums.q.value(sums.count), sums.v0 / sums.count
-    model = _solved(design.plant.feeder, p, q, v0)[design.places]
+    model = _solved(design.plant.feeder, p[None], q[None], v0[None])[0, design.places]
     with np.errstate(all="ignore"):
         y = sums.y / sums.heard  # NaN without a reading
     t = np.array([(sums.block + 0.5) * design.block_s])
@@ -405,9 +406,12 @@ def _closed(design: DataErrorDesign, window: Window, sums: _Sums) -> Window:
 
 
 def _solved(feeder: Network, p: Floats, q: Floats, v0: Floats) -> Floats:
-    """Squared voltages of all places with losses, (n,); not finite for absurd powers."""
-    busbar = v0 if isinstance(feeder, InPhases) else float(v0[0])
+    """Squared voltages of all places with losses, (T, n); not finite for absurd powers."""
     with np.errstate(all="ignore"):
+        if isinstance(feeder, PhasedMesh):  # one operating point at a time
+            each = zip(p, q, v0, strict=True)
+            return np.array([bus_voltages(feeder, *one, steps=_LOSS_STEPS) for one in each])
+        busbar = v0 if isinstance(feeder, PhasedFeeder) else v0[:, 0]
         return bus_voltages(feeder, p, q, busbar, steps=_LOSS_STEPS)
 
 
@@ -465,6 +469,7 @@ class _Scene:
     accused: Bools  # (k,)
     fixed: Floats  # (k, k) covariance of the means
     varying: Floats  # (k, k) covariance of the changes
+    attacked: dict[bytes, float] = field(default_factory=dict)  # misfit of H_a, by the meters compared
 
 
 def compare(design: DataErrorDesign, rows: Rows, held: DataError | None = None) -> DataError | None:
@@ -561,8 +566,7 @@ class _Move:
         places[list(self.customers)] = self.places(design)
         feeder = _at(design.plant.feeder, places)
         there = places[design.plant.meters[scene.meters]]
-        each = zip(rows.p, rows.q, rows.v0, strict=True)
-        return np.array([_solved(feeder, p, q, v0)[there] for p, q, v0 in each]) - rows.model[:, scene.at]
+        return np.asarray(_solved(feeder, rows.p, rows.q, rows.v0)[:, there] - rows.model[:, scene.at])
 
 
 def _moves(scene: _Scene) -> Iterator[_Move]:
@@ -666,7 +670,10 @@ def _gain(
     of_mean, left = _squared(fixed, mean[None, use]), _squared(varying, (rest - mean)[:, use])
     if sure and (of_mean > most or left > most * len(rest)):
         return 0.0, ()
-    gain = _manipulated(scene, use, varying) - left - limit
+    of_attack = scene.attacked.get(use.tobytes())
+    if of_attack is None:
+        of_attack = scene.attacked[use.tobytes()] = _manipulated(scene, use)
+    gain = of_attack - left - limit
     return gain if sure else gain - of_mean, tuple(scene.meters[use[explained]].tolist())
 
 
@@ -679,25 +686,25 @@ def _squared(factor: Floats, rest: Floats) -> float:
     return float((solve_triangular(factor, rest.T, lower=True) ** 2).sum())
 
 
-def _manipulated(scene: _Scene, use: Ints, factor: Floats) -> float:
-    """Least misfit of the changes where accused meters have slopes, gains, both or none; ln T for each."""
+def _manipulated(scene: _Scene, use: Ints) -> float:
+    """Least misfit of the changes where accused meters have slopes, gains, both or none; ln T for each.
+
+    With weights W, regressors r_a(t) at meters j_a and changes e, the normal equations have the entries
+    ``W[j_a, j_b] sum_t r_a r_b`` and ``sum_t r_a (W e)_a``.
+    """
     at = np.flatnonzero(scene.accused[use])
+    weights = np.linalg.inv(scene.varying[np.ix_(use, use)])
     e = scene.e[:, use] - scene.e[:, use].mean(axis=0)
-    T, k = e.shape
+    weighted = e @ weights
+    whole = float((weighted * e).sum())
     slope, model = scene.rows.t[:, None] + np.zeros(at.size), scene.rows.model[:, scene.at[use[at]]]
-    columns = np.zeros((2, at.size, T, k))
-    for part, values in enumerate((slope, model)):
-        change = values - values.mean(axis=0)
-        size = np.abs(change).max(axis=0)
-        columns[part, np.arange(at.size), :, at] = (change / np.where(size > 0.0, size, 1.0)).T
-    white = solve_triangular(factor, e.T, lower=True).ravel()
-    basis = np.array(
-        [[solve_triangular(factor, one.T, lower=True).ravel() for one in part] for part in columns]
-    )
-
-    def left(parts: list[int]) -> float:
-        some = basis[parts].reshape(-1, white.size).T
-        fitted, *_ = np.linalg.lstsq(some, white, rcond=None)
-        return float(((white - some @ fitted) ** 2).sum()) + some.shape[1] * math.log(T)
-
-    return min(left(parts) for parts in ([], [0], [1], [0, 1]))
+    least = whole
+    for columns in ((slope,), (model,), (slope, model)):
+        r, j = np.hstack(columns), np.tile(at, len(columns))
+        r = r - r.mean(axis=0)
+        size = np.abs(r).max(axis=0)
+        r /= np.where(size > 0.0, size, 1.0)
+        normal, right = weights[np.ix_(j, j)] * (r.T @ r), (r * weighted[:, j]).sum(axis=0)
+        fitted, *_ = np.linalg.lstsq(normal, right, rcond=None)
+        least = min(least, whole - float(right @ fitted) + r.shape[1] * math.log(len(e)))
+    return least
