@@ -112,6 +112,8 @@ class DataErrorDesign:
     ----------
     plant
         Feeder, inverters and meters.
+    anywhere
+        The same feeder with one customer at each of the places.
     places : (C,)
         Places, ascending.
     at : (N,)
@@ -125,6 +127,7 @@ class DataErrorDesign:
     """
 
     plant: Plant
+    anywhere: Network
     places: Ints
     at: Ints
     unit: Floats
@@ -252,9 +255,11 @@ def design(plant: Plant, base_volt: Floats, step_s: float) -> DataErrorDesign | 
         places = _places(feeder, np.unique(feeder.bus // _phases(feeder)))
     if places.size > MOST_PLACES:
         return None
-    model = linear(_at(feeder, places))
+    anywhere = _at(feeder, places)
+    model = linear(anywhere)
     return DataErrorDesign(
         plant=plant,
+        anywhere=anywhere,
         places=frozen_ints(places),
         at=frozen_ints(np.searchsorted(places, feeder.bus)),
         unit=frozen(base_volt[places]),
@@ -383,7 +388,7 @@ def _variance(half_width: Floats, std: Floats | None) -> Floats:
 def _closed(design: DataErrorDesign, window: Window, sums: _Sums) -> Window:
     """The window with one more complete block."""
     (p, p_var), (q, q_var), v0 = sums.p.value(sums.count), sums.q.value(sums.count), sums.v0 / sums.count
-    model = _solved(design.plant.feeder, p[None], q[None], v0[None])[0, design.places]
+    model = _solved(design, design.at, p[None], q[None], v0=v0[None])[0]
     with np.errstate(all="ignore"):
         y = sums.y / sums.heard  # NaN without a reading
     t = np.array([(sums.block + 0.5) * design.block_s])
@@ -405,14 +410,20 @@ def _closed(design: DataErrorDesign, window: Window, sums: _Sums) -> Window:
     return Window(rows, compare(design, rows, window.error), window.t, None, since)
 
 
-def _solved(feeder: Network, p: Floats, q: Floats, v0: Floats) -> Floats:
-    """Squared voltages of all places with losses, (T, n); not finite for absurd powers."""
+def _solved(design: DataErrorDesign, at: Ints, p: Floats, q: Floats, *, v0: Floats) -> Floats:
+    """Squared voltages (T, C) with losses, by the place of each customer; not finite for absurd powers."""
+    feeder, shape = design.anywhere, (len(p), design.places.size)
+    P, Q = np.zeros(shape), np.zeros(shape)
+    for there, power in ((P, p), (Q, q)):
+        np.add.at(there, (slice(None), at), power)
     with np.errstate(all="ignore"):
         if isinstance(feeder, PhasedMesh):  # one operating point at a time
-            each = zip(p, q, v0, strict=True)
-            return np.array([bus_voltages(feeder, *one, steps=_LOSS_STEPS) for one in each])
-        busbar = v0 if isinstance(feeder, PhasedFeeder) else v0[:, 0]
-        return bus_voltages(feeder, p, q, busbar, steps=_LOSS_STEPS)
+            each = zip(P, Q, v0, strict=True)
+            v2 = np.array([bus_voltages(feeder, *one, steps=_LOSS_STEPS) for one in each])
+        else:
+            busbar = v0 if isinstance(feeder, PhasedFeeder) else v0[:, 0]
+            v2 = bus_voltages(feeder, P, Q, busbar, steps=_LOSS_STEPS)
+    return np.asarray(v2[:, design.places])
 
 
 _LOSS_STEPS: Final = 3
@@ -562,11 +573,11 @@ class _Move:
     def shifted(self, scene: _Scene) -> Floats:
         """d: what the change adds to the voltages of all meters, losses included, (T, k)."""
         design, rows = scene.design, scene.rows
-        places = design.places[design.at]
-        places[list(self.customers)] = self.places(design)
-        feeder = _at(design.plant.feeder, places)
-        there = places[design.plant.meters[scene.meters]]
-        return np.asarray(_solved(feeder, rows.p, rows.q, rows.v0)[:, there] - rows.model[:, scene.at])
+        at = design.at.copy()
+        at[list(self.customers)] = self.to
+        there = at[design.plant.meters[scene.meters]]
+        v2 = _solved(design, at, rows.p, rows.q, v0=rows.v0)
+        return np.asarray(v2[:, there] - rows.model[:, scene.at])
 
 
 def _moves(scene: _Scene) -> Iterator[_Move]:
