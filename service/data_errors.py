@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 from feeders.load import Site, plant
 from gridsec.network import InPhases
@@ -41,6 +41,11 @@ class DataErrorReport:
     proposed: tuple[str, ...]
     study: str
     text: str
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the error as plain JSON types."""
+        lists = {name: list(getattr(self, name)) for name in ("meters", "customers", "proposed")}
+        return {"kind": self.kind, **lists, "study": self.study, "text": self.text}
 
 
 class DataErrors:

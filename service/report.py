@@ -8,7 +8,7 @@ strings and floats, so it can be kept, compared, sent and read from any thread.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import zip_longest
 from typing import Any
 
@@ -652,7 +652,7 @@ def to_json(report: FeederReport) -> dict[str, Any]:
                 report.bus_v_volt, report.bus_phases, report.bus_model_only
             )
         ],
-        "data_error": None if report.data_error is None else asdict(report.data_error),
+        "data_error": None if report.data_error is None else report.data_error.to_json(),
         "silent": [{"meter": meter, "seconds": finite(seconds)} for meter, seconds in report.silent],
         "v_min_volt": report.v_min_volt,
         "v_max_volt": report.v_max_volt,

@@ -415,7 +415,7 @@ def _solved(design: DataErrorDesign, at: Ints, p: Floats, q: Floats, *, v0: Floa
     feeder, shape = design.anywhere, (len(p), design.places.size)
     P, Q = np.zeros(shape), np.zeros(shape)
     for there, power in ((P, p), (Q, q)):
-        np.add.at(there, (slice(None), at), power)
+        np.add.at(there.T, at, power.T)
     with np.errstate(all="ignore"):
         if isinstance(feeder, PhasedMesh):  # one operating point at a time
             each = zip(P, Q, v0, strict=True)
