@@ -8,15 +8,16 @@ from pathlib import Path
 import pytest
 
 from benchmarks.calibrate_exchanges import truth_of
-from feeders.load import Site, from_tables
+from feeders import estimators
+from feeders.load import Site, from_tables, to_frame
 from feeders.recording import read_recording, record
-from feeders.scenario import Scenario
+from feeders.scenario import Scenario, simulate, snapshots
 from feeders.schema import FeederTables, write
 from gridsec.online import Cause
 from service.alarms import AlarmBook, AlarmKind, AlarmRules, Change, acknowledge, advance, conditions
 from service.alarms import from_json as alarm_from_json
 from service.alarms import to_json as alarm_to_json
-from service.data_errors import DataErrorReport
+from service.data_errors import DataErrorReport, DataErrors
 from service.models import AlarmModel, State
 from service.replay import Tally, replay
 from service.report import to_json, with_data_error
@@ -144,3 +145,20 @@ def test_another_meter_s_alarm_and_a_silent_tick_have_no_hint() -> None:
     (alarm,) = (c for c in conditions(undecided) if c.kind is AlarmKind.UNDECIDED)
     assert alarm.evidence.data_error == ERROR
     assert with_data_error(now, None) is now
+
+
+def test_the_window_begins_anew_with_a_new_design(files: Site) -> None:
+    """A hint rests on readings since the design: the first tick after `renew` has none."""
+    found, watcher = DataErrors(files), estimators.design(files)
+    state, hints = watcher.init(SCENE.start), []
+    true = from_tables(tables(exchanged=False))
+    assert true.meter_ids == files.meter_ids
+    for one in snapshots(simulate(true, replace(SCENE, duration_s=900.0))):
+        frame = to_frame(files, one)
+        state, estimate, verdict = watcher.step(state, frame)
+        hints.append(found.follow(frame, estimate, verdict))
+        if hints[-1] is not None:
+            found.renew()
+    at = [k for k, hint in enumerate(hints) if hint is not None]
+    assert at
+    assert len(at) == 1
