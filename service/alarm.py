@@ -9,6 +9,7 @@ from typing import Any
 
 from gridsec.errors import GridsecError
 from service.conditions import AlarmKind, Evidence, Severity
+from service.data_errors import DataErrorReport
 from service.report import ExplanationReport, StalledMeter
 
 
@@ -26,6 +27,7 @@ class Change(StrEnum):
     RAISED = "raised"
     ACKNOWLEDGED = "acknowledged"
     CLEARED = "cleared"
+    UPDATED = "updated"
 
 
 class AlarmUnknown(GridsecError):
@@ -155,5 +157,15 @@ def from_json(data: Mapping[str, Any]) -> Alarm:
         for e in shown
     )
     learning = tuple(StalledMeter(**meter) for meter in evidence.pop("learning", ()))
-    fields["evidence"] = Evidence(**evidence, explanations=explanations, learning=learning)
+    error = evidence.pop("data_error", None)
+    fields["evidence"] = Evidence(
+        **evidence, explanations=explanations, learning=learning, data_error=_data_error(error)
+    )
     return Alarm(**fields)
+
+
+def _data_error(data: Mapping[str, Any] | None) -> DataErrorReport | None:
+    if data is None:
+        return None
+    lists = {name: tuple(data[name]) for name in ("meters", "customers", "proposed")}
+    return DataErrorReport(kind=data["kind"], study=data["study"], text=data["text"], **lists)

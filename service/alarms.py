@@ -11,6 +11,9 @@ must never look like no attack. So an alarm is raised once its condition has bee
 without a tick in between that saw it absent, and cleared once it has been seen absent for `off_delay_s`
 without a tick that saw it present; time after an unknown tick counts for neither. Ticks that were not judged
 are unknown (`hold`), and so is a restart (`restore`).
+
+The evidence of an alarm is that of the tick that raised it. It is updated when an error of the feeder's files
+is found that explains the condition as well.
 """
 
 from __future__ import annotations
@@ -251,11 +254,7 @@ def _settle(
     kind, alarm = key[0], entry.alarm
     lasted = t - entry.since
     if condition is not None:
-        due = lasted >= rules.on(kind) and (not condition.unheard or lasted > rules.silence_s)
-        if (alarm is None or not alarm.active) and due:
-            alarm = _raise(alarm, condition, rules, entry.onset, t)
-            return replace(entry, alarm=alarm), (Transition(alarm, Change.RAISED, t),)
-        return entry, ()
+        return _present(entry, condition, rules, t)
     if alarm is None:
         return None, ()
     if alarm.active:
@@ -264,6 +263,31 @@ def _settle(
         alarm = replace(alarm, state=AlarmState.CLEARED, t_cleared=t)
         return replace(entry, alarm=alarm), (Transition(alarm, Change.CLEARED, t),)
     return (entry if _remembered(alarm, rules, t) else None), ()
+
+
+def _present(
+    entry: Entry, condition: Condition, rules: AlarmRules, t: float
+) -> tuple[Entry, tuple[Transition, ...]]:
+    """Raise the alarm of a present condition when it is due, and update its evidence."""
+    alarm, lasted = entry.alarm, t - entry.since
+    if alarm is None or not alarm.active:
+        due = lasted >= rules.on(condition.kind) and (not condition.unheard or lasted > rules.silence_s)
+        if not due:
+            return entry, ()
+        alarm, change = _raise(alarm, condition, rules, entry.onset, t), Change.RAISED
+    elif _explains_more(condition.evidence, alarm.evidence):
+        alarm, change = replace(alarm, reason=condition.reason, evidence=condition.evidence), Change.UPDATED
+    else:
+        return entry, ()
+    return replace(entry, alarm=alarm), (Transition(alarm, change, t),)
+
+
+def _explains_more(now: Evidence, before: Evidence) -> bool:
+    """An error of the feeder's files explains the condition, and the alarm names another one or none."""
+    error, told = now.data_error, before.data_error
+    if error is None or told is None:
+        return error is not None
+    return (error.kind, set(error.customers)) != (told.kind, set(told.customers))
 
 
 def _remembered(alarm: Alarm, rules: AlarmRules, t: float) -> bool:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from gridsec.online import Cause, Decision
+from service.data_errors import DataErrorReport
 from service.report import BUSBAR, ExplanationReport, FeederReport, MeterReport, StalledMeter, finite
 
 
@@ -49,6 +50,8 @@ class Evidence:
         What could all explain the readings, where nobody can be named.
     learning
         Meters that are not learned after twice the expected time, with the reasons.
+    data_error
+        Error of the feeder's files that explains the accusation as well.
     """
 
     score: float | None = None
@@ -60,6 +63,7 @@ class Evidence:
     attack_kvar_estimated: float | None = None
     explanations: tuple[ExplanationReport, ...] = ()
     learning: tuple[StalledMeter, ...] = ()
+    data_error: DataErrorReport | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,15 +166,23 @@ def _manipulated(report: FeederReport) -> Iterable[Condition]:
             if meter.model_only
             else f"but the rest of the feeder says {estimated}"
         )
+        error = _data_error(report, meter.meter)
+        hint = "" if error is None else f". {error.text}"
         yield Condition(
             AlarmKind.METER_MANIPULATED,
             report.feeder,
             meter.meter,
             Severity.CRITICAL,
-            evidence,
-            f"reports {reported}, {beside}",
+            replace(evidence, data_error=error),
+            f"reports {reported}, {beside}{hint}",
             known,
         )
+
+
+def _data_error(report: FeederReport, meter: str) -> DataErrorReport | None:
+    """The error of the files that explains an accused meter."""
+    error = report.data_error
+    return error if error is not None and meter in error.meters else None
 
 
 def _busbar(report: FeederReport) -> Iterable[Condition]:
@@ -276,7 +288,7 @@ def _undecided(report: FeederReport) -> Iterable[Condition]:
         report.feeder,
         None,
         Severity.MAJOR,
-        Evidence(explanations=report.explanations),
+        Evidence(explanations=report.explanations, data_error=report.data_error),
         reason=report.reason,
         known=not told and report.cause is not Cause.SETTLING,
         unheard=unheard,

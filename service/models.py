@@ -11,6 +11,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StringConstr
 
 from gridsec.online import Cause, Decision
 from gridsec.sequential import LearningReason, LearningState
+from gridsec.studies.data_errors import DataErrorKind
 from service.alarms import AlarmKind, AlarmState, Change, Severity
 from service.busbar import BUSBAR
 from service.commissioning import Stage, Step
@@ -139,6 +140,17 @@ class ExplanationModel(BaseModel):
     probability: float = Field(description="Its share among the explanations given.")
 
 
+class DataErrorModel(BaseModel):
+    """An error of the feeder's files that explains accused meters as well as a manipulation does."""
+
+    kind: DataErrorKind
+    meters: list[str] = Field(description="The accused meters that it explains.")
+    customers: list[str] = Field(description="The one customer, or the two that are exchanged.")
+    proposed: list[str] = Field(description="Bus and phase of each customer that explain the readings.")
+    study: str = Field(description="Command that checks it on a recording.")
+    text: str = Field(description="One sentence for the operator.")
+
+
 class BusState(BaseModel):
     """One bus at the latest tick."""
 
@@ -190,6 +202,9 @@ class State(BaseModel):
     customers: list[CustomerState] = []
     inverters: list[InverterState] = []
     explanations: list[ExplanationModel] = []
+    data_error: DataErrorModel | None = Field(
+        default=None, description="Error of the feeder's files that explains the accused meters as well."
+    )
 
 
 class MeterCommissioning(BaseModel):
@@ -342,7 +357,7 @@ class StalledMeterModel(BaseModel):
 
 
 class AlarmEvidence(BaseModel):
-    """The numbers behind an alarm when it was raised."""
+    """The numbers behind an alarm when it was raised, or when `data_error` was found."""
 
     score: Number
     threshold: Number
@@ -355,6 +370,9 @@ class AlarmEvidence(BaseModel):
     )
     explanations: list[ExplanationModel] = []
     learning: list[StalledMeterModel] = Field(default=[], description="Meters whose learning is stalled.")
+    data_error: DataErrorModel | None = Field(
+        default=None, description="Error of the feeder's files that explains the accusation as well."
+    )
 
 
 class AlarmModel(BaseModel):

@@ -19,6 +19,7 @@ from gridsec.arrays import Bools
 from gridsec.online import Cause, Decision, Estimate, Verdict
 from service.align import Tick
 from service.busbar import BUSBAR, UNKNOWN_BUSBAR, BusbarReport, busbar_report
+from service.data_errors import DataErrorReport
 from service.reasons import reason_of
 from service.voltages import Grounds, attack_volts, bus_volts, busbar_phases, grounds, std_volts
 
@@ -26,6 +27,7 @@ __all__ = [
     "BUSBAR",
     "BusbarReport",
     "CustomerReport",
+    "DataErrorReport",
     "ExplanationReport",
     "FeederReport",
     "InverterReport",
@@ -36,6 +38,7 @@ __all__ = [
     "build",
     "finite",
     "to_json",
+    "with_data_error",
     "with_learning",
 ]
 
@@ -270,6 +273,8 @@ class FeederReport:
         Of each entry of `bus_v_volt`, whether it is model only; empty: none is.
     t_measured
         Newest tick at which a value rested on a reading, Unix s; None: no such tick since the start.
+    data_error
+        Error of the feeder's files that explains accused meters; None: none does.
     """
 
     feeder: str
@@ -295,6 +300,7 @@ class FeederReport:
     model_only_phases: tuple[str, ...] = ()
     bus_model_only: tuple[bool, ...] = ()
     t_measured: float | None = None
+    data_error: DataErrorReport | None = None
 
     @property
     def suspects(self) -> tuple[str, ...]:
@@ -321,6 +327,19 @@ def with_learning(report: FeederReport, learning: LearningReport) -> FeederRepor
     each = zip(report.meters, learning.states, learning.reasons, strict=True)
     meters = tuple(replace(m, learning_state=state, learning_reason=reason) for m, state, reason in each)
     return replace(report, meters=meters, learning=learning)
+
+
+def with_data_error(report: FeederReport, error: DataErrorReport | None) -> FeederReport:
+    """Return the report with an error of the files that explains accused meters, in its reason too.
+
+    Parameters
+    ----------
+    report, error
+        Of the same feeder and tick.
+    """
+    if error is None:
+        return report
+    return replace(report, data_error=error, reason=f"{report.reason.removesuffix('.')}. {error.text}")
 
 
 def build(site: Site, tick: Tick, max_attacked: int, estimate: Estimate, verdict: Verdict) -> FeederReport:
@@ -633,6 +652,7 @@ def to_json(report: FeederReport) -> dict[str, Any]:
                 report.bus_v_volt, report.bus_phases, report.bus_model_only
             )
         ],
+        "data_error": None if report.data_error is None else report.data_error.to_json(),
         "silent": [{"meter": meter, "seconds": finite(seconds)} for meter, seconds in report.silent],
         "v_min_volt": report.v_min_volt,
         "v_max_volt": report.v_max_volt,

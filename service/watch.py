@@ -23,8 +23,9 @@ from service.alarms import AlarmBook, AlarmRules, Transition, acknowledge, advan
 from service.align import Aligner, AlignRules, Clock, Outcome, Tick, rules
 from service.commissioning import Commissioning
 from service.conditions import conditions
+from service.data_errors import DataErrors
 from service.reading import Known, Reading
-from service.report import FeederReport, blind, build, with_learning
+from service.report import FeederReport, blind, build, with_data_error, with_learning
 from service.suspicions import Suspicions
 from service.voltages import snapshot
 
@@ -170,6 +171,7 @@ class Watch:
         self.skipped = 0
         self.defect: Exception | None = None
         self._alarm_rules = alarm_rules(site, rules)
+        self._data_errors = DataErrors(site)
         self._watcher: estimators.Watcher | None = None
         self._state: Any = None
 
@@ -194,6 +196,7 @@ class Watch:
             The design.
         """
         self._watcher, self._state = finished, None
+        self._data_errors.renew()
         self.max_attacked = finished.max_attacked
         self.commissioning.install(finished)
         self.suspicions.install(finished)
@@ -365,9 +368,11 @@ class Watch:
             # The first tick, or the clock was set back: readings from before belong to another time.
             begun = self._watcher.init(tick.t, self.commissioning.known)
             self._state = self.suspicions.restore(begun)
+            self._data_errors.renew()
         frame = to_frame(self.site, snapshot(self.site, tick))
         self._state, estimate, verdict = self._watcher.step(self._state, frame)
         self.commissioning.follow(self._state, tick.t)
         self.suspicions.follow(self._state, tick.t)
         report = build(self.site, tick, self.max_attacked, estimate, verdict)
+        report = with_data_error(report, self._data_errors.follow(frame, estimate, verdict))
         return with_learning(report, self.commissioning.report())

@@ -77,7 +77,7 @@ def bus_voltages(
         The feeder.
     p, q : (…, N)
         Net active and reactive injection of each customer (generation positive), pu.
-    v0_squared : (3,) or scalar
+    v0_squared : (…, 3) or scalar
         Squared busbar voltage of each phase, pu.
     steps
         As in `gridsec.phases.loss_correction`; with no steps LinDist3Flow alone.
@@ -87,7 +87,8 @@ def bus_voltages(
     (…, n)
         Squared voltages, pu.
     """
-    v0 = np.broadcast_to(np.asarray(v0_squared, dtype=np.float64), len(PHASES))
+    given = np.asarray(v0_squared, dtype=np.float64)
+    v0 = np.broadcast_to(given, (*given.shape[:-1], len(PHASES)))
     by_phase = flow.bus_voltages(feeder.tree, 3.0 * p, 3.0 * q, v0, steps=steps)
     return np.moveaxis(by_phase, -2, -1).reshape(*by_phase.shape[:-2], len(feeder.buses))
 

@@ -23,6 +23,11 @@ function stalled({ learning = [] }) {
   return `. Meters: ${learning.slice(0, LISTED).map((m) => m.meter).join(", ")}${more}`;
 }
 
+// An error of the feeder's files that explains the accusation as well.
+function hint({ data_error: error }) {
+  return error ? el("p", { class: "hint", text: error.text }) : null;
+}
+
 export class Alarms {
   constructor({ onPick, onLink }) {
     this.alarms = new Map();
@@ -213,6 +218,7 @@ export class Alarms {
           this.onPick(alarm.feeder, alarm.meter, alarm.customer);
         } } })),
         el("p", { class: "numbers", text: numbers }),
+        alarm.kind === "meter-manipulated" ? hint(e) : null,
         el("p", { class: "quiet since", text: since }), answered),
       alarm.acknowledged_by === null
         ? el("button", { type: "button", class: "ack", text: "Acknowledge", on: { click: () => this.ask(alarm) } })

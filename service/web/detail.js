@@ -82,6 +82,8 @@ export function showDetail(feeder, customer, { meter, inverter, alone, v, std, o
   if (half !== null) list.append(...row("Standard deviation", volt(std, 2)));
   if (own) list.append(...row(...own));
   if (meter?.suspect) list.append(...row("Manipulation", `${signed(meter.attack_volt_estimated, 2)} V`, meter.kind ?? ""));
+  const error = report?.data_error;
+  if (meter && error?.meters.includes(meter.meter)) list.append(...row("Files", error.proposed.join("; "), error.kind.replace("-", " ")));
   if (inverter && isKnown(inverter.q_kvar_estimated)) {
     list.append(...row("Inverter injects", `${signed(inverter.q_kvar_estimated, 1)} kvar`, inverter.judged ? "" : "by its droop curve"));
   }

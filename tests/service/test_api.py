@@ -163,7 +163,7 @@ def test_an_alarm_and_its_fields(setup: Setup) -> None:
     assert contract <= set(alarm)
     assert set(alarm["evidence"]) == {
         *("score", "threshold", "v_volt_reported", "v_volt_estimated", "attack_volt_estimated"),
-        *("kind", "attack_kvar_estimated", "explanations", "learning"),
+        *("kind", "attack_kvar_estimated", "explanations", "learning", "data_error"),
     }
     assert alarm["customer"] is None
     assert (alarm["kind"], alarm["meter"], alarm["state"]) == ("meter-manipulated", "H3", "raised")

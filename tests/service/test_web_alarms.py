@@ -13,9 +13,11 @@ from service.alarms import AlarmState, Change, Transition
 from service.report import (
     BusbarReport,
     CustomerReport,
+    DataErrorReport,
     InverterReport,
     LearningReport,
     StalledMeter,
+    with_data_error,
     with_learning,
 )
 from tests.service.asking import T0
@@ -50,6 +52,23 @@ def test_a_manipulated_inverter_and_its_alarm(site: Site) -> None:
     expect(page.locator('.alarm:has-text("Meter manipulated")')).to_contain_text("drift")
     page.select_option("#alarm-kind", "inverter-manipulated")
     expect(page.locator(".alarm")).to_have_count(1)
+
+
+def test_an_error_of_the_files_stands_beside_the_accusation(site: Site) -> None:
+    """In the reason of the verdict, at the alarm, which has it later than it was raised, and at the meter."""
+    text = "An error of the feeder's files explains this as well: customer H3 at another bus (bus drop-9)."
+    error = DataErrorReport("bus", ("H3",), ("H3",), ("bus drop-9",), "gridsec study calibrate village", text)
+    page = site.open()
+    for k in range(5):
+        report = site.village.report(T0 + k, cause=Cause.RESIDUALS)
+        (at,) = (j for j, m in enumerate(report.meters) if m.meter == "H3")
+        liar = replace(report.meters[at], suspect=True, attack_volt_estimated=9.0)
+        report = replace(report, meters=(*report.meters[:at], liar, *report.meters[at + 1 :]))
+        site.service.tick(with_data_error(report, error if k == 4 else None))
+    expect(page.locator("#reason")).to_contain_text(text)
+    expect(page.locator(".alarm .hint")).to_have_text(text)
+    page.locator(".alarm a.where").click()
+    expect(page.locator("#detail-card")).to_contain_text("bus drop-9")
 
 
 @pytest.mark.parametrize("size", [DESKTOP, PHONE])

@@ -1,0 +1,138 @@
+"""Errors of a feeder's files as explanations of accusations, in the words of its operators."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+from feeders.load import Site, plant
+from gridsec.network import InPhases
+from gridsec.online import Estimate, Frame, Verdict
+from gridsec.phases import PHASES
+from gridsec.studies import data_errors
+from gridsec.studies.data_errors import DataError, DataErrorKind
+
+__all__ = ["DataErrorReport", "DataErrors"]
+
+
+@dataclass(frozen=True, slots=True)
+class DataErrorReport:
+    """An error of the feeder's files that explains accused meters as well as a manipulation does.
+
+    Attributes
+    ----------
+    kind
+        See `gridsec.studies.data_errors.DataErrorKind`.
+    meters
+        The accused meters that it explains.
+    customers
+        The customers at another phase or bus than the files say, or with exchanged meters.
+    proposed
+        Bus and phase of each of these customers that explain the readings.
+    study
+        Command that checks it on a recording.
+    text
+        One sentence for the operator.
+    """
+
+    kind: str
+    meters: tuple[str, ...]
+    customers: tuple[str, ...]
+    proposed: tuple[str, ...]
+    study: str
+    text: str
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the error as plain JSON types."""
+        lists = {name: list(getattr(self, name)) for name in ("meters", "customers", "proposed")}
+        return {"kind": self.kind, **lists, "study": self.study, "text": self.text}
+
+
+class DataErrors:
+    """Search for errors of a feeder's files while a meter is accused; nothing runs while none is.
+
+    Parameters
+    ----------
+    site
+        The feeder.
+    """
+
+    def __init__(self, site: Site) -> None:
+        self._site = site
+        self._window = data_errors.begin()
+        self._design: data_errors.DataErrorDesign | None = None
+        self._designed = False
+
+    def renew(self) -> None:
+        """Begin the window anew."""
+        self._window = data_errors.begin()
+
+    def follow(self, frame: Frame, estimate: Estimate, verdict: Verdict) -> DataErrorReport | None:
+        """Take one tick into the window; return the error that explains a meter accused at this tick.
+
+        Parameters
+        ----------
+        frame, estimate, verdict
+            Input and output of the estimator.
+        """
+        accused = data_errors.accused(verdict)
+        if not self._designed:
+            if not accused.any():
+                return None
+            self._design, self._designed = self._prepared(), True
+        if self._design is None:
+            return None
+        self._window = data_errors.follow(self._design, self._window, frame, estimate.x, accused)
+        error = self._window.error
+        if error is None or not accused[list(error.meters)].any():
+            return None
+        return _in_words(self._site, error)
+
+    def _prepared(self) -> data_errors.DataErrorDesign | None:
+        return data_errors.design(
+            plant(self._site), self._site.base_volt, self._site.tables.meta.monitor.tick_s
+        )
+
+
+_PHASE, _SWAP, _BUS = "phase", "swap", "bus"
+
+_LOOK_FOR: Final = {
+    DataErrorKind.PHASE: (_PHASE,),
+    DataErrorKind.EXCHANGED_PHASES: (_PHASE, _SWAP),
+    DataErrorKind.EXCHANGED_METERS: (_SWAP,),
+    DataErrorKind.BUS: (_BUS,),
+}
+"""Errors that `gridsec study calibrate` compares: on short lines an exchange of phases is one of meters."""
+
+
+def _in_words(site: Site, error: DataError) -> DataErrorReport:
+    customers = tuple(site.feeder.customers[i] for i in error.customers)
+    proposed = tuple(_place(site, q) for q in error.places)
+    one = customers[0]
+    match error.kind:
+        case DataErrorKind.PHASE:
+            what = f"customer {one} on another phase ({proposed[0]})"
+        case DataErrorKind.BUS:
+            what = f"customer {one} at another bus ({proposed[0]})"
+        case DataErrorKind.EXCHANGED_PHASES:
+            what = f"exchanged phases of customers {one} and {customers[1]}"
+        case DataErrorKind.EXCHANGED_METERS:
+            what = f"exchanged meters of customers {one} and {customers[1]}"
+    options = " ".join(f"--look-for {name}" for name in _LOOK_FOR[error.kind])
+    study = f"gridsec study calibrate {site.feeder.name} --readings FILE {options}"
+    return DataErrorReport(
+        kind=str(error.kind),
+        meters=tuple(site.meter_ids[j] for j in error.meters),
+        customers=customers,
+        proposed=proposed,
+        study=study,
+        text=f"An error of the feeder's files explains this as well: {what}. Check with `{study}`.",
+    )
+
+
+def _place(site: Site, place: int) -> str:
+    """Bus and phase of a place."""
+    if not isinstance(site.feeder, InPhases):
+        return f"bus {site.feeder.buses[place]}"
+    bus, phase = divmod(place, len(PHASES))
+    return f"bus {site.spanning.buses[bus]}, phase {PHASES[phase]}"
