@@ -37,6 +37,7 @@ class Cause(StrEnum):
     RESIDUALS = "residuals"
     SETTLING = "settling"
     SILENT_METERS = "silent-meters"
+    MISSING_POWERS = "missing-powers"
     TOO_FEW_METERS = "too-few-meters"
     NO_BUSBAR = "no-busbar"
     TOO_MANY_SUSPECTS = "too-many-suspects"
@@ -132,7 +133,8 @@ class Frame:
         Standard deviation of the truth about `p` and `q` where it is known apart from the intervals, as that
         of forecasts is, pu; NaN, or None for all, where it is that of a uniform distribution in the interval.
     p_origin : (N,) or None
-        `PowerOrigin` of `p`; None: `READ` everywhere. No estimate depends on it: it explains wide intervals.
+        `PowerOrigin` of `p`; None: `READ` everywhere. A voltage reading beside an unread power of the same
+        meter is not checked by that power.
     """
 
     t: float

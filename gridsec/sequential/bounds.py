@@ -244,7 +244,9 @@ class Grounds:
     busbar
         Whether its voltage is metered; in three phases (3,).
     y, trusted : (p,)
-        Squared readings, and which of them count.
+        Squared readings, and the meters that the estimate rests on.
+    checked : (p,)
+        Trusted meters whose customer's power is read: the bound rests on these readings.
     sigmas
         Standard deviations of jitter that an honest reading may be off.
     """
@@ -256,6 +258,7 @@ class Grounds:
     busbar: Bools | bool
     y: Floats
     trusted: Bools
+    checked: Bools
     sigmas: float
 
     def half_width(self, v2: Floats) -> Floats:
@@ -277,7 +280,7 @@ class Grounds:
         base = by_place(plant.feeder, self.powers.v0_squared)[plant.feeder.bus]
         spread = spread + np.abs(correction) * moved / np.maximum(base - moved, _LEAST)
         low, high = self.model + low - spread, self.model + high + spread
-        own = np.where(self.trusted, reading, np.inf)
+        own = np.where(self.checked, reading, np.inf)
         low[at], high[at] = _both(low[at], high[at], self.y - own, self.y + own)
         return np.minimum(np.maximum(high - v2, v2 - low), NO_VOLTAGE)
 
@@ -286,7 +289,7 @@ class Grounds:
         plant, at = self.plant, self.plant.meters
         known = np.atleast_1d(busbar_errors(plant, self.powers.v0_squared, self.sigmas))
         known = np.where(self.busbar, known, np.inf)
-        off, room = self.y - self.model[at], np.where(self.trusted, reading + spread[at], np.inf)
+        off, room = self.y - self.model[at], np.where(self.checked, reading + spread[at], np.inf)
         heard = np.where(hangs_on(plant.feeder)[at] > 0.0, room[:, None], np.inf)
         low = (off[:, None] - heard).max(axis=0, initial=-np.inf)
         high = (off[:, None] + heard).min(axis=0, initial=np.inf)

@@ -16,6 +16,7 @@ from gridsec.judge import Situation, decide
 from gridsec.network import busbar_places, one_busbar, over_places
 from gridsec.online import Cause, Decision, Estimate, Explanation, Frame, Verdict
 from gridsec.sequential import words
+from gridsec.sequential.apart import apart
 from gridsec.sequential.bounds import Bounded, Grounds, Powers
 from gridsec.sequential.busbar import Busbar, follow
 from gridsec.sequential.conditional import Prior, judge
@@ -76,7 +77,10 @@ def conclude(
         The state with the answer in it, and the answer.
     """
     trust, heard = state.trust, tick.heard
-    estimate, released = _estimate(design, state, tick)
+    beside = apart(state.apart, state.fits, state.doubts)
+    state = state if beside is state.apart else changed(state, apart=beside)
+    s, moved = _best(design, state)
+    estimate, released = _estimate(design, state, tick, s, moved)
     busbar, inverters = _busbar(design, state, heard, estimate), _inverters(design, state)
     score, threshold, judged = _worst(design, tick.seen, heard.live.size)
     live, beyond = judged & heard.live, score > threshold
@@ -104,7 +108,8 @@ def conclude(
     said = _unvouched(design, heard.busbar, live, differs, said)
     open_ = _open(design, state, said)
     said = _beside_meters(design, inverters, differs, amounts, tick.rivals, open_, said)
-    decision, cause, reason = _unexplained(tick.seen.misfit, said)
+    said = _unexplained(tick.seen.misfit, said)
+    decision, cause, reason = _unread(design, ~state.doubts.vouched[max(s, 0)], estimate, said)
     verdict = Verdict(
         decision,
         cause,
@@ -159,11 +164,12 @@ def _injected(
 
 
 def _estimate(
-    design: SequentialDesign, state: SequentialState, tick: Tick
+    design: SequentialDesign, state: SequentialState, tick: Tick, s: int, moved: float
 ) -> tuple[Estimate, Released | None]:
+    """The estimate by scale s, whose mean is short of a part `moved` of the loads' variance."""
     plant = design.plant
     heard = tick.heard
-    w, variance, released = _reconstructed(design, state, tick)
+    w, variance, released = _reconstructed(design, state, tick, s, moved)
     v2_bus = tick.v2_bus + w
     first = busbar_places(plant.feeder)
     v2_bus[first] = np.where(heard.busbar, heard.v0_squared, v2_bus[first])
@@ -181,6 +187,7 @@ def _estimate(
         busbar=heard.busbar,
         y=heard.y,
         trusted=trusted,
+        checked=trusted & state.doubts.vouched[0],
         sigmas=design.sigmas[0],
     )
     x = np.zeros(0) if state.x is None else state.x
@@ -267,6 +274,23 @@ def _unexplained(misfit: tuple[bool, ...], said: _Said) -> _Said:
     return Decision.UNDECIDED, Cause.MISFIT, sentence
 
 
+def _unread(design: SequentialDesign, unread: Bools, estimate: Estimate, said: _Said) -> _Said:
+    """The answer, unless a voltage beside a power that is not read is known too badly to be called clean."""
+    if said[0] is not Decision.CLEAN or not any_of(unread):
+        return said
+    at, limit = design.plant.meters, design.options.unread_std_percent
+    v = np.sqrt(np.maximum(estimate.v2[at], _DEAD))
+    percent = 50.0 * estimate.std[at] / (v * design.plant.droop.vbar)
+    wide = unread & ~(percent <= limit)
+    if not any_of(wide):
+        return said
+    return Decision.UNDECIDED, Cause.MISSING_POWERS, words.unread(design.names, wide, percent, limit)
+
+
+_DEAD = 1e-2
+"""Least squared voltage by which a standard deviation is related to the voltage, pu."""
+
+
 def _open(design: SequentialDesign, state: SequentialState, said: _Said) -> tuple[Explanation, ...]:
     """What metered reactive powers leave open, whoever else is named."""
     if state.curves.idle:
@@ -336,10 +360,9 @@ def _mean(state: SequentialState, s: int) -> Floats:
 
 
 def _reconstructed(
-    design: SequentialDesign, state: SequentialState, tick: Tick
+    design: SequentialDesign, state: SequentialState, tick: Tick, s: int, moved: float
 ) -> tuple[Floats, Floats, Released | None]:
     """What the trusted meters add to the model at every bus, its variance, and what is kept of the work."""
-    s, moved = _best(design, state)
     prior_, told = state.doubts.priors[max(s, 0)], tick.frame.p_std
     now, view = (None, None) if s < 0 else (state.fits[s], tick.seen.views[s])
     if now is None:
@@ -349,6 +372,9 @@ def _reconstructed(
     jitter = (1.0 - 1.0 / design.lengths[s]) * design.flicker
     flicker = over_places(design.plant.feeder, np.where(tick.heard.busbar, jitter, 0.0))
     after = moved * prior_.variance + _hidden(state, prior_) + flicker
+    beside = state.apart[s]
+    if beside is not None:
+        after = after + beside.added(judged)
     liars = design.plant.meters[~state.trust.trusted]
     # Nobody lies about powers that nobody told, which are known by a standard deviation.
     liars = liars if told is None else liars[np.isnan(told[liars])]
@@ -371,8 +397,8 @@ def _best(design: SequentialDesign, state: SequentialState) -> tuple[int, float]
     for s, (now, length) in enumerate(zip(state.fits, design.lengths, strict=True)):
         if now is None:
             continue
-        lag = min(1.0, length * design.step_s / design.doubt.time_s) * (length > 1)
-        total = now.total() + lag * now.prior.total
+        lag, beside = min(1.0, length * design.step_s / design.doubt.time_s) * (length > 1), state.apart[s]
+        total = (now if beside is None else beside.rest).total() + lag * now.prior.total
         if total < least:
             at, least, moved = s, total, lag
     return at, moved

@@ -16,7 +16,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of
 from gridsec.frames import usual
-from gridsec.online import Frame
+from gridsec.online import Frame, PowerOrigin
 from gridsec.sequential.conditional import Prior
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.loads import EXACT, UNMETERED, prior
@@ -29,8 +29,8 @@ class Doubts:
     Attributes
     ----------
     p, q : (s, N)
-        Factors, powers of two, on the standard deviations of the design: the largest that any residual in the
-        mean of a scale was made with.
+        Factors on the standard deviations of the design: the largest that any residual in the mean of a scale
+        was made with. Exact for a power that the frame states as unread, else powers of two.
     p_calm, q_calm : (s, N)
         For how many ticks a smaller one would have done.
     p_rest, q_rest : (s, N)
@@ -44,6 +44,11 @@ class Doubts:
     sizes : (k,)
         How much there may be of whatever else is in the book of the design, pu: false powers are of the size
         of what the customers claim, rounded up.
+    vouched : (s, p)
+        Meters without a residual in the mean of a scale that was made without a reading of their customer's
+        active power.
+    vouched_calm : (s, p)
+        Consecutive ticks without such a residual, for meters that are not vouched.
     heard
         While no meter is heard: the same when one was, for the last time.
     """
@@ -58,6 +63,8 @@ class Doubts:
     busbar_calm: Ints
     priors: tuple[Prior, ...]
     sizes: Floats
+    vouched: Bools
+    vouched_calm: Ints
     heard: Doubts | None = None
 
 
@@ -72,12 +79,18 @@ def none(design: SequentialDesign) -> Doubts:
     scales, phases = len(design.lengths), design.hangs_on.shape[1]
     one, never = np.ones((scales, design.customers)), np.zeros((scales, design.customers), dtype=np.intp)
     known, unbroken = np.ones((scales, phases), dtype=np.bool_), np.zeros((scales, phases), dtype=np.intp)
-    priors = (design.prior,) * scales
-    return Doubts(one, one, never, never, one, one, known, unbroken, priors, design.book.std)
+    priors, meters = (design.prior,) * scales, design.plant.meters.size
+    vouched, calm = np.ones((scales, meters), dtype=np.bool_), np.zeros((scales, meters), dtype=np.intp)
+    sizes = design.book.std
+    return Doubts(one, one, never, never, one, one, known, unbroken, priors, sizes, vouched, calm)
 
 
-# Frames that claim to know loads so much less well than the design assumes are believed.
 _MUCH_LESS = 4.0
+"""Ratio of a frame's uncertainty to the design's beyond which it is used, unless the power is unread."""
+_ROUNDED = 1.0 + 1e-9
+"""Ratio up to which two uncertainties are the same but for rounding."""
+_ALIKE = 0.5
+"""Share of the variance of powers that are not read that all of them have in common."""
 
 
 def doubted(
@@ -101,23 +114,47 @@ def doubted(
     """
     last = before if before.heard is None else before.heard
     if any_of(live):
-        return _doubts(design, last, frame, busbar)
-    found = _doubts(design, before, frame, busbar)
+        return _doubts(design, last, frame, live, busbar)
+    found = _doubts(design, before, frame, live, busbar)
     return found if found.heard is last else replace(found, heard=last)
 
 
-def _doubts(design: SequentialDesign, before: Doubts, frame: Frame, busbar: Bools | bool) -> Doubts:
+def _origins(design: SequentialDesign, frame: Frame) -> Ints | None:
+    """`PowerOrigin` of all customers, those without a meter as read, (N,); None: all metered ones are read.
+
+    The design supposes no reading of a customer without a meter.
+    """
+    if frame.p_origin is None:
+        return None
+    meters = design.plant.meters
+    of_meters = frame.p_origin[meters]
+    if not any_of(of_meters):
+        return None
+    out = np.zeros(frame.p.size, dtype=np.intp)
+    out[meters] = of_meters
+    return out
+
+
+def _doubts(
+    design: SequentialDesign, before: Doubts, frame: Frame, live: Bools, busbar: Bools | bool
+) -> Doubts:
     """What this frame does not know; new priors only where that changed."""
     # The design has standard deviations, and so have frames that tell them apart from their intervals.
     frame, lengths = usual(frame), design.lengths
+    origins = _origins(design, frame)
+    unread = None if origins is None else origins == PowerOrigin.UNREAD
     p, p_calm, p_rest = _factors(
-        frame.p_error, design.doubt.even_p, (before.p, before.p_calm, before.p_rest), lengths
+        frame.p_error, design.doubt.even_p, (before.p, before.p_calm, before.p_rest), lengths, unread
     )
     q, q_calm, q_rest = _factors(
-        frame.q_error, design.doubt.even_q, (before.q, before.q_calm, before.q_rest), lengths
+        frame.q_error, design.doubt.even_q, (before.q, before.q_calm, before.q_rest), lengths, unread
     )
     sizes = _claims(np.abs(frame.p), design.options.hidden_power, before.sizes)
     metered, calm = _metered(busbar, before.busbar, before.busbar_calm, lengths)
+    checked = True if origins is None else _checked(design, frame, live, origins)
+    vouched, vouched_calm = _metered(checked, before.vouched, before.vouched_calm, lengths)
+    if vouched is not before.vouched:
+        before = replace(before, vouched=vouched, vouched_calm=vouched_calm)
     if metered is before.busbar and p is before.p and q is before.q:
         return before if sizes is before.sizes else replace(before, sizes=sizes)
     same = np.ones(len(lengths), dtype=np.bool_)
@@ -143,15 +180,30 @@ def _doubts(design: SequentialDesign, before: Doubts, frame: Frame, busbar: Bool
         shared = (k for k in range(s) if all(np.array_equal(of[k], of[s]) for of in (p, q, metered)))
         k = next(shared, None)
         priors.append(_prior(design, p[s], q[s], metered[s]) if k is None else priors[k])
-    return Doubts(p, q, p_calm, q_calm, p_rest, q_rest, metered, calm, tuple(priors), sizes)
+    return Doubts(
+        p, q, p_calm, q_calm, p_rest, q_rest, metered, calm, tuple(priors), sizes, vouched, vouched_calm
+    )
+
+
+def _checked(design: SequentialDesign, frame: Frame, live: Bools, origins: Ints) -> Bools:
+    """Meters without a residual at this frame, or with a usable reading of their customer's power, (p,).
+
+    A power that is not read is as good as one that is if the design supposes no more of it.
+    """
+    least = np.where(origins == PowerOrigin.UNREAD, _ROUNDED, _MUCH_LESS)
+    wide = (origins != PowerOrigin.READ) & (frame.p_error > least * design.doubt.even_p)
+    return np.asarray(~(live & wide[design.plant.meters]))
 
 
 def _prior(design: SequentialDesign, p: Floats, q: Floats, busbar: Bools) -> Prior:
     if all_of(busbar) and all_of(p == 1.0) and all_of(q == 1.0):
         return design.prior
     unknown = np.where(busbar, design.busbar, UNMETERED)
+    # Of the powers that are not read, those of metered customers are low together by night as well.
+    alike = np.where(p > 1.0, np.maximum(design.doubt.together, _ALIKE), design.doubt.together)
     doubt = replace(
         design.doubt,
+        together=alike,
         p=np.where(p > 1.0, np.maximum(design.doubt.p, EXACT) * p, design.doubt.p),
         q=np.where(q > 1.0, np.maximum(design.doubt.q, EXACT) * q, design.doubt.q),
     )
@@ -186,15 +238,19 @@ def _metered(busbar: Bools | bool, old: Bools, calm: Ints, lengths: tuple[int, .
     return known, np.where(now & ~known, calm + 1, 0)
 
 
-def _factors(
-    error: Floats, known: Floats, before: tuple[Floats, Ints, Floats], lengths: tuple[int, ...]
+def _factors(  # noqa: PLR0917  # one power of all customers
+    error: Floats,
+    known: Floats,
+    before: tuple[Floats, Ints, Floats],
+    lengths: tuple[int, ...],
+    unread: Bools | None,
 ) -> tuple[Floats, Ints, Floats]:
     """`_factor`, but as long as residuals are remembered that were made with a larger one, that one.
 
     Then the largest of those made since, for as long again: they are remembered still.
     """
     old, calm, rest = before
-    new = _factor(error, known, old)
+    new = _factor(error, known, old, unread)
     if new is old:
         return before
     lower = new < old
@@ -205,11 +261,20 @@ def _factors(
     return after, np.where(held, calm + 1, 0), np.where(held, rest, 1.0)
 
 
-def _factor(error: Floats, known: Floats, old: Floats) -> Floats:
-    """Power of two by which a frame knows a power less well than the design assumes, with hysteresis."""
-    if all_of(error <= _MUCH_LESS * known) and all_of(old <= 1.0):
+def _factor(error: Floats, known: Floats, old: Floats, unread: Bools | None) -> Floats:
+    """Factor by which a frame knows a power less well than the design assumes, with hysteresis.
+
+    A power of two where the power is read, the ratio itself where it is not.
+    """
+    if unread is None and all_of(error <= _MUCH_LESS * known) and all_of(old <= 1.0):
         return old
     ratio = error / known
-    keep = (ratio <= old * _MUCH_LESS) & (ratio * _MUCH_LESS >= old) & (old > 1.0)
+    keep = (ratio <= old * _MUCH_LESS) & (ratio * _MUCH_LESS >= old) & (old > _MUCH_LESS)
     raised = np.exp2(np.ceil(np.log2(np.maximum(ratio, 1.0))))
-    return np.where(keep, old, np.where(ratio > _MUCH_LESS, raised, 1.0))
+    new = np.where(keep, old, np.where(ratio > _MUCH_LESS, raised, 1.0))
+    if unread is None:
+        return new
+    # A forecast states its own standard deviation; rounding it up would widen more than is stated.
+    near = (ratio <= _ROUNDED * old) & (ratio * _MUCH_LESS >= old) & (old > 1.0)
+    exact = np.where(near, old, np.where(ratio > _ROUNDED, ratio, 1.0))
+    return np.where(unread, exact, new)

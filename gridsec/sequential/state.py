@@ -8,6 +8,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of
 from gridsec.online import Estimate, Frame, Verdict
+from gridsec.sequential.apart import Apart
 from gridsec.sequential.bounds import Lag
 from gridsec.sequential.bounds import start as no_lag
 from gridsec.sequential.busbar import Busbar
@@ -114,6 +115,8 @@ class SequentialState:
         What the trusted meters say on each scale; None where no meter can be judged yet.
     wholes : (s,)
         Fits of all that reported, or of more, from when they were trusted; None where none is kept.
+    apart : (s,)
+        Fits without the meters that withhold their customer's power; None where there is no such meter.
     misfit : (s,)
         Scales whose trusted meters were inconsistent at the last look, after the search.
     released
@@ -149,6 +152,7 @@ class SequentialState:
     trust: Trust
     fits: tuple[Fit | None, ...]
     wholes: tuple[Fit | None, ...]
+    apart: tuple[Apart | None, ...]
     misfit: tuple[bool, ...]
     released: Released | None
     doubts: Doubts
@@ -213,6 +217,7 @@ def init(
         ),
         fits=(None,) * s,
         wholes=(None,) * s,
+        apart=(None,) * s,
         misfit=(False,) * s,
         released=None,
         doubts=no_doubts(design),
