@@ -77,10 +77,24 @@ def apart(
 
 def _apart(kept: Apart | None, now: Fit, vouched: Bools) -> Apart | None:
     fallen = now.trusted & ~vouched
-    if not any_of(fallen):
-        return None
     if kept is not None and kept.whole is now and np.array_equal(kept.fallen, fallen):
         return kept
+    return set_apart(now, vouched)
+
+
+def set_apart(now: Fit, vouched: Bools) -> Apart | None:
+    """A fit without the meters that are not vouched for; None where it has none.
+
+    Parameters
+    ----------
+    now
+        The trusted meters.
+    vouched : (p,)
+        Meters with a check by their customer's power.
+    """
+    fallen = now.trusted & ~vouched
+    if not any_of(fallen):
+        return None
     if sound(now.prior, now.noise):
         return Apart(now, fallen, without(now, fallen))
     return Apart(now, fallen, fit(now.prior, now.noise, now.trusted & ~fallen, now.loose))

@@ -109,7 +109,9 @@ def conclude(
     open_ = _open(design, state, said)
     said = _beside_meters(design, inverters, differs, amounts, tick.rivals, open_, said)
     said = _unexplained(tick.seen.misfit, said)
-    decision, cause, reason = _unread(design, ~state.doubts.vouched[max(s, 0)], estimate, said)
+    if not (tick.rivals or open_):
+        said = _unread(design, ~state.doubts.vouched[max(s, 0)], estimate, said)
+    decision, cause, reason = said
     verdict = Verdict(
         decision,
         cause,
@@ -276,7 +278,7 @@ def _unexplained(misfit: tuple[bool, ...], said: _Said) -> _Said:
 
 def _unread(design: SequentialDesign, unread: Bools, estimate: Estimate, said: _Said) -> _Said:
     """The answer, unless a voltage beside a power that is not read is known too badly to be called clean."""
-    if said[0] is not Decision.CLEAN or not any_of(unread):
+    if said[1] not in _MILD or not any_of(unread):
         return said
     at, limit = design.plant.meters, design.options.unread_std_percent
     v = np.sqrt(np.maximum(estimate.v2[at], _DEAD))

@@ -30,7 +30,7 @@ class Doubts:
     ----------
     p, q : (s, N)
         Factors on the standard deviations of the design: the largest that any residual in the mean of a scale
-        was made with. Exact for a power that the frame states as unread, else powers of two.
+        was made with. Exact for a power that a reporting meter withholds, else powers of two.
     p_calm, q_calm : (s, N)
         For how many ticks a smaller one would have done.
     p_rest, q_rest : (s, N)
@@ -86,7 +86,7 @@ def none(design: SequentialDesign) -> Doubts:
 
 
 _MUCH_LESS = 4.0
-"""Ratio of a frame's uncertainty to the design's beyond which it is used, unless the power is unread."""
+"""Ratio of a frame's uncertainty to the design's beyond which it is used, unless a power is withheld."""
 _ROUNDED = 1.0 + 1e-9
 """Ratio up to which two uncertainties are the same but for rounding."""
 _ALIKE = 0.5
@@ -119,20 +119,21 @@ def doubted(
     return found if found.heard is last else replace(found, heard=last)
 
 
-def _origins(design: SequentialDesign, frame: Frame) -> Ints | None:
-    """`PowerOrigin` of all customers, those without a meter as read, (N,); None: all metered ones are read.
+def _withheld(design: SequentialDesign, frame: Frame, live: Bools) -> Bools | None:
+    """Meters with a voltage at this frame and without a usable active power, (p,); None: there is none.
 
-    The design supposes no reading of a customer without a meter.
+    A power that is not read is as good as one that is if the design supposes no more of it.
     """
     if frame.p_origin is None:
         return None
     meters = design.plant.meters
-    of_meters = frame.p_origin[meters]
-    if not any_of(of_meters):
+    origins = frame.p_origin[meters]
+    if not any_of(origins):
         return None
-    out = np.zeros(frame.p.size, dtype=np.intp)
-    out[meters] = of_meters
-    return out
+    least = np.where(origins == PowerOrigin.UNREAD, _ROUNDED, _MUCH_LESS)
+    wide = frame.p_error[meters] > least * design.doubt.even_p[meters]
+    out = np.asarray(live & (origins != PowerOrigin.READ) & wide)
+    return out if any_of(out) else None
 
 
 def _doubts(
@@ -141,18 +142,18 @@ def _doubts(
     """What this frame does not know; new priors only where that changed."""
     # The design has standard deviations, and so have frames that tell them apart from their intervals.
     frame, lengths = usual(frame), design.lengths
-    origins = _origins(design, frame)
-    unread = None if origins is None else origins == PowerOrigin.UNREAD
+    withheld = _withheld(design, frame, live)
+    exact = None if withheld is None else _customers(design, withheld)
     p, p_calm, p_rest = _factors(
-        frame.p_error, design.doubt.even_p, (before.p, before.p_calm, before.p_rest), lengths, unread
+        frame.p_error, design.doubt.even_p, (before.p, before.p_calm, before.p_rest), lengths, exact
     )
     q, q_calm, q_rest = _factors(
-        frame.q_error, design.doubt.even_q, (before.q, before.q_calm, before.q_rest), lengths, unread
+        frame.q_error, design.doubt.even_q, (before.q, before.q_calm, before.q_rest), lengths, exact
     )
     sizes = _claims(np.abs(frame.p), design.options.hidden_power, before.sizes)
     metered, calm = _metered(busbar, before.busbar, before.busbar_calm, lengths)
-    checked = True if origins is None else _checked(design, frame, live, origins)
-    vouched, vouched_calm = _metered(checked, before.vouched, before.vouched_calm, lengths)
+    read = True if withheld is None else ~withheld
+    vouched, vouched_calm = _metered(read, before.vouched, before.vouched_calm, lengths)
     if vouched is not before.vouched:
         before = replace(before, vouched=vouched, vouched_calm=vouched_calm)
     if metered is before.busbar and p is before.p and q is before.q:
@@ -177,33 +178,34 @@ def _doubts(
             priors.append(known)
             continue
         # Scales that are in doubt about the same share what follows.
-        shared = (k for k in range(s) if all(np.array_equal(of[k], of[s]) for of in (p, q, metered)))
+        parts = (p, q, metered, vouched)
+        shared = (k for k in range(s) if all(np.array_equal(of[k], of[s]) for of in parts))
         k = next(shared, None)
-        priors.append(_prior(design, p[s], q[s], metered[s]) if k is None else priors[k])
+        priors.append(_prior(design, p[s], q[s], metered[s], vouched[s]) if k is None else priors[k])
     return Doubts(
         p, q, p_calm, q_calm, p_rest, q_rest, metered, calm, tuple(priors), sizes, vouched, vouched_calm
     )
 
 
-def _checked(design: SequentialDesign, frame: Frame, live: Bools, origins: Ints) -> Bools:
-    """Meters without a residual at this frame, or with a usable reading of their customer's power, (p,).
-
-    A power that is not read is as good as one that is if the design supposes no more of it.
-    """
-    least = np.where(origins == PowerOrigin.UNREAD, _ROUNDED, _MUCH_LESS)
-    wide = (origins != PowerOrigin.READ) & (frame.p_error > least * design.doubt.even_p)
-    return np.asarray(~(live & wide[design.plant.meters]))
+def _customers(design: SequentialDesign, meters: Bools) -> Bools:
+    """Customers of some meters, (N,)."""
+    out = np.zeros(design.customers, dtype=np.bool_)
+    out[design.plant.meters] = meters
+    return out
 
 
-def _prior(design: SequentialDesign, p: Floats, q: Floats, busbar: Bools) -> Prior:
+def _prior(design: SequentialDesign, p: Floats, q: Floats, busbar: Bools, vouched: Bools) -> Prior:
     if all_of(busbar) and all_of(p == 1.0) and all_of(q == 1.0):
         return design.prior
     unknown = np.where(busbar, design.busbar, UNMETERED)
-    # Of the powers that are not read, those of metered customers are low together by night as well.
-    alike = np.where(p > 1.0, np.maximum(design.doubt.together, _ALIKE), design.doubt.together)
+    together = design.doubt.together
+    if not all_of(vouched):
+        # Powers that are not read are low together by night, with a meter as without.
+        unread = (p > 1.0) & _customers(design, ~vouched)
+        together = np.where(unread, np.maximum(together, _ALIKE), together)
     doubt = replace(
         design.doubt,
-        together=alike,
+        together=together,
         p=np.where(p > 1.0, np.maximum(design.doubt.p, EXACT) * p, design.doubt.p),
         q=np.where(q > 1.0, np.maximum(design.doubt.q, EXACT) * q, design.doubt.q),
     )
@@ -243,14 +245,14 @@ def _factors(  # noqa: PLR0917  # one power of all customers
     known: Floats,
     before: tuple[Floats, Ints, Floats],
     lengths: tuple[int, ...],
-    unread: Bools | None,
+    exact: Bools | None,
 ) -> tuple[Floats, Ints, Floats]:
     """`_factor`, but as long as residuals are remembered that were made with a larger one, that one.
 
     Then the largest of those made since, for as long again: they are remembered still.
     """
     old, calm, rest = before
-    new = _factor(error, known, old, unread)
+    new = _factor(error, known, old, exact)
     if new is old:
         return before
     lower = new < old
@@ -261,20 +263,19 @@ def _factors(  # noqa: PLR0917  # one power of all customers
     return after, np.where(held, calm + 1, 0), np.where(held, rest, 1.0)
 
 
-def _factor(error: Floats, known: Floats, old: Floats, unread: Bools | None) -> Floats:
+def _factor(error: Floats, known: Floats, old: Floats, exact: Bools | None) -> Floats:
     """Factor by which a frame knows a power less well than the design assumes, with hysteresis.
 
-    A power of two where the power is read, the ratio itself where it is not.
+    The ratio itself where `exact`, else a power of two.
     """
-    if unread is None and all_of(error <= _MUCH_LESS * known) and all_of(old <= 1.0):
+    if exact is None and all_of(error <= _MUCH_LESS * known) and all_of(old <= 1.0):
         return old
     ratio = error / known
     keep = (ratio <= old * _MUCH_LESS) & (ratio * _MUCH_LESS >= old) & (old > _MUCH_LESS)
     raised = np.exp2(np.ceil(np.log2(np.maximum(ratio, 1.0))))
     new = np.where(keep, old, np.where(ratio > _MUCH_LESS, raised, 1.0))
-    if unread is None:
+    if exact is None:
         return new
     # A forecast states its own standard deviation; rounding it up would widen more than is stated.
     near = (ratio <= _ROUNDED * old) & (ratio * _MUCH_LESS >= old) & (old > 1.0)
-    exact = np.where(near, old, np.where(ratio > _ROUNDED, ratio, 1.0))
-    return np.where(unread, exact, new)
+    return np.where(exact, np.where(near, old, np.where(ratio > _ROUNDED, ratio, 1.0)), new)

@@ -24,7 +24,8 @@ from gridsec.sequential.drive import Free, ahead, drive
 from gridsec.sequential.examine import Examined, ended, examine
 from gridsec.sequential.heard import Heard, clean, possible
 from gridsec.sequential.kinds import Kinds, describe, listen, repeated
-from gridsec.sequential.naming import name
+from gridsec.sequential.naming import name, supported
+from gridsec.sequential.scales import Scales
 from gridsec.sequential.state import SequentialState, Trust
 from gridsec.sequential.windows import Window, empty, forget, push, shift
 from gridsec.values import changed
@@ -180,6 +181,9 @@ def _judge(
         return seen, now.window, ()
     over = ended(design, now.doubts.priors, now.trust, seen, now.window)
     trust, rivals = name(design, now.trust, _acquit(seen, over), look.heard.live, now.curves)
+    model = look.state.model_error + look.transient
+    scales = Scales(design, now.doubts, now.window, now.learned, model)
+    trust = supported(scales, now.trust, seen, trust)
     trust = _distrust(trust, look.copies)
     rivals = rivals or _undecided(design, now.last, before, trust)
     seen = seen if trust is seen.trust else replace(seen, trust=trust)
