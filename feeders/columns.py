@@ -363,6 +363,14 @@ META_COLUMNS: dict[str, tuple[Column, ...]] = {
             low=0.0,
             high=1e8,
         ),
+        Column(
+            "unread_std_percent",
+            Kind.NUMBER,
+            "largest standard deviation of a voltage beside a withheld power at CLEAN, %",
+            0.5,
+            low=0.0,
+            high=100.0,
+        ),
     ),
 }
 

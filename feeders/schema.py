@@ -163,6 +163,7 @@ class MonitorDefaults:
     silence_s: float = 10.0
     alarms_per_year: float = 1.0
     commission_s: float = 86400.0
+    unread_std_percent: float = 0.5
 
 
 @dataclass(frozen=True, slots=True)

@@ -216,8 +216,8 @@ def _inverters(report: FeederReport) -> Iterable[Condition]:
 
 
 # With these causes the reconstruction still is what the design promises: the readings that are there are
-# enough. With every other UNDECIDED its bound is not a bound.
-_SOUND = frozenset({Cause.AGREEMENT, Cause.RESIDUALS, Cause.SILENT_METERS})
+# enough, or the standard deviation is wide. With every other UNDECIDED its bound is not a bound.
+_SOUND = frozenset({Cause.AGREEMENT, Cause.RESIDUALS, Cause.SILENT_METERS, Cause.MISSING_POWERS})
 
 
 def _voltage_limit(report: FeederReport, meter: MeterReport) -> Iterable[Condition]:
