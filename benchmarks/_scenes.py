@@ -160,7 +160,9 @@ def without(frame: Frame, nothing: Frame, silent: Bools) -> Frame:
         The customers.
     """
     names = ("p", "p_error", "q", "q_error")
-    origin = np.where(silent, PowerOrigin.UNREAD, PowerOrigin.READ if frame.p_origin is None else frame.p_origin)
+    origin = np.where(
+        silent, PowerOrigin.UNREAD, PowerOrigin.READ if frame.p_origin is None else frame.p_origin
+    )
     return replace(
         frame,
         p_origin=origin.astype(np.intp),

@@ -128,7 +128,9 @@ def run(setting: Setting, meters: Ints, *, lying: bool, stated: bool) -> Played:
 
 def main(seeds: int, feeders: tuple[str, ...]) -> int:
     """Print a table; 1 if a limit is missed."""
-    print("| feeder | withheld | voltages | powers | lie V | error V | clean % | in std | in bounds |", end="")
+    print(
+        "| feeder | withheld | voltages | powers | lie V | error V | clean % | in std | in bounds |", end=""
+    )
     print(" in std at clean | in bounds at clean | named | honest named |\n|" + "---|" * 13)
     good = True
     for feeder in feeders:
@@ -139,12 +141,18 @@ def main(seeds: int, feeders: tuple[str, ...]) -> int:
                 pairs = zip(settings, sets, strict=True)
                 runs = [run(one, chosen, lying=kind == "lie", stated=stated) for one, chosen in pairs]
                 top = {f.name: max(getattr(one, f.name) for one in runs) for f in fields(Played)}
-                mid = {name: float(np.median([getattr(one, name) for one in runs])) for name in ("lie", "clean")}
+                mid = {
+                    name: float(np.median([getattr(one, name) for one in runs])) for name in ("lie", "clean")
+                }
                 cells = [feeder, f"{sets[0].size} {where}", kind, "unread" if stated else "interval only"]
                 cells += [f"{mid['lie']:.1f}", f"{top['error']:.1f}", f"{mid['clean']:.0f}"]
                 names = ("of_std", "of_bound", "clean_std", "clean_bound")
                 cells += [f"{top[name]:.1f}" for name in names]
-                cells += [f"{sum(one.named for one in runs)} of {sets[0].size * seeds}"] if kind == "lie" else ["-"]
+                cells += (
+                    [f"{sum(one.named for one in runs)} of {sets[0].size * seeds}"]
+                    if kind == "lie"
+                    else ["-"]
+                )
                 cells += [f"{sum(one.honest for one in runs)}"]
                 print(f"| {' | '.join(cells)} |", flush=True)
                 good &= not stated or (top["clean_bound"] <= 1.0 and top["honest"] == 0)

@@ -240,7 +240,7 @@ def _metered(busbar: Bools | bool, old: Bools, calm: Ints, lengths: tuple[int, .
     return known, np.where(now & ~known, calm + 1, 0)
 
 
-def _factors(  # noqa: PLR0917  # one power of all customers
+def _factors(  # one power of all customers
     error: Floats,
     known: Floats,
     before: tuple[Floats, Ints, Floats],

@@ -73,15 +73,11 @@ def watch(seed: int, withhold: Bools, *, lying: bool) -> Iterator[tuple[Sample, 
         if lying and age == LIE_S:
             assert isinstance(state, SequentialState)
             room = SHARE * (misfit_limit(model) - withhold.size)
-            lie = within_misfit(
-                linear_tests(model, state), np.flatnonzero(withhold), room, share=SHARE
-            ).lie
+            lie = within_misfit(linear_tests(model, state), np.flatnonzero(withhold), room, share=SHARE).lie
             assert np.abs(lie).max() > 0.02
         p_kw = np.where(withhold & (age >= WITHHELD_S), np.nan, said.p_kw)
         v = at * np.sqrt(np.maximum((said.v_volt / at) ** 2 + lie, 0.0))
-        state, estimate, verdict = watcher().step(
-            state, to_frame(site(), replace(said, v_volt=v, p_kw=p_kw))
-        )
+        state, estimate, verdict = watcher().step(state, to_frame(site(), replace(said, v_volt=v, p_kw=p_kw)))
         if age >= WITHHELD_S:
             yield sample, estimate, verdict
 
@@ -122,7 +118,9 @@ def test_the_reason_names_the_setting_and_a_larger_one_is_clean() -> None:
     meta = site().tables.meta
     loose = design(
         from_tables(
-            replace(site().tables, meta=replace(meta, monitor=replace(meta.monitor, unread_std_percent=100.0)))
+            replace(
+                site().tables, meta=replace(meta, monitor=replace(meta.monitor, unread_std_percent=100.0))
+            )
         )
     )
     withhold = np.ones(site().meters.size, dtype=np.bool_)
