@@ -136,6 +136,7 @@ class MeterDefaults:
     p_error_percent: float = 1.0
     q_error_percent: float = 2.0
     p_resolution_kw: float = 0.01
+    p_interval_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

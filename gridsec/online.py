@@ -66,6 +66,8 @@ class PowerOrigin(IntEnum):
     """No usable reading: a range, or a forecast."""
     BEYOND = 2
     """A reading beyond the declared load or generation, believed in part or not at all."""
+    LATE = 3
+    """A reading older than the voltage beside it, and than the files state."""
 
 
 def _none() -> Bools:

@@ -14,7 +14,7 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, all_of, any_of
 from gridsec.judge import Situation, decide
 from gridsec.network import busbar_places, one_busbar, over_places
-from gridsec.online import Cause, Decision, Estimate, Explanation, Frame, Verdict
+from gridsec.online import Cause, Decision, Estimate, Explanation, Frame, PowerOrigin, Verdict
 from gridsec.sequential import words
 from gridsec.sequential.apart import apart
 from gridsec.sequential.bounds import Bounded, Grounds, Powers
@@ -379,7 +379,7 @@ def _reconstructed(
         after = after + beside.added(judged)
     liars = design.plant.meters[~state.trust.trusted]
     # Nobody lies about powers that nobody told, which are known by a standard deviation.
-    liars = liars if told is None else liars[np.isnan(told[liars])]
+    liars = liars if told is None else liars[np.isnan(told[liars]) | _late(tick.frame)[liars]]
     if not liars.size:
         return judged.w, now.variance + after, None
     sizes, released = state.doubts.sizes[liars], state.released
@@ -388,6 +388,13 @@ def _reconstructed(
     elif s in tick.seen.found or not released.holds(judged):
         released = released.anew(judged)
     return released.said(judged), released.variance + after, released
+
+
+def _late(frame: Frame) -> Bools:
+    """Customers with a power that is read and known by a standard deviation all the same, (N,)."""
+    if frame.p_origin is None:
+        return np.zeros(frame.p.size, dtype=np.bool_)
+    return np.asarray(frame.p_origin != PowerOrigin.UNREAD)
 
 
 def _best(design: SequentialDesign, state: SequentialState) -> tuple[int, float]:

@@ -49,6 +49,8 @@ class Doubts:
         active power.
     vouched_calm : (s, p)
         Consecutive ticks without such a residual, for meters that are not vouched.
+    read, read_calm : (s, p)
+        The same with late powers as readings.
     heard
         While no meter is heard: the same when one was, for the last time.
     """
@@ -65,6 +67,8 @@ class Doubts:
     sizes: Floats
     vouched: Bools
     vouched_calm: Ints
+    read: Bools
+    read_calm: Ints
     heard: Doubts | None = None
 
 
@@ -82,7 +86,9 @@ def none(design: SequentialDesign) -> Doubts:
     priors, meters = (design.prior,) * scales, design.plant.meters.size
     vouched, calm = np.ones((scales, meters), dtype=np.bool_), np.zeros((scales, meters), dtype=np.intp)
     sizes = design.book.std
-    return Doubts(one, one, never, never, one, one, known, unbroken, priors, sizes, vouched, calm)
+    return Doubts(
+        one, one, never, never, one, one, known, unbroken, priors, sizes, vouched, calm, vouched, calm
+    )
 
 
 _MUCH_LESS = 4.0
@@ -119,21 +125,25 @@ def doubted(
     return found if found.heard is last else replace(found, heard=last)
 
 
-def _withheld(design: SequentialDesign, frame: Frame, live: Bools) -> Bools | None:
-    """Meters with a voltage at this frame and without a usable active power, (p,); None: there is none.
+def _withheld(
+    design: SequentialDesign, frame: Frame, live: Bools
+) -> tuple[Bools | None, Bools | None]:
+    """Meters with a voltage at this frame and without a usable active power of its moment, (p,); None: none.
 
-    A power that is not read is as good as one that is if the design supposes no more of it.
+    And those of them without a late one. A power that is not read is as good as one that is if the design supposes no more of it.
     """
     if frame.p_origin is None:
-        return None
+        return None, None
     meters = design.plant.meters
     origins = frame.p_origin[meters]
     if not any_of(origins):
-        return None
+        return None, None
+    # A power that is not read has the deviation of its range; others are used as readings are.
     least = np.where(origins == PowerOrigin.UNREAD, _ROUNDED, _MUCH_LESS)
     wide = frame.p_error[meters] > least * design.doubt.even_p[meters]
     out = np.asarray(live & (origins != PowerOrigin.READ) & wide)
-    return out if any_of(out) else None
+    unread = out & (origins != PowerOrigin.LATE)
+    return out if any_of(out) else None, unread if any_of(unread) else None
 
 
 def _doubts(
@@ -142,8 +152,8 @@ def _doubts(
     """What this frame does not know; new priors only where that changed."""
     # The design has standard deviations, and so have frames that tell them apart from their intervals.
     frame, lengths = usual(frame), design.lengths
-    withheld = _withheld(design, frame, live)
-    exact = None if withheld is None else _customers(design, withheld)
+    withheld, unread = _withheld(design, frame, live)
+    exact = None if unread is None else _customers(design, unread)
     p, p_calm, p_rest = _factors(
         frame.p_error, design.doubt.even_p, (before.p, before.p_calm, before.p_rest), lengths, exact
     )
@@ -152,10 +162,7 @@ def _doubts(
     )
     sizes = _claims(np.abs(frame.p), design.options.hidden_power, before.sizes)
     metered, calm = _metered(busbar, before.busbar, before.busbar_calm, lengths)
-    read = True if withheld is None else ~withheld
-    vouched, vouched_calm = _metered(read, before.vouched, before.vouched_calm, lengths)
-    if vouched is not before.vouched:
-        before = replace(before, vouched=vouched, vouched_calm=vouched_calm)
+    before = _checks(before, withheld, unread, lengths)
     if metered is before.busbar and p is before.p and q is before.q:
         return before if sizes is before.sizes else replace(before, sizes=sizes)
     same = np.ones(len(lengths), dtype=np.bool_)
@@ -178,13 +185,37 @@ def _doubts(
             priors.append(known)
             continue
         # Scales that are in doubt about the same share what follows.
-        parts = (p, q, metered, vouched)
+        parts = (p, q, metered, before.read)
         shared = (k for k in range(s) if all(np.array_equal(of[k], of[s]) for of in parts))
         k = next(shared, None)
-        priors.append(_prior(design, p[s], q[s], metered[s], vouched[s]) if k is None else priors[k])
-    return Doubts(
-        p, q, p_calm, q_calm, p_rest, q_rest, metered, calm, tuple(priors), sizes, vouched, vouched_calm
+        priors.append(_prior(design, p[s], q[s], metered[s], before.read[s]) if k is None else priors[k])
+    return replace(
+        before,
+        p=p,
+        q=q,
+        p_calm=p_calm,
+        q_calm=q_calm,
+        p_rest=p_rest,
+        q_rest=q_rest,
+        busbar=metered,
+        busbar_calm=calm,
+        priors=tuple(priors),
+        sizes=sizes,
+        heard=None,
     )
+
+
+def _checks(
+    before: Doubts, withheld: Bools | None, unread: Bools | None, lengths: tuple[int, ...]
+) -> Doubts:
+    """The doubts with `vouched` and `read` of this tick."""
+    if withheld is None and all_of(before.vouched):
+        return before
+    vouched, vouched_calm = _metered(
+        True if withheld is None else ~withheld, before.vouched, before.vouched_calm, lengths
+    )
+    read, read_calm = _metered(True if unread is None else ~unread, before.read, before.read_calm, lengths)
+    return replace(before, vouched=vouched, vouched_calm=vouched_calm, read=read, read_calm=read_calm)
 
 
 def _customers(design: SequentialDesign, meters: Bools) -> Bools:
@@ -194,14 +225,14 @@ def _customers(design: SequentialDesign, meters: Bools) -> Bools:
     return out
 
 
-def _prior(design: SequentialDesign, p: Floats, q: Floats, busbar: Bools, vouched: Bools) -> Prior:
+def _prior(design: SequentialDesign, p: Floats, q: Floats, busbar: Bools, read: Bools) -> Prior:
     if all_of(busbar) and all_of(p == 1.0) and all_of(q == 1.0):
         return design.prior
     unknown = np.where(busbar, design.busbar, UNMETERED)
     together = design.doubt.together
-    if not all_of(vouched):
+    if not all_of(read):
         # Powers that are not read are low together by night, with a meter as without.
-        unread = (p > 1.0) & _customers(design, ~vouched)
+        unread = (p > 1.0) & _customers(design, ~read)
         together = np.where(unread, np.maximum(together, _ALIKE), together)
     doubt = replace(
         design.doubt,

@@ -74,7 +74,7 @@ def unread(names: tuple[str, ...], which: Bools, percent: Floats, limit: float) 
     """
     who = _list([name for name, one in zip(names, which, strict=True) if one])
     return (
-        f"No usable active power from {who}: the voltage there is known to {percent[which].max():.2g} % "
+        f"No active power of the same moment from {who}: the voltage there is known to {percent[which].max():.2g} % "
         f"(standard deviation), and `[monitor] unread_std_percent` allows {limit:g} %."
     )
 
