@@ -2,17 +2,18 @@
 
     python -m benchmarks.late_powers [runs] [minutes]
 
-Kerber Dorfnetz without inverters, one reading per second, AC power flow as the truth. Every household switches
-a kettle of 2 kW for 150 s, every ten minutes on average; every fifth customer, with a connection of 14 kW,
-charges a car with 11 kW from a random moment on. Meters have fixed errors within their class, registers of 1 %.
+Kerber Dorfnetz without inverters, one reading per second, AC power flow as the truth. Every household
+switches a kettle of 2 kW for 150 s, every ten minutes on average; every fifth customer, with a connection of
+14 kW, charges a car with 11 kW from a random moment on. Meters have fixed errors within their class, and
+registers of 1 %.
 
 Powers: `fresh`, of the moment of the voltage; `late`, 60 s old; `held`, read every 60 s at a moment of the
-customer's own and repeated. Stated: nothing; `t_power` on the wire; `p_interval_s` = 60 s in the feeder's files.
+customer's own and repeated. Stated: nothing; `t_power` on the wire; `p_interval_s` = 60 s in the files.
 
 Columns: runs; runs with an honest meter named; honest meters named; ticks CLEAN, UNDECIDED and ATTACKED, %;
 largest error of a voltage over its standard deviation and over its bound; named of a third of the meters that
-reads 3 % wrong, with random signs, in the last two minutes. Exits 1 when an honest meter is named although the
-age is stated, or an error is beyond the bound.
+reads 3 % wrong, with random signs, in the last two minutes. Exits 1 when an honest meter is named although
+the age is stated, or an error is beyond the bound.
 """
 
 from __future__ import annotations
@@ -43,6 +44,8 @@ LATE_S = 60.0
 KETTLE_KW, KETTLE_S, KETTLE_EVERY_S = 2.0, 150.0, 600.0
 CAR_KW, CAR_CONNECTION_KW, CAR_OF = 11.0, 14.0, 5
 """Power of a charging car, connection of its customer, kW, and customers for each car."""
+TAP_EVERY_S = 120.0
+"""Interval with one step of the tap changer, s."""
 LIES_S = 120.0
 """Length of the manipulation at the end, s."""
 LIE = 0.03
@@ -96,7 +99,7 @@ class World:
 
 
 @lru_cache(maxsize=64)
-def world(seed: int, duration_s: int) -> World:
+def world(seed: int, duration_s: int, tap_step_pu: float = 0.0) -> World:
     """One run.
 
     Parameters
@@ -105,11 +108,14 @@ def world(seed: int, duration_s: int) -> World:
         Chooses everything random.
     duration_s
         Length, s.
+    tap_step_pu
+        Height of the steps of the transformer's tap changer, one in each interval of `TAP_EVERY_S`.
     """
     where, random = site(0.0), np.random.default_rng([seed, 60])
     t = START + np.arange(-LATE_S, duration_s)
     profile_s = float(random.uniform(0.0, 13.0 * 86_400.0))
-    honest = Customers(where, Variation(tap_step_pu=0.0), seed, START, profile_s).at(t)
+    variation = Variation(tap_step_pu=tap_step_pu, tap_interval_s=TAP_EVERY_S)
+    honest = Customers(where, variation, seed, START, profile_s).at(t)
     peak, count = np.array([row.load_kw for row in where.tables.customers]), len(where.tables.customers)
     on = np.zeros((t.size, count))
     for k in range(count):
@@ -150,7 +156,10 @@ def run(seed: int, duration_s: int, how: str, stated: str) -> tuple[Counter[str]
     interval = LATE_S if stated == "p_interval_s" else 0.0
     where, made, truth = site(interval), watcher(interval), world(seed, duration_s)
     age, random = ages(seed, how, truth.t.size, truth.v.shape[1]), np.random.default_rng([seed, 62])
-    liars, sign = random.permutation(truth.v.shape[1]) < truth.v.shape[1] // 3, random.choice([-1.0, 1.0], truth.v.shape[1])
+    liars, sign = (
+        random.permutation(truth.v.shape[1]) < truth.v.shape[1] // 3,
+        random.choice([-1.0, 1.0], truth.v.shape[1]),
+    )
     state, seen, named = made.init(START), Counter[str](), np.zeros((2, liars.size), dtype=np.bool_)
     of_std = of_bound = 0.0
     for k, t in enumerate(truth.t):
@@ -170,14 +179,21 @@ def run(seed: int, duration_s: int, how: str, stated: str) -> tuple[Counter[str]
         error = np.abs(estimate.v2 - (truth.v[k] / where.customer_volt) ** 2)
         of_std = max(of_std, float((error / estimate.std).max()))
         of_bound = max(of_bound, float((error / estimate.bound).max()))
-    seen["ticks"], seen["honest"], seen["named"] = truth.t.size - round(LIES_S), int(named[0].sum()), int(named[1].sum())
+    seen["ticks"], seen["honest"], seen["named"] = (
+        truth.t.size - round(LIES_S),
+        int(named[0].sum()),
+        int(named[1].sum()),
+    )
     seen["liars"], seen["false"] = int(liars.sum()), int(named[0].any())
     return seen, of_std, of_bound
 
 
 def main(runs: int, minutes: int) -> int:
     """Print a table; 1 if a limit is missed."""
-    print("| powers | stated | runs | with honest named | honest named | CLEAN % | UNDECIDED % | ATTACKED % |", end="")
+    print(
+        "| powers | stated | runs | with honest named | honest named | CLEAN % | UNDECIDED % | ATTACKED % |",
+        end="",
+    )
     print(" in std | in bounds | liars named |\n|" + "---|" * 11)
     good = True
     for how, stated in CASES:

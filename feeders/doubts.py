@@ -38,8 +38,8 @@ def load_doubt(site: Site) -> LoadDoubt:
     them, so that design and frames say the same. `p_std_kw` and `q_std_kvar` say it directly, and then of
     errors that come and go within `correlation_s`; they are believed as they are: with a meter as the error
     of what it reports, without one as the distance from the middle of the range. Where powers are forecast it
-    is the distance from the forecast, and that of the library where the files say nothing. With `p_interval_s`
-    the powers of metered customers are off by what loads do meanwhile, too.
+    is the distance from the forecast, and that of the library where the files say nothing. With
+    `p_interval_s` the powers of metered customers are off by what loads do meanwhile, too.
 
     Parameters
     ----------

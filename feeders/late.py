@@ -1,8 +1,8 @@
 """Active powers that are older than the voltage reading beside them.
 
-A load follows a first-order process with the standard deviation sigma of its range, or of its forecast, and the
-correlation time tau = `[load] correlation_s`. Single devices switch the whole difference J between the reading
-and the farther end of the range at once. The change over an age a > 0 has the standard deviation
+A load follows a first-order process with the standard deviation sigma of its range, or of its forecast, and
+the correlation time tau = `[load] correlation_s`. Single devices switch the whole difference J between the
+reading and the farther end of the range at once. The change over an age a > 0 has the standard deviation
 
     s(a) = sqrt(2 sigma^2 (1 - exp(-a / tau)) + (J / SWITCHED)^2).
 
@@ -27,8 +27,11 @@ if TYPE_CHECKING:
     from feeders.load import Site, Snapshot
 
 SWITCHED: Final = 5.0
-"""Standard deviations that switching the whole difference to the end of the range amounts to. The limits of one
-meter begin at 5.2: no single device exceeds them. A larger value names honest meters, a smaller one hides lies."""
+"""Standard deviations that switching the whole difference to the end of the range amounts to.
+
+The limits of one meter begin at 5.2: no single device exceeds them. A larger value names honest meters, a
+smaller one hides lies.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -176,7 +176,9 @@ class Snapshot:
     v0_volt
         Busbar voltage, V; NaN where missing. In three phases (3,).
     p_age_s : (p,) or None
-        Age of the powers at the voltage readings beside them, s; NaN, or None for all, where it is not stated.
+        Age of the powers at the voltage readings beside them, s; NaN, or None for all, where not stated.
+    clock_offset_s : (p,) or None
+        By how much each meter's clock is ahead, s; NaN, or None for all, where that is not measurable.
     """
 
     t: float
@@ -185,6 +187,7 @@ class Snapshot:
     q_kvar: Floats
     v0_volt: Floats | float
     p_age_s: Floats | None = None
+    clock_offset_s: Floats | None = None
 
 
 def load(path_or_name: Path | str) -> Site:
@@ -408,6 +411,7 @@ def to_frame(site: Site, snapshot: Snapshot) -> Frame:
         q_net_error=np.maximum(model.q_error, model.q_fraction * size),
         v0_phases=v0_phases,
         p_origin=_origin(metered, known, beyond),
+        clock_offset=snapshot.clock_offset_s,
     )
     frame = frame if site.forecast is None else site.forecast.fill(frame, ~known)
     return frame if aged is None else aged.widen(site, frame)

@@ -137,6 +137,8 @@ class Frame:
     p_origin : (N,) or None
         `PowerOrigin` of `p`; None: `READ` everywhere. A voltage reading beside an unread power of the same
         meter is not checked by that power.
+    clock_offset : (p,) or None
+        By how much each meter's clock is ahead, s; NaN, or None for all, where that is not measurable.
     """
 
     t: float
@@ -153,6 +155,7 @@ class Frame:
     p_std: Floats | None = None
     q_std: Floats | None = None
     p_origin: Ints | None = None
+    clock_offset: Floats | None = None
 
 
 @dataclass(frozen=True, slots=True)

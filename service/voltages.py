@@ -39,6 +39,7 @@ def snapshot(site: Site, tick: Tick) -> Snapshot:
         q_kvar=columns[:, 2].copy(),
         v0_volt=busbar_volt(site, tick),
         p_age_s=None if np.isnan(age).all() else age,
+        clock_offset_s=np.array(tick.clock_offset, dtype=np.float64) if any(tick.clock_offset) else None,
     )
 
 

@@ -24,6 +24,7 @@ from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.examine import Examined
 from gridsec.sequential.heard import Heard
 from gridsec.sequential.release import Released, release
+from gridsec.sequential.scales import needed
 from gridsec.sequential.state import SequentialState
 from gridsec.values import changed
 
@@ -83,6 +84,10 @@ def conclude(
     estimate, released = _estimate(design, state, tick, s, moved)
     busbar, inverters = _busbar(design, state, heard, estimate), _inverters(design, state)
     score, threshold, judged = _worst(design, tick.seen, heard.live.size)
+    if state.skew is not None:
+        # Of a scale that judges such a meter there is not a look at every tick.
+        need = np.array([needed(design, k) for k in range(len(design.lengths))])
+        judged = judged | state.skew.judged(state.window.counts, need)
     live, beyond = judged & heard.live, score > threshold
     attack = np.zeros(live.size)
     if any_of(trust.named):

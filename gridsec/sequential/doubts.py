@@ -125,12 +125,11 @@ def doubted(
     return found if found.heard is last else replace(found, heard=last)
 
 
-def _withheld(
-    design: SequentialDesign, frame: Frame, live: Bools
-) -> tuple[Bools | None, Bools | None]:
+def _withheld(design: SequentialDesign, frame: Frame, live: Bools) -> tuple[Bools | None, Bools | None]:
     """Meters with a voltage at this frame and without a usable active power of its moment, (p,); None: none.
 
-    And those of them without a late one. A power that is not read is as good as one that is if the design supposes no more of it.
+    And those of them without a late one. A power that is not read is as good as one that is if the design
+    supposes no more of it.
     """
     if frame.p_origin is None:
         return None, None
@@ -205,9 +204,7 @@ def _doubts(
     )
 
 
-def _checks(
-    before: Doubts, withheld: Bools | None, unread: Bools | None, lengths: tuple[int, ...]
-) -> Doubts:
+def _checks(before: Doubts, withheld: Bools | None, unread: Bools | None, lengths: tuple[int, ...]) -> Doubts:
     """The doubts with `vouched` and `read` of this tick."""
     if withheld is None and all_of(before.vouched):
         return before

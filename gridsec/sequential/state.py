@@ -26,6 +26,7 @@ from gridsec.sequential.kinds import Kinds
 from gridsec.sequential.kinds import empty as no_kinds
 from gridsec.sequential.release import Released
 from gridsec.sequential.repeats import forget as forget_calm
+from gridsec.sequential.skew import Skew
 from gridsec.sequential.windows import Window, empty, forget
 
 
@@ -123,6 +124,8 @@ class SequentialState:
         What they say where the powers of the others are not believed; None where all are.
     doubts
         What the frames do not know.
+    skew
+        Changes of the voltages within clock offsets; None while no offset is measured.
     learning
         What was gathered of the meters' fixed errors; None once they are known.
     learned
@@ -156,6 +159,7 @@ class SequentialState:
     misfit: tuple[bool, ...]
     released: Released | None
     doubts: Doubts
+    skew: Skew | None
     learning: Learning | None
     learned: Learned
     model_error: Floats
@@ -221,6 +225,7 @@ def init(
         misfit=(False,) * s,
         released=None,
         doubts=no_doubts(design),
+        skew=None,
         learning=known.learning,
         learned=known.learned,
         model_error=np.zeros(p),

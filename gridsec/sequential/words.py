@@ -73,8 +73,9 @@ def unread(names: tuple[str, ...], which: Bools, percent: Floats, limit: float) 
         Largest one that is allowed, % of nominal.
     """
     who = _list([name for name, one in zip(names, which, strict=True) if one])
+    worst = percent[which].max()
     return (
-        f"No active power of the same moment from {who}: the voltage there is known to {percent[which].max():.2g} % "
+        f"No active power of the same moment from {who}: the voltage there is known to {worst:.2g} % "
         f"(standard deviation), and `[monitor] unread_std_percent` allows {limit:g} %."
     )
 

@@ -112,7 +112,7 @@ def test_a_stated_interval_is_in_design_and_frames_alike(site: Site) -> None:
 
 @pytest.mark.parametrize("stated", ["t_power", "p_interval_s"])
 def test_kettles_and_cars_accuse_nobody_once_the_age_is_stated(stated: str) -> None:
-    """Powers 60 s old: without the age honest meters are named in this run, with it none, and the liars are."""
+    """Powers 60 s old: without the age honest meters are named in these runs, with it none."""
     assert run(0, 600, "late", "")[0]["honest"] + run(1, 600, "late", "")[0]["honest"] > 0
     for seed in (0, 1):
         seen, _, of_bound = run(seed, 600, "late", stated)

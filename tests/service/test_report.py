@@ -136,6 +136,7 @@ def test_json_is_plain_and_has_no_nan(site: Site) -> None:
     assert {i["judged"] for i in found["inverters"]} == {False}
     assert found["explanations"] == []
     wanted = {
+        "clock_offset_s",
         "kind",
         "learning_reason",
         "learning_state",
@@ -198,7 +199,9 @@ def test_a_withheld_power_is_a_reason_with_the_ids_of_meters(site: Site) -> None
     verdict = replace(verdict, decision=Decision.UNDECIDED, cause=Cause.MISSING_POWERS)
     if "unread_std_percent" not in verdict.reason:
         names = ", ".join(site.feeder.customers[c] for c in site.meters[:2])
-        verdict = replace(verdict, reason=f"No active power of the same moment from {names}: unread_std_percent.")
+        verdict = replace(
+            verdict, reason=f"No active power of the same moment from {names}: unread_std_percent."
+        )
     report = build(site, bare, 2, estimate, verdict)
     assert "m01" in report.reason
     assert "unread_std_percent" in report.reason
