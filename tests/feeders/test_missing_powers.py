@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache
 
@@ -64,7 +64,31 @@ def design_of() -> SequentialDesign:
     return found
 
 
-def watch(seed: int, withhold: Bools, *, lying: bool) -> Iterator[tuple[Sample, Estimate, Verdict]]:
+def omitted(said: Snapshot, gone: Bools) -> Snapshot:
+    return replace(said, p_kw=np.where(gone, np.nan, said.p_kw))
+
+
+def absurd(said: Snapshot, gone: Bools) -> Snapshot:
+    return replace(said, p_kw=np.where(gone, 9_000.0, said.p_kw))
+
+
+def beyond(said: Snapshot, gone: Bools) -> Snapshot:
+    """Almost twice what the connection carries, which is believed by a tenth."""
+    peak = site().loads.load_peak[site().meters] * site().feeder.base_kva
+    return replace(said, p_kw=np.where(gone, 1.9 * peak, said.p_kw))
+
+
+def late(said: Snapshot, gone: Bools) -> Snapshot:
+    return replace(said, p_age_s=np.where(gone, 60.0, np.nan))
+
+
+def watch(
+    seed: int,
+    withhold: Bools,
+    *,
+    lying: bool,
+    how: Callable[[Snapshot, Bools], Snapshot] = omitted,
+) -> Iterator[tuple[Sample, Estimate, Verdict]]:
     """Answers from the first withheld power on; the lie is the largest within the monitor's own limits."""
     model, at = design_of(), site().customer_volt[site().meters]
     state, lie = watcher().init(START), np.zeros(withhold.size)
@@ -75,9 +99,9 @@ def watch(seed: int, withhold: Bools, *, lying: bool) -> Iterator[tuple[Sample, 
             room = SHARE * (misfit_limit(model) - withhold.size)
             lie = within_misfit(linear_tests(model, state), np.flatnonzero(withhold), room, share=SHARE).lie
             assert np.abs(lie).max() > 0.02
-        p_kw = np.where(withhold & (age >= WITHHELD_S), np.nan, said.p_kw)
+        told = how(said, withhold & (age >= WITHHELD_S))
         v = at * np.sqrt(np.maximum((said.v_volt / at) ** 2 + lie, 0.0))
-        state, estimate, verdict = watcher().step(state, to_frame(site(), replace(said, v_volt=v, p_kw=p_kw)))
+        state, estimate, verdict = watcher().step(state, to_frame(site(), replace(told, v_volt=v)))
         if age >= WITHHELD_S:
             yield sample, estimate, verdict
 
@@ -101,6 +125,19 @@ def test_colluding_meters_that_withhold_powers_are_never_clean_beyond_the_bound(
             off.append((wrong / estimate.std).max())
     assert lied > 0
     assert max(off) < 4.0
+
+
+@pytest.mark.parametrize("how", [absurd, beyond, late])
+def test_powers_that_are_worth_nothing_are_as_good_as_withheld_ones(
+    how: Callable[[Snapshot, Bools], Snapshot],
+) -> None:
+    """The same meters report powers that nothing connected can have, or old ones."""
+    for sample, estimate, verdict in watch(0, street(LIARS, 0), lying=True, how=how):
+        if sample.t - START >= LIE_S:
+            wrong = error(sample, estimate)
+            assert verdict.decision is not Decision.CLEAN
+            assert (wrong <= estimate.bound).all()
+            assert (wrong <= 4.0 * estimate.std).all()
 
 
 @pytest.mark.parametrize(("count", "seed"), [(1, 0), (1, 1), (1, 2), (5, 3), (LIARS, 4)])
