@@ -131,7 +131,7 @@ def change(site: Site, age_s: Floats | float, reach: Floats) -> Floats:
         Distance to the farther end of the range, pu.
     """
     slow = -2.0 * np.expm1(-np.asarray(age_s) / site.tables.meta.load.correlation_s)
-    moved = np.sqrt(slow * spread(site) ** 2 + (reach / SWITCHED) ** 2)
+    moved = np.hypot(np.sqrt(slow) * spread(site), reach / SWITCHED)
     return np.asarray(np.where(np.asarray(age_s) > 0.0, moved, 0.0))
 
 
@@ -144,5 +144,7 @@ def spread(site: Site) -> Floats:
 
 def expected(site: Site) -> Floats:
     """Standard deviation of the change over `[meters] p_interval_s` that the design supposes, (N,), pu."""
+    if site.tables.meta.meters.p_interval_s == 0.0:
+        return np.zeros(site.loads.load_peak.size)
     reach = site.loads.load_peak + site.loads.pv_peak
     return np.minimum(change(site, site.tables.meta.meters.p_interval_s, reach), spread(site))

@@ -21,6 +21,7 @@ from gridsec.sequential.bounds import Bounded, Grounds, Powers
 from gridsec.sequential.busbar import Busbar, follow
 from gridsec.sequential.conditional import Prior, judge
 from gridsec.sequential.design import SequentialDesign
+from gridsec.sequential.doubts import checked
 from gridsec.sequential.examine import Examined
 from gridsec.sequential.heard import Heard
 from gridsec.sequential.release import Released, release
@@ -194,7 +195,7 @@ def _estimate(
         busbar=heard.busbar,
         y=heard.y,
         trusted=trusted,
-        checked=trusted & state.doubts.vouched[0],
+        checked=trusted & checked(design, tick.frame),
         sigmas=design.sigmas[0],
     )
     x = np.zeros(0) if state.x is None else state.x

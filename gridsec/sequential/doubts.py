@@ -16,6 +16,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of
 from gridsec.frames import usual
+from gridsec.network import reach
 from gridsec.online import Frame, PowerOrigin
 from gridsec.sequential.conditional import Prior
 from gridsec.sequential.design import SequentialDesign
@@ -95,6 +96,8 @@ _MUCH_LESS = 4.0
 """Ratio of a frame's uncertainty to the design's beyond which it is used, unless a power is withheld."""
 _ROUNDED = 1.0 + 1e-9
 """Ratio up to which two uncertainties are the same but for rounding."""
+_FELT = 0.5
+"""Part of the accuracy class that doubts about late or excessive powers must move a voltage by to count."""
 _ALIKE = 0.5
 """Share of the variance of powers that are not read that all of them have in common."""
 
@@ -125,22 +128,42 @@ def doubted(
     return found if found.heard is last else replace(found, heard=last)
 
 
+def checked(design: SequentialDesign, frame: Frame) -> Bools:
+    """Meters with an active power that is known about as well as the design supposes, (p,).
+
+    A power that is not read is as good as one that is if the design supposes no more of it.
+
+    Parameters
+    ----------
+    design, frame
+        The design, and a frame with powers that can be.
+    """
+    meters = design.plant.meters
+    if frame.p_origin is None:
+        return np.ones(meters.size, dtype=np.bool_)
+    origins = frame.p_origin[meters]
+    if not any_of(origins):
+        return np.ones(meters.size, dtype=np.bool_)
+    least = np.where(origins == PowerOrigin.UNREAD, _ROUNDED, _MUCH_LESS)
+    wide = frame.p_error[meters] > least * design.doubt.even_p[meters]
+    return np.asarray((origins == PowerOrigin.READ) | ~wide)
+
+
 def _withheld(design: SequentialDesign, frame: Frame, live: Bools) -> tuple[Bools | None, Bools | None]:
     """Meters with a voltage at this frame and without a usable active power of its moment, (p,); None: none.
 
-    And those of them without a late one. A power that is not read is as good as one that is if the design
-    supposes no more of it.
+    And those of them without a late one. A late power, or one beyond the declared range, counts if all of
+    these together can move the voltage at its meter by `_FELT` of the accuracy class.
     """
-    if frame.p_origin is None:
-        return None, None
     meters = design.plant.meters
-    origins = frame.p_origin[meters]
-    if not any_of(origins):
+    if frame.p_origin is None or not any_of(frame.p_origin[meters]):
         return None, None
-    # A power that is not read has the deviation of its range; others are used as readings are.
-    least = np.where(origins == PowerOrigin.UNREAD, _ROUNDED, _MUCH_LESS)
-    wide = frame.p_error[meters] > least * design.doubt.even_p[meters]
-    out = np.asarray(live & (origins != PowerOrigin.READ) & wide)
+    origins, out = frame.p_origin[meters], live & ~checked(design, frame)
+    doubted = out & (origins != PowerOrigin.UNREAD)
+    if any_of(doubted):
+        power = np.where(_customers(design, doubted), frame.p_error, 0.0)
+        moved = reach(design.plant.feeder, power, np.zeros_like(power))[design.prior.meters]
+        out = out & ~(doubted & (moved <= _FELT * design.allowed))
     unread = out & (origins != PowerOrigin.LATE)
     return out if any_of(out) else None, unread if any_of(unread) else None
 
