@@ -8,6 +8,7 @@ docs/theory-sequential.md, sections 5 and 7.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -115,7 +116,7 @@ def conclude(
     open_ = _open(design, state, said)
     said = _beside_meters(design, inverters, differs, amounts, tick.rivals, open_, said)
     said = _unexplained(tick.seen.misfit, said)
-    if not (tick.rivals or open_):
+    if not (tick.rivals or open_ or all_of(state.doubts.vouched)):
         said = _unread(design, ~state.doubts.vouched[max(s, 0)], estimate, said)
     decision, cause, reason = said
     verdict = Verdict(
@@ -195,7 +196,7 @@ def _estimate(
         busbar=heard.busbar,
         y=heard.y,
         trusted=trusted,
-        checked=trusted & checked(design, tick.frame),
+        reads=partial(checked, design, tick.frame),
         sigmas=design.sigmas[0],
     )
     x = np.zeros(0) if state.x is None else state.x
