@@ -27,7 +27,8 @@ from gridsec.sequential.examine import Examined
 from gridsec.sequential.heard import Heard
 from gridsec.sequential.release import Released, release
 from gridsec.sequential.scales import needed
-from gridsec.sequential.state import SequentialState
+from gridsec.sequential.skew import Skew
+from gridsec.sequential.state import SequentialState, Trust
 from gridsec.values import changed
 
 
@@ -87,9 +88,7 @@ def conclude(
     busbar, inverters = _busbar(design, state, heard, estimate), _inverters(design, state)
     score, threshold, judged = _worst(design, tick.seen, heard.live.size)
     if state.skew is not None:
-        # Of a scale that judges such a meter there is not a look at every tick.
-        need = np.array([needed(design, k) for k in range(len(design.lengths))])
-        judged = judged | state.skew.judged(state.window.counts, need)
+        judged = judged | _judged_seldom(design, state.skew, state)
     live, beyond = judged & heard.live, score > threshold
     attack = np.zeros(live.size)
     if any_of(trust.named):
@@ -97,20 +96,9 @@ def conclude(
         attack = np.where(trust.named & heard.live, off, 0.0)
     amounts = _amounts(design, state, tick.seen)
     settled = all_of(tick.transient <= design.options.settled * threshold)
-    said = decide(
-        Situation(
-            names=design.names,
-            max_attacked=max(1, min(design.most, int(np.count_nonzero(live)) // 3)),
-            live=live,
-            suspected=~trust.trusted | beyond,
-            named=trust.named,
-            wide=live & ~(threshold <= design.options.widest),
-            valid=True,
-            settled=settled,
-            busbar=True,
-        )
+    said = _of_meters(
+        design, trust, live, beyond, wide=~(threshold <= design.options.widest), settled=settled
     )
-    said = _contradicted(design, beyond & ~trust.named, trust.named, said)
     differs = _differs(design, busbar, estimate)
     said = _unvouched(design, heard.busbar, live, differs, said)
     open_ = _open(design, state, said)
@@ -206,6 +194,32 @@ def _estimate(
 _Said = tuple[Decision, Cause, str]
 # What a verdict about inverters and loads may add to: nothing more serious was found.
 _MILD = (Cause.AGREEMENT, Cause.AMBIGUOUS)
+
+
+def _of_meters(  # what there is to say of meters
+    design: SequentialDesign, trust: Trust, live: Bools, beyond: Bools, *, wide: Bools, settled: bool
+) -> _Said:
+    """The answer by the meters alone: those that report, are beyond, and have too wide limits, (p,) each."""
+    said = decide(
+        Situation(
+            names=design.names,
+            max_attacked=max(1, min(design.most, int(np.count_nonzero(live)) // 3)),
+            live=live,
+            suspected=~trust.trusted | beyond,
+            named=trust.named,
+            wide=live & wide,
+            valid=True,
+            settled=settled,
+            busbar=True,
+        )
+    )
+    return _contradicted(design, beyond & ~trust.named, trust.named, said)
+
+
+def _judged_seldom(design: SequentialDesign, skew: Skew, state: SequentialState) -> Bools:
+    """Meters with a clock offset, (p,): of a scale that judges them there is not a look at every tick."""
+    need = np.array([needed(design, s) for s in range(len(design.lengths))])
+    return skew.judged(state.window.counts, need)
 
 
 def _contradicted(design: SequentialDesign, beyond: Bools, named: Bools, said: _Said) -> _Said:
