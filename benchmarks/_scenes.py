@@ -25,7 +25,7 @@ from feeders.variation import Variation
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.attack import Attack
 from gridsec.network import InPhases
-from gridsec.online import Frame
+from gridsec.online import Frame, PowerOrigin
 from gridsec.sequential import SequentialDesign, SequentialState, init, step
 from gridsec.sequential.commission import Learned
 
@@ -146,12 +146,28 @@ def play(
     )
     silent, nothing = without_powers(setting), unread(stated)
     for frame, truth in frames(trial, scenario, stated=stated):
-        yield (_without(frame, nothing, silent) if silent.any() else frame), truth
+        yield (without(frame, nothing, silent) if silent.any() else frame), truth
 
 
-def _without(frame: Frame, nothing: Frame, silent: Bools) -> Frame:
+def without(frame: Frame, nothing: Frame, silent: Bools) -> Frame:
+    """The frame without power readings of some customers.
+
+    Parameters
+    ----------
+    frame, nothing
+        The frame, and one without any power reading.
+    silent : (N,)
+        The customers.
+    """
     names = ("p", "p_error", "q", "q_error")
-    return replace(frame, **{k: np.where(silent, getattr(nothing, k), getattr(frame, k)) for k in names})
+    origin = np.where(
+        silent, PowerOrigin.UNREAD, PowerOrigin.READ if frame.p_origin is None else frame.p_origin
+    )
+    return replace(
+        frame,
+        p_origin=origin.astype(np.intp),
+        **{k: np.where(silent, getattr(nothing, k), getattr(frame, k)) for k in names},
+    )
 
 
 def moment(setting: Setting) -> float:

@@ -302,6 +302,14 @@ META_COLUMNS: dict[str, tuple[Column, ...]] = {
             high=100.0,
         ),
         Column("p_resolution_kw", Kind.NUMBER, "resolution of the active power, kW", 0.01, low=0.0, high=1e6),
+        Column(
+            "p_interval_s",
+            Kind.NUMBER,
+            "largest age of a power at its voltage reading, s; 0: of the same moment",
+            0.0,
+            low=0.0,
+            high=1e6,
+        ),
     ),
     "load": (
         Column("power_factor", Kind.NUMBER, "expected power factor, lagging", 0.95, low=0.01, high=1.0),
@@ -362,6 +370,14 @@ META_COLUMNS: dict[str, tuple[Column, ...]] = {
             86400.0,
             low=0.0,
             high=1e8,
+        ),
+        Column(
+            "unread_std_percent",
+            Kind.NUMBER,
+            "largest standard deviation of a voltage beside a withheld power at CLEAN, %",
+            0.5,
+            low=0.0,
+            high=100.0,
         ),
     ),
 }

@@ -9,6 +9,7 @@ import numpy as np
 
 from feeders.columns import META_COLUMNS
 from feeders.forecast import always
+from feeders.late import expected
 from feeders.load import Site, Snapshot, to_frame
 from feeders.schema import FeederTables
 from gridsec.arrays import Floats
@@ -37,7 +38,8 @@ def load_doubt(site: Site) -> LoadDoubt:
     them, so that design and frames say the same. `p_std_kw` and `q_std_kvar` say it directly, and then of
     errors that come and go within `correlation_s`; they are believed as they are: with a meter as the error
     of what it reports, without one as the distance from the middle of the range. Where powers are forecast it
-    is the distance from the forecast, and that of the library where the files say nothing.
+    is the distance from the forecast, and that of the library where the files say nothing. With
+    `p_interval_s` the powers of metered customers are off by what loads do meanwhile, too.
 
     Parameters
     ----------
@@ -56,9 +58,10 @@ def load_doubt(site: Site) -> LoadDoubt:
     told_q = np.array([np.nan if row.q_std_kvar is None else row.q_std_kvar for row in rows])
     by_limits = bool(np.isnan(told_q).any() or np.isnan(told_p).any())
     open_ = unmetered & np.isnan(told_p)
+    changed = np.where(unmetered, 0.0, expected(site))
     return LoadDoubt(
-        p=np.where(np.isnan(told_p), p, told_p / base),
-        q=np.where(np.isnan(told_q), q, told_q / base),
+        p=np.hypot(np.where(np.isnan(told_p), p, told_p / base), changed),
+        q=np.hypot(np.where(np.isnan(told_q), q, told_q / base), loads.tan_max * changed),
         time_s=site.tables.meta.load.correlation_s,
         common_q=ALIKE if np.isnan(told_q[site.meters]).any() else 0.0,
         lasting=1.0 if by_limits else 0.0,

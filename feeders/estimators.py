@@ -89,7 +89,9 @@ def design(
 def _sequential(site: Site, _: Job) -> sequential.SequentialDesign:
     settings = site.tables.meta.monitor
     options = sequential.SequentialOptions(
-        alarms_per_year=settings.alarms_per_year, commission_s=settings.commission_s
+        alarms_per_year=settings.alarms_per_year,
+        commission_s=settings.commission_s,
+        unread_std_percent=settings.unread_std_percent,
     )
     return sequential.design(plant(site), doubt=load_doubt(site), step_s=settings.tick_s, options=options)
 

@@ -26,6 +26,7 @@ from feeders.equipment import (
     positions,
 )
 from feeders.forecast import Forecast, forecast
+from feeders.late import late
 from feeders.load_phases import spanned, unsupported
 from feeders.schema import CustomerRow, FeederTables, validate
 from feeders.taps import Referred, refer
@@ -174,6 +175,10 @@ class Snapshot:
         Net reactive import, the inverter included, kvar; NaN where not reported.
     v0_volt
         Busbar voltage, V; NaN where missing. In three phases (3,).
+    p_age_s : (p,) or None
+        Age of the powers at the voltage readings beside them, s; NaN, or None for all, where not stated.
+    clock_offset_s : (p,) or None
+        By how much each meter's clock is ahead, s; NaN, or None for all, where that is not measurable.
     """
 
     t: float
@@ -181,6 +186,8 @@ class Snapshot:
     p_kw: Floats
     q_kvar: Floats
     v0_volt: Floats | float
+    p_age_s: Floats | None = None
+    clock_offset_s: Floats | None = None
 
 
 def load(path_or_name: Path | str) -> Site:
@@ -350,7 +357,7 @@ def to_frame(site: Site, snapshot: Snapshot) -> Frame:
     load to full load without generation. Its middle is p; `p_std_kw` of a customer without a meter says how
     far from that the truth is, and the half-width is `sqrt(3)` of it if that is less. With
     `forecast = "profiles"` p and q are those of `feeders.forecast`, with the whole range as interval about
-    them.
+    them. A power older than its voltage reading is widened by what loads do meanwhile (`feeders.late`).
 
     Reactive power of the load (the inverter's is the observer's business): with net import P, the load
     alone lies in ``[max(P, 0), max(P, min(P + pv, load_kw))]``, each end widened by the error of P;
@@ -372,6 +379,9 @@ def to_frame(site: Site, snapshot: Snapshot) -> Frame:
     v0_squared, v0_phases = _busbar(snapshot.v0_volt, site.feeder.base_volt)
     metered = np.full(model.load_peak.size, np.nan)
     metered[site.meters] = snapshot.p_kw / base_kva
+    aged = late(site, snapshot)
+    if aged is not None:
+        metered[aged.useless] = np.nan
     known = np.abs(metered) <= model.credible  # False for NaN
     p = np.where(known, metered, 0.5 * (model.load_peak - model.pv_peak))
     beyond = np.maximum(p - model.load_peak, 0.0) + np.maximum(-p - model.pv_peak, 0.0)
@@ -401,8 +411,10 @@ def to_frame(site: Site, snapshot: Snapshot) -> Frame:
         q_net_error=np.maximum(model.q_error, model.q_fraction * size),
         v0_phases=v0_phases,
         p_origin=_origin(metered, known, beyond),
+        clock_offset=snapshot.clock_offset_s,
     )
-    return frame if site.forecast is None else site.forecast.fill(frame, ~known)
+    frame = frame if site.forecast is None else site.forecast.fill(frame, ~known)
+    return frame if aged is None else aged.widen(site, frame)
 
 
 def _origin(metered: Floats, known: Bools, beyond: Floats) -> Ints:

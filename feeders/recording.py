@@ -56,7 +56,9 @@ PHASES: Final = pa.field("v_phases", pa.list_(pa.float64()))
 """Voltages of the busbar's phases, a column of recordings of feeders in three phases."""
 
 REQUIRED: Final = ("meter", "t", "v_volt")
-REGISTERS: Final = ("seq", "p_kw", "q_kvar")
+T_POWER: Final = pa.field("t_power", pa.float64())
+"""Time of the powers, a column of foreign recordings whose powers are older than their voltages."""
+REGISTERS: Final = ("seq", "p_kw", "q_kvar", "t_power")
 """Columns in which NaN says, as null does, that nothing was reported: tables of floats have nothing else."""
 
 
@@ -214,7 +216,7 @@ def read_recording(path: Path | str) -> Recording:
     """Open a recording, ours or a foreign one.
 
     A foreign file needs the columns `meter`, `t` and `v_volt`. Without `arrival` readings arrive at their own
-    time; `seq`, `p_kw` and `q_kvar` may be absent, and null or NaN where they are not reported.
+    time; `seq`, `p_kw`, `q_kvar` and `t_power` may be absent, and null or NaN where they are not reported.
 
     Raises
     ------
@@ -267,7 +269,7 @@ def _wrong_columns(schema: Any) -> list[str]:
     """What is wrong with the columns of a file, all at once."""
     missing = [name for name in REQUIRED if name not in schema.names]
     problems = [f"columns {', '.join(missing)} are missing"] if missing else []
-    for name in (*READINGS.names, PHASES.name):
+    for name in (*READINGS.names, PHASES.name, T_POWER.name):
         if name not in schema.names:
             continue
         given = schema.field(name).type
@@ -284,7 +286,7 @@ def _wrong_columns(schema: Any) -> list[str]:
     return problems
 
 
-_TIMES: Final = ("t", "arrival")
+_TIMES: Final = ("t", "arrival", "t_power")
 
 
 def _wrong_numbers(file: Any) -> list[str]:
@@ -428,10 +430,10 @@ def _readings(batch: Any) -> Iterator[Reading]:
     there = {
         name: _column(batch, name).to_pylist()
         for name in batch.schema.names
-        if name in (*READINGS.names, PHASES.name)
+        if name in (*READINGS.names, PHASES.name, T_POWER.name)
     }
     nothing = [None] * size
-    for meter, t, seq, arrival, v_volt, p_kw, q_kvar, phases in zip(
+    for meter, t, seq, arrival, v_volt, p_kw, q_kvar, phases, t_power in zip(
         there["meter"],
         there["t"],
         there.get("seq", nothing),
@@ -440,9 +442,10 @@ def _readings(batch: Any) -> Iterator[Reading]:
         there.get("p_kw", nothing),
         there.get("q_kvar", nothing),
         there.get(PHASES.name, nothing),
+        there.get(T_POWER.name, nothing),
         strict=True,
     ):
-        yield Reading(meter, t, seq, arrival, v_volt, p_kw, q_kvar, phases and tuple(phases))
+        yield Reading(meter, t, seq, arrival, v_volt, p_kw, q_kvar, phases and tuple(phases), t_power)
 
 
 def _column(batch: Any, name: str) -> Any:

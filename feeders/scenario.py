@@ -148,6 +148,8 @@ class Reading:
         Net import, kW and kvar; None where not reported.
     v_phases
         Busbar voltage of each phase, V; None on a balanced feeder.
+    t_power
+        Time of the powers by the meter's clock, Unix s; None where it is `t`.
     """
 
     meter: str
@@ -158,6 +160,7 @@ class Reading:
     p_kw: float | None
     q_kvar: float | None
     v_phases: tuple[float, ...] | None = None
+    t_power: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -136,6 +136,7 @@ class MeterDefaults:
     p_error_percent: float = 1.0
     q_error_percent: float = 2.0
     p_resolution_kw: float = 0.01
+    p_interval_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,6 +164,7 @@ class MonitorDefaults:
     silence_s: float = 10.0
     alarms_per_year: float = 1.0
     commission_s: float = 86400.0
+    unread_std_percent: float = 0.5
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,6 +37,7 @@ class Cause(StrEnum):
     RESIDUALS = "residuals"
     SETTLING = "settling"
     SILENT_METERS = "silent-meters"
+    MISSING_POWERS = "missing-powers"
     TOO_FEW_METERS = "too-few-meters"
     NO_BUSBAR = "no-busbar"
     TOO_MANY_SUSPECTS = "too-many-suspects"
@@ -65,6 +66,8 @@ class PowerOrigin(IntEnum):
     """No usable reading: a range, or a forecast."""
     BEYOND = 2
     """A reading beyond the declared load or generation, believed in part or not at all."""
+    LATE = 3
+    """A reading older than the voltage beside it, and than the files state."""
 
 
 def _none() -> Bools:
@@ -132,7 +135,10 @@ class Frame:
         Standard deviation of the truth about `p` and `q` where it is known apart from the intervals, as that
         of forecasts is, pu; NaN, or None for all, where it is that of a uniform distribution in the interval.
     p_origin : (N,) or None
-        `PowerOrigin` of `p`; None: `READ` everywhere. No estimate depends on it: it explains wide intervals.
+        `PowerOrigin` of `p`; None: `READ` everywhere. A voltage reading beside an unread power of the same
+        meter is not checked by that power.
+    clock_offset : (p,) or None
+        By how much each meter's clock is ahead, s; NaN, or None for all, where that is not measurable.
     """
 
     t: float
@@ -149,6 +155,7 @@ class Frame:
     p_std: Floats | None = None
     q_std: Floats | None = None
     p_origin: Ints | None = None
+    clock_offset: Floats | None = None
 
 
 @dataclass(frozen=True, slots=True)

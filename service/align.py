@@ -21,6 +21,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from itertools import zip_longest
 
+from service.clock_offsets import ClockOffsets
 from service.reading import Reading
 
 HELD_PER_SOURCE = 512
@@ -37,6 +38,9 @@ BRIDGED_TICK_S = 2.0
 
 GAP_MAX = 1_000_000
 """A running number that leaps further was not counted on; nothing is known to be lost."""
+
+OFFSETS_TICKS = 16
+"""Ticks from one measurement of the clock offsets to the next."""
 
 _ACTIVE_ROUNDS = 4
 
@@ -166,6 +170,8 @@ class Tick:
         and infinity says never.
     skipped
         Number of ticks directly before this one that are not judged.
+    clock_offset : (p,) or ()
+        By how much the clock of each meter is ahead, s; None where that is not measurable, () where none is.
     """
 
     t: float
@@ -173,6 +179,7 @@ class Tick:
     busbar: Reading | None
     silent: tuple[tuple[str | None, float], ...]
     skipped: int = 0
+    clock_offset: tuple[float | None, ...] = ()
 
 
 @dataclass(slots=True)
@@ -227,6 +234,8 @@ class Aligner:
         self._arrivals = 0
         self._active: OrderedDict[str | None, float] = OrderedDict()
         self._claims: list[float] = []
+        self._clocks = ClockOffsets((*self.meters, None), rules.tick_s)
+        self._offsets: tuple[float | None, ...] = ()
 
     # ---------------------------------------------------------------- in
 
@@ -269,6 +278,8 @@ class Aligner:
         index = bisect_left(source.held, t, key=_time_of)
         if index < len(source.held) and source.held[index].t == t:
             return Outcome.DUPLICATE
+        if now is not None and self.rules.clock is Clock.WALL:
+            self._clocks.note(reading.meter, t, now)
         self._count_gap(reading, source)
         late = self._next is not None and t <= self._time(self._next - 1) + self.rules.lead_s
         if late and t <= source.last_t:
@@ -378,6 +389,8 @@ class Aligner:
             for source in self._sources.values():
                 source.held.clear()
                 source.last_t = source.last_heard = source.last_used = -math.inf
+            self._clocks.forget()
+            self._offsets = ()
             self._latest = wall
             self._begin(wall)
         self._latest = max(self._latest, wall)
@@ -493,7 +506,11 @@ class Aligner:
             if (seconds := self._silent_for(source, source.last_used, t)) > 0.0
         )
         skipped, self._skipped = self._skipped, 0
-        return Tick(t, tuple(seen[meter] for meter in self.meters), seen[None], silent, skipped)
+        if self._number() % OFFSETS_TICKS == 0:
+            found = self._clocks.measured()
+            self._offsets = tuple(found.get(meter) for meter in self.meters) if found else ()
+        readings = tuple(seen[meter] for meter in self.meters)
+        return Tick(t, readings, seen[None], silent, skipped, self._offsets)
 
     def _usable(self, source: _Source, t: float) -> Reading | None:
         index = bisect_left(source.held, math.nextafter(t + self.rules.lead_s, math.inf), key=_time_of)

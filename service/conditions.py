@@ -22,6 +22,7 @@ class AlarmKind(StrEnum):
     DATA_LOSS = "data-loss"
     UNDECIDED = "undecided"
     LEARNING_STALLED = "learning-stalled"
+    CLOCK_OFFSET = "clock-offset"
 
 
 class Severity(StrEnum):
@@ -117,6 +118,7 @@ def conditions(report: FeederReport) -> list[Condition]:
       `data-loss` says already why: everybody of whom a reading is missing is silent.
     - `learning-stalled`: the fixed error of a meter is not learned after twice the expected time; one
       condition per feeder. Unknown at a tick without a monitor.
+    - `clock-offset`: the clock of a meter is measurably ahead or behind, or its readings come late.
 
     Parameters
     ----------
@@ -129,7 +131,7 @@ def conditions(report: FeederReport) -> list[Condition]:
         What is not in it is known to be absent.
     """
     manipulated = (*_manipulated(report), *_busbar(report), *_inverters(report))
-    found = [*manipulated, *_data_loss(report), *_undecided(report), *_learning(report)]
+    found = [*manipulated, *_data_loss(report), *_undecided(report), *_learning(report), *_clocks(report)]
     for meter in report.meters:
         found.extend(_voltage_limit(report, meter))
     return found
@@ -228,8 +230,8 @@ def _inverters(report: FeederReport) -> Iterable[Condition]:
 
 
 # With these causes the reconstruction still is what the design promises: the readings that are there are
-# enough. With every other UNDECIDED its bound is not a bound.
-_SOUND = frozenset({Cause.AGREEMENT, Cause.RESIDUALS, Cause.SILENT_METERS})
+# enough, or the standard deviation is wide. With every other UNDECIDED its bound is not a bound.
+_SOUND = frozenset({Cause.AGREEMENT, Cause.RESIDUALS, Cause.SILENT_METERS, Cause.MISSING_POWERS})
 
 
 def _voltage_limit(report: FeederReport, meter: MeterReport) -> Iterable[Condition]:
@@ -293,6 +295,17 @@ def _undecided(report: FeederReport) -> Iterable[Condition]:
         known=not told and report.cause is not Cause.SETTLING,
         unheard=unheard,
     )
+
+
+def _clocks(report: FeederReport) -> Iterable[Condition]:
+    for meter in report.meters:
+        offset = meter.clock_offset_s
+        if offset is None:
+            continue
+        side = "ahead of" if offset > 0.0 else "behind"
+        late = "" if offset > 0.0 else ", or its readings come later"
+        reason = f"the clock is {abs(offset):.1f} s {side} the other meters'{late}"
+        yield Condition(AlarmKind.CLOCK_OFFSET, report.feeder, meter.meter, Severity.MINOR, reason=reason)
 
 
 def _learning(report: FeederReport) -> Iterable[Condition]:

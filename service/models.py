@@ -80,6 +80,10 @@ class MeterState(BaseModel):
         default=None, description="Reason that took most of the time that did not count; null on schedule."
     )
     model_only: ModelOnly = False
+    clock_offset_s: Number = Field(
+        default=None,
+        description="By how much its clock is ahead of the other meters', s; null where not measurable.",
+    )
 
 
 class BusbarMeterState(BaseModel):

@@ -63,6 +63,8 @@ class Reading(msgspec.Struct, frozen=True, gc=False):
     v_phases
         Voltage of each phase at the busbar of a feeder in three phases, V, NaN where there is none; None
         where the reading does not tell them apart.
+    t_power
+        Unix time of the powers by the meter's clock, s; NaN where they are of the moment `t`.
     """
 
     feeder: str
@@ -73,6 +75,7 @@ class Reading(msgspec.Struct, frozen=True, gc=False):
     q_kvar: float = NOT_REPORTED
     seq: int | None = None
     v_phases: tuple[float, ...] | None = None
+    t_power: float = NOT_REPORTED
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,6 +143,7 @@ class Raw(msgspec.Struct, gc=False):
     seq: int | None = None
     meter: str | None = None
     v_phases: list[float | None] | None = None
+    t_power: float | None = None
 
 
 def plausible(raw: Raw, known: Known, meter: str | None) -> bool:
@@ -152,6 +156,7 @@ def plausible(raw: Raw, known: Known, meter: str | None) -> bool:
         and (raw.q_kvar is None or -limit <= raw.q_kvar <= limit)
         and (raw.seq is None or 0 <= raw.seq <= SEQ_MAX)
         and (raw.v_phases is None or _phases_plausible(raw.v_phases, known))
+        and (raw.t_power is None or T_MIN <= raw.t_power <= T_MAX)
     )
 
 
@@ -172,6 +177,7 @@ def to_reading(feeder: str, meter: str | None, raw: Raw) -> Reading:
         NOT_REPORTED if raw.q_kvar is None else raw.q_kvar,
         raw.seq,
         _phases_of(raw),
+        NOT_REPORTED if raw.t_power is None else raw.t_power,
     )
 
 
@@ -234,6 +240,9 @@ def judge(value: Any, known: Known, meter: str | None = None, *, in_batch: bool)
         findings.add(BadReason.VALUE, problem)
     p_kw = _power(value, "p_kw", known, findings)
     q_kvar = _power(value, "q_kvar", known, findings)
+    t_power = _number(value, "t_power", findings, required=False)
+    if t_power is not None and not T_MIN <= t_power <= T_MAX:
+        findings.add(BadReason.VALUE, f"t_power = {t_power:g} is no Unix time in seconds")
     v_phases = _phases(value.get("v_phases"), known, findings)
     seq = value.get("seq")
     if seq is not None and (isinstance(seq, bool) or not isinstance(seq, int)):
@@ -248,7 +257,7 @@ def judge(value: Any, known: Known, meter: str | None = None, *, in_batch: bool)
         findings.add(BadReason.UNKNOWN_METER, f"the feeder has no meter `{str(named)[:64]}`")
     if findings.of or t is None or v_volt is None:
         return findings
-    return Raw(t, v_volt, p_kw, q_kvar, seq, named, v_phases)
+    return Raw(t, v_volt, p_kw, q_kvar, seq, named, v_phases, t_power)
 
 
 def _phases(value: Any, known: Known, findings: Findings) -> list[float | None] | None:

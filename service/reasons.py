@@ -14,6 +14,8 @@ from gridsec.online import Cause, Verdict
 from service.align import Tick
 from service.busbar import busbar_in_words, busbar_off
 
+_NAMING: Final = frozenset({Cause.AMBIGUOUS, Cause.SILENT_METERS, Cause.MISSING_POWERS})
+"""Causes with a sentence of the monitor that names meters by their customers."""
 _SHOWN: Final = 5
 """So many names are listed at most."""
 
@@ -46,7 +48,7 @@ def reason_of(site: Site, tick: Tick, max_attacked: int, verdict: Verdict) -> st
     if verdict.cause is Cause.SILENT_METERS and unseen:
         return f"No reading from {_meters(site, unseen)}."
     text = re.sub(r"([Tt])he meter of the busbar\b", r"\1he substation's meter", verdict.reason)
-    return _in_ids(site, text) if verdict.cause in {Cause.AMBIGUOUS, Cause.SILENT_METERS} else text
+    return _in_ids(site, text) if verdict.cause in _NAMING else text
 
 
 def _named(site: Site, tick: Tick, verdict: Verdict) -> str:

@@ -129,6 +129,7 @@ def _checked(feeder: str, known: Known, recorded: Recorded, tally: Tally, clock:
         "q_kvar": recorded.q_kvar,
         "seq": recorded.seq,
         "v_phases": recorded.v_phases and list(recorded.v_phases),
+        "t_power": recorded.t_power,
     }
     found = judge(fields, known, recorded.meter, in_batch=False)
     if isinstance(found, Findings):

@@ -121,6 +121,8 @@ class MeterReport:
         As in `LearningReport`; None where the estimator does not learn, or does not run.
     model_only
         The estimated values rest on no reading of this tick, see `voltages.Grounds`.
+    clock_offset_s
+        By how much its clock is ahead of those of the other meters, s; None where that is not measurable.
     """
 
     meter: str
@@ -141,6 +143,7 @@ class MeterReport:
     learning_state: str | None = None
     learning_reason: str | None = None
     model_only: bool = False
+    clock_offset_s: float | None = None
 
     def limits(self, report: FeederReport) -> tuple[float, float]:
         """Return the lowest and the highest voltage allowed at the meter, V.
@@ -364,7 +367,7 @@ def build(site: Site, tick: Tick, max_attacked: int, estimate: Estimate, verdict
     rests_on = grounds(site, tick, estimate, verdict)
     alone = rests_on.model_only(site)
     kinds = verdict.kinds or (None,) * len(site.meter_ids)
-    allowed = _limits(site)
+    allowed, offsets = _limits(site), tick.clock_offset or (None,) * len(site.meter_ids)
     meters = []
     for k, (meter, reading) in enumerate(zip(site.meter_ids, tick.readings, strict=True)):
         score, threshold, v_volt, v_std, v2_pu = (finite(value) for value in numbers[k])
@@ -386,6 +389,7 @@ def build(site: Site, tick: Tick, max_attacked: int, estimate: Estimate, verdict
                 v_min_volt=allowed[k][0],
                 v_max_volt=allowed[k][1],
                 model_only=bool(alone[at[k]]),
+                clock_offset_s=offsets[k],
             )
         )
     one, phases, buses_alone = bus_volts(site, estimate.v2_bus, rests_on.measured)
@@ -419,7 +423,7 @@ def blind(site: Site, tick: Tick, max_attacked: int, cause: Cause, reason: str) 
     cause, reason
         Why there is no estimate.
     """
-    allowed = _limits(site)
+    allowed, offsets = _limits(site), tick.clock_offset or (None,) * len(site.meter_ids)
     rests_on = grounds(site, tick)
     alone = rests_on.model_only(site)
     meters = tuple(
@@ -439,6 +443,7 @@ def blind(site: Site, tick: Tick, max_attacked: int, cause: Cause, reason: str) 
             v_min_volt=allowed[k][0],
             v_max_volt=allowed[k][1],
             model_only=bool(alone[site.meters[k]]),
+            clock_offset_s=offsets[k],
         )
         for k, (meter, reading) in enumerate(zip(site.meter_ids, tick.readings, strict=True))
     )
@@ -610,6 +615,7 @@ def to_json(report: FeederReport) -> dict[str, Any]:
                 "learning_state": m.learning_state,
                 "learning_reason": m.learning_reason,
                 "model_only": m.model_only,
+                "clock_offset_s": m.clock_offset_s,
             }
             for m in report.meters
         ],

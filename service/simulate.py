@@ -69,6 +69,7 @@ def payload_of(reading: Reading) -> bytes:
         "p_kw": reading.p_kw,
         "q_kvar": reading.q_kvar,
         "v_phases": reading.v_phases,
+        "t_power": reading.t_power,
     }
     return msgspec.json.encode({name: value for name, value in fields.items() if value is not None})
 

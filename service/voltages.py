@@ -26,14 +26,20 @@ def snapshot(site: Site, tick: Tick) -> Snapshot:
         The feeder, and the tick.
     """
     nan = math.nan
-    rows = [(nan, nan, nan) if r is None else (r.v_volt, r.p_kw, r.q_kvar) for r in tick.readings]
-    columns = np.array(rows, dtype=np.float64).reshape(-1, 3)
+    rows = [
+        (nan, nan, nan, nan, nan) if r is None else (r.v_volt, r.p_kw, r.q_kvar, r.t, r.t_power)
+        for r in tick.readings
+    ]
+    columns = np.array(rows, dtype=np.float64).reshape(-1, 5)
+    age = columns[:, 3] - columns[:, 4]
     return Snapshot(
         t=tick.t,
         v_volt=columns[:, 0].copy(),
         p_kw=columns[:, 1].copy(),
         q_kvar=columns[:, 2].copy(),
         v0_volt=busbar_volt(site, tick),
+        p_age_s=None if np.isnan(age).all() else age,
+        clock_offset_s=np.array(tick.clock_offset, dtype=np.float64) if any(tick.clock_offset) else None,
     )
 
 

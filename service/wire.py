@@ -229,7 +229,7 @@ def _json_batch(payload: bytes, source: Source, known: Known, base: BadReading) 
 # Columns
 
 
-_FIELDS = ("meter", "t", "v_volt", "p_kw", "q_kvar", "seq")
+_FIELDS = ("meter", "t", "v_volt", "p_kw", "q_kvar", "seq", "t_power")
 
 
 def _cbor(payload: bytes, source: Source, known: Known, base: BadReading) -> Decoded:

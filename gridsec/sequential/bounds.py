@@ -26,6 +26,7 @@ docs/theory-sequential.md, section 7; docs/theory-detection.md for the lag and f
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -244,7 +245,9 @@ class Grounds:
     busbar
         Whether its voltage is metered; in three phases (3,).
     y, trusted : (p,)
-        Squared readings, and which of them count.
+        Squared readings, and the meters that the estimate rests on.
+    reads
+        Meters whose customer's power is known, (p,): the bound rests on these. Asked for with the bound.
     sigmas
         Standard deviations of jitter that an honest reading may be off.
     """
@@ -256,6 +259,7 @@ class Grounds:
     busbar: Bools | bool
     y: Floats
     trusted: Bools
+    reads: Callable[[], Bools]
     sigmas: float
 
     def half_width(self, v2: Floats) -> Floats:
@@ -270,23 +274,24 @@ class Grounds:
         injected = plant.droop.per_customer(self.injected, plant.feeder.bus.size)
         lost, correction = self.powers.lost(plant, injected)
         spread = np.minimum(self.powers.linear(plant, injected) + lost, NO_VOLTAGE)
-        reading = told_error(plant.accuracy, self.y, self.sigmas)
-        low, high = (by_place(plant.feeder, end)[plant.feeder.bus] for end in self._busbar(spread, reading))
+        reading, use = told_error(plant.accuracy, self.y, self.sigmas), self.trusted & self.reads()
+        ends = self._busbar(spread, reading, use)
+        low, high = (by_place(plant.feeder, end)[plant.feeder.bus] for end in ends)
         # What losses take off is that of the assumed busbar voltage.
         moved = np.minimum(np.maximum(np.abs(low), np.abs(high)), NO_VOLTAGE)
         base = by_place(plant.feeder, self.powers.v0_squared)[plant.feeder.bus]
         spread = spread + np.abs(correction) * moved / np.maximum(base - moved, _LEAST)
         low, high = self.model + low - spread, self.model + high + spread
-        own = np.where(self.trusted, reading, np.inf)
+        own = np.where(use, reading, np.inf)
         low[at], high[at] = _both(low[at], high[at], self.y - own, self.y + own)
         return np.minimum(np.maximum(high - v2, v2 - low), NO_VOLTAGE)
 
-    def _busbar(self, spread: Floats, reading: Floats) -> tuple[Floats, Floats]:
+    def _busbar(self, spread: Floats, reading: Floats, use: Bools) -> tuple[Floats, Floats]:
         """How far squared busbar voltages may be from those assumed: by their meters, and by all others."""
         plant, at = self.plant, self.plant.meters
         known = np.atleast_1d(busbar_errors(plant, self.powers.v0_squared, self.sigmas))
         known = np.where(self.busbar, known, np.inf)
-        off, room = self.y - self.model[at], np.where(self.trusted, reading + spread[at], np.inf)
+        off, room = self.y - self.model[at], np.where(use, reading + spread[at], np.inf)
         heard = np.where(hangs_on(plant.feeder)[at] > 0.0, room[:, None], np.inf)
         low = (off[:, None] - heard).max(axis=0, initial=-np.inf)
         high = (off[:, None] + heard).min(axis=0, initial=np.inf)

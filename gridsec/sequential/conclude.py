@@ -8,22 +8,27 @@ docs/theory-sequential.md, sections 5 and 7.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, all_of, any_of
 from gridsec.judge import Situation, decide
 from gridsec.network import busbar_places, one_busbar, over_places
-from gridsec.online import Cause, Decision, Estimate, Explanation, Frame, Verdict
+from gridsec.online import Cause, Decision, Estimate, Explanation, Frame, PowerOrigin, Verdict
 from gridsec.sequential import words
+from gridsec.sequential.apart import apart
 from gridsec.sequential.bounds import Bounded, Grounds, Powers
 from gridsec.sequential.busbar import Busbar, follow
 from gridsec.sequential.conditional import Prior, judge
 from gridsec.sequential.design import SequentialDesign
+from gridsec.sequential.doubts import checked
 from gridsec.sequential.examine import Examined
 from gridsec.sequential.heard import Heard
 from gridsec.sequential.release import Released, release
-from gridsec.sequential.state import SequentialState
+from gridsec.sequential.scales import needed
+from gridsec.sequential.skew import Skew
+from gridsec.sequential.state import SequentialState, Trust
 from gridsec.values import changed
 
 
@@ -76,9 +81,14 @@ def conclude(
         The state with the answer in it, and the answer.
     """
     trust, heard = state.trust, tick.heard
-    estimate, released = _estimate(design, state, tick)
+    beside = apart(state.apart, state.fits, state.doubts)
+    state = state if beside is state.apart else changed(state, apart=beside)
+    s, moved = _best(design, state)
+    estimate, released = _estimate(design, state, tick, s, moved)
     busbar, inverters = _busbar(design, state, heard, estimate), _inverters(design, state)
     score, threshold, judged = _worst(design, tick.seen, heard.live.size)
+    if state.skew is not None:
+        judged = judged | _judged_seldom(design, state.skew, state)
     live, beyond = judged & heard.live, score > threshold
     attack = np.zeros(live.size)
     if any_of(trust.named):
@@ -86,25 +96,17 @@ def conclude(
         attack = np.where(trust.named & heard.live, off, 0.0)
     amounts = _amounts(design, state, tick.seen)
     settled = all_of(tick.transient <= design.options.settled * threshold)
-    said = decide(
-        Situation(
-            names=design.names,
-            max_attacked=max(1, min(design.most, int(np.count_nonzero(live)) // 3)),
-            live=live,
-            suspected=~trust.trusted | beyond,
-            named=trust.named,
-            wide=live & ~(threshold <= design.options.widest),
-            valid=True,
-            settled=settled,
-            busbar=True,
-        )
+    said = _of_meters(
+        design, trust, live, beyond, wide=~(threshold <= design.options.widest), settled=settled
     )
-    said = _contradicted(design, beyond & ~trust.named, trust.named, said)
     differs = _differs(design, busbar, estimate)
     said = _unvouched(design, heard.busbar, live, differs, said)
     open_ = _open(design, state, said)
     said = _beside_meters(design, inverters, differs, amounts, tick.rivals, open_, said)
-    decision, cause, reason = _unexplained(tick.seen.misfit, said)
+    said = _unexplained(tick.seen.misfit, said)
+    if not (tick.rivals or open_ or all_of(state.doubts.vouched)):
+        said = _unread(design, ~state.doubts.vouched[max(s, 0)], estimate, said)
+    decision, cause, reason = said
     verdict = Verdict(
         decision,
         cause,
@@ -159,11 +161,12 @@ def _injected(
 
 
 def _estimate(
-    design: SequentialDesign, state: SequentialState, tick: Tick
+    design: SequentialDesign, state: SequentialState, tick: Tick, s: int, moved: float
 ) -> tuple[Estimate, Released | None]:
+    """The estimate by scale s, whose mean is short of a part `moved` of the loads' variance."""
     plant = design.plant
     heard = tick.heard
-    w, variance, released = _reconstructed(design, state, tick)
+    w, variance, released = _reconstructed(design, state, tick, s, moved)
     v2_bus = tick.v2_bus + w
     first = busbar_places(plant.feeder)
     v2_bus[first] = np.where(heard.busbar, heard.v0_squared, v2_bus[first])
@@ -181,6 +184,7 @@ def _estimate(
         busbar=heard.busbar,
         y=heard.y,
         trusted=trusted,
+        reads=partial(checked, design, tick.frame),
         sigmas=design.sigmas[0],
     )
     x = np.zeros(0) if state.x is None else state.x
@@ -190,6 +194,32 @@ def _estimate(
 _Said = tuple[Decision, Cause, str]
 # What a verdict about inverters and loads may add to: nothing more serious was found.
 _MILD = (Cause.AGREEMENT, Cause.AMBIGUOUS)
+
+
+def _of_meters(  # what there is to say of meters
+    design: SequentialDesign, trust: Trust, live: Bools, beyond: Bools, *, wide: Bools, settled: bool
+) -> _Said:
+    """The answer by the meters alone: those that report, are beyond, and have too wide limits, (p,) each."""
+    said = decide(
+        Situation(
+            names=design.names,
+            max_attacked=max(1, min(design.most, int(np.count_nonzero(live)) // 3)),
+            live=live,
+            suspected=~trust.trusted | beyond,
+            named=trust.named,
+            wide=live & wide,
+            valid=True,
+            settled=settled,
+            busbar=True,
+        )
+    )
+    return _contradicted(design, beyond & ~trust.named, trust.named, said)
+
+
+def _judged_seldom(design: SequentialDesign, skew: Skew, state: SequentialState) -> Bools:
+    """Meters with a clock offset, (p,): of a scale that judges them there is not a look at every tick."""
+    need = np.array([needed(design, s) for s in range(len(design.lengths))])
+    return skew.judged(state.window.counts, need)
 
 
 def _contradicted(design: SequentialDesign, beyond: Bools, named: Bools, said: _Said) -> _Said:
@@ -267,6 +297,23 @@ def _unexplained(misfit: tuple[bool, ...], said: _Said) -> _Said:
     return Decision.UNDECIDED, Cause.MISFIT, sentence
 
 
+def _unread(design: SequentialDesign, unread: Bools, estimate: Estimate, said: _Said) -> _Said:
+    """The answer, unless a voltage beside a power that is not read is known too badly to be called clean."""
+    if said[1] not in _MILD or not any_of(unread):
+        return said
+    at, limit = design.plant.meters, design.options.unread_std_percent
+    v = np.sqrt(np.maximum(estimate.v2[at], _DEAD))
+    percent = 50.0 * estimate.std[at] / (v * design.plant.droop.vbar)
+    wide = unread & ~(percent <= limit)
+    if not any_of(wide):
+        return said
+    return Decision.UNDECIDED, Cause.MISSING_POWERS, words.unread(design.names, wide, percent, limit)
+
+
+_DEAD = 1e-2
+"""Least squared voltage by which a standard deviation is related to the voltage, pu."""
+
+
 def _open(design: SequentialDesign, state: SequentialState, said: _Said) -> tuple[Explanation, ...]:
     """What metered reactive powers leave open, whoever else is named."""
     if state.curves.idle:
@@ -336,10 +383,9 @@ def _mean(state: SequentialState, s: int) -> Floats:
 
 
 def _reconstructed(
-    design: SequentialDesign, state: SequentialState, tick: Tick
+    design: SequentialDesign, state: SequentialState, tick: Tick, s: int, moved: float
 ) -> tuple[Floats, Floats, Released | None]:
     """What the trusted meters add to the model at every bus, its variance, and what is kept of the work."""
-    s, moved = _best(design, state)
     prior_, told = state.doubts.priors[max(s, 0)], tick.frame.p_std
     now, view = (None, None) if s < 0 else (state.fits[s], tick.seen.views[s])
     if now is None:
@@ -349,9 +395,12 @@ def _reconstructed(
     jitter = (1.0 - 1.0 / design.lengths[s]) * design.flicker
     flicker = over_places(design.plant.feeder, np.where(tick.heard.busbar, jitter, 0.0))
     after = moved * prior_.variance + _hidden(state, prior_) + flicker
+    beside = state.apart[s]
+    if beside is not None:
+        after = after + beside.added(judged)
     liars = design.plant.meters[~state.trust.trusted]
     # Nobody lies about powers that nobody told, which are known by a standard deviation.
-    liars = liars if told is None else liars[np.isnan(told[liars])]
+    liars = liars if told is None else liars[np.isnan(told[liars]) | _late(tick.frame)[liars]]
     if not liars.size:
         return judged.w, now.variance + after, None
     sizes, released = state.doubts.sizes[liars], state.released
@@ -360,6 +409,13 @@ def _reconstructed(
     elif s in tick.seen.found or not released.holds(judged):
         released = released.anew(judged)
     return released.said(judged), released.variance + after, released
+
+
+def _late(frame: Frame) -> Bools:
+    """Customers with a power that is read and known by a standard deviation all the same, (N,)."""
+    if frame.p_origin is None:
+        return np.zeros(frame.p.size, dtype=np.bool_)
+    return np.asarray(frame.p_origin != PowerOrigin.UNREAD)
 
 
 def _best(design: SequentialDesign, state: SequentialState) -> tuple[int, float]:
@@ -371,8 +427,8 @@ def _best(design: SequentialDesign, state: SequentialState) -> tuple[int, float]
     for s, (now, length) in enumerate(zip(state.fits, design.lengths, strict=True)):
         if now is None:
             continue
-        lag = min(1.0, length * design.step_s / design.doubt.time_s) * (length > 1)
-        total = now.total() + lag * now.prior.total
+        lag, beside = min(1.0, length * design.step_s / design.doubt.time_s) * (length > 1), state.apart[s]
+        total = (now if beside is None else beside.rest).total() + lag * now.prior.total
         if total < least:
             at, least, moved = s, total, lag
     return at, moved

@@ -71,6 +71,9 @@ class SequentialOptions:
         The meters' fixed errors are learned over this time, s; 0 for never.
     stability
         Part of its accuracy class by which an honest meter may change after that.
+    unread_std_percent
+        Largest standard deviation of the voltage at a metered customer without a power reading for which the
+        verdict can be CLEAN, % of nominal.
     widest, v2_limits, settled
         As in `gridsec.plant.Options`.
 
@@ -93,6 +96,7 @@ class SequentialOptions:
     hidden_charge: float = 5.0
     commission_s: float = 86400.0
     stability: float = 0.1
+    unread_std_percent: float = 0.5
     widest: float = 0.1
     v2_limits: tuple[float, float] = (0.25, 2.25)
     settled: float = 0.1
@@ -112,7 +116,7 @@ class SequentialOptions:
             ("like", 1.0 <= self.like < np.inf, "must be at least 1 and finite"),
             *(
                 (name, 0.0 <= getattr(self, name) < np.inf, zero)
-                for name in ("hidden_charge", "commission_s", "stability")
+                for name in ("hidden_charge", "commission_s", "stability", "unread_std_percent")
             ),
         ]
         refuse(

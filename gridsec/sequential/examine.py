@@ -81,7 +81,7 @@ def examine(design: SequentialDesign, state: SequentialState, model: Floats, hon
     wholes = list(state.wholes)
     found: dict[int, Found] = {}
     misfit = list(state.misfit)
-    scales = Scales(design, state.doubts, state.window, state.learned, model)
+    scales = Scales(design, state.doubts, state.window, state.learned, model, state.skew)
     for s, every in enumerate(design.every):
         before = fits[s]
         stale = before is None or (not trust.calm and any_of(before.trusted & ~trust.trusted))

@@ -15,11 +15,13 @@ import numpy as np
 from gridsec.arrays import Bools, Ints, all_of, any_of, indices
 from gridsec.network import Power
 from gridsec.online import Explanation
+from gridsec.sequential.apart import set_apart
+from gridsec.sequential.conditional import judge
 from gridsec.sequential.curves import Curves
 from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.examine import Examined
 from gridsec.sequential.exchanges import swaps, turns
-from gridsec.sequential.scales import View
+from gridsec.sequential.scales import Scales, View
 from gridsec.sequential.search import Found
 from gridsec.sequential.state import Trust
 
@@ -82,6 +84,30 @@ def name(
         inverters=inverters,
     )
     return trust, rivals
+
+
+def supported(scales: Scales, before: Trust, seen: Examined, trust: Trust) -> Trust:
+    """Only those newly named that are beyond their limits without the meters that withhold powers.
+
+    Parameters
+    ----------
+    scales
+        The scales of this tick.
+    before, seen, trust
+        From the last tick, what this tick brought, and what `name` made of it.
+    """
+    fresh, vouched = trust.named & ~before.named, scales.doubts.vouched
+    if all_of(vouched) or not any_of(fresh):
+        return trust
+    out = np.zeros_like(fresh)
+    for s, now in enumerate(seen.fits):
+        which = fresh & (trust.scale == s)
+        beside = None if now is None or not any_of(which) else set_apart(now, vouched[s])
+        if beside is not None:
+            here = scales[s]
+            judged = judge(beside.rest, here.m)
+            out |= which & (np.abs(judged.offset) <= here.limits.of(judged.std))
+    return replace(trust, named=trust.named & ~out) if any_of(out) else trust
 
 
 def _accused(seen: Examined, meters: int) -> Bools:

@@ -21,6 +21,7 @@ from gridsec.sequential.design import SequentialDesign
 from gridsec.sequential.dictionary import Dictionary
 from gridsec.sequential.doubts import Doubts
 from gridsec.sequential.search import Limits
+from gridsec.sequential.skew import Skew
 from gridsec.sequential.state import Trust
 from gridsec.sequential.windows import Window
 
@@ -114,18 +115,21 @@ class Scales:
         What is not known of powers, the last residuals, and what is known of the meters' errors.
     model : (p,)
         What the model may be off, squared pu.
+    skew
+        Changes of the voltages within clock offsets; None for none.
     """
 
-    def __init__(  # what every scale is made of
+    def __init__(  # noqa: PLR0917  # what every scale is made of
         self,
         design: SequentialDesign,
         doubts: Doubts,
         window: Window,
         learned: Learned,
         model: Floats,
+        skew: Skew | None = None,
     ) -> None:
         self.design, self.doubts, self.window, self.model = design, doubts, window, model
-        self.learned, self.made = learned, dict[int, Scale]()
+        self.learned, self.skew, self.made = learned, skew, dict[int, Scale]()
 
     @cached_property
     def book(self) -> Dictionary:
@@ -140,11 +144,14 @@ class Scales:
     def _scale(self, s: int) -> Scale:
         design, counts, learned = self.design, self.window.counts[s], self.learned
         need = needed(design, s)
+        noise, enough = design.white / need + learned.variance, counts >= need
+        if self.skew is not None:
+            noise, enough = noise + self.skew.variance[s], enough & ~self.skew.aside[s]
         return Scale(
             prior=self.doubts.priors[s],
-            noise=design.white / need + learned.variance,
+            noise=noise,
             m=self.window.sums[s] / np.maximum(counts, 1),
-            enough=counts >= need,
+            enough=enough,
             limits=Limits(
                 *(design.sigmas[s], self.model, learned.allowed, learned.variance, design.most, learned.late),
                 learned.recent[s],
@@ -174,7 +181,7 @@ class Scales:
         """
         each = {id(prior): prior.wider(direction) for prior in self.doubts.priors}
         doubts = replace(self.doubts, priors=tuple(each[id(prior)] for prior in self.doubts.priors))
-        return Scales(self.design, doubts, self.window, self.learned, self.model)
+        return Scales(self.design, doubts, self.window, self.learned, self.model, self.skew)
 
 
 def view_of(design: SequentialDesign, here: Scale, judged: Judged) -> View:

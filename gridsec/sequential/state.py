@@ -8,6 +8,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of
 from gridsec.online import Estimate, Frame, Verdict
+from gridsec.sequential.apart import Apart
 from gridsec.sequential.bounds import Lag
 from gridsec.sequential.bounds import start as no_lag
 from gridsec.sequential.busbar import Busbar
@@ -25,6 +26,7 @@ from gridsec.sequential.kinds import Kinds
 from gridsec.sequential.kinds import empty as no_kinds
 from gridsec.sequential.release import Released
 from gridsec.sequential.repeats import forget as forget_calm
+from gridsec.sequential.skew import Skew
 from gridsec.sequential.windows import Window, empty, forget
 
 
@@ -114,12 +116,16 @@ class SequentialState:
         What the trusted meters say on each scale; None where no meter can be judged yet.
     wholes : (s,)
         Fits of all that reported, or of more, from when they were trusted; None where none is kept.
+    apart : (s,)
+        Fits without the meters that withhold their customer's power; None where there is no such meter.
     misfit : (s,)
         Scales whose trusted meters were inconsistent at the last look, after the search.
     released
         What they say where the powers of the others are not believed; None where all are.
     doubts
         What the frames do not know.
+    skew
+        Changes of the voltages within clock offsets; None while no offset is measured.
     learning
         What was gathered of the meters' fixed errors; None once they are known.
     learned
@@ -149,9 +155,11 @@ class SequentialState:
     trust: Trust
     fits: tuple[Fit | None, ...]
     wholes: tuple[Fit | None, ...]
+    apart: tuple[Apart | None, ...]
     misfit: tuple[bool, ...]
     released: Released | None
     doubts: Doubts
+    skew: Skew | None
     learning: Learning | None
     learned: Learned
     model_error: Floats
@@ -213,9 +221,11 @@ def init(
         ),
         fits=(None,) * s,
         wholes=(None,) * s,
+        apart=(None,) * s,
         misfit=(False,) * s,
         released=None,
         doubts=no_doubts(design),
+        skew=None,
         learning=known.learning,
         learned=known.learned,
         model_error=np.zeros(p),

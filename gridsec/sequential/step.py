@@ -24,7 +24,9 @@ from gridsec.sequential.drive import Free, ahead, drive
 from gridsec.sequential.examine import Examined, ended, examine
 from gridsec.sequential.heard import Heard, clean, possible
 from gridsec.sequential.kinds import Kinds, describe, listen, repeated
-from gridsec.sequential.naming import name
+from gridsec.sequential.naming import name, supported
+from gridsec.sequential.scales import Scales, needed
+from gridsec.sequential.skew import follow as follow_clocks
 from gridsec.sequential.state import SequentialState, Trust
 from gridsec.sequential.windows import Window, empty, forget, push, shift
 from gridsec.values import changed
@@ -96,6 +98,7 @@ def _look(design: SequentialDesign, state: SequentialState, frame: Frame) -> _Lo
     copies = repeated(kinds) * (design.decoder is None)
     x, free, lag = _inverters(design, state, frame, heard, doubts.sizes)
     q, v2_bus = _voltages(design, frame, heard, x)
+    state = _clocks(design, state, frame, v2_bus[design.prior.meters])
     residual = heard.y - v2_bus[design.prior.meters] - state.learned.bias
     if state.x is not None and frame.t - state.t >= design.lengths[-1] * design.step_s:
         # After a pause as long as the longest scale loads are others: nothing is remembered.
@@ -110,6 +113,21 @@ def _look(design: SequentialDesign, state: SequentialState, frame: Frame) -> _Lo
     powers = Powers(frame, q, heard.told, heard.v0_squared, state.trust.trusted, doubts.sizes)
     seen = examine(design, now, state.model_error + transient, Honest(powers, lag.error))
     return _Look(state, heard, doubts, kinds, copies, x, free, lag, q, v2_bus, residual, transient, now, seen)
+
+
+def _clocks(design: SequentialDesign, state: SequentialState, frame: Frame, v2: Floats) -> SequentialState:
+    """The state with the voltages' changes within clock offsets, and without fits of other variances."""
+    before = state.skew
+    if before is None and frame.clock_offset is None:
+        return state
+    need = np.array([needed(design, s) for s in range(len(design.lengths))])
+    noise = design.white / need[:, None] + state.learned.variance
+    skew = follow_clocks(design, before, frame.clock_offset, v2, noise)
+    none = np.zeros(noise.shape)
+    old, new = (none if each is None else each.variance for each in (before, skew))
+    same = (old == new).all(axis=1).tolist()
+    fits = tuple(fit if one else None for fit, one in zip(state.fits, same, strict=True))
+    return changed(state, skew=skew, fits=fits)
 
 
 def _answer(design: SequentialDesign, look: _Look, frame: Frame) -> tuple[SequentialState, Estimate, Verdict]:
@@ -180,6 +198,9 @@ def _judge(
         return seen, now.window, ()
     over = ended(design, now.doubts.priors, now.trust, seen, now.window)
     trust, rivals = name(design, now.trust, _acquit(seen, over), look.heard.live, now.curves)
+    model = look.state.model_error + look.transient
+    scales = Scales(design, now.doubts, now.window, now.learned, model, now.skew)
+    trust = supported(scales, now.trust, seen, trust)
     trust = _distrust(trust, look.copies)
     rivals = rivals or _undecided(design, now.last, before, trust)
     seen = seen if trust is seen.trust else replace(seen, trust=trust)

@@ -58,6 +58,28 @@ def busbar_off(off: Floats, v0_squared: Floats, which: Bools) -> str:
     return f"reads {abs(worst):.1f} % {'more' if worst > 0 else 'less'} than the meters of the feeder say"
 
 
+def unread(names: tuple[str, ...], which: Bools, percent: Floats, limit: float) -> str:
+    """The customers whose power is missing and whose voltage is therefore not known well enough.
+
+    Parameters
+    ----------
+    names : (p,)
+        Customers of the meters.
+    which : (p,)
+        Meters in question.
+    percent : (p,)
+        Standard deviation of the voltage, % of nominal.
+    limit
+        Largest one that is allowed, % of nominal.
+    """
+    who = _list([name for name, one in zip(names, which, strict=True) if one])
+    worst = percent[which].max()
+    return (
+        f"No active power of the same moment from {who}: the voltage there is known to {worst:.2g} % "
+        f"(standard deviation), and `[monitor] unread_std_percent` allows {limit:g} %."
+    )
+
+
 # So many explanations, and so many names in each, are told in a sentence.
 _SHOWN = 5
 

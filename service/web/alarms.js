@@ -10,6 +10,7 @@ const KIND = {
   "data-loss": "Data loss",
   undecided: "Undecided",
   "learning-stalled": "Learning stalled",
+  "clock-offset": "Clock offset",
 };
 const LISTED = 5; // Meters of one alarm that its text names.
 const PAGE = 50;

@@ -119,7 +119,7 @@ def test_voltage_limit_needs_the_whole_interval(
 @pytest.mark.parametrize("cause", list(Cause))
 def test_voltage_limit_only_where_the_reconstruction_is_sound(cause: Cause) -> None:
     found = said(conditions(report(meter(v_volt_estimated=260.0), cause=cause)))
-    sound = cause in (Cause.AGREEMENT, Cause.RESIDUALS, Cause.SILENT_METERS)
+    sound = cause in (Cause.AGREEMENT, Cause.RESIDUALS, Cause.SILENT_METERS, Cause.MISSING_POWERS)
     assert found["voltage-limit", "m1"] is sound
 
 

@@ -7,6 +7,7 @@ import math
 import re
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -135,6 +136,7 @@ def test_json_is_plain_and_has_no_nan(site: Site) -> None:
     assert {i["judged"] for i in found["inverters"]} == {False}
     assert found["explanations"] == []
     wanted = {
+        "clock_offset_s",
         "kind",
         "learning_reason",
         "learning_state",
@@ -173,6 +175,37 @@ def test_snapshots_keep_the_order_of_the_meters(site: Site) -> None:
     frame = to_frame(site, found)
     assert frame.seen.tolist() == [k not in (0, 2) for k in range(13)]
     assert frame.v0_squared == pytest.approx(1.01**2)
+
+
+def test_snapshots_have_the_age_of_powers_with_a_time_of_their_own(site: Site) -> None:
+    now = tick(site, unseen=(2,))
+    assert snapshot(site, now).p_age_s is None
+    first = now.readings[0]
+    assert first is not None
+    late = msgspec.structs.replace(first, t_power=T - 60.0)
+    age = snapshot(site, replace(now, readings=(late, *now.readings[1:]))).p_age_s
+    assert age is not None
+    assert age[0] == 60.0
+    assert np.isnan(age[1:]).all()
+
+
+def test_a_withheld_power_is_a_reason_with_the_ids_of_meters(site: Site) -> None:
+    """Readings of voltages alone: undecided, and the sentence names the setting."""
+    watcher = design(site)
+    state, whole = watcher.init(T - 1.0), tick(site)
+    readings = tuple(r and msgspec.structs.replace(r, p_kw=math.nan) for r in whole.readings)
+    bare = replace(whole, readings=readings, silent=())
+    _, estimate, verdict = watcher.step(state, to_frame(site, snapshot(site, bare)))
+    verdict = replace(verdict, decision=Decision.UNDECIDED, cause=Cause.MISSING_POWERS)
+    if "unread_std_percent" not in verdict.reason:
+        names = ", ".join(site.feeder.customers[c] for c in site.meters[:2])
+        verdict = replace(
+            verdict, reason=f"No active power of the same moment from {names}: unread_std_percent."
+        )
+    report = build(site, bare, 2, estimate, verdict)
+    assert "m01" in report.reason
+    assert "unread_std_percent" in report.reason
+    assert not any(customer in report.reason for customer in site.feeder.customers)
 
 
 def test_kinds_inverters_and_a_standard_deviation_of_its_own(site: Site) -> None:

@@ -61,6 +61,24 @@ def test_powers_and_number_are_optional_and_unknown_fields_are_ignored() -> None
     assert decode(good(p_kw=None, q_kvar=None, seq=None)).readings
 
 
+def test_powers_may_have_a_time_of_their_own() -> None:
+    """In every format; without one they are of the moment of the voltage."""
+    (reading,) = decode(good(t_power=T - 60.0)).readings
+    assert reading.t_power == T - 60.0
+    assert math.isnan(decode(good()).readings[0].t_power)
+    for payload, encoding in (
+        (cbor2.dumps(columns() | {"t_power": [T - 5.0, None]}), "application/cbor"),
+        (arrow(columns() | {"t_power": [T - 5.0, None]}), STREAM),
+    ):
+        first, second = decode(payload, BATCH, encoding).readings
+        assert first.t_power == T - 5.0
+        assert math.isnan(second.t_power)
+    for wrong, reason in ((12.0, BadReason.VALUE), ("now", BadReason.TYPE), (1e13, BadReason.VALUE)):
+        found, problems = only_bad(decode(good(t_power=wrong)))
+        assert found is reason
+        assert "t_power" in problems[0]
+
+
 def test_the_busbar_has_no_meter_id() -> None:
     assert decode({"t": T, "v_volt": 233.0}, BUSBAR).readings[0].meter is None
 
@@ -305,7 +323,7 @@ VALUES = st.recursive(
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=4),
     max_leaves=8,
 )
-FIELDS = st.sampled_from(["t", "v_volt", "p_kw", "q_kvar", "seq", "meter", "x"])
+FIELDS = st.sampled_from(["t", "v_volt", "p_kw", "q_kvar", "seq", "meter", "t_power", "x"])
 
 
 def sound(decoded: Decoded) -> None:

@@ -1,0 +1,113 @@
+"""Readings of meters with a measured clock offset: of another moment than the model beside them.
+
+A meter with a clock that is o ahead reports at the tick t what it measured at t - o. Its residual is off by
+at most the change of its voltage meanwhile, by the model
+
+    c_j(t) = max over k = 1 .. K_j of |v2_j(t) - v2_j(t - k h)|,   K_j = ceil(|o_j| / h) + 1,
+
+h being the interval of the ticks. The mean over a scale is off by at most the mean of c_j, whose square is
+added to the variance of the meter's mean. Around a step of the busbar's voltage all these meters are off
+together, so a meter is not judged on scales shorter than `_OFFSETS` offsets, but for the longest scale.
+
+References
+----------
+docs/theory-sequential.md, section 3.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats, Ints, any_of
+from gridsec.sequential.design import SequentialDesign
+
+_OFFSETS = 4.0
+"""Shortest scale that judges a meter, in offsets of its clock."""
+_LITTLE = 0.1
+"""Variance of a change, as a part of that of a mean, below which it is left out."""
+_STEP = 4.0
+"""Ratio of two variances that are used alike: each other one is a new factorisation."""
+_LONGEST = 64
+"""Largest number of ticks over which changes are taken."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Skew:
+    """Changes of the voltages within the clock offsets. p meters, s scales.
+
+    Attributes
+    ----------
+    model : (k, p)
+        Squared voltages by the model at the last ticks, the newest last, pu.
+    moved : (longest, p)
+        c at the last ticks, the newest last, squared pu.
+    variance : (s, p)
+        Variance that is added to those of the means, squared pu^2, in powers of `_STEP`.
+    aside : (s, p)
+        Meters that a scale does not judge.
+    """
+
+    model: Floats
+    moved: Floats
+    variance: Floats
+    aside: Bools
+
+    def judged(self, counts: Ints, needed: Ints) -> Bools:
+        """Meters with enough readings on a scale that judges them, (p,).
+
+        Parameters
+        ----------
+        counts : (s, p)
+            Readings on each scale.
+        needed : (s,)
+            Readings that a scale judges a meter by at least.
+        """
+        enough = (counts >= needed[:, None]) & ~self.aside
+        return np.asarray(enough.any(axis=0) & self.aside.any(axis=0))
+
+
+def follow(
+    design: SequentialDesign, before: Skew | None, offset_s: Floats | None, v2: Floats, noise: Floats
+) -> Skew | None:
+    """Take in one tick; None while no offset is measured.
+
+    Parameters
+    ----------
+    design, before
+        The design, and the changes so far.
+    offset_s : (p,)
+        By how much each meter's clock is ahead, s; NaN where that is not measurable.
+    v2 : (p,)
+        Squared voltages by the model at the meters, pu.
+    noise : (s, p)
+        Variances of the means without offsets, squared pu^2.
+    """
+    if offset_s is None:
+        return None
+    size = np.abs(np.nan_to_num(offset_s))
+    if not any_of(size):
+        return None
+    lengths, step = np.array(design.lengths), design.step_s
+    ticks = np.where(size > 0.0, np.minimum(np.ceil(size / step) + 1.0, _LONGEST), 0.0)
+    old = np.zeros((0, v2.size)) if before is None else before.model
+    change = np.zeros(v2.size)
+    for k in range(1, min(int(ticks.max()), len(old)) + 1):
+        change = np.where(ticks >= k, np.maximum(change, np.abs(v2 - old[-k])), change)
+    moved = np.zeros((lengths[-1], v2.size)) if before is None else before.moved
+    moved = np.vstack([moved[1:], change])
+    mean = np.stack([moved[-length:].mean(axis=0) for length in lengths])
+    reach = np.minimum(_OFFSETS * size, lengths[-1] * step)
+    aside = lengths[:, None] * step < reach
+    kept = np.zeros_like(noise) if before is None else before.variance
+    return Skew(np.vstack([old, v2])[-_LONGEST:], moved, _variance(mean * mean, noise, kept), aside)
+
+
+def _variance(found: Floats, noise: Floats, before: Floats) -> Floats:
+    """The variances in powers of `_STEP`, with hysteresis."""
+    wanted = np.where(found > _LITTLE * noise, found, 0.0)
+    with np.errstate(divide="ignore"):
+        raised = _STEP ** np.ceil(np.log(np.where(wanted > 0.0, wanted, 1.0)) / np.log(_STEP))
+    keep = (wanted <= before) & (wanted * _STEP**2 >= before) & (wanted > 0.0)
+    return np.where(keep, before, np.where(wanted > 0.0, raised, 0.0))
