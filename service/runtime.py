@@ -28,7 +28,7 @@ from service.bus import Sample
 from service.commissioning import to_json as commissioning_json
 from service.errors import FeederFixed, TooManyFeeders
 from service.inbox import Inbox
-from service.keeper import Done, Publisher, at_once
+from service.keeper import Done, Publisher
 from service.report import FeederReport
 from service.rounds import Rounds, RuntimeConfig
 from service.store import OutcomeUnknown, Store, StoreUnavailable
@@ -85,24 +85,23 @@ class Runtime:
     ) -> None:
         self._wall, self._settled = wall, settled
         self._stopping = False
-        # Where the readings tell the time, nothing is late by waiting for the database.
-        waits = config.clock is Clock.EVENTS
         self._rounds = Rounds(
             config,
             store,
             sites,
             wall=wall,
             stored=lambda: self._in_loop(partial(self._notify, "alarm")),
-            apart=at_once if waits else self._write_apart,
+            apart=self._write_apart,
             unloaded=unloaded,
             go_on=lambda: not self._stopping,
         )
-        self._waits = waits
+        # Where the readings tell the time, samples wait for ticks and for the database.
+        self._waits = config.clock is Clock.EVENTS
         self._given = frozenset(self._rounds.watches) if given is None else frozenset(given)
         self._inbox = Inbox(
             lambda: self._in_loop(self._wake.set),
             max_samples=config.max_samples,
-            lossless=config.clock is Clock.EVENTS,
+            lossless=self._waits,
         )
         self._commands: deque[tuple[Callable[[], Future[Any]], asyncio.Future[Any]]] = deque()
         self._prepared: set[asyncio.Future[tuple[Site, Watcher]]] = set()
@@ -190,10 +189,11 @@ class Runtime:
         self._notify("stop")
 
     def _samples(self) -> list[Sample]:
-        """Take the samples of the next round; none while ticks of the last one wait."""
+        """Take the samples of the next round; where they wait, none before the last are judged and stored."""
         if not self._waits:
             return self._inbox.drain(len(self._inbox))
-        return [] if self._rounds.behind else self._inbox.drain(SAMPLES_PER_ROUND)
+        busy = self._rounds.behind or self._rounds.keeper.storing
+        return [] if busy else self._inbox.drain(SAMPLES_PER_ROUND)
 
     async def _pause(self) -> None:
         """Wait for samples, commands or the next tick."""
@@ -201,7 +201,7 @@ class Runtime:
         if self._stopping or self._outcomes or commands or self._rounds.behind:
             await asyncio.sleep(0)
             return
-        if len(self._inbox):
+        if len(self._inbox) and not (self._waits and self._rounds.keeper.storing):
             await asyncio.sleep(0.0 if self._waits else GATHER_S)
             return
         now = self._wall()
