@@ -15,8 +15,11 @@ import pytest
 import sqlalchemy as sa
 
 from feeders.load import Site, load
+from feeders.meters import BUSBAR
 from feeders.schema import to_json
 from service.alarms import AlarmState, acknowledged
+from service.rounds import Rounds
+from service.simulate import key_of
 from service.store import OutcomeUnknown, Rejected, Store, StoreUnavailable, connect
 from tests.service.asking import is_problem
 from tests.service.databases import Cluster
@@ -265,3 +268,32 @@ def test_a_feeder_is_put_and_deleted_around_a_freeze(cluster: Cluster, tmp_path:
         assert live.http.delete("/api/v1/feeders/other", timeout=60.0).status_code == 204
         time.sleep(2.0)
         assert {alarm["state"] for alarm in live.alarms(feeder="other")} == {str(AlarmState.CLEARED)}
+
+
+@pytest.mark.parametrize("clock", ["wall", "events"])
+def test_the_database_is_written_apart_from_judging(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, clock: str
+) -> None:
+    """Threads of judging and of writing differ with every clock, and what is judged is stored."""
+    judging, writing = set[str](), set[str]()
+    round_, commit = Rounds.round, Store.commit
+
+    def judged(self: Rounds, *given: Any) -> bool:
+        judging.add(threading.current_thread().name)
+        return round_(self, *given)
+
+    def stored(self: Store, *given: Any, **more: Any) -> tuple[int, ...]:
+        writing.add(threading.current_thread().name)
+        return commit(self, *given, **more)
+
+    monkeypatch.setattr(Rounds, "round", judged)
+    monkeypatch.setattr(Store, "commit", stored)
+    now = time.time()
+    with service(tmp_path, clock=clock) as live:
+        for k in range(6):
+            for meter in (*load(FEEDER).meter_ids, BUSBAR):
+                live.put(key_of(FEEDER, meter), {"t": now + k, "v_volt": 230.0})
+        until(lambda: live.get(f"/api/v1/feeders/{FEEDER}/history")["points"], "a stored tick")
+    assert judging
+    assert writing
+    assert not judging & writing
