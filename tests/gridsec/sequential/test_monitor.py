@@ -66,6 +66,23 @@ def watch(
     return state, answers
 
 
+def test_a_single_long_scale_answers_at_every_tick() -> None:
+    """Looks of the shortest scale come at every tick, whatever its length; before it is full it settles."""
+    rng = np.random.default_rng(3)
+    plant = make_plant(rng, customers=12, drop=0.04)
+    options = SequentialOptions(commission_s=0.0, scales_s=(60.0,))
+    design = sequential.design(plant, doubt=prepare(plant).doubt, step_s=1.0, options=options)
+    assert design.lengths == (60,)
+    street = Street(plant, rng)
+    state, answers = watch(street, design, 150)
+    decided = [verdict.decision is Decision.CLEAN for _, verdict in answers]
+    first = decided.index(True)
+    assert first <= 60
+    assert all(decided[first:])
+    _, answers = watch(street, design, 120, state=state, lies={2: 0.03})
+    assert np.flatnonzero(answers[-1][1].suspects).tolist() == [2]
+
+
 class TestHonestStreets:
     @settings(max_examples=15, deadline=None)
     @given(
