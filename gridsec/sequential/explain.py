@@ -331,8 +331,8 @@ class Search:
     def _alike_groups(self, best: Solution) -> Iterator[Explanation]:
         """Explanations in which one neighbourhood, or two, are off by one amount each.
 
-        Such a group is one hypothesis, not one for each of its meters: it costs ``2 ln(p M)`` for its centre
-        and its size of at most M meters, and ``2 ln binom(k, e)`` for e honest ones among its k. Its meters
+        Such a group is one hypothesis, not one for each of its meters: it costs ``2 ln(p K)`` for its centre
+        and its size of at most K meters, and ``2 ln binom(k, e)`` for e honest ones among its k. Its meters
         keep telling their differences.
         """
         if not self._about_to_be_named(best):
@@ -359,14 +359,15 @@ class Search:
         and without accused meters: one meter that differs from all around it stands against its street.
         """
         (at, Q), prior = every.trusting(), self.here.prior
-        largest = min(self.design.most, _STREET, at.size - 1)
+        # As many meters stay trusted as may be manipulated.
+        largest = min(at.size - self.design.most, _STREET, at.size - 1)
         if largest < 2:
             return []
         b, between, place = every.weights(self.here.m)[at], prior.among(at), prior.meters[at]
         std = np.sqrt(np.maximum(between.diagonal(), np.finfo(np.float64).tiny))
         whole, believed = np.ones(at.size, dtype=np.bool_), best.trusted[at]
         count = np.arange(1, largest + 1)
-        centre = 2.0 * np.log(at.size * self.design.most)
+        centre = 2.0 * np.log(at.size * largest)
         out: list[_Group] = []
         for j in np.argsort(-(b * b) / Q.diagonal())[:_SEEDS].tolist():
             # By correlation a stretch of a street comes first, by covariance all that is behind one bus.

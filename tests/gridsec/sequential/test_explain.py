@@ -177,7 +177,7 @@ def test_a_street_off_alike_is_a_rival_at_the_price_of_one_hypothesis() -> None:
         for one in hunt._neighbourhoods(hunt._fit(base), best)
         if set(group) == set(np.flatnonzero(one.meters))
     )
-    charge = 2.0 * float(np.log(count * FAR))
+    charge = 2.0 * float(np.log(count * (count - FAR)))
     assert first.charge == pytest.approx(charge)
     _, other = hunt._off_alike(best, base, [first])
     alike = np.where(np.isin(np.arange(count), group), 0.2, 0.0)
