@@ -90,11 +90,14 @@ class NotObservable(GridsecError):
         What they do determine: a rank, or the number of meters when counting is the obstacle.
     why
         The condition that fails, in words.
+    code
+        Code of the condition: lower case words joined by hyphens.
     """
 
-    def __init__(self, subset: Iterable[int], rank: int, why: str) -> None:
+    def __init__(self, subset: Iterable[int], rank: int, why: str, *, code: str = "not-observable") -> None:
         self.subset: tuple[int, ...] = tuple(subset)
         self.rank = rank
+        self.code = code
         super().__init__(why)
 
 
@@ -109,12 +112,17 @@ class DesignInfeasible(GridsecError):
         What the solver said, or which check failed. A solver's word is never proof by itself.
     margin
         The recomputed margin of the failed condition (negative: violated), if there is one.
+    code
+        Code of the reason: lower case words joined by hyphens.
     """
 
-    def __init__(self, what: str, status: str, margin: float | None = None) -> None:
+    def __init__(
+        self, what: str, status: str, margin: float | None = None, *, code: str = "design-infeasible"
+    ) -> None:
         self.what = what
         self.status = status
         self.margin = margin
+        self.code = code
         tail = "" if margin is None else f", margin {margin:.3g}"
         super().__init__(f"{what}: {status}{tail}")
 
