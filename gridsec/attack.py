@@ -469,7 +469,7 @@ def _check_meters(meters: Ints, t_on: float, t_off: float, *, what: str = "meter
         raise InputInvalid(
             [
                 Problem(
-                    "duplicate",
+                    "duplicate" if np.all(meters >= 0) else "unknown-index",
                     f"{what} of an attack must be different indices from 0, got {meters.tolist()}",
                 )
             ]

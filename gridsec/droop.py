@@ -430,7 +430,7 @@ def fleet(
         raise FeederInvalid(
             [
                 Problem(
-                    "unknown-name",
+                    "missing" if capability == "circular" else "unknown-name",
                     f"capability {capability!r} must be 'fixed', or 'circular' together with p_gen",
                 )
             ]
