@@ -138,7 +138,7 @@ def _problems(feeder: PhasedMesh) -> list[Problem]:
             elif (here & ~tree.phases[end]).any():
                 out.append(
                     Problem(
-                        "phases",
+                        "absent-phase",
                         f"{where}: phases {named(here)!r} but the other lines bring only "
                         f"{named(tree.phases[end])!r} to {tree.buses[end]!r}",
                     )
@@ -146,7 +146,7 @@ def _problems(feeder: PhasedMesh) -> list[Problem]:
         if one == other:
             out.append(Problem("self-loop", f"{where}: both ends are bus {one}; a line needs two"))
         if not here.any():
-            out.append(Problem("phases", f"{where}: it has no phase; expected one, two or three"))
+            out.append(Problem("no-phase", f"{where}: it has no phase; expected one, two or three"))
         lines = line_problems(feeder.z[k], feeder.charging[k], here)
         out.extend(Problem(problem.code, f"{where}: {problem}") for problem in lines)
     return out

@@ -188,11 +188,11 @@ def _branch_problems(feeder: ThreePhaseFeeder) -> list[Problem]:
             continue
         here, there = feeder.phases[k + 1], feeder.phases[above]
         if not here.any():
-            out.append(Problem("phases", f"{where}: it has no phase; expected one, two or three"))
+            out.append(Problem("no-phase", f"{where}: it has no phase; expected one, two or three"))
         elif (here & ~there).any():
             out.append(
                 Problem(
-                    "phases",
+                    "absent-phase",
                     f"{where}: phases {named(here)!r} but only {named(there)!r} "
                     f"arrive at {feeder.buses[above]!r}",
                 )
@@ -227,7 +227,7 @@ def _block_problems(block: Phasors | Floats, here: Bools) -> list[Problem]:
         return [Problem("not-finite", "is not finite")]
     out = []
     if block[~here].any() or block[:, ~here].any():
-        out.append(Problem("phases", "is not 0 on a phase that is absent"))
+        out.append(Problem("absent-phase", "is not 0 on a phase that is absent"))
     if np.abs(block - block.T).max() > _ROUNDING * np.abs(block).max():
         out.append(Problem("not-symmetric", "is not symmetric; lines and cables are reciprocal"))
     return out
@@ -258,11 +258,11 @@ def _customer_problems(feeder: ThreePhaseFeeder) -> list[Problem]:
                 Problem("unknown-index", f"customer {name!r}: bus {bus} does not exist; expected 0 to {last}")
             )
         elif not wanted.any():
-            out.append(Problem("phases", f"customer {name!r}: is connected to no phase"))
+            out.append(Problem("no-phase", f"customer {name!r}: is connected to no phase"))
         elif (wanted & ~feeder.phases[bus]).any():
             out.append(
                 Problem(
-                    "phases",
+                    "absent-phase",
                     f"customer {name!r}: phases {named(wanted)!r} but bus {feeder.buses[bus]!r} has only "
                     f"{named(feeder.phases[bus])!r}",
                 )

@@ -53,7 +53,7 @@ class PhasedFeeder(OnTree):
             raise FeederInvalid(
                 [
                     Problem(
-                        "phases",
+                        "several-phases",
                         f"customer {tree.customers[k]!r} has several phases; expected one customer for each",
                     )
                     for k in np.flatnonzero(several).tolist()

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import gridsec
-from gridsec import bank
+from gridsec import bank, monitor
 from gridsec.arrays import not_negative
 from gridsec.attack import Bias, Replay, Stuck, coordinate
 from gridsec.certificates import certify
@@ -26,6 +26,7 @@ from gridsec.errors import DesignInfeasible, FeederInvalid, InputInvalid, NotObs
 from gridsec.families import windowed
 from gridsec.feeder import Feeder, loss_correction
 from gridsec.gains import refuse_blind
+from gridsec.lmi import options_for
 from gridsec.lmi.discrete import discrete_contraction
 from gridsec.lmi.pursuit import group_pursuit
 from gridsec.lmi.sampled import DiscreteLure
@@ -38,14 +39,16 @@ from gridsec.observers.high_gain.inverse import check, corners_and_interior
 from gridsec.observers.high_gain.symbolic import decompose
 from gridsec.observers.unknown_input import exact
 from gridsec.papers import uniformly_observable, yang2021
-from gridsec.phases import ThreePhaseFeeder
+from gridsec.phases import PhasedFeeder, ThreePhaseFeeder
+from gridsec.plant import Options
+from gridsec.sequential import LoadDoubt, SequentialOptions
 from gridsec.studies.droop_stability import Update
 from gridsec.studies.protect import fewest_protected
 from gridsec.subsets import subsets
 from tests.codes import codes_of
 from tests.gridsec.plants import line
 from tests.gridsec.radial import random_feeder
-from tests.gridsec.street import make_plant
+from tests.gridsec.street import accuracy, make_plant
 from tests.gridsec.unbalanced import random_three_phase
 
 PACKAGE = Path(gridsec.__file__).parent
@@ -139,6 +142,19 @@ def changed_block(row: int, column: int, value: float) -> Any:
     return z
 
 
+def broken_feeder() -> Feeder:
+    good = random_feeder(7, customers=3)
+    r = np.array([-1.0, *good.r[1:]])
+    return replace(good, r=r, bus=np.array([0, 99, -1]), base_kva=0.0, customers=("a", "a", "b"))
+
+
+def broken_fleet() -> Droop:
+    v, q = np.array([[0.9, 0.98, 1.02, 1.1]] * 3), np.array([[0.1, 0.0, 0.0, -0.1]] * 3)
+    v[1] = v[1, ::-1]
+    q[2, 0] = np.inf
+    return Droop(np.arange(3), v, q, np.array([0.0, 1.0, -1.0]))
+
+
 def late_parent() -> Feeder:
     feeder = random_feeder(3)
     return replace(feeder, parent=np.array([*feeder.parent[:-1], feeder.parent.size]))
@@ -149,6 +165,15 @@ def foreign_gains() -> Any:
     lure = line(3).lure
     given = bank.direct_gains(lure, subsets(3, 1, most=1000).masks())
     return bank.design(lure, 1, gains=replace(given, K=np.ones_like(given.K)))
+
+
+def absent_phase() -> Any:
+    """Self-impedance of a phase that a line of a single phase lacks."""
+    feeder = random_three_phase(1, charging=0.0)
+    k, phase = np.argwhere(~feeder.phases[1:])[0]
+    z = feeder.z.copy()
+    z[k, phase, phase] = 0.1
+    return replace(feeder, z=z)
 
 
 def rising() -> Droop:
@@ -222,6 +247,8 @@ CALLS: dict[str, Callable[[], Any]] = {
     "customer on no phase": lambda: three_phases(
         connected=np.zeros_like(random_three_phase(1, charging=0.0).connected)
     ),
+    "customer on three phases": lambda: PhasedFeeder(random_three_phase(1, charging=0.0)),
+    "impedance of an absent phase": absent_phase,
     "observable on one side": lambda: symbolic("half"),
     "tie from a bus to itself": lambda: MeshedFeeder(
         random_feeder(3), np.array([[1, 1]]), np.ones(1), np.ones(1), np.zeros(1)
@@ -246,6 +273,26 @@ CALLS: dict[str, Callable[[], Any]] = {
     "slopes above zero": lambda: discrete_contraction(sampled(0.5, lower=0.5), decays=0.9),
     "line without impedance": lambda: MeshedFeeder(
         random_feeder(3), np.array([[0, 1]]), np.zeros(1), np.zeros(1), np.zeros(1)
+    ),
+    "plant and numbers of a monitor": lambda: monitor.design(
+        street(meters=np.array([-1, 3, 3])), max_attacked=-1, step_s=0.0
+    ),
+    "options of a monitor": lambda: Options(
+        np.nan, confirm=0, release=0, settled=0.0, tie=-1.0, widest=np.nan, v2_limits=(2.0, 1.0)
+    ),
+    "options of the sequential monitor": lambda: SequentialOptions(
+        alarms_per_year=0.0, scales_s=(np.nan,), enough=0.0, several=-1, release=0, suspect=1.0, like=0.5
+    ),
+    "uncertainty of loads": lambda: LoadDoubt(
+        np.array([-1.0]), np.array([np.nan]), 0.0, common_p=2.0, common_q=-1.0
+    ),
+    "accuracy of meters": lambda: replace(
+        accuracy(2), class_fraction=np.array([np.nan, 0.0]), resolution=-np.ones(3), busbar_class=-1.0
+    ),
+    "radial feeder": broken_feeder,
+    "fleet of three": broken_fleet,
+    "options of a matrix inequality": lambda: options_for(
+        line(3).lure, rate=0.0, noise=-1.0, load=np.full(3, np.inf), floor=1.0
     ),
     "row of zeros": lambda: linear(np.eye(2), np.ones((2, 1)), np.diag([1.0, 0.0]), np.ones(2)),
 }

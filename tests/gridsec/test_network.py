@@ -139,5 +139,5 @@ def test_what_is_refused() -> None:
     several = next(
         tree for tree in map(random_three_phase, range(100)) if (tree.connected.sum(axis=1) > 1).any()
     )
-    with refused(FeederInvalid, "phases"):
+    with refused(FeederInvalid, "several-phases"):
         PhasedFeeder(several)

@@ -252,7 +252,7 @@ def test_every_problem_is_named() -> None:
         FeederInvalid,
         "unknown-index",
         "self-loop",
-        "phases",
+        "no-phase",
         "zero-impedance",
         "not-symmetric",
         "not-definite",
@@ -267,7 +267,7 @@ def test_every_problem_is_named() -> None:
     )
     far = int(np.flatnonzero(~lateral.phases.all(axis=1))[0])
     block = 0.01 * np.eye(3, dtype=complex)[None]
-    with refused(FeederInvalid, "phases"):
+    with refused(FeederInvalid, "absent-phase"):
         PhasedMesh(lateral, np.array([[0, far]]), np.ones((1, 3), dtype=bool), block, np.zeros((1, 3, 3)))
     # Two reactances that cancel around a loop are no lines.
     with refused(FeederInvalid, "singular"):
