@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gridsec.arrays import Floats, Ints, frozen
-from gridsec.errors import refuse
+from gridsec.errors import Problem, refuse
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,13 +57,15 @@ class MeterAccuracy:
             value = frozen(getattr(self, name))
             object.__setattr__(self, name, value)
             if value.ndim != 1 or value.shape != p:
-                problems.append(f"{name} must have one entry per meter, got shape {value.shape}")
+                problems.append(
+                    Problem("shape", f"{name} must have one entry per meter, got shape {value.shape}")
+                )
             if not (np.isfinite(value).all() and (value >= 0).all()):
-                problems.append(f"{name} must be finite and not negative")
+                problems.append(Problem("negative", f"{name} must be finite and not negative"))
         for name in ("busbar_class", "busbar_resolution", "busbar_jitter"):
             number = float(getattr(self, name))
             if not (np.isfinite(number) and number >= 0):
-                problems.append(f"{name} must be finite and not negative, got {number}")
+                problems.append(Problem("negative", f"{name} must be finite and not negative, got {number}"))
         refuse(problems)
 
 

@@ -8,6 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from gridsec.errors import InputInvalid, Problem
+
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.intp]
@@ -76,7 +78,9 @@ def not_negative(name: str, values: Floats | float) -> Floats:
     out = np.asarray(values, dtype=np.float64)
     wrong = out[~(out >= 0.0)]
     if wrong.size:
-        raise ValueError(f"{name} is {wrong[0]}; it must be a number that is not negative")
+        raise InputInvalid(
+            [Problem("negative", f"{name} is {wrong[0]}; it must be a number that is not negative")]
+        )
     return out
 
 

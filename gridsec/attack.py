@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridsec.arrays import Bools, Floats, Ints
+from gridsec.errors import InputInvalid, Problem
 
 Past: TypeAlias = Callable[[Floats], Floats]
 """Honest reports of all p meters at earlier times: (T,) s -> (T, p) pu."""
@@ -124,7 +125,9 @@ class Drift(_Attack):
         _check_meters(self.meters, self.t_on, self.t_off)
         _check_per_meter(self.meters, rate=self.rate, limit=self.limit)
         if np.any(self.limit < 0.0):
-            raise ValueError("limit of a drift is a magnitude and cannot be negative")
+            raise InputInvalid(
+                [Problem("negative", "limit of a drift is a magnitude and cannot be negative")]
+            )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -152,7 +155,9 @@ class Replay(_Attack):
     def __post_init__(self) -> None:
         _check_meters(self.meters, self.t_on, self.t_off)
         if not self.delay_s > 0.0:
-            raise ValueError(f"a replay needs a positive delay, got {self.delay_s}")
+            raise InputInvalid(
+                [Problem("not-positive", f"a replay needs a positive delay, got {self.delay_s}")]
+            )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -183,9 +188,11 @@ class Random(_Attack):
         _check_meters(self.meters, self.t_on, self.t_off)
         _check_per_meter(self.meters, low=self.low, high=self.high)
         if np.any(self.low < 0.0) or np.any(self.high < self.low):
-            raise ValueError("a random attack needs 0 <= low <= high for every meter")
+            raise InputInvalid([Problem("order", "a random attack needs 0 <= low <= high for every meter")])
         if not self.hold_s > 0.0:
-            raise ValueError(f"a random attack needs a positive hold time, got {self.hold_s}")
+            raise InputInvalid(
+                [Problem("not-positive", f"a random attack needs a positive hold time, got {self.hold_s}")]
+            )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -245,8 +252,13 @@ class InverterAttack:
     def __post_init__(self) -> None:
         _check_meters(self.inverters, self.t_on, self.t_off, what="inverters")
         if self.q.shape != self.inverters.shape or not np.all(np.isfinite(self.q)):
-            raise ValueError(
-                f"q has shape {self.q.shape} or is not finite; one number per inverter is needed"
+            raise InputInvalid(
+                [
+                    Problem(
+                        "shape",
+                        f"q has shape {self.q.shape} or is not finite; one number per inverter is needed",
+                    )
+                ]
             )
 
 
@@ -366,7 +378,7 @@ def most_affected(pattern: Floats, count: int) -> Ints:
         If there are fewer entries than that, or none is asked for.
     """
     if not 0 < count <= pattern.size:
-        raise ValueError(f"cannot choose {count} of {pattern.size} meters")
+        raise InputInvalid([Problem("out-of-range", f"cannot choose {count} of {pattern.size} meters")])
     order = np.argsort(-np.abs(pattern), kind="stable")
     return np.sort(order[:count])
 
@@ -395,7 +407,7 @@ def coordinate(pattern: Floats, meters: Ints, size: float) -> float:
     """
     weakest = float(np.min(np.abs(pattern[meters])))
     if not weakest > 0.0:
-        raise ValueError("a chosen meter does not feel the fake load at all")
+        raise InputInvalid([Problem("no-effect", "a chosen meter does not feel the fake load at all")])
     return size / weakest
 
 
@@ -450,16 +462,29 @@ def _scramble(bits: _Bits) -> _Bits:
 
 def _check_meters(meters: Ints, t_on: float, t_off: float, *, what: str = "meters") -> None:
     if meters.ndim != 1 or meters.size == 0:
-        raise ValueError(f"an attack needs a one-dimensional, non-empty array of {what}")
+        raise InputInvalid(
+            [Problem("shape", f"an attack needs a one-dimensional, non-empty array of {what}")]
+        )
     if np.unique(meters).size != meters.size or np.any(meters < 0):
-        raise ValueError(f"{what} of an attack must be different indices from 0, got {meters.tolist()}")
+        raise InputInvalid(
+            [
+                Problem(
+                    "duplicate" if np.all(meters >= 0) else "unknown-index",
+                    f"{what} of an attack must be different indices from 0, got {meters.tolist()}",
+                )
+            ]
+        )
     if not t_on < t_off:
-        raise ValueError(f"an attack must begin before it ends, got t_on={t_on} and t_off={t_off}")
+        raise InputInvalid(
+            [Problem("order", f"an attack must begin before it ends, got t_on={t_on} and t_off={t_off}")]
+        )
 
 
 def _check_per_meter(meters: Ints, **values: Floats) -> None:
     for name, value in values.items():
         if value.shape != meters.shape:
-            raise ValueError(f"{name} has shape {value.shape}, but there are {meters.size} meters")
+            raise InputInvalid(
+                [Problem("shape", f"{name} has shape {value.shape}, but there are {meters.size} meters")]
+            )
         if not np.all(np.isfinite(value)):
-            raise ValueError(f"{name} must be finite")
+            raise InputInvalid([Problem("not-finite", f"{name} must be finite")])

@@ -20,7 +20,7 @@ import numpy as np
 from gridsec import slot_steps, slots, stacked
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.choices import no_choice
-from gridsec.errors import DesignInfeasible, refuse
+from gridsec.errors import DesignInfeasible, InputInvalid, Problem, refuse
 from gridsec.gains import CircleOptions
 from gridsec.gains import stacked as in_one
 from gridsec.lmi.circle_criterion import solve_many
@@ -178,14 +178,19 @@ def _check_gains(lure: Lure, masks: Bools, gains: Gains) -> None:
     o, p = masks.shape
     n, m = lure.A.shape[0], lure.slope.size
     if gains.L.shape != (o, n, p) or gains.K.shape != (o, m, p):
-        raise ValueError(
-            f"gains have shapes {gains.L.shape}, {gains.K.shape}; expected {(o, n, p)}, {(o, m, p)}"
+        raise InputInvalid(
+            [
+                Problem(
+                    "shape",
+                    f"gains have shapes {gains.L.shape}, {gains.K.shape}; expected {(o, n, p)}, {(o, m, p)}",
+                )
+            ]
         )
     if not (np.isfinite(gains.L).all() and np.isfinite(gains.K).all()):
-        raise ValueError("gains must be finite")
+        raise InputInvalid([Problem("not-finite", "gains must be finite")])
     outside = ~masks[:, None, :]
     if (gains.L * outside).any() or (gains.K * outside).any():
-        raise ValueError("an observer has gains from a meter outside its set")
+        raise InputInvalid([Problem("wrong-design", "an observer has gains from a meter outside its set")])
     deaf = ~(gains.L.any(axis=(1, 2)) | gains.K.any(axis=(1, 2)))
     # A set whose meters sit at no inverter has nothing to inject into; its silence is no degeneracy.
     reach = (direct_gains(lure, masks).K != 0).any(axis=(1, 2))
@@ -194,6 +199,7 @@ def _check_gains(lure: Lure, masks: Bools, gains: Gains) -> None:
             "observer bank",
             f"{np.count_nonzero(deaf & reach)} of {o} observers have L = K = 0: they converge because the "
             "plant does, listen to no meter, agree with each other under any attack, and so detect nothing",
+            code="degenerate",
         )
 
 
@@ -269,13 +275,13 @@ def step(  # noqa: PLR0917  # design and state, then the four inputs that every 
 
 def _structure(bank: Bank) -> tuple[slots.Layout, slots.Plan]:
     if bank.layout is None or bank.base is None:
-        raise ValueError("this state belongs to a bank with direct injection")
+        raise InputInvalid([Problem("wrong-design", "this state belongs to a bank with direct injection")])
     return bank.layout, bank.base
 
 
 def _gains(bank: Bank) -> Gains:
     if bank.gains is None:
-        raise ValueError("this state belongs to a bank with stacked gains")
+        raise InputInvalid([Problem("wrong-design", "this state belongs to a bank with stacked gains")])
     return bank.gains
 
 

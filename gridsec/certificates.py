@@ -119,6 +119,7 @@ def reactance(lure: Lure) -> Certificate:
             "reactance certificate S T^-1 + T^-1 S > 0",
             "the error can grow in this norm: time constants too far apart, or S too far from symmetric",
             best * float(np.max(form.tau)),
+            code="unstable",
         )
     status = "closed form; S + kappa / D with the best of the shares"
     return quadratic(lure, chosen, multiplier, (1.0 - BACKOFF) * best, kind="reactance", status=status)
@@ -153,7 +154,9 @@ def small_gain(lure: Lure) -> Certificate:
     best = float(np.min(np.linalg.eigvals(comparison).real))
     if not best > 0:
         worst = best * float(np.max(tau))
-        raise DesignInfeasible("small-gain certificate rho(D |S|) < 1", "the loop gain is too large", worst)
+        raise DesignInfeasible(
+            "small-gain certificate rho(D |S|) < 1", "the loop gain is too large", worst, code="unstable"
+        )
     rate = (1.0 - WEIGHT_BACKOFF) * best
     weights = np.asarray(np.linalg.solve(comparison - rate * np.eye(tau.size), 1.0 / tau), dtype=np.float64)
     weights /= np.max(weights)
@@ -222,7 +225,9 @@ def certify(lure: Lure) -> Certificate:
             failed.append(error)
     if not found:
         best = max((error.margin for error in failed if error.margin is not None), default=None)
-        raise DesignInfeasible("closed-form certificate", "; ".join(map(str, failed)), best)
+        raise DesignInfeasible(
+            "closed-form certificate", "; ".join(map(str, failed)), best, code="no-certificate"
+        )
     return max(found, key=lambda certificate: certificate.rate)
 
 
@@ -262,7 +267,9 @@ def verify(certificate: Certificate, lure: Lure, trusted: Bools | None = None) -
     shaped = P.shape == (count, count) and multiplier.shape == (count,)
     if certificate.kind in {"reactance", "lmi"} and shaped:
         return _quadratic_margin(P, multiplier, certificate.rate, form)
-    raise DesignInfeasible(f"{certificate.kind} certificate", "its numbers do not fit the system")
+    raise DesignInfeasible(
+        f"{certificate.kind} certificate", "its numbers do not fit the system", code="wrong-form"
+    )
 
 
 def feeds(lure: Readout) -> Bools:
@@ -408,7 +415,7 @@ def _droop_form(lure: Lure, what: str) -> _Form:
     # Arrays of different shapes are not equal.
     fits = np.array_equal(lure.G, -lure.A) and np.array_equal(lure.A, np.diag(own)) and np.all(own < 0)
     if not fits or np.any(lure.B):
-        raise DesignInfeasible(what, "the system is not T x' = -x + phi(H x + F u)")
+        raise DesignInfeasible(what, "the system is not T x' = -x + phi(H x + F u)", code="wrong-form")
     return _Form(-1.0 / own, -lure.H, lure.slope)
 
 
@@ -495,6 +502,9 @@ def _checked(certificate: Certificate) -> Certificate:
     """The certificate, if its margin is positive."""
     if not certificate.margin > 0:
         raise DesignInfeasible(
-            f"{certificate.kind} certificate", "it fails its verification", certificate.margin
+            f"{certificate.kind} certificate",
+            "it fails its verification",
+            certificate.margin,
+            code="not-verified",
         )
     return certificate

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from enum import StrEnum
 from typing import TypeVar
 
-from gridsec.errors import refuse
+from gridsec.errors import Problem, refuse
 
 __all__ = ["choice", "each_choice", "no_choice"]
 
@@ -25,7 +25,9 @@ def no_choice(name: str, kind: Iterable[str], *values: str) -> list[str]:
     """
     known = tuple(kind)
     return [
-        f"{name} is {value!r}; expected one of {', '.join(known)}" for value in values if value not in known
+        Problem("unknown-name", f"{name} is {value!r}; expected one of {', '.join(known)}")
+        for value in values
+        if value not in known
     ]
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridsec.arrays import frozen, frozen_ints
-from gridsec.errors import DesignInfeasible
+from gridsec.errors import DesignInfeasible, InputInvalid, Problem
 from gridsec.gains import CircleGains, CircleOptions, margin, refuse_blind, sensitivity
 from gridsec.lmi import BACKOFF, solve_many
 from gridsec.lure import Lure
@@ -101,18 +101,20 @@ def from_bytes(blob: bytes) -> tuple[CircleGains, ...]:
     """
     digest, content = blob[:_DIGEST], blob[_DIGEST:]
     if hashlib.sha256(content).digest() != digest:
-        raise DesignInfeasible("stored design", "cannot be read: damaged, the digest does not fit")
+        raise DesignInfeasible(
+            "stored design", "cannot be read: damaged, the digest does not fit", code="unreadable"
+        )
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
         return _unpack(arrays)
     except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as damage:
-        raise DesignInfeasible("stored design", f"cannot be read: {damage}") from damage
+        raise DesignInfeasible("stored design", f"cannot be read: {damage}", code="unreadable") from damage
 
 
 def _unpack(arrays: _Arrays) -> tuple[CircleGains, ...]:
     if str(arrays["format"]) != _FORMAT:
-        raise ValueError(f"unknown format {arrays['format']!s}")
+        raise InputInvalid([Problem("unreadable", f"unknown format {arrays['format']!s}")])
     load, weight = frozen(arrays["load"]), frozen(arrays["weight"])
     taken = dict.fromkeys(np.unique(arrays["sizes"]).tolist(), 0)
     out = []
@@ -198,21 +200,21 @@ def _proven(
     what = "stored design"
     wanted = [tuple(int(j) for j in subset) for subset in subsets]
     if [tuple(one.J.tolist()) for one in stored] != wanted:
-        raise DesignInfeasible(what, "made for other sets of meters")
+        raise DesignInfeasible(what, "made for other sets of meters", code="wrong-design")
     out = []
     for one in stored:
         shapes = (one.L.shape, one.K.shape, one.P.shape, one.Lambda.shape, one.load.shape)
         n, m, k = len(lure.A), len(lure.slope), len(one.J)
         if shapes != ((n, k), (m, k), (n, n), (m,), options.load.shape):
-            raise DesignInfeasible(what, "made for a plant of another size")
+            raise DesignInfeasible(what, "made for a plant of another size", code="wrong-design")
         # A relaxed rate is part of a design; anything beyond the stated back-off is damage.
         honest = (1.0 - BACKOFF[-1]) * options.rate <= one.alpha <= options.rate * (1.0 + 1e-12)
         same = np.array_equal(one.noise, options.noise[one.J]) and np.array_equal(one.load, options.load)
         if not (honest and same):
-            raise DesignInfeasible(what, f"{one.J.tolist()} was made for other options")
+            raise DesignInfeasible(what, f"{one.J.tolist()} was made for other options", code="wrong-design")
         found = margin(lure, one.J, one)
         if not found > 0.0:
-            raise DesignInfeasible(what, f"{one.J.tolist()} does not hold", found)
+            raise DesignInfeasible(what, f"{one.J.tolist()} does not hold", found, code="not-verified")
         heard = sensitivity(lure, one.L, one.K)
         refuse_blind(one.J, heard)
         out.append(replace(one, margin=found, sensitivity=frozen(heard)))

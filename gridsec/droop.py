@@ -20,7 +20,7 @@ from math import log
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints
-from gridsec.errors import FeederInvalid
+from gridsec.errors import FeederInvalid, Problem
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -215,7 +215,7 @@ def _ramps(z: Floats, q: Floats) -> tuple[list[_Ramp], Floats]:
     return ramps, q[:, 2]
 
 
-def _problems(droop: Droop) -> list[str]:
+def _problems(droop: Droop) -> list[Problem]:
     """Every reason why the fields of `droop` do not describe a fleet."""
     count = droop.customer.size
     shapes = (
@@ -224,22 +224,25 @@ def _problems(droop: Droop) -> list[str]:
         ("tau", droop.tau.shape, (count,)),
         ("rating", droop.rating.shape, (count,)),
     )
-    out = [f"droop: {what} has shape {has}; expected {wants}" for what, has, wants in shapes if has != wants]
+    out = [
+        Problem("shape", f"droop: {what} has shape {has}; expected {wants}")
+        for what, has, wants in shapes
+        if has != wants
+    ]
     if out:
         return out
     if not (np.isfinite(droop.vbar) and droop.vbar > 0):
-        out.append(f"droop: vbar is {droop.vbar}; it must be a positive number")
+        out.append(Problem("not-positive", f"droop: vbar is {droop.vbar}; it must be a positive number"))
     for wrong, text in _row_problems(droop):
-        out.extend(
-            f"inverter {i}: {text}; v {droop.v[i].tolist()}, q {droop.q[i].tolist()}, tau {droop.tau[i]} s"
-            for i in np.flatnonzero(wrong)
-        )
+        for i in np.flatnonzero(wrong):
+            given = f"v {droop.v[i].tolist()}, q {droop.q[i].tolist()}, tau {droop.tau[i]} s"
+            out.append(Problem(text.code, f"inverter {i}: {text}; {given}"))
     if np.any(droop.customer < 0):
-        out.append("droop: a customer index is negative")
+        out.append(Problem("unknown-index", "droop: a customer index is negative"))
     return out
 
 
-def _row_problems(droop: Droop) -> tuple[tuple[Bools, str], ...]:
+def _row_problems(droop: Droop) -> tuple[tuple[Bools, Problem], ...]:
     """Which inverters' breakpoints, time constants or ratings are wrong, and why."""
     v, q, tau = droop.v, droop.q, droop.tau
     most = np.abs(q).max(axis=1, initial=0.0)
@@ -248,12 +251,24 @@ def _row_problems(droop: Droop) -> tuple[tuple[Bools, str], ...]:
     steps = np.diff(np.where(finite[:, None], v, 1.0), axis=1)
     falls = np.diff(np.where(finite[:, None], q, 0.0), axis=1)
     return (
-        (~finite, "breakpoints must be finite"),
-        (finite & ((v[:, 0] <= 0) | np.any(steps < 0, axis=1)), "voltages must be positive and ascending"),
-        (np.any(falls > 0, axis=1), "reactive power must not increase with the voltage"),
-        (np.any((steps == 0) & (falls < 0), axis=1), "reactive power jumps where two voltages are equal"),
-        (~(np.isfinite(tau) & (tau > 0)), "time constant must be positive"),
-        (finite & ~(droop.rating >= most), "the curve asks for more than the rating"),
+        (~finite, Problem("not-finite", "breakpoints must be finite")),
+        (
+            finite & ((v[:, 0] <= 0) | np.any(steps < 0, axis=1)),
+            Problem("order", "voltages must be positive and ascending"),
+        ),
+        (
+            np.any(falls > 0, axis=1),
+            Problem("not-monotone", "reactive power must not increase with the voltage"),
+        ),
+        (
+            np.any((steps == 0) & (falls < 0), axis=1),
+            Problem("not-monotone", "reactive power jumps where two voltages are equal"),
+        ),
+        (~(np.isfinite(tau) & (tau > 0)), Problem("not-positive", "time constant must be positive")),
+        (
+            finite & ~(droop.rating >= most),
+            Problem("above-rating", "the curve asks for more than the rating"),
+        ),
     )
 
 
@@ -341,7 +356,9 @@ def preset(name: str) -> DroopCurve:
     for curve in _CURVES:
         if curve.name == name:
             return curve
-    raise FeederInvalid([f"droop preset {name!r} does not exist; there are {', '.join(PRESETS)}"])
+    raise FeederInvalid(
+        [Problem("unknown-name", f"droop preset {name!r} does not exist; there are {', '.join(PRESETS)}")]
+    )
 
 
 def fleet(
@@ -387,10 +404,17 @@ def fleet(
     each = [names] * index.size if isinstance(names, str) else list(names)
     if len(each) != index.size or rated.shape != index.shape:
         raise FeederInvalid(
-            [f"{index.size} inverters, {len(each)} presets, {rated.size} ratings: lengths differ"]
+            [
+                Problem(
+                    "shape",
+                    f"{index.size} inverters, {len(each)} presets, {rated.size} ratings: lengths differ",
+                )
+            ]
         )
     if not np.all(np.isfinite(rated) & (rated > 0)):
-        raise FeederInvalid(["rated apparent power of every inverter must be positive, in kVA"])
+        raise FeederInvalid(
+            [Problem("not-positive", "rated apparent power of every inverter must be positive, in kVA")]
+        )
     curves = [preset(name) for name in each]
     v = np.array([curve.v for curve in curves], dtype=np.float64).reshape(index.size, 4)
     q = np.array([curve.q for curve in curves], dtype=np.float64).reshape(index.size, 4)
@@ -403,11 +427,21 @@ def fleet(
     if capability == "fixed":
         return droop
     if capability != "circular" or p_gen is None:
-        raise FeederInvalid([f"capability {capability!r} must be 'fixed', or 'circular' together with p_gen"])
+        raise FeederInvalid(
+            [
+                Problem(
+                    "missing" if capability == "circular" else "unknown-name",
+                    f"capability {capability!r} must be 'fixed', or 'circular' together with p_gen",
+                )
+            ]
+        )
     headroom = rating**2 - np.asarray(p_gen, dtype=np.float64) ** 2
     if not np.all(headroom >= 0):
         raise FeederInvalid(
-            [f"inverter {i} generates above its rating" for i in np.flatnonzero(~(headroom >= 0))]
+            [
+                Problem("above-rating", f"inverter {i} generates above its rating")
+                for i in np.flatnonzero(~(headroom >= 0))
+            ]
         )
     return capped(droop, np.sqrt(headroom))
 

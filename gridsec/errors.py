@@ -1,15 +1,55 @@
-"""The error tree. Offline code raises these; online code returns outcomes as values instead."""
+"""The error tree. Offline code raises these; online code returns outcomes as values instead.
+
+Every problem has a stable code beside its sentence. Programs and tests compare codes; sentences may change.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Self
+
+
+class Problem(str):
+    """One problem of an input: a sentence with a stable code.
+
+    Parameters
+    ----------
+    code
+        Lower case words joined by hyphens: the rule that is broken, such as `shape` or `not-finite`.
+    text
+        Where, what, and what would be right.
+    """
+
+    __slots__ = ("code",)
+    code: str
+
+    def __new__(cls, code: str, text: str) -> Self:
+        """Return the sentence, with its code beside it."""
+        self = super().__new__(cls, text)
+        self.code = code
+        return self
+
+    def __reduce__(self) -> tuple[type[Problem], tuple[str, str]]:
+        """Return class and arguments: a pickled sentence keeps its code."""
+        return type(self), (self.code, str(self))
 
 
 class GridsecError(Exception):
     """Base of every error that this project raises on purpose."""
 
 
-class FeederInvalid(GridsecError):
+class _Problems:
+    """Problems of an error, all at once."""
+
+    problems: tuple[str, ...]
+
+    @property
+    def codes(self) -> tuple[str, ...]:
+        """Code of each problem; empty for a sentence without one."""
+        return tuple(getattr(problem, "code", "") for problem in self.problems)
+
+
+class FeederInvalid(_Problems, GridsecError):
     """A feeder's description is wrong; `problems` names everything that is wrong with it at once.
 
     Parameters
@@ -19,10 +59,24 @@ class FeederInvalid(GridsecError):
     """
 
     def __init__(self, problems: Iterable[str]) -> None:
-        self.problems: tuple[str, ...] = tuple(problems)
+        self.problems = tuple(problems)
         count = len(self.problems)
         head = f"{count} problem{'s' if count != 1 else ''} with the feeder"
         super().__init__("\n  - ".join([head + ":", *self.problems]))
+
+
+class InputInvalid(_Problems, ValueError):
+    """Arguments are wrong; `problems` names everything that is wrong with them at once.
+
+    Parameters
+    ----------
+    problems
+        One clause each: what is wrong, and what would be right.
+    """
+
+    def __init__(self, problems: Iterable[str]) -> None:
+        self.problems = tuple(problems)
+        super().__init__("; ".join(self.problems))
 
 
 class NotObservable(GridsecError):
@@ -36,11 +90,14 @@ class NotObservable(GridsecError):
         What they do determine: a rank, or the number of meters when counting is the obstacle.
     why
         The condition that fails, in words.
+    code
+        Code of the condition: lower case words joined by hyphens.
     """
 
-    def __init__(self, subset: Iterable[int], rank: int, why: str) -> None:
+    def __init__(self, subset: Iterable[int], rank: int, why: str, *, code: str = "not-observable") -> None:
         self.subset: tuple[int, ...] = tuple(subset)
         self.rank = rank
+        self.code = code
         super().__init__(why)
 
 
@@ -55,18 +112,23 @@ class DesignInfeasible(GridsecError):
         What the solver said, or which check failed. A solver's word is never proof by itself.
     margin
         The recomputed margin of the failed condition (negative: violated), if there is one.
+    code
+        Code of the reason: lower case words joined by hyphens.
     """
 
-    def __init__(self, what: str, status: str, margin: float | None = None) -> None:
+    def __init__(
+        self, what: str, status: str, margin: float | None = None, *, code: str = "design-infeasible"
+    ) -> None:
         self.what = what
         self.status = status
         self.margin = margin
+        self.code = code
         tail = "" if margin is None else f", margin {margin:.3g}"
         super().__init__(f"{what}: {status}{tail}")
 
 
 def refuse(problems: Iterable[str]) -> None:
-    """Raise one ValueError that names all problems of an input; nothing if there are none.
+    """Raise one error that names all problems of an input; nothing if there are none.
 
     Parameters
     ----------
@@ -75,9 +137,9 @@ def refuse(problems: Iterable[str]) -> None:
 
     Raises
     ------
-    ValueError
+    InputInvalid
         If there is any.
     """
     found = tuple(problems)
     if found:
-        raise ValueError("; ".join(found))
+        raise InputInvalid(found)

@@ -19,7 +19,7 @@ from math import prod
 import numpy as np
 
 from gridsec.arrays import Floats, Ints, any_of, frozen, frozen_ints
-from gridsec.errors import FeederInvalid
+from gridsec.errors import FeederInvalid, InputInvalid, Problem
 from gridsec.trees import below, from_root, shrinking, walk
 
 
@@ -115,7 +115,7 @@ class Feeder:
         object.__setattr__(self, "squared", frozen(self.r**2 + self.x**2))
 
 
-def _problems(feeder: Feeder) -> list[str]:
+def _problems(feeder: Feeder) -> list[Problem]:
     """Every reason why the fields of `feeder` do not describe a radial feeder."""
     out = _shape_problems(feeder)
     if out:
@@ -124,29 +124,42 @@ def _problems(feeder: Feeder) -> list[str]:
     for what in ("base_volt", "base_kva"):
         value = getattr(feeder, what)
         if not (np.isfinite(value) and value > 0):
-            out.append(f"{what} is {value}; it must be a positive number")
+            out.append(Problem("not-positive", f"{what} is {value}; it must be a positive number"))
     for k in range(branches):
         where = f"branch {k} into bus {feeder.buses[k + 1]!r}"
         if not 0 <= feeder.parent[k] <= k:
-            out.append(f"{where}: parent {feeder.parent[k]} does not precede it; expected 0 to {k}")
+            out.append(
+                Problem(
+                    "not-radial", f"{where}: parent {feeder.parent[k]} does not precede it; expected 0 to {k}"
+                )
+            )
         for what in ("r", "x", "charging"):
             value = getattr(feeder, what)[k]
             if not (np.isfinite(value) and value >= 0):
-                out.append(f"{where}: {what} is {value}; it must be finite and not negative")
+                out.append(
+                    Problem("negative", f"{where}: {what} is {value}; it must be finite and not negative")
+                )
         if feeder.r[k] == 0 and feeder.x[k] == 0:
-            out.append(f"{where}: r and x are both 0; fuse the two buses")
+            out.append(Problem("zero-impedance", f"{where}: r and x are both 0; fuse the two buses"))
     for j, bus in enumerate(feeder.bus):
         if not 0 <= bus <= branches:
             out.append(
-                f"customer {feeder.customers[j]!r}: bus {bus} does not exist; expected 0 to {branches}"
+                Problem(
+                    "unknown-index",
+                    f"customer {feeder.customers[j]!r}: bus {bus} does not exist; expected 0 to {branches}",
+                )
             )
     for what, names in (("customer", feeder.customers), ("bus", feeder.buses)):
         counted = Counter(names)
-        out.extend(f"{what} {name!r} is named {times} times" for name, times in counted.items() if times > 1)
+        out.extend(
+            Problem("duplicate", f"{what} {name!r} is named {times} times")
+            for name, times in counted.items()
+            if times > 1
+        )
     return out
 
 
-def _shape_problems(feeder: Feeder) -> list[str]:
+def _shape_problems(feeder: Feeder) -> list[Problem]:
     """Fields whose lengths do not fit together; nothing else can be said before these are right."""
     branches = feeder.parent.size
     expected = (
@@ -157,7 +170,11 @@ def _shape_problems(feeder: Feeder) -> list[str]:
         ("buses", (len(feeder.buses),), (branches + 1,)),
         ("bus", feeder.bus.shape, (len(feeder.customers),)),
     )
-    return [f"{what} has shape {has}; expected {wants}" for what, has, wants in expected if has != wants]
+    return [
+        Problem("shape", f"{what} has shape {has}; expected {wants}")
+        for what, has, wants in expected
+        if has != wants
+    ]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -325,7 +342,7 @@ def loss_correction(
     Baran and Wu 1989, the DistFlow equations. Derivation: docs/theory-model.md.
     """
     if steps < 1:
-        raise ValueError(f"steps is {steps}; it must be at least 1")
+        raise InputInvalid([Problem("out-of-range", f"steps is {steps}; it must be at least 1")])
     flows = _linear_flows(feeder, p, q, v0_squared)
     return np.asarray(_lossy(feeder, flows, flows, steps).v2 - flows.v2)
 
@@ -370,7 +387,7 @@ def corrected(
         If `steps` is below 1.
     """
     if steps < 1:
-        raise ValueError(f"steps is {steps}; it must be at least 1")
+        raise InputInvalid([Problem("out-of-range", f"steps is {steps}; it must be at least 1")])
     flows = _linear_flows(feeder, p, q, v0_squared)
     once = _lossy(feeder, flows, flows, 1)
     return np.asarray(_lossy(feeder, flows, once, steps - 1).v2 - flows.v2), _remainder(feeder, flows, once)

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gridsec.arrays import Floats, Ints, frozen
-from gridsec.errors import DesignInfeasible, refuse
+from gridsec.errors import DesignInfeasible, InputInvalid, Problem, refuse
 from gridsec.lure import Lure
 
 # A meter that moves the observer by less than this part of what it could is not listened to.
@@ -61,22 +61,25 @@ class CircleOptions:
         problems = [
             text
             for bad, text in (
-                (not (np.isfinite(self.rate) and self.rate > 0.0), "the rate must be positive"),
+                (
+                    not (np.isfinite(self.rate) and self.rate > 0.0),
+                    Problem("not-positive", "the rate must be positive"),
+                ),
                 (
                     self.noise.ndim != 1 or not _within(self.noise),
-                    "noise must be finite, >= 0, of shape (p,)",
+                    Problem("negative", "noise must be finite, >= 0, of shape (p,)"),
                 ),
                 (
                     self.load.ndim != 2 or not np.isfinite(self.load).all(),
-                    "load must be finite, of shape (l, r)",
+                    Problem("not-finite", "load must be finite, of shape (l, r)"),
                 ),
-                (not _is_square(self.weight), "the weight must be a finite square matrix"),
-                (not 0.0 <= self.floor < 1.0, "the floor must lie in [0, 1)"),
+                (not _is_square(self.weight), Problem("shape", "the weight must be a finite square matrix")),
+                (not 0.0 <= self.floor < 1.0, Problem("out-of-range", "the floor must lie in [0, 1)")),
             )
             if bad
         ]
         if not np.any(self.noise > 0.0):
-            problems.append("at least one meter must have a noise scale above zero")
+            problems.append(Problem("not-positive", "at least one meter must have a noise scale above zero"))
         refuse(problems)
 
 
@@ -170,7 +173,14 @@ def options_for(
         floor=float(floor),
     )
     if len(options.load) != lure.F.shape[1] or len(options.weight) != len(lure.A):
-        raise ValueError(f"load {options.load.shape} or weight {options.weight.shape} do not fit the plant")
+        raise InputInvalid(
+            [
+                Problem(
+                    "shape",
+                    f"load {options.load.shape} or weight {options.weight.shape} do not fit the plant",
+                )
+            ]
+        )
     return options
 
 
@@ -215,7 +225,9 @@ def circle_matrix(lure: Lure, J: Ints | Sequence[int], gains: CircleGains) -> Fl
     """
     keep = np.isin(gains.J, np.asarray(J, dtype=np.intp))
     if np.count_nonzero(keep) != len(J):
-        raise ValueError(f"{list(J)} is no subset of the design's meters {gains.J.tolist()}")
+        raise InputInvalid(
+            [Problem("wrong-design", f"{list(J)} is no subset of the design's meters {gains.J.tolist()}")]
+        )
     rows, L, K, N = gains.J[keep], gains.L[:, keep], gains.K[:, keep], gains.noise[keep]
     live = lure.slope > 0.0
     G, H, F, K = lure.G[:, live], lure.H[live], lure.F[live], K[live]
@@ -336,6 +348,7 @@ def refuse_blind(J: Ints, heard: Floats) -> None:
             "visible in it. State the uncertainty of the loads (`load`), or smaller meter noise, or demand a "
             "smallest gain (`floor`)",
             float(np.max(heard, initial=0.0)) - _BLIND,
+            code="degenerate",
         )
 
 

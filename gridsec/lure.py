@@ -21,7 +21,7 @@ from scipy.linalg import expm
 
 from gridsec.arrays import Floats, Ints, exponential_integrals, perron_bound
 from gridsec.droop import Droop
-from gridsec.errors import FeederInvalid, refuse
+from gridsec.errors import FeederInvalid, InputInvalid, Problem, refuse
 from gridsec.feeder import LinDistFlow
 from gridsec.lure_form import as_floats, freeze, input_matrices, without_lower
 from gridsec.network import Network, Power, columns
@@ -67,7 +67,12 @@ class Lure:
     def __post_init__(self) -> None:
         wrong = freeze(self, "slope")
         if np.any(self.slope < 0.0):
-            wrong.append("an upper slope is below its lower one, which is 0 unless `Lure.of` is told another")
+            wrong.append(
+                Problem(
+                    "order",
+                    "an upper slope is below its lower one, which is 0 unless `Lure.of` is told another",
+                )
+            )
         refuse(wrong)
 
     @classmethod
@@ -141,7 +146,7 @@ def close_loop(feeder: Network | ThreePhaseFeeder, droop: Droop, meters: Ints) -
     """
     count = len(feeder.customers)
     problems = [
-        f"{what} {i}: customer {j} does not exist; expected 0 to {count - 1}"
+        Problem("unknown-index", f"{what} {i}: customer {j} does not exist; expected 0 to {count - 1}")
         for what, where in (("inverter", droop.customer), ("meter", meters))
         for i, j in enumerate(where)
         if not 0 <= j < count
@@ -312,7 +317,9 @@ def transition(lure: Lure, h: float, policy: StepPolicy = POLICY) -> Transition:
     M. Hochbruck, A. Ostermann, "Exponential integrators", Acta Numerica 19, 2010, sections 2.1, 2.3.
     """
     if not (np.isfinite(h) and h >= 0):
-        raise ValueError(f"a step of {h} s is no step; expected a number that is not negative")
+        raise InputInvalid(
+            [Problem("negative", f"a step of {h} s is no step; expected a number that is not negative")]
+        )
     own = np.diagonal(lure.A)
     diagonal = np.count_nonzero(lure.A) == np.count_nonzero(own)
     if diagonal:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gridsec.arrays import Floats, frozen
+from gridsec.errors import Problem
 from gridsec.newton import Nonlinearity
 
 _MATRICES = ("A", "G", "H", "F", "B", "C", "D")
@@ -69,7 +70,7 @@ def input_matrices(
     return tuple(np.zeros((count, inputs)) if one is None else one for one, count in rows)
 
 
-def freeze(system: object, *slopes: str) -> list[str]:
+def freeze(system: object, *slopes: str) -> list[Problem]:
     """Freeze the arrays of a system that is being made, and return what is wrong with them.
 
     Parameters
@@ -88,7 +89,7 @@ def freeze(system: object, *slopes: str) -> list[str]:
     for name, array in given.items():
         object.__setattr__(system, name, array)
     if wrong := [
-        f"{name} has shape {array.shape}; expected {count} axes"
+        Problem("shape", f"{name} has shape {array.shape}; expected {count} axes")
         for name, array in given.items()
         if array.ndim != (count := 1 if name in slopes else 2)
     ]:
@@ -97,12 +98,12 @@ def freeze(system: object, *slopes: str) -> list[str]:
     wanted = {"A": (n, n), "G": (n, m), "H": (m, n), "F": (m, inputs), "B": (n, inputs), "C": (p, n)}
     wanted |= {"D": (p, inputs)}
     wrong = [
-        f"{name} has shape {given[name].shape}; expected {shape}"
+        Problem("shape", f"{name} has shape {given[name].shape}; expected {shape}")
         for name, shape in (wanted | dict.fromkeys(slopes, (m,))).items()
         if given[name].shape != shape
     ]
     if not all(np.isfinite(array).all() for array in given.values()):
-        wrong.append("every entry must be finite")
+        wrong.append(Problem("not-finite", "every entry must be finite"))
     return wrong
 
 

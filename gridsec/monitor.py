@@ -102,7 +102,9 @@ def design(
         proof = _proof(proven) if bank.direct else small_gain(proven)
     margin = verify(proof, proven)
     if not margin > 0:
-        raise DesignInfeasible(f"{proof.kind} certificate", "it fails its verification", margin)
+        raise DesignInfeasible(
+            f"{proof.kind} certificate", "it fails its verification", margin, code="not-verified"
+        )
     return MonitorDesign(plant, model, bank, errors, proof, proven, step_s, options)
 
 
@@ -137,7 +139,10 @@ def _loop(lure: Lure, big: Majorant) -> Floats:
     deaf = lure.slope <= 0
     if through[deaf].any():
         raise DesignInfeasible(
-            "observer bank", "gains inject into the state of an inverter that does nothing", None
+            "observer bank",
+            "gains inject into the state of an inverter that does nothing",
+            None,
+            code="wrong-form",
         )
     return np.asarray(big.H + through / np.where(deaf, 1.0, lure.slope)[:, None])
 

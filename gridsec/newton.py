@@ -79,7 +79,10 @@ def settle(
         open_rows, now, residual = open_rows[rough], now[rough], residual[rough]
         x[open_rows] = loop.newton(now, residual)
     raise DesignInfeasible(
-        "equilibrium of the droop loop", f"residual above {tol:g} after {max_iter} Newton steps", None
+        "equilibrium of the droop loop",
+        f"residual above {tol:g} after {max_iter} Newton steps",
+        None,
+        code="not-converged",
     )
 
 

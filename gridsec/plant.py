@@ -13,7 +13,7 @@ from gridsec.arrays import Floats, Ints
 from gridsec.certificates import Certificate
 from gridsec.detect import ErrorBound, ErrorModel, error_model
 from gridsec.droop import Droop
-from gridsec.errors import refuse
+from gridsec.errors import Problem, refuse
 from gridsec.feeder import LinDistFlow
 from gridsec.judge import Tally
 from gridsec.lure import Lure
@@ -53,9 +53,14 @@ class Plant:
     def __post_init__(self) -> None:
         meters, problems = np.asarray(self.meters), []
         if meters.ndim != 1 or (meters.size and meters.dtype.kind not in "iu"):
-            problems.append("meters must be whole numbers, one for each meter")
+            problems.append(Problem("not-integer", "meters must be whole numbers, one for each meter"))
         if not _whole(self.loss_correction, 0):
-            problems.append(f"loss_correction is {self.loss_correction}; it must be a whole number from 0 on")
+            problems.append(
+                Problem(
+                    "not-integer",
+                    f"loss_correction is {self.loss_correction}; it must be a whole number from 0 on",
+                )
+            )
         refuse(problems)
 
 
@@ -102,12 +107,17 @@ class Options:
         refuse(
             [
                 *(
-                    f"{name} is {getattr(self, name)}; it must be a finite number that is not negative"
+                    Problem(
+                        "negative",
+                        f"{name} is {getattr(self, name)}; it must be a finite number that is not negative",
+                    )
                     for name in ("sigmas", "tie")
                     if not 0.0 <= getattr(self, name) < np.inf
                 ),
                 *(
-                    f"{name} is {getattr(self, name)}; it must be a whole number from 1 on"
+                    Problem(
+                        "not-integer", f"{name} is {getattr(self, name)}; it must be a whole number from 1 on"
+                    )
                     for name in ("confirm", "release")
                     if not _whole(getattr(self, name), 1)
                 ),
@@ -116,7 +126,7 @@ class Options:
         )
 
 
-def judging_problems(settled: float, widest: float, v2_limits: tuple[float, float]) -> list[str]:
+def judging_problems(settled: float, widest: float, v2_limits: tuple[float, float]) -> list[Problem]:
     """What is wrong with the numbers that say when a verdict can be given at all.
 
     Parameters
@@ -126,11 +136,19 @@ def judging_problems(settled: float, widest: float, v2_limits: tuple[float, floa
     """
     problems = []
     if not 0.0 < settled <= 1.0:
-        problems.append(f"settled is {settled}; it must be a part of a threshold, above 0 and up to 1")
+        problems.append(
+            Problem(
+                "out-of-range", f"settled is {settled}; it must be a part of a threshold, above 0 and up to 1"
+            )
+        )
     if not widest > 0.0:
-        problems.append(f"widest is {widest}; it must be a positive number")
+        problems.append(Problem("not-positive", f"widest is {widest}; it must be a positive number"))
     if not 0.0 <= v2_limits[0] < v2_limits[1]:
-        problems.append(f"v2_limits is {v2_limits}; it must be two ascending numbers that are not negative")
+        problems.append(
+            Problem(
+                "order", f"v2_limits is {v2_limits}; it must be two ascending numbers that are not negative"
+            )
+        )
     return problems
 
 
@@ -139,7 +157,7 @@ def _whole(value: object, least: int) -> bool:
     return isinstance(value, int | np.integer) and int(value) >= least
 
 
-def check_plant(plant: Plant, *, max_attacked: int, step_s: float, more: Iterable[str] = ()) -> None:
+def check_plant(plant: Plant, *, max_attacked: int, step_s: float, more: Iterable[Problem] = ()) -> None:
     """Refuse what no estimator can watch, before anything is computed.
 
     Parameters
@@ -161,16 +179,25 @@ def check_plant(plant: Plant, *, max_attacked: int, step_s: float, more: Iterabl
     meters, customers, problems = np.asarray(plant.meters), plant.feeder.bus.size, []
     nowhere = meters[(meters < 0) | (meters >= customers)]
     if nowhere.size:
-        problems.append(f"meters {nowhere.tolist()} are at no customer: there are {customers}")
+        problems.append(
+            Problem("unknown-index", f"meters {nowhere.tolist()} are at no customer: there are {customers}")
+        )
     if np.unique(meters).size != meters.size:
-        problems.append("two meters at one customer: combine them before")
+        problems.append(Problem("duplicate", "two meters at one customer: combine them before"))
     if plant.accuracy.class_fraction.shape != meters.shape:
         given = plant.accuracy.class_fraction.size
-        problems.append(f"accuracy is given for {given} meters of {meters.size}")
+        problems.append(Problem("shape", f"accuracy is given for {given} meters of {meters.size}"))
     if not _whole(max_attacked, 0):
-        problems.append(f"max_attacked is {max_attacked}; it must be a whole number that is not negative")
+        problems.append(
+            Problem(
+                "not-integer",
+                f"max_attacked is {max_attacked}; it must be a whole number that is not negative",
+            )
+        )
     if not (np.isfinite(step_s) and step_s > 0):
-        problems.append(f"step_s is {step_s}; it must be a positive number of seconds")
+        problems.append(
+            Problem("not-positive", f"step_s is {step_s}; it must be a positive number of seconds")
+        )
     refuse([*problems, *more])
 
 

@@ -24,6 +24,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.droop import Droop
+from gridsec.errors import InputInvalid, Problem
 from gridsec.lure import Lure, StepPolicy, Transition, transition
 from gridsec.subsets import Subsets
 
@@ -104,7 +105,9 @@ def layout(lure: Lure, reactive: Floats | None) -> Layout:
         and np.allclose(lure.G, np.diag(rate), rtol=1e-12, atol=0.0)
         and not lure.B.any()
     ):
-        raise ValueError("direct injection needs A = -T^-1, G = T^-1 and B = 0; see close_loop")
+        raise InputInvalid(
+            [Problem("wrong-form", "direct injection needs A = -T^-1, G = T^-1 and B = 0; see close_loop")]
+        )
     n, p = lure.A.shape[0], lure.C.shape[0]
     own, seen_by = np.hstack([lure.H, lure.F]), np.hstack([lure.C, lure.D])
     same = (own[:, None, :] == seen_by[None, :, :]).all(axis=-1).reshape(n, p)

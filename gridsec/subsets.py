@@ -15,7 +15,7 @@ from math import comb
 import numpy as np
 
 from gridsec.arrays import Bools, Ints
-from gridsec.errors import DesignInfeasible, NotObservable
+from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable, Problem
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,7 +94,7 @@ def subsets(meters: int, max_attacked: int, *, most: int) -> Subsets:
     chong2020, Theorem 1 (ii), equations (5) and (6).
     """
     if max_attacked < 0:
-        raise ValueError(f"max_attacked is {max_attacked}; it cannot be negative")
+        raise InputInvalid([Problem("negative", f"max_attacked is {max_attacked}; it cannot be negative")])
     if meters <= 2 * max_attacked:
         raise NotObservable(
             range(meters),
@@ -102,12 +102,14 @@ def subsets(meters: int, max_attacked: int, *, most: int) -> Subsets:
             f"{meters} meters cannot be told apart when {max_attacked} of them may lie: "
             f"more than {2 * max_attacked} meters are needed (chong2020, Theorem 1), because two groups of "
             f"{max_attacked} liars could otherwise tell two different stories that are equally credible",
+            code="too-few-meters",
         )
     count = comb(meters, max_attacked) + comb(meters, 2 * max_attacked)
     if count > most:
         raise DesignInfeasible(
             f"exact bank for {meters} meters of which {max_attacked} may lie",
             f"it needs {count} observers, and at most {most} are allowed; allow fewer manipulated meters",
+            code="too-many",
         )
     out_large = _combinations(meters, max_attacked)
     out_small = _combinations(meters, 2 * max_attacked)

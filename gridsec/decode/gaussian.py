@@ -25,7 +25,7 @@ from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints
 from gridsec.choices import no_choice
 from gridsec.decode.chisquare import log_density, log_tail
 from gridsec.decode.stacks import MOST_SUBSETS, Stack, subsets
-from gridsec.errors import DesignInfeasible, NotObservable, refuse
+from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable, Problem, refuse
 
 Rule = Literal["density", "tail"]
 
@@ -69,7 +69,9 @@ class Test:
             If it is not.
         """
         if not 0.0 < false_alarm < 1.0:
-            raise ValueError(f"false_alarm is {false_alarm}; it must lie in (0, 1)")
+            raise InputInvalid(
+                [Problem("out-of-range", f"false_alarm is {false_alarm}; it must lie in (0, 1)")]
+            )
         return float(chdtri(self.freedom, false_alarm))
 
 
@@ -167,6 +169,7 @@ def design_test(stack: Stack, P: Floats, kept: Ints | None = None) -> Test:
             alone,
             stack.unknowns,
             f"sensors {alone} determine the state without redundancy: nothing could contradict them",
+            code="no-redundancy",
         )
     return test
 
@@ -179,14 +182,19 @@ def _least_squares(stack: Stack, P: Floats, kept: Ints | None = None) -> Test:
     try:
         L = np.linalg.cholesky(P[np.ix_(rows, rows)])
     except np.linalg.LinAlgError as failure:
-        raise DesignInfeasible("chi-square test", "the covariance P is not positive definite") from failure
+        raise DesignInfeasible(
+            "chi-square test", "the covariance P is not positive definite", code="not-definite"
+        ) from failure
     white = solve_triangular(L, np.eye(rows.size), lower=True)
     Q, R = np.linalg.qr(white @ stack.matrix[rows], mode="complete")
     R = R[:n]
     rank = int(np.linalg.matrix_rank(R)) if R.size else 0
     if rank < n:
         raise NotObservable(
-            use.tolist(), rank, f"sensors {use.tolist()} determine only {rank} of {n} unknowns"
+            use.tolist(),
+            rank,
+            f"sensors {use.tolist()} determine only {rank} of {n} unknowns",
+            code="not-observable",
         )
     estimator, standardise = np.zeros((n, N)), np.zeros((rows.size - n, N))
     root = solve_triangular(R, np.eye(n))

@@ -20,6 +20,7 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, Ints, not_negative
 from gridsec.decode.search import Decoded, Decoder, bounded, cheapest
 from gridsec.decode.stacks import MOST_SUBSETS, Stack, masked, require, residual, subsets
+from gridsec.errors import InputInvalid, Problem
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,7 +165,7 @@ def correction_constants(
     p = stack.count
     r = cheapest(p, q) if left_out is None else left_out
     if not q <= r <= 2 * q:
-        raise ValueError(f"r = {r} with q = {q}; expected q <= r <= 2 q")
+        raise InputInvalid([Problem("out-of-range", f"r = {r} with q = {q}; expected q <= r <= 2 q")])
     rho, _ = _subset_norms(stack, subsets(p, p - 2 * q, most))
     smallest = float(rho.min())
     eta = _best_prediction(stack, q, r, most)

@@ -15,7 +15,7 @@ from scipy.special import chdtr
 
 from gridsec.arrays import Floats, not_negative
 from gridsec.decode.stacks import Stack
-from gridsec.errors import DesignInfeasible
+from gridsec.errors import DesignInfeasible, InputInvalid, Problem
 
 # Of Ruben's series: its longest, and the index in parts of the spread by which nothing is left of it.
 _TERMS = 2000
@@ -82,7 +82,7 @@ def bound_for(stack: Stack, P: Floats, probability: float, *, tol: float) -> flo
         If it is not reached, because `tol` is too coarse for it.
     """
     if not 0.0 < probability < 1.0:
-        raise ValueError(f"probability is {probability}; it must lie in (0, 1)")
+        raise InputInvalid([Problem("out-of-range", f"probability is {probability}; it must lie in (0, 1)")])
     size = float(np.sqrt(max(float(np.max(np.linalg.eigvalsh(P))), 0.0)))
     if size == 0.0:
         return 0.0
@@ -91,7 +91,9 @@ def bound_for(stack: Stack, P: Floats, probability: float, *, tol: float) -> flo
         if bound_probability(stack, P, high, tol=tol) >= probability:
             break
     else:
-        raise DesignInfeasible("bound of the noise", f"{probability} is not reached up to {high:g}")
+        raise DesignInfeasible(
+            "bound of the noise", f"{probability} is not reached up to {high:g}", code="not-converged"
+        )
     found, result = brentq(
         lambda v: bound_probability(stack, P, v, tol=tol) - probability, 0.0, high, full_output=True
     )
@@ -122,7 +124,7 @@ def quadratic_probability(values: Floats, limit: float, *, tol: float) -> float:
     """
     top = float(np.max(values, initial=0.0))
     if not np.all(np.isfinite(values) & (values >= -_ROUNDING * top)):
-        raise ValueError("weights must be finite and not negative")
+        raise InputInvalid([Problem("negative", "weights must be finite and not negative")])
     not_negative("limit", limit)
     used = values[values > 0.0]
     if limit == 0.0 or used.size == 0:
@@ -184,4 +186,8 @@ def _integral(values: Floats, limit: float, tol: float) -> float:
         if error <= tol:
             return min(max(now - error, 0.0), 1.0)
         before = now
-    raise DesignInfeasible("probability of a quadratic form", f"known up to {error:.1e} only, not {tol:.1e}")
+    raise DesignInfeasible(
+        "probability of a quadratic form",
+        f"known up to {error:.1e} only, not {tol:.1e}",
+        code="not-converged",
+    )

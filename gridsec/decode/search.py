@@ -19,6 +19,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, frozen, not_negative
 from gridsec.decode.stacks import MOST_SUBSETS, Stack, masked, require, subsets
+from gridsec.errors import InputInvalid, Problem
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,7 +110,14 @@ def design(
     q = max_attacked
     r = cheapest(stack.count, q) if left_out is None else left_out
     if q < 0 or not q <= r <= 2 * q:
-        raise ValueError(f"r = {r} with q = {q}; expected 0 <= q <= r <= 2 q (lee2018, Theorem 2.2.7)")
+        raise InputInvalid(
+            [
+                Problem(
+                    "out-of-range",
+                    f"r = {r} with q = {q}; expected 0 <= q <= r <= 2 q (lee2018, Theorem 2.2.7)",
+                )
+            ]
+        )
     require(stack, 2 * q, tol, f"undoing {q} errors")
     kept = subsets(stack.count, stack.count - r, most)
     inverses = np.asarray(np.linalg.pinv(masked(stack, kept)), dtype=np.float64)

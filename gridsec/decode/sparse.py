@@ -72,7 +72,7 @@ def basis_pursuit(F: Floats, y: Floats) -> Floats:
     # Scaled, because the solver's tolerances are absolute.
     found = linprog(np.ones(2 * p), A_eq=np.hstack([F, -F]), b_eq=y / size, method="highs")
     if not found.success or found.x is None:
-        raise DesignInfeasible("basis pursuit", f"linear program: {found.message}")
+        raise DesignInfeasible("basis pursuit", f"linear program: {found.message}", code="no-solution")
     return np.asarray(size * (found.x[:p] - found.x[p:]))
 
 

@@ -20,7 +20,7 @@ from math import comb
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints, unit_rows
-from gridsec.errors import DesignInfeasible, NotObservable
+from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable, Problem
 from gridsec.index import Sparsest, fewest, kernel, row_space
 
 MOST_SUBSETS = 200_000
@@ -54,10 +54,17 @@ class Stack:
         object.__setattr__(self, "matrix", frozen(self.matrix))
         object.__setattr__(self, "heights", frozen_ints(self.heights))
         if self.matrix.ndim != 2 or self.heights.ndim != 1 or np.any(self.heights < 0):
-            raise ValueError("a stack needs a matrix and one height, not negative, for every block")
+            raise InputInvalid(
+                [Problem("shape", "a stack needs a matrix and one height, not negative, for every block")]
+            )
         if int(self.heights.sum()) != self.matrix.shape[0]:
-            raise ValueError(
-                f"heights sum to {self.heights.sum()}; the matrix has {self.matrix.shape[0]} rows"
+            raise InputInvalid(
+                [
+                    Problem(
+                        "shape",
+                        f"heights sum to {self.heights.sum()}; the matrix has {self.matrix.shape[0]} rows",
+                    )
+                ]
             )
         block = np.repeat(np.arange(self.heights.size), self.heights)
         object.__setattr__(self, "membership", frozen(np.eye(self.heights.size)[block]))
@@ -203,6 +210,7 @@ def require(stack: Stack, lost: int, tol: float, purpose: str) -> None:
         rank,
         f"{purpose} needs a state that stays determined without any {lost} of the {stack.count} sensors; "
         f"without sensors {found.blocks.tolist()} it is not (lee2018, Propositions 2.2.2 and 2.2.3)",
+        code="not-observable",
     )
 
 
@@ -217,7 +225,9 @@ def subsets(p: int, size: int, most: int) -> Ints:
     count = comb(p, size)
     if count > most:
         raise DesignInfeasible(
-            f"enumeration of {size} of {p} sensors", f"{count} subsets; at most {most} allowed"
+            f"enumeration of {size} of {p} sensors",
+            f"{count} subsets; at most {most} allowed",
+            code="too-many",
         )
     flat = np.fromiter(chain.from_iterable(combinations(range(p), size)), dtype=np.intp, count=count * size)
     return flat.reshape(count, size)

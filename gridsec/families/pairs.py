@@ -97,6 +97,7 @@ def pairs(gain: Floats, most_meters: int, most_inverters: int) -> tuple[Pairs, t
             f"{count} pairs of up to {most_meters} of {p} meters and {most_inverters} of {m} inverters "
             "cannot be tried within a tick",
             None,
+            code="too-many",
         )
     found, missing = [], []
     for meters in _subsets(p, most_meters):

@@ -154,12 +154,12 @@ def design(
     check_plant(plant, max_attacked=max_attacked, step_s=step_s)
     if p <= 2 * max_attacked:
         why = f"{p} meters, of which {max_attacked} may lie; more than {2 * max_attacked} are needed"
-        raise NotObservable(range(p), p, why)
+        raise NotObservable(range(p), p, why, code="too-few-meters")
     sets, rows = comb(p, max_attacked), 3 * p
     unknowns = plant.droop.tau.size + 2 * len(plant.feeder.customers) + busbar_places(plant.feeder).stop
     if sets > MOST_SUBSETS or sets * rows * (rows + unknowns) > MOST_WORK * step_s:
         said = f"{sets} sets of up to {rows} rows every {step_s:g} s are too many"
-        raise DesignInfeasible(f"fits without every {max_attacked} of {p} meters", said)
+        raise DesignInfeasible(f"fits without every {max_attacked} of {p} meters", said, code="too-many")
     if options is None:
         options = Options() if step_s <= 30.0 else Options(release=4)
     model = circle.design(close_loop(plant.feeder, plant.droop, meters), np.zeros(p, dtype=np.bool_))

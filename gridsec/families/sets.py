@@ -62,7 +62,10 @@ def check(candidates: int, most: int) -> None:
     count = sum(comb(candidates, k) for k in range(most + 1))
     if count > MOST_SETS:
         raise DesignInfeasible(
-            "search over all sets", f"{count} sets of up to {most} of {candidates}; at most {MOST_SETS}", None
+            "search over all sets",
+            f"{count} sets of up to {most} of {candidates}; at most {MOST_SETS}",
+            None,
+            code="too-many",
         )
 
 

@@ -21,7 +21,7 @@ from gridsec.accuracy import reading_error
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.certificates import Certificate, certify
 from gridsec.detect import ErrorBound, ErrorModel, Motion, Uncertainty
-from gridsec.errors import DesignInfeasible, NotObservable
+from gridsec.errors import DesignInfeasible, NotObservable, Problem
 from gridsec.families.sets import MOST_SETS
 from gridsec.frames import Inputs, injections, reconstruct
 from gridsec.judge import Tally
@@ -151,14 +151,20 @@ def design(
     """
     p = plant.meters.size
     wrong = dwell_s is not None and not 0.0 <= dwell_s < np.inf
-    more = [f"dwell_s is {dwell_s}; it must be a number of seconds that is not negative"] if wrong else []
+    more = (
+        [Problem("negative", f"dwell_s is {dwell_s}; it must be a number of seconds that is not negative")]
+        if wrong
+        else []
+    )
     check_plant(plant, max_attacked=max_attacked, step_s=step_s, more=more)
     if p <= 2 * max_attacked:
         what = f"{p} meters cannot be told apart when {max_attacked} of them may lie"
-        raise NotObservable(range(p), p, what)
+        raise NotObservable(range(p), p, what, code="too-few-meters")
     sets = sum(comb(p, k) for k in range(1, max_attacked + 1))
     if sets > MOST_SETS:
-        raise DesignInfeasible("search over sets", f"{sets} sets of dropped meters; at most {MOST_SETS}")
+        raise DesignInfeasible(
+            "search over sets", f"{sets} sets of dropped meters; at most {MOST_SETS}", code="too-many"
+        )
     dropped = np.zeros((sets, p), dtype=np.bool_)
     chosen = (D for k in range(1, max_attacked + 1) for D in combinations(range(p), k))
     for row, D in zip(dropped, chosen, strict=True):

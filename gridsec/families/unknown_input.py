@@ -29,7 +29,7 @@ from dataclasses import replace
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, frozen
-from gridsec.errors import NotObservable
+from gridsec.errors import NotObservable, Problem
 from gridsec.families.pair_tick import Tick, UnknownInputDesign, UnknownInputState, observe
 from gridsec.families.pair_verdict import Found, answer, deaf_inverters, explain
 from gridsec.families.pairs import Trial, pairs, try_pair
@@ -74,13 +74,19 @@ def design(
         attacked one can go is what decides whether it can be the explanation.
     """
     p, m = plant.meters.size, plant.droop.tau.size
-    more = [f"max_inverters is {max_inverters}; it cannot be negative"] if not max_inverters >= 0 else []
+    more = (
+        [Problem("negative", f"max_inverters is {max_inverters}; it cannot be negative")]
+        if not max_inverters >= 0
+        else []
+    )
     untold = np.flatnonzero(~np.isfinite(plant.droop.rating)).tolist()
-    more += [f"inverters {untold} have no rating; `Droop.rating` tells it"] if untold else []
+    more += (
+        [Problem("missing", f"inverters {untold} have no rating; `Droop.rating` tells it")] if untold else []
+    )
     check_plant(plant, max_attacked=max_attacked, step_s=step_s, more=more)
     if p <= 2 * max_attacked:
         why = f"{p} meters of which {max_attacked} may lie: more than {2 * max_attacked} are needed"
-        raise NotObservable(range(p), p, why + " (yang2021, Assumption 3)")
+        raise NotObservable(range(p), p, why + " (yang2021, Assumption 3)", code="too-few-meters")
     if options is None:
         options = Options() if step_s <= 30.0 else Options(release=4)
     made = setting(plant, max_attacked=max_attacked, options=options)

@@ -37,7 +37,7 @@ from gridsec import monitor
 from gridsec.arrays import Bools, Floats
 from gridsec.choices import no_choice
 from gridsec.detect import ErrorBound
-from gridsec.errors import DesignInfeasible, refuse
+from gridsec.errors import DesignInfeasible, Problem, refuse
 from gridsec.online import Cause, Decision, Estimate, Frame, Verdict
 from gridsec.plant import MonitorDesign, MonitorState, Plant
 from gridsec.slots import SlotState
@@ -150,10 +150,16 @@ def design(
         If a window would be empty, or there is no such rule.
     """
     if not plant.droop.tau.size:
-        raise DesignInfeasible("windows of consistency", "no droop inverter whose injection is estimated")
+        raise DesignInfeasible(
+            "windows of consistency",
+            "no droop inverter whose injection is estimated",
+            code="nothing-to-design",
+        )
     if max_attacked < 1:
-        raise DesignInfeasible("windows of consistency", "without a possible liar nothing is isolated")
-    wrong = ["a window has at least one reading"] if length < 1 else []
+        raise DesignInfeasible(
+            "windows of consistency", "without a possible liar nothing is isolated", code="nothing-to-design"
+        )
+    wrong = [Problem("out-of-range", "a window has at least one reading")] if length < 1 else []
     refuse((*wrong, *no_choice("rule", get_args(Rule), rule)))
     return WindowedDesign(monitor.design(plant, max_attacked=max_attacked, step_s=step_s), length, rule)
 

@@ -160,7 +160,7 @@ def fewest(
         if nodes > most:
             what = f"direction that the fewest of {len(rows)} blocks see"
             raise DesignInfeasible(
-                what, f"more than {most} nodes of the search; best so far: {best:g} blocks"
+                what, f"more than {most} nodes of the search; best so far: {best:g} blocks", code="too-many"
             )
         seen = blocks[undecided] @ here
         sizes = np.linalg.svd(seen, compute_uv=False) if seen.size else np.zeros((len(undecided), 1))

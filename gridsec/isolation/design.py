@@ -16,7 +16,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints
 from gridsec.choices import no_choice
-from gridsec.errors import DesignInfeasible, NotObservable, refuse
+from gridsec.errors import DesignInfeasible, NotObservable, Problem, refuse
 from gridsec.lmi.unknown_input import Multiplier
 from gridsec.observers.unknown_input import Missing, Pair, UnknownInputDesign, UnknownInputPlant
 from gridsec.observers.unknown_input import design as design_family
@@ -95,14 +95,25 @@ def members(inputs: int, sensors: int, max_inputs: int, max_sensors: int) -> tup
         If a count is negative.
     """
     counts = {"max_inputs": max_inputs, "max_sensors": max_sensors}
-    refuse(f"{name} is {count}; it cannot be negative" for name, count in counts.items() if count < 0)
+    refuse(
+        Problem("negative", f"{name} is {count}; it cannot be negative")
+        for name, count in counts.items()
+        if count < 0
+    )
     if sensors <= 2 * max_sensors:
         why = f"{sensors} sensors of which {max_sensors} may lie: more than {2 * max_sensors} are needed"
-        raise NotObservable(range(sensors), sensors, why + " (yang2021, Assumptions 2 and 3)")
+        raise NotObservable(
+            range(sensors), sensors, why + " (yang2021, Assumptions 2 and 3)", code="too-few-meters"
+        )
     complete = max_inputs == inputs
     if not complete and inputs <= 2 * max_inputs:
         why = f"{inputs} inputs of which {max_inputs} may lie: more than {2 * max_inputs} are needed"
-        raise NotObservable(range(inputs), inputs, why + ", or the complete bank (yang2021, Assumption 3)")
+        raise NotObservable(
+            range(inputs),
+            inputs,
+            why + ", or the complete bank (yang2021, Assumption 3)",
+            code="too-few-meters",
+        )
     double = inputs if complete else 2 * max_inputs
 
     def all_pairs(distrusted: int, trusted: int) -> list[Pair]:
@@ -157,7 +168,9 @@ def design(
     large = [pair for pair in wide if pair in place]
     if not large:
         raise DesignInfeasible(
-            "bank of unknown-input observers", f"no large one exists: {family.missing[0].why}"
+            "bank of unknown-input observers",
+            f"no large one exists: {family.missing[0].why}",
+            code="no-solution",
         )
     inside = [[place[s] for s in narrow if s in place and _within(s, pair)] for pair in large]
     width = max((len(row) for row in inside), default=0) or 1

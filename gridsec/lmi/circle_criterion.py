@@ -162,9 +162,11 @@ def contraction(lure: Lure, *, rate: float) -> Certificate:
         with solver_warnings_as_status():
             problem.solve(solver=cp.CLARABEL)
     except cp.error.SolverError as failure:
-        raise DesignInfeasible(what, f"the solver failed: {failure}") from failure
+        raise DesignInfeasible(what, f"the solver failed: {failure}", code="solver-failed") from failure
     if problem.status not in {cp.OPTIMAL, cp.OPTIMAL_INACCURATE} or not slack.value > 0.0:
-        raise DesignInfeasible(what, f"the inequality has no solution ({problem.status})", slack.value)
+        raise DesignInfeasible(
+            what, f"the inequality has no solution ({problem.status})", slack.value, code="no-solution"
+        )
     found = np.asarray(P.value, dtype=np.float64) / slope[:, None] / slope
     # e^T P e in plant units; the multiplier follows from psi = slope * scaled psi and the clock.
     Lambda = np.asarray(lam.value, dtype=np.float64) * clock / slope
@@ -214,7 +216,7 @@ def solve_many(
 
     def collect(indices: Sequence[int], outcome: list[CircleGains] | _Failure) -> None:
         if isinstance(outcome, _Failure):
-            raise DesignInfeasible(outcome.what, outcome.status, outcome.margin)
+            raise DesignInfeasible(outcome.what, outcome.status, outcome.margin, code=outcome.code)
         results.update(zip(indices, outcome, strict=True))
         if progress is not None:
             progress(len(results), len(subsets))
@@ -246,6 +248,7 @@ class _Failure:
     what: str
     status: str
     margin: float | None
+    code: str
 
 
 def _chunks(subsets: Sequence[Sequence[int]]) -> list[tuple[list[int], list[Ints]]]:
@@ -282,7 +285,7 @@ def _solve_chunk(lure: Lure, options: CircleOptions, group: Sequence[Ints]) -> l
         template = _Template(lure, options, len(group[0]))
         return [template.solve(J) for J in group]
     except DesignInfeasible as failure:
-        return _Failure(failure.what, failure.status, failure.margin)
+        return _Failure(failure.what, failure.status, failure.margin, failure.code)
 
 
 class _Template:
@@ -298,7 +301,9 @@ class _Template:
         self, lure: Lure, options: CircleOptions, size: int, given: tuple[Floats, Floats] | None = None
     ) -> None:
         if size == 0:
-            raise DesignInfeasible("circle-criterion observer", "no trusted meter: nothing to design")
+            raise DesignInfeasible(
+                "circle-criterion observer", "no trusted meter: nothing to design", code="nothing-to-design"
+            )
         self.lure, self.options, self.size, self.given = lure, options, size, given
         self.live = lure.slope > 0.0
         self._set_units()
@@ -316,7 +321,11 @@ class _Template:
         scaled = self.x_unit[:, None] * self.options.weight * self.x_unit
         self.q_unit = float(np.trace(scaled)) / len(scaled)
         if not self.q_unit > 0.0:
-            raise DesignInfeasible("circle-criterion observer", "the weight Q is zero: nothing to keep small")
+            raise DesignInfeasible(
+                "circle-criterion observer",
+                "the weight Q is zero: nothing to keep small",
+                code="nothing-to-design",
+            )
 
     def _pose(self) -> None:
         """State the problem in scaled coordinates, with the set of meters as a parameter."""
@@ -377,9 +386,11 @@ class _Template:
             with solver_warnings_as_status():
                 self.problem.solve(solver=cp.CLARABEL)
         except cp.error.SolverError as failure:
-            raise DesignInfeasible(what, f"the solver failed: {failure}") from failure
+            raise DesignInfeasible(what, f"the solver failed: {failure}", code="solver-failed") from failure
         if self.problem.status not in {cp.OPTIMAL, cp.OPTIMAL_INACCURATE}:
-            raise DesignInfeasible(what, f"the inequality has no solution ({self.problem.status})")
+            raise DesignInfeasible(
+                what, f"the inequality has no solution ({self.problem.status})", code="no-solution"
+            )
         return settle(lure, self._in_plant_units(J), what, blind=self.given is not None)
 
     def _in_plant_units(self, J: Ints) -> CircleGains:
@@ -455,4 +466,6 @@ def settle(lure: Lure, found: CircleGains, what: str, *, blind: bool = False) ->
                 refuse_blind(found.J, found.sensitivity)
             return replace(tried, margin=reached)
         best = max(best, reached)
-    raise DesignInfeasible(what, f"solver: {found.status}, but the rebuilt inequality is violated", best)
+    raise DesignInfeasible(
+        what, f"solver: {found.status}, but the rebuilt inequality is violated", best, code="not-verified"
+    )

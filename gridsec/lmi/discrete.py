@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from gridsec.arrays import Floats, Ints, frozen, frozen_ints
-from gridsec.errors import DesignInfeasible, refuse
+from gridsec.errors import DesignInfeasible, Problem, refuse
 from gridsec.gains import negativity
 from gridsec.lmi.discrete_bounds import (
     DirectProof,
@@ -75,9 +75,9 @@ class DiscreteOptions:
         decays = bool(self.decays) and all(0.0 < decay < 1.0 for decay in self.decays)
         noise = self.noise.ndim == 1 and np.isfinite(self.noise).all() and bool(np.all(self.noise > 0.0))
         held = {
-            "decays must lie between 0 and 1, and there must be one": decays,
-            "noise must be finite and positive, of shape (p,)": noise,
-            "the weight must be positive definite": negativity(-self.weight) > 0.0,
+            Problem("out-of-range", "decays must lie between 0 and 1, and there must be one"): decays,
+            Problem("not-positive", "noise must be finite and positive, of shape (p,)"): noise,
+            Problem("not-definite", "the weight must be positive definite"): negativity(-self.weight) > 0.0,
         }
         refuse(text for text, holds in held.items() if not holds)
 
@@ -170,7 +170,9 @@ def discrete_circles(
         rows = np.asarray(J, dtype=np.intp)
         if not len(rows):
             raise DesignInfeasible(
-                "discrete circle-criterion observer", "no trusted meter: nothing to design"
+                "discrete circle-criterion observer",
+                "no trusted meter: nothing to design",
+                code="nothing-to-design",
             )
         if len(rows) not in templates:
             templates[len(rows)] = _Template(system, options, len(rows), None)
@@ -225,7 +227,7 @@ def discrete_contraction(system: DiscreteLure, *, decays: Sequence[float] | floa
     """
     what = "proof of direct injection for all sets of meters"
     if np.any(system.lower > 0.0) or np.any(system.upper < 0.0):
-        raise DesignInfeasible(what, "a slope interval does not contain zero")
+        raise DesignInfeasible(what, "a slope interval does not contain zero", code="wrong-form")
     options = discrete_options(system, decays=decays, noise=1.0)
     n, m = len(system.A), len(system.lower)
     silent = _Template(system, options, 0, (np.zeros((n, 0)), np.zeros((m, 0))))
@@ -239,7 +241,9 @@ def discrete_contraction(system: DiscreteLure, *, decays: Sequence[float] | floa
         if cost < best:
             found, best = tried, cost
     if found is None:
-        raise DesignInfeasible(what, f"the inequality has no solution for lambda in {options.decays}")
+        raise DesignInfeasible(
+            what, f"the inequality has no solution for lambda in {options.decays}", code="no-solution"
+        )
     return DirectProof(found.P, found.Lambda, found.decay, found.margin, found.status)
 
 
@@ -256,6 +260,7 @@ def _refuse_blind(system: DiscreteLure, gains: DiscreteGains) -> None:
             "degenerate: the best gains are L = K = 0. The plant settles by itself, and nothing but the "
             "meters was said to be uncertain: listening only costs. State what else is unknown "
             "(`unknown`), or smaller meter noise",
+            code="degenerate",
         )
 
 
@@ -370,7 +375,11 @@ class _Template:
             if cost < best:
                 found, best = tried, cost
         if found is None:
-            raise failure if failure is not None else DesignInfeasible("observer", "no candidate decay")
+            raise (
+                failure
+                if failure is not None
+                else DesignInfeasible("observer", "no candidate decay", code="no-solution")
+            )
         return found
 
     def solve(self, J: Ints, decay: float) -> DiscreteGains:
@@ -388,9 +397,11 @@ class _Template:
             with _quiet():
                 self.problem.solve(solver=cp.CLARABEL)
         except cp.error.SolverError as failure:
-            raise DesignInfeasible(what, f"the solver failed: {failure}") from failure
+            raise DesignInfeasible(what, f"the solver failed: {failure}", code="solver-failed") from failure
         if self.problem.status not in {cp.OPTIMAL, cp.OPTIMAL_INACCURATE}:
-            raise DesignInfeasible(what, f"the inequality has no solution ({self.problem.status})")
+            raise DesignInfeasible(
+                what, f"the inequality has no solution ({self.problem.status})", code="no-solution"
+            )
         return _settle(self.system, self._in_plant_units(J, decay), what)
 
     def _in_plant_units(self, J: Ints, decay: float) -> DiscreteGains:
@@ -456,4 +467,6 @@ def _settle(system: DiscreteLure, found: DiscreteGains, what: str) -> DiscreteGa
         if held > 0.0:
             return replace(tried, margin=held)
         best = max(best, held)
-    raise DesignInfeasible(what, f"the rebuilt inequality is violated ({found.status})", best)
+    raise DesignInfeasible(
+        what, f"the rebuilt inequality is violated ({found.status})", best, code="not-verified"
+    )

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gridsec.arrays import Floats, Ints, frozen
+from gridsec.errors import InputInvalid, Problem
 from gridsec.gains import negativity
 from gridsec.lmi.sampled import DiscreteLure, shift
 
@@ -46,7 +47,9 @@ class Uncertainty:
         for name in ("state", "argument", "output"):
             object.__setattr__(self, name, frozen(getattr(self, name)))
         if not self.state.shape[1] == self.argument.shape[1] == self.output.shape[1]:
-            raise ValueError("state, argument and output must have one column for each entry of delta")
+            raise InputInvalid(
+                [Problem("shape", "state, argument and output must have one column for each entry of delta")]
+            )
 
 
 def nothing_unknown(system: DiscreteLure) -> Uncertainty:
@@ -162,7 +165,9 @@ def discrete_matrix(system: DiscreteLure, J: Ints | Sequence[int], gains: Discre
     """
     keep = np.isin(gains.J, np.asarray(J, dtype=np.intp))
     if np.count_nonzero(keep) != len(J):
-        raise ValueError(f"{list(J)} is no subset of the design's meters {gains.J.tolist()}")
+        raise InputInvalid(
+            [Problem("wrong-design", f"{list(J)} is no subset of the design's meters {gains.J.tolist()}")]
+        )
     rows, L, K, N = gains.J[keep], gains.L[:, keep], gains.K[:, keep], gains.noise[keep]
     moved, lower = shift(system), system.G * system.lower
     L = L + lower @ K

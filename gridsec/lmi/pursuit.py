@@ -50,13 +50,18 @@ def group_pursuit(F: Floats, y: Floats, heights: Ints) -> Floats:
     try:
         problem.solve(solver=cp.CLARABEL)
     except cp.error.SolverError as failure:
-        raise DesignInfeasible("stacked basis pursuit", f"the solver failed: {failure}") from failure
+        raise DesignInfeasible(
+            "stacked basis pursuit", f"the solver failed: {failure}", code="solver-failed"
+        ) from failure
     if e.value is None:
-        raise DesignInfeasible("stacked basis pursuit", f"no solution ({problem.status})")
+        raise DesignInfeasible("stacked basis pursuit", f"no solution ({problem.status})", code="no-solution")
     found = size * np.asarray(e.value, dtype=np.float64)
     gap = float(np.max(np.abs(F @ found - y))) / size
     if not gap <= 1e-6:
         raise DesignInfeasible(
-            "stacked basis pursuit", f"{problem.status}, but the equation is violated", -gap
+            "stacked basis pursuit",
+            f"{problem.status}, but the equation is violated",
+            -gap,
+            code="not-verified",
         )
     return found

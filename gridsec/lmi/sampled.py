@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from scipy.linalg import expm
 
 from gridsec.arrays import Floats, exponential_integrals, spectral_radius
-from gridsec.errors import refuse
+from gridsec.errors import Problem, refuse
 from gridsec.lure import Lure
 from gridsec.lure_form import as_floats, freeze, input_matrices, without_lower
 from gridsec.newton import Nonlinearity
@@ -67,9 +67,9 @@ class DiscreteLure:
     def __post_init__(self) -> None:
         wrong = freeze(self, "lower", "upper")
         if self.lower.shape == self.upper.shape and np.any(self.lower > self.upper):
-            wrong.append("a lower slope exceeds its upper slope")
+            wrong.append(Problem("order", "a lower slope exceeds its upper slope"))
         if not (np.isfinite(self.h) and self.h > 0.0):
-            wrong.append(f"h is {self.h}; the time between steps must be positive")
+            wrong.append(Problem("not-positive", f"h is {self.h}; the time between steps must be positive"))
         refuse(wrong)
 
     @classmethod

@@ -28,7 +28,7 @@ import numpy as np
 
 from gridsec.arrays import Floats, frozen
 from gridsec.choices import no_choice
-from gridsec.errors import DesignInfeasible, refuse
+from gridsec.errors import DesignInfeasible, InputInvalid, Problem, refuse
 from gridsec.lmi.solver import cvxpy_late, solver_warnings_as_status
 
 Multiplier = Literal["diagonal", "scalar"]
@@ -82,15 +82,15 @@ class ErrorSystem:
         n, m, k, d = len(self.M), self.half.size, self.N.size, self.W.shape[-1]
         wanted = {"M": (n, n), "S": (n, m), "H": (m, n), "half": (m,), "C": (k, n), "W": (n, d), "N": (k,)}
         wrong = [
-            f"{name} has shape {getattr(self, name).shape}; expected {shape}"
+            Problem("shape", f"{name} has shape {getattr(self, name).shape}; expected {shape}")
             for name, shape in wanted.items()
             if getattr(self, name).shape != shape
         ]
         refuse(wrong)
         if not np.all(self.N > 0.0):
-            raise ValueError("every sensor must have a positive error scale N")
+            raise InputInvalid([Problem("not-positive", "every sensor must have a positive error scale N")])
         if np.any(self.half < 0.0):
-            raise ValueError("half-widths of slopes cannot be negative")
+            raise InputInvalid([Problem("negative", "half-widths of slopes cannot be negative")])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -263,7 +263,13 @@ class UnknownInputTemplate:
             If the rate is not inside (0, 1).
         """
         if not 0.0 < rate < 1.0:
-            raise ValueError(f"the rate is {rate:g}; it is a contraction per step, between 0 and 1")
+            raise InputInvalid(
+                [
+                    Problem(
+                        "out-of-range", f"the rate is {rate:g}; it is a contraction per step, between 0 and 1"
+                    )
+                ]
+            )
         cp = cvxpy_late()
         live = system.half > 0.0
         x = state_units(system)
@@ -284,9 +290,11 @@ class UnknownInputTemplate:
             with solver_warnings_as_status():
                 self.problem.solve(solver=cp.CLARABEL)
         except cp.error.SolverError as failure:
-            raise DesignInfeasible(what, f"the solver failed: {failure}") from failure
+            raise DesignInfeasible(what, f"the solver failed: {failure}", code="solver-failed") from failure
         if self.problem.status not in {cp.OPTIMAL, cp.OPTIMAL_INACCURATE}:
-            raise DesignInfeasible(what, f"the inequality has no solution ({self.problem.status})")
+            raise DesignInfeasible(
+                what, f"the inequality has no solution ({self.problem.status})", code="no-solution"
+            )
         P, Y, mu = (np.asarray(v.value, dtype=np.float64) for v in self.variables[:3])
         Lambda = np.zeros(system.half.size)
         if self.variables[3] is not None:
@@ -361,4 +369,6 @@ def _settle(system: ErrorSystem, found: UnknownInputGains, what: str) -> Unknown
         if reached > 0.0:
             return replace(tried, margin=reached)
         best = max(best, reached)
-    raise DesignInfeasible(what, f"solver: {found.status}, but the rebuilt inequality is violated", best)
+    raise DesignInfeasible(
+        what, f"solver: {found.status}, but the rebuilt inequality is violated", best, code="not-verified"
+    )

@@ -26,7 +26,7 @@ from scipy.sparse import csc_array, diags_array
 from scipy.sparse.linalg import splu
 
 from gridsec.arrays import Floats, Ints, Phasors, frozen, frozen_ints
-from gridsec.errors import FeederInvalid
+from gridsec.errors import FeederInvalid, Problem
 from gridsec.feeder import Feeder, common_paths
 from gridsec.trees import OnTree
 
@@ -110,7 +110,7 @@ class MeshedFeeder(OnTree):
         return self.tree.buses
 
 
-def _problems(feeder: MeshedFeeder) -> list[str]:
+def _problems(feeder: MeshedFeeder) -> list[Problem]:
     """Every reason why the ties do not fit the tree."""
     count, buses = feeder.r.size, len(feeder.tree.buses)
     expected = (
@@ -119,20 +119,29 @@ def _problems(feeder: MeshedFeeder) -> list[str]:
         ("x", feeder.x.shape, (count,)),
         ("charging", feeder.charging.shape, (count,)),
     )
-    out = [f"{what} has shape {has}; expected {wants}" for what, has, wants in expected if has != wants]
+    out = [
+        Problem("shape", f"{what} has shape {has}; expected {wants}")
+        for what, has, wants in expected
+        if has != wants
+    ]
     if out:
         return out
     for k, (one, other) in enumerate(feeder.ends.tolist()):
         missing = [end for end in (one, other) if not 0 <= end < buses]
-        out.extend(f"tie {k}: bus {end} does not exist; expected 0 to {buses - 1}" for end in missing)
+        out.extend(
+            Problem("unknown-index", f"tie {k}: bus {end} does not exist; expected 0 to {buses - 1}")
+            for end in missing
+        )
         if one == other:
-            out.append(f"tie {k}: both ends are bus {one}; a line needs two")
+            out.append(Problem("self-loop", f"tie {k}: both ends are bus {one}; a line needs two"))
         for what in ("r", "x", "charging"):
             value = getattr(feeder, what)[k]
             if not (np.isfinite(value) and value >= 0):
-                out.append(f"tie {k}: {what} is {value}; it must be finite and not negative")
+                out.append(
+                    Problem("negative", f"tie {k}: {what} is {value}; it must be finite and not negative")
+                )
         if feeder.r[k] == 0 and feeder.x[k] == 0:
-            out.append(f"tie {k}: r and x are both 0; fuse the two buses")
+            out.append(Problem("zero-impedance", f"tie {k}: r and x are both 0; fuse the two buses"))
     return out
 
 

@@ -15,7 +15,7 @@ from scipy.sparse import coo_array, csc_array
 from scipy.sparse.linalg import splu
 
 from gridsec.arrays import Bools, Floats, Ints, Phasors, frozen, frozen_ints
-from gridsec.errors import FeederInvalid
+from gridsec.errors import FeederInvalid, Problem
 from gridsec.phases import PHASES, ROTATION, PhasedFeeder, ThreePhaseFeeder
 from gridsec.phases.feeder import line_problems, named
 from gridsec.phases.flow import common_paths
@@ -111,7 +111,7 @@ class PhasedMesh(OnTree):
         put("size", np.abs(self.between))
 
 
-def _problems(feeder: PhasedMesh) -> list[str]:
+def _problems(feeder: PhasedMesh) -> list[Problem]:
     """Every reason why the ties do not fit the tree."""
     count, tree = len(feeder.ends), feeder.tree
     expected = (
@@ -120,7 +120,11 @@ def _problems(feeder: PhasedMesh) -> list[str]:
         ("z", feeder.z.shape, (count, 3, 3)),
         ("charging", feeder.charging.shape, (count, 3, 3)),
     )
-    out = [f"{what} has shape {has}; expected {wants}" for what, has, wants in expected if has != wants]
+    out = [
+        Problem("shape", f"{what} has shape {has}; expected {wants}")
+        for what, has, wants in expected
+        if has != wants
+    ]
     if out:
         return out
     last = len(tree.buses) - 1
@@ -128,17 +132,23 @@ def _problems(feeder: PhasedMesh) -> list[str]:
         here, where = feeder.phases[k], f"tie {k}"
         for end in (one, other):
             if not 0 <= end <= last:
-                out.append(f"{where}: bus {end} does not exist; expected 0 to {last}")
+                out.append(
+                    Problem("unknown-index", f"{where}: bus {end} does not exist; expected 0 to {last}")
+                )
             elif (here & ~tree.phases[end]).any():
                 out.append(
-                    f"{where}: phases {named(here)!r} but the other lines bring only "
-                    f"{named(tree.phases[end])!r} to {tree.buses[end]!r}"
+                    Problem(
+                        "absent-phase",
+                        f"{where}: phases {named(here)!r} but the other lines bring only "
+                        f"{named(tree.phases[end])!r} to {tree.buses[end]!r}",
+                    )
                 )
         if one == other:
-            out.append(f"{where}: both ends are bus {one}; a line needs two")
+            out.append(Problem("self-loop", f"{where}: both ends are bus {one}; a line needs two"))
         if not here.any():
-            out.append(f"{where}: it has no phase; expected one, two or three")
-        out.extend(f"{where}: {problem}" for problem in line_problems(feeder.z[k], feeder.charging[k], here))
+            out.append(Problem("no-phase", f"{where}: it has no phase; expected one, two or three"))
+        lines = line_problems(feeder.z[k], feeder.charging[k], here)
+        out.extend(Problem(problem.code, f"{where}: {problem}") for problem in lines)
     return out
 
 
@@ -163,7 +173,7 @@ def _impedances(feeder: PhasedMesh) -> Phasors:
         loops = own + across[3 * one + phase] - across[3 * other + phase]
         size = np.sqrt(np.abs(np.diagonal(loops)))
         if not size.all() or np.linalg.cond(loops / np.outer(size, size)) > _SINGULAR:
-            raise FeederInvalid(["ties: the impedances around a loop add up to nothing"])
+            raise FeederInvalid([Problem("singular", "ties: the impedances around a loop add up to nothing")])
         Z = Z - across @ np.linalg.solve(loops, across[feeder.bus].T)
     return np.asarray(3.0 * Z)
 
@@ -193,7 +203,9 @@ def admittance(feeder: PhasedMesh) -> csc_array:
         some = np.ix_(here, here)
         if np.linalg.cond(z[some]) > _SINGULAR:
             where = f"branch {k}" if k < len(tree.z) else f"tie {k - len(tree.z)}"
-            raise FeederInvalid([f"{where}: z is singular; with charging every current has to meet some"])
+            raise FeederInvalid(
+                [Problem("singular", f"{where}: z is singular; with charging every current has to meet some")]
+            )
         out[some] = np.linalg.inv(z[some])
     one, other = lines.T
     every = np.arange(len(tree.buses))

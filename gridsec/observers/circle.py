@@ -23,7 +23,7 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, Ints, frozen
 from gridsec.certificates import Certificate, certify, error_bound, feeds
 from gridsec.choices import no_choice
-from gridsec.errors import DesignInfeasible, refuse
+from gridsec.errors import DesignInfeasible, InputInvalid, Problem, refuse
 from gridsec.gains import CircleGains, CircleOptions, margin, sensitivity, state_bound
 from gridsec.lmi import circle, contraction
 from gridsec.lure import POLICY, Lure, StepPolicy, advance
@@ -132,7 +132,9 @@ def design(
     """
     trusted = np.asarray(trusted, dtype=np.bool_)
     if trusted.shape != (len(lure.C),):
-        raise ValueError(f"trusted has shape {trusted.shape}; the plant has {len(lure.C)} meters")
+        raise InputInvalid(
+            [Problem("shape", f"trusted has shape {trusted.shape}; the plant has {len(lure.C)} meters")]
+        )
     if isinstance(gains, str):
         refuse(no_choice("gains", ("direct", "lmi"), gains))
     if gains == "direct":
@@ -141,13 +143,22 @@ def design(
     if isinstance(gains, CircleGains):
         made = gains
         if sorted(made.J.tolist()) != meters.tolist():
-            raise ValueError(f"the design is for the meters {made.J.tolist()}, not {meters.tolist()}")
+            raise InputInvalid(
+                [
+                    Problem(
+                        "wrong-design",
+                        f"the design is for the meters {made.J.tolist()}, not {meters.tolist()}",
+                    )
+                ]
+            )
         held = margin(lure, made.J, made)
         if not held > 0.0:
-            raise DesignInfeasible(f"observer of the meters {meters.tolist()}", "does not hold here", held)
+            raise DesignInfeasible(
+                f"observer of the meters {meters.tolist()}", "does not hold here", held, code="not-verified"
+            )
         made = replace(made, margin=held)
     elif options is None:
-        raise ValueError('gains="lmi" needs options: gridsec.lmi.options_for')
+        raise InputInvalid([Problem("missing", 'gains="lmi" needs options: gridsec.lmi.options_for')])
     else:
         made = circle(
             lure,

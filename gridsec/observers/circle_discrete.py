@@ -23,7 +23,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, frozen
 from gridsec.choices import no_choice
-from gridsec.errors import DesignInfeasible, refuse
+from gridsec.errors import DesignInfeasible, InputInvalid, Problem, refuse
 from gridsec.lmi.discrete import DiscreteOptions, discrete_circle
 from gridsec.lmi.discrete_bounds import (
     DirectProof,
@@ -122,7 +122,9 @@ def design(
     trusted = np.array(trusted, dtype=np.bool_)
     trusted.flags.writeable = False
     if trusted.shape != (len(system.C),):
-        raise ValueError(f"trusted has shape {trusted.shape}; the plant has {len(system.C)} meters")
+        raise InputInvalid(
+            [Problem("shape", f"trusted has shape {trusted.shape}; the plant has {len(system.C)} meters")]
+        )
     if isinstance(gains, str):
         refuse(no_choice("gains", ("lmi",), gains))
     if isinstance(gains, DirectProof):
@@ -131,13 +133,22 @@ def design(
     if isinstance(gains, DiscreteGains):
         made = gains
         if sorted(made.J.tolist()) != meters.tolist():
-            raise ValueError(f"the design is for the meters {made.J.tolist()}, not {meters.tolist()}")
+            raise InputInvalid(
+                [
+                    Problem(
+                        "wrong-design",
+                        f"the design is for the meters {made.J.tolist()}, not {meters.tolist()}",
+                    )
+                ]
+            )
         held = discrete_margin(system, made.J, made)
         if not held > 0.0:
             what = f"discrete observer of the meters {meters.tolist()}"
-            raise DesignInfeasible(what, "does not hold here", held)
+            raise DesignInfeasible(what, "does not hold here", held, code="not-verified")
     elif options is None:
-        raise ValueError('gains="lmi" needs options: gridsec.lmi.discrete.discrete_options')
+        raise InputInvalid(
+            [Problem("missing", 'gains="lmi" needs options: gridsec.lmi.discrete.discrete_options')]
+        )
     else:
         made = discrete_circle(system, meters, options)
     L, K = np.zeros((len(system.A), trusted.size)), np.zeros((len(system.lower), trusted.size))
@@ -174,7 +185,7 @@ def _direct(system: DiscreteLure, trusted: Bools, proof: DirectProof) -> Discret
     )
     held = discrete_margin(system, [], silent)
     if not held > 0.0:
-        raise DesignInfeasible("direct injection", "the proof does not hold here", held)
+        raise DesignInfeasible("direct injection", "the proof does not hold here", held, code="not-verified")
     K = direct_gain(system, trusted)
     return DiscreteDesign(
         system,
@@ -278,7 +289,9 @@ def settling_steps(design: DiscreteDesign, *, start: float, epsilon: float) -> i
     if design.growth * start <= epsilon:
         return 0
     if epsilon <= 0.0:
-        raise ValueError("epsilon must be positive unless the observers start in the true state")
+        raise InputInvalid(
+            [Problem("not-positive", "epsilon must be positive unless the observers start in the true state")]
+        )
     return int(np.ceil(np.log(epsilon / (design.growth * start)) / np.log(design.decay)))
 
 
@@ -316,7 +329,7 @@ def stack(designs: Sequence[DiscreteDesign]) -> Stack:
         If the observers belong to different plants.
     """
     if any(one.system is not designs[0].system for one in designs):
-        raise ValueError("the observers belong to different plants")
+        raise InputInvalid([Problem("wrong-design", "the observers belong to different plants")])
     return Stack(
         designs[0].system,
         np.stack([one.trusted for one in designs]),
@@ -423,11 +436,18 @@ def monte_carlo(
     width = np.broadcast_to(np.asarray(half_width, dtype=np.float64), (p,))
     problems = []
     if not (runs and 0.0 < confidence < 1.0):
-        problems.append("at least one run, and a confidence between 0 and 1")
+        problems.append(Problem("out-of-range", "at least one run, and a confidence between 0 and 1"))
     if not np.all(np.isfinite(width) & (width >= 0.0)):
-        problems.append(f"half_width must be finite and not negative, got {width.tolist()}")
+        problems.append(
+            Problem("negative", f"half_width must be finite and not negative, got {width.tolist()}")
+        )
     elif not np.all(stack.masks @ width > 0.0):
-        problems.append("every observer needs a meter with noise: half_width is 0 for all that some trust")
+        problems.append(
+            Problem(
+                "not-positive",
+                "every observer needs a meter with noise: half_width is 0 for all that some trust",
+            )
+        )
     refuse(problems)
     everyone, truth = np.ones(p, dtype=np.bool_), np.asarray(start, dtype=np.float64)
     x = np.repeat(truth[:, None, :], len(stack.masks), axis=1)

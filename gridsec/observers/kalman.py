@@ -26,7 +26,7 @@ import numpy as np
 from scipy.linalg import block_diag, solve_discrete_lyapunov
 
 from gridsec.arrays import Bools, Floats, frozen, spectral_radius, symmetry_defect
-from gridsec.errors import DesignInfeasible, refuse
+from gridsec.errors import DesignInfeasible, Problem, refuse
 from gridsec.observers.parts import Stack, decompose, heard, riccati, stack
 
 RESIDUAL = 1e-8
@@ -133,16 +133,20 @@ def design(
     lee2018, Assumption 4.3.3, (4.3.8), (4.3.9).
     """
     Q, R = np.asarray(Q, dtype=np.float64), np.asarray(R, dtype=np.float64)
-    problems: list[str] = []
+    problems: list[Problem] = []
     for name, M, size in (("Q", Q, len(A)), ("R", R, len(C))):
         if M.shape != (size, size):
-            problems.append(f"{name} has shape {M.shape}; ({size}, {size}) is needed")
+            problems.append(Problem("shape", f"{name} has shape {M.shape}; ({size}, {size}) is needed"))
             continue
         scale = float(np.max(np.abs(M), initial=0.0))
         if not np.all(np.isfinite(M)):
-            problems.append(f"{name} is not finite")
+            problems.append(Problem("not-finite", f"{name} is not finite"))
         elif not symmetry_defect(M) <= 1e-12 or float(np.linalg.eigvalsh(M)[0]) < -1e-12 * scale:
-            problems.append(f"{name} is no covariance: not symmetric, or not positive semidefinite")
+            problems.append(
+                Problem(
+                    "not-definite", f"{name} is no covariance: not symmetric, or not positive semidefinite"
+                )
+            )
     refuse(problems)
     whole = stack(decompose(A, C, slowest=slowest, tol=tol), B)
     own = block_diag(*(np.ones((part.t.size, 1)) for part in whole.parts))
@@ -291,7 +295,9 @@ def steady(design: KalmanDesign) -> Steady:
     F = J @ whole.S
     radius = spectral_radius(F)
     if not radius < 1.0:
-        raise DesignInfeasible("stationary filters", f"spectral radius {radius:.6g}", 1.0 - radius)
+        raise DesignInfeasible(
+            "stationary filters", f"spectral radius {radius:.6g}", 1.0 - radius, code="unstable"
+        )
     P = np.asarray(
         solve_discrete_lyapunov(F, J @ design.process @ J.T + gains @ design.noise @ gains.T),
         dtype=np.float64,

@@ -22,7 +22,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, frozen, spectral_radius
 from gridsec.choices import no_choice
-from gridsec.errors import DesignInfeasible, refuse
+from gridsec.errors import DesignInfeasible, InputInvalid, Problem, refuse
 from gridsec.observers.parts import Part, Stack, decompose, heard, riccati, stack
 
 LONGEST = 1 << 17
@@ -162,7 +162,7 @@ def riccati_gain(part: Part, process: Floats, noise: float, *, rate: float) -> F
     B. Anderson, J. Moore, "Optimal filtering", Prentice-Hall, 1979, sections 4.4 and 6.3 (prescribed decay).
     """
     if not 0.0 < rate <= 1.0:
-        raise ValueError(f"rate is {rate}; it must lie in (0, 1]")
+        raise InputInvalid([Problem("out-of-range", f"rate is {rate}; it must lie in (0, 1]")])
     size = part.t.size if rate == 1.0 else part.observable.shape[1]
     gain = np.zeros(part.t.size)
     if not size:
@@ -174,7 +174,10 @@ def riccati_gain(part: Part, process: Floats, noise: float, *, rate: float) -> F
     radius = spectral_radius(part.S[:size, :size] - np.outer(gain[:size], part.t[:size]))
     if not radius < rate:
         raise DesignInfeasible(
-            f"observer gain for decay like {rate:g}^k", f"spectral radius {radius:.6g}", rate - radius
+            f"observer gain for decay like {rate:g}^k",
+            f"spectral radius {radius:.6g}",
+            rate - radius,
+            code="unstable",
         )
     return gain
 
@@ -225,14 +228,30 @@ def design(
     parts = decompose(A, C, slowest=slowest, tol=tol)
     E, noise = np.asarray(bounds.E, dtype=np.float64), np.asarray(bounds.noise, dtype=np.float64)
     if E.ndim != 2 or E.shape[0] != len(A) or noise.shape != (len(parts),):
-        raise ValueError(f"E has shape {E.shape} and noise {noise.shape} for n = {len(A)}, p = {len(parts)}")
+        raise InputInvalid(
+            [
+                Problem(
+                    "shape",
+                    f"E has shape {E.shape} and noise {noise.shape} for n = {len(A)}, p = {len(parts)}",
+                )
+            ]
+        )
     if not (bounds.process >= 0.0 and np.all(noise >= 0.0)):
-        raise ValueError("bounds of disturbance and noise must be numbers and cannot be negative")
+        raise InputInvalid(
+            [Problem("negative", "bounds of disturbance and noise must be numbers and cannot be negative")]
+        )
     if isinstance(gains, str):
         refuse(no_choice("gains", ("riccati",), gains))
         weight = bounds.process**2 * E @ E.T
         if np.any(noise == 0.0):
-            raise ValueError('gains="riccati" needs positive bounds of the noise; give the gains otherwise')
+            raise InputInvalid(
+                [
+                    Problem(
+                        "not-positive",
+                        'gains="riccati" needs positive bounds of the noise; give the gains otherwise',
+                    )
+                ]
+            )
         chosen = [
             riccati_gain(part, weight, float(size) ** 2, rate=rate)
             for part, size in zip(parts, noise, strict=True)
@@ -240,7 +259,9 @@ def design(
     else:
         chosen = [np.asarray(gain, dtype=np.float64) for gain in gains]
     if [gain.shape for gain in chosen] != [part.t.shape for part in parts]:
-        raise ValueError(f"gains must have the lengths {[part.t.size for part in parts]}")
+        raise InputInvalid(
+            [Problem("shape", f"gains must have the lengths {[part.t.size for part in parts]}")]
+        )
     whole = stack(parts, B)
     L = np.zeros((whole.phi.shape[0], len(parts)))
     for i, gain in enumerate(chosen):
@@ -274,7 +295,9 @@ def envelope(part: Part, gain: Floats, process: float, noise: float, E: Floats) 
     F = part.S - np.outer(gain, part.t)
     radius = spectral_radius(F)
     if not radius < 1.0:
-        raise DesignInfeasible("partial observer", f"spectral radius {radius:.6g} of S - L t", 1.0 - radius)
+        raise DesignInfeasible(
+            "partial observer", f"spectral radius {radius:.6g} of S - L t", 1.0 - radius, code="unstable"
+        )
     if not part.t.size:
         return Envelope(frozen(np.array([1.0, 0.0])), 0.0)
     powers, sizes = _powers(F)
@@ -290,7 +313,9 @@ def _powers(F: Floats) -> tuple[Floats, Floats]:
     sizes = np.linalg.norm(powers, 2, axis=(1, 2))
     while sizes[-1] * sizes.max() > 0.5:
         if len(powers) > LONGEST:
-            raise DesignInfeasible("partial observer", f"errors may not have halved after {LONGEST} steps")
+            raise DesignInfeasible(
+                "partial observer", f"errors may not have halved after {LONGEST} steps", code="not-converged"
+            )
         more = powers[1:] @ powers[-1]
         powers = np.concatenate([powers, more])
         sizes = np.concatenate([sizes, np.linalg.norm(more, 2, axis=(1, 2))])
@@ -325,7 +350,9 @@ def geometric(part: Part, gain: Floats, process: float, noise: float, E: Floats,
     """
     F = part.S - np.outer(gain, part.t)
     if not spectral_radius(F) < beta < 1.0:
-        raise ValueError(f"beta is {beta}; it must lie between {spectral_radius(F):.6g} and 1")
+        raise InputInvalid(
+            [Problem("out-of-range", f"beta is {beta}; it must lie between {spectral_radius(F):.6g} and 1")]
+        )
     # |F^j M| beta^-j is largest within the first K powers: later ones are shorter than those K before.
     powers, sizes = _powers(F / beta)
     eta_f = float(sizes.max())

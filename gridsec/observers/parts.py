@@ -18,7 +18,7 @@ import numpy as np
 from scipy.linalg import LinAlgError, block_diag, schur, solve_discrete_are
 
 from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints, unit_rows
-from gridsec.errors import DesignInfeasible
+from gridsec.errors import DesignInfeasible, InputInvalid, Problem
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,9 +89,17 @@ def decompose(A: Floats, C: Floats, *, slowest: float, tol: float) -> tuple[Part
     """
     A, C = np.asarray(A, dtype=np.float64), np.asarray(C, dtype=np.float64)
     if A.ndim != 2 or A.shape[0] != A.shape[1] or C.ndim != 2 or C.shape[1] != A.shape[0]:
-        raise ValueError(f"A has shape {A.shape} and C {C.shape}; (n, n) and (p, n) are needed")
+        raise InputInvalid(
+            [Problem("shape", f"A has shape {A.shape} and C {C.shape}; (n, n) and (p, n) are needed")]
+        )
     if not 0.0 <= slowest <= 1.0:
-        raise ValueError(f"slowest is {slowest}; it is the modulus of a decaying mode, in [0, 1]")
+        raise InputInvalid(
+            [
+                Problem(
+                    "out-of-range", f"slowest is {slowest}; it is the modulus of a decaying mode, in [0, 1]"
+                )
+            ]
+        )
     return tuple(_part(A, c, row, slowest, tol) for c, row in zip(C, unit_rows(C, tol=tol), strict=True))
 
 
@@ -223,7 +231,7 @@ def riccati(S: Floats, t: Floats, Q: Floats, r: float, *, tol: float) -> Floats:
         if off < worst:
             best, worst = M, off
     if not worst <= tol:
-        raise DesignInfeasible("Riccati equation of one sensor", said, -worst)
+        raise DesignInfeasible("Riccati equation of one sensor", said, -worst, code="no-solution")
     return np.asarray(0.5 * (best + best.T))
 
 

@@ -24,6 +24,7 @@ from gridsec import bank as banks
 from gridsec.arrays import Floats, Ints
 from gridsec.certificates import reactance
 from gridsec.droop import Droop, fleet
+from gridsec.errors import InputInvalid, Problem
 from gridsec.feeder import Feeder, lindistflow
 from gridsec.gains import CircleGains, margin, options_for
 from gridsec.gains import stacked as in_one
@@ -272,7 +273,7 @@ def observe(
     count, bank = len(w), made.bank
     gains = bank.gains
     if gains is None:
-        raise ValueError("the bank needs explicit gains")
+        raise InputInvalid([Problem("missing", "the bank needs explicit gains")])
     L, K = gains.L, gains.K
 
     def field(t: float, flat: Floats) -> Floats:

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, Phasors, frozen, frozen_ints
-from gridsec.errors import FeederInvalid
+from gridsec.errors import FeederInvalid, Problem
 from gridsec.trees import walk
 
 PHASES = "abc"
@@ -154,7 +154,7 @@ def sequence_matrix(positive: Phasors | Floats, zero: Phasors | Floats) -> Phaso
     return np.asarray(one * np.eye(3) + (none - one) / 3.0)
 
 
-def _shape_problems(feeder: ThreePhaseFeeder) -> list[str]:
+def _shape_problems(feeder: ThreePhaseFeeder) -> list[Problem]:
     """Fields whose lengths do not fit together; nothing else can be said before these are right."""
     branches, customers = feeder.parent.size, len(feeder.customers)
     expected = (
@@ -166,32 +166,43 @@ def _shape_problems(feeder: ThreePhaseFeeder) -> list[str]:
         ("bus", feeder.bus.shape, (customers,)),
         ("connected", feeder.connected.shape, (customers, 3)),
     )
-    return [f"{what} has shape {has}; expected {wants}" for what, has, wants in expected if has != wants]
+    return [
+        Problem("shape", f"{what} has shape {has}; expected {wants}")
+        for what, has, wants in expected
+        if has != wants
+    ]
 
 
-def _branch_problems(feeder: ThreePhaseFeeder) -> list[str]:
+def _branch_problems(feeder: ThreePhaseFeeder) -> list[Problem]:
     out = []
     for what in ("base_volt", "base_kva"):
         value = getattr(feeder, what)
         if not (np.isfinite(value) and value > 0):
-            out.append(f"{what} is {value}; it must be a positive number")
+            out.append(Problem("not-positive", f"{what} is {value}; it must be a positive number"))
     for k, above in enumerate(feeder.parent.tolist()):
         where = f"branch {k} into bus {feeder.buses[k + 1]!r}"
         if not 0 <= above <= k:
-            out.append(f"{where}: parent {above} does not precede it; expected 0 to {k}")
+            out.append(
+                Problem("not-radial", f"{where}: parent {above} does not precede it; expected 0 to {k}")
+            )
             continue
         here, there = feeder.phases[k + 1], feeder.phases[above]
         if not here.any():
-            out.append(f"{where}: it has no phase; expected one, two or three")
+            out.append(Problem("no-phase", f"{where}: it has no phase; expected one, two or three"))
         elif (here & ~there).any():
             out.append(
-                f"{where}: phases {named(here)!r} but only {named(there)!r} arrive at {feeder.buses[above]!r}"
+                Problem(
+                    "absent-phase",
+                    f"{where}: phases {named(here)!r} but only {named(there)!r} "
+                    f"arrive at {feeder.buses[above]!r}",
+                )
             )
-        out.extend(f"{where}: {problem}" for problem in line_problems(feeder.z[k], feeder.charging[k], here))
+        lines = line_problems(feeder.z[k], feeder.charging[k], here)
+        out.extend(Problem(problem.code, f"{where}: {problem}") for problem in lines)
     return out
 
 
-def line_problems(z: Phasors, charging: Floats, present: Bools) -> list[str]:
+def line_problems(z: Phasors, charging: Floats, present: Bools) -> list[Problem]:
     """What is wrong with the impedances and susceptances of a line.
 
     Parameters
@@ -202,50 +213,67 @@ def line_problems(z: Phasors, charging: Floats, present: Bools) -> list[str]:
         Phases that the line has.
     """
     blocks = (("z", z), ("charging", charging))
-    out = [f"{what} {problem}" for what, block in blocks for problem in _block_problems(block, present)]
+    out = [
+        Problem(problem.code, f"{what} {problem}")
+        for what, block in blocks
+        for problem in _block_problems(block, present)
+    ]
     return out + _impedance_problems(z, present)
 
 
-def _block_problems(block: Phasors | Floats, here: Bools) -> list[str]:
+def _block_problems(block: Phasors | Floats, here: Bools) -> list[Problem]:
     """What is wrong with a 3x3 block, of impedances or of susceptances."""
     if not np.isfinite(block).all():
-        return ["is not finite"]
+        return [Problem("not-finite", "is not finite")]
     out = []
     if block[~here].any() or block[:, ~here].any():
-        out.append("is not 0 on a phase that is absent")
+        out.append(Problem("absent-phase", "is not 0 on a phase that is absent"))
     if np.abs(block - block.T).max() > _ROUNDING * np.abs(block).max():
-        out.append("is not symmetric; lines and cables are reciprocal")
+        out.append(Problem("not-symmetric", "is not symmetric; lines and cables are reciprocal"))
     return out
 
 
-def _impedance_problems(z: Phasors, here: Bools) -> list[str]:
+def _impedance_problems(z: Phasors, here: Bools) -> list[Problem]:
     if not np.isfinite(z).all():
         return []
     own = z[np.ix_(here, here)]
     if (np.diagonal(own) == 0).any():
-        return ["a phase without self-impedance; fuse the two buses"]
+        return [Problem("zero-impedance", "a phase without self-impedance; fuse the two buses")]
     # Only the losses of a passive line are never negative, and only their matrix is semidefinite.
     if own.size and np.linalg.eigvalsh(0.5 * (own.real + own.real.T))[0] < -_ROUNDING * np.abs(own).max():
-        return ["its resistances generate power; the matrix must be positive semidefinite"]
+        return [
+            Problem(
+                "not-definite", "its resistances generate power; the matrix must be positive semidefinite"
+            )
+        ]
     return []
 
 
-def _customer_problems(feeder: ThreePhaseFeeder) -> list[str]:
+def _customer_problems(feeder: ThreePhaseFeeder) -> list[Problem]:
     out = []
     last = feeder.parent.size
     for name, bus, wanted in zip(feeder.customers, feeder.bus.tolist(), feeder.connected, strict=True):
         if not 0 <= bus <= last:
-            out.append(f"customer {name!r}: bus {bus} does not exist; expected 0 to {last}")
+            out.append(
+                Problem("unknown-index", f"customer {name!r}: bus {bus} does not exist; expected 0 to {last}")
+            )
         elif not wanted.any():
-            out.append(f"customer {name!r}: is connected to no phase")
+            out.append(Problem("no-phase", f"customer {name!r}: is connected to no phase"))
         elif (wanted & ~feeder.phases[bus]).any():
             out.append(
-                f"customer {name!r}: phases {named(wanted)!r} but bus {feeder.buses[bus]!r} has only "
-                f"{named(feeder.phases[bus])!r}"
+                Problem(
+                    "absent-phase",
+                    f"customer {name!r}: phases {named(wanted)!r} but bus {feeder.buses[bus]!r} has only "
+                    f"{named(feeder.phases[bus])!r}",
+                )
             )
     for what, names in (("customer", feeder.customers), ("bus", feeder.buses)):
         counted = Counter(names)
-        out.extend(f"{what} {name!r} is named {times} times" for name, times in counted.items() if times > 1)
+        out.extend(
+            Problem("duplicate", f"{what} {name!r} is named {times} times")
+            for name, times in counted.items()
+            if times > 1
+        )
     return out
 
 

@@ -29,6 +29,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gridsec.arrays import Floats, Ints, Phasors, frozen
+from gridsec.errors import InputInvalid, Problem
 from gridsec.intervals import Sweeps, bounds
 from gridsec.phases.feeder import ROTATION, ThreePhaseFeeder
 from gridsec.trees import below, from_root, meetings, shrinking
@@ -366,7 +367,7 @@ def interval_bounds(
 
 def _check(steps: int) -> None:
     if steps < 1:
-        raise ValueError(f"steps is {steps}; it must be at least 1")
+        raise InputInvalid([Problem("out-of-range", f"steps is {steps}; it must be at least 1")])
 
 
 def _rotated(feeder: ThreePhaseFeeder) -> Phasors:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gridsec.arrays import Floats, Ints, frozen, frozen_ints
-from gridsec.errors import FeederInvalid
+from gridsec.errors import FeederInvalid, Problem
 from gridsec.phases import flow
 from gridsec.phases.feeder import PHASES, ThreePhaseFeeder
 from gridsec.phases.flow import lindist3flow
@@ -52,7 +52,10 @@ class PhasedFeeder(OnTree):
         if several.any():
             raise FeederInvalid(
                 [
-                    f"customer {tree.customers[k]!r} has several phases; expected one customer for each"
+                    Problem(
+                        "several-phases",
+                        f"customer {tree.customers[k]!r} has several phases; expected one customer for each",
+                    )
                     for k in np.flatnonzero(several).tolist()
                 ]
             )

@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, submatrix
-from gridsec.errors import refuse
+from gridsec.errors import Problem, refuse
 from gridsec.network import one_busbar
 from gridsec.sequential.conditional import invert
 from gridsec.sequential.design import SequentialDesign
@@ -439,14 +439,18 @@ def from_arrays(design: SequentialDesign, arrays: Mapping[str, Floats]) -> Commi
 _ROUNDED = 1.0 + 1e-9
 
 
-def _problems(design: SequentialDesign, arrays: Mapping[str, Floats]) -> list[str]:
+def _problems(design: SequentialDesign, arrays: Mapping[str, Floats]) -> list[Problem]:
     """Everything that is wrong with arrays."""
     p, needed, times = design.allowed.size, {*_KNOWN, *_GATHERED}, {_WATCHED, *_LOST}
-    problems = [f"{name} is missing" for name in sorted(needed - arrays.keys())]
-    problems += [f"{name} is not known" for name in sorted(arrays.keys() - needed - times)]
+    problems = [Problem("missing", f"{name} is missing") for name in sorted(needed - arrays.keys())]
+    problems += [
+        Problem("unknown-name", f"{name} is not known") for name in sorted(arrays.keys() - needed - times)
+    ]
     shapes = {name: arrays[name].shape for name in sorted((needed | times) & arrays.keys())}
     problems += [
-        f"{name} has the shape {shape}, not ({p},)" for name, shape in shapes.items() if shape != (p,)
+        Problem("shape", f"{name} has the shape {shape}, not ({p},)")
+        for name, shape in shapes.items()
+        if shape != (p,)
     ]
     if problems:
         return problems
@@ -456,23 +460,27 @@ def _problems(design: SequentialDesign, arrays: Mapping[str, Floats]) -> list[st
     # Comparisons with NaN are false: NaN breaks every rule.
     rules = {
         **{
-            f"{name} is not a time": np.isfinite(arrays[name]) & (arrays[name] >= 0)
+            Problem("negative", f"{name} is not a time"): np.isfinite(arrays[name]) & (arrays[name] >= 0)
             for name in sorted(times & arrays.keys())
         },
-        "bias is beyond the class": np.abs(arrays["bias"]) <= widest,
-        "variance is not within that of the class": (arrays["variance"] >= 0)
+        Problem("out-of-range", "bias is beyond the class"): np.abs(arrays["bias"]) <= widest,
+        Problem("out-of-range", "variance is not within that of the class"): (arrays["variance"] >= 0)
         & (arrays["variance"] <= design.fixed * _ROUNDED),
-        "allowed is not within the class": (arrays["allowed"] >= 0) & (arrays["allowed"] <= widest),
-        "hidden is no variance": (arrays["hidden"] >= 0) & np.isfinite(arrays["hidden"]),
-        "at is no time": np.isnan(at) | np.isfinite(at),
-        "since is no time": np.isnan(since) | np.isfinite(since),
-        "neither learned nor being learned": (np.isfinite(at) ^ np.isfinite(since)) | (idle & np.isnan(at)),
-        "total is no number": np.isfinite(arrays["total"]),
-        "count is no number of readings": np.isfinite(count) & (count >= 0) & (count == np.floor(count)),
-        "time_s is no time": np.isfinite(time_s) & (time_s >= 0),
+        Problem("out-of-range", "allowed is not within the class"): (arrays["allowed"] >= 0)
+        & (arrays["allowed"] <= widest),
+        Problem("negative", "hidden is no variance"): (arrays["hidden"] >= 0) & np.isfinite(arrays["hidden"]),
+        Problem("not-finite", "at is no time"): np.isnan(at) | np.isfinite(at),
+        Problem("not-finite", "since is no time"): np.isnan(since) | np.isfinite(since),
+        Problem("inconsistent", "neither learned nor being learned"): (np.isfinite(at) ^ np.isfinite(since))
+        | (idle & np.isnan(at)),
+        Problem("not-finite", "total is no number"): np.isfinite(arrays["total"]),
+        Problem("not-integer", "count is no number of readings"): np.isfinite(count)
+        & (count >= 0)
+        & (count == np.floor(count)),
+        Problem("negative", "time_s is no time"): np.isfinite(time_s) & (time_s >= 0),
     }
     return [
-        f"{what} (meters {', '.join(map(str, np.flatnonzero(~good)))})"
+        Problem(what.code, f"{what} (meters {', '.join(map(str, np.flatnonzero(~good)))})")
         for what, good in rules.items()
         if not all_of(good)
     ]

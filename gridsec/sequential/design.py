@@ -17,7 +17,7 @@ from gridsec.accuracy import ToldError, busbar_error, steady_rounding
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.certificates import Certificate, certify, verify
 from gridsec.detect import curve_mismatch
-from gridsec.errors import DesignInfeasible, NotObservable, refuse
+from gridsec.errors import DesignInfeasible, NotObservable, Problem, refuse
 from gridsec.lmi import contraction
 from gridsec.lure import Lure, close_loop
 from gridsec.network import Network, Power, hangs_on, own, sizes
@@ -33,7 +33,7 @@ from gridsec.sequential.repeats import rules
 YEAR_S = 365.25 * 86400.0
 
 
-_SCALES = "must be at least one number of seconds, none of them negative"
+_SCALES = Problem("out-of-range", "must be at least one number of seconds, none of them negative")
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,18 +102,21 @@ class SequentialOptions:
     settled: float = 0.1
 
     def __post_init__(self) -> None:
-        positive, zero = "must be a positive number", "must be a finite number that is not negative"
+        positive, zero = (
+            Problem("not-positive", "must be a positive number"),
+            Problem("negative", "must be a finite number that is not negative"),
+        )
         wanted = [
             ("alarms_per_year", 0.0 < self.alarms_per_year < np.inf, positive),
             ("scales_s", bool(self.scales_s) and all(0.0 <= s < np.inf for s in self.scales_s), _SCALES),
-            ("enough", 0.0 < self.enough <= 1.0, "must be above 0 and up to 1"),
+            ("enough", 0.0 < self.enough <= 1.0, Problem("out-of-range", "must be above 0 and up to 1")),
             ("focus", 0.0 < self.focus < np.inf, positive),
             ("several", self.several >= 0, zero),
-            ("release", self.release >= 1, "must be at least 1"),
-            ("suspect", 0.0 < self.suspect < 1.0, "must be between 0 and 1"),
-            ("lower", 0.0 < self.lower <= 1.0, "must be above 0 and up to 1"),
+            ("release", self.release >= 1, Problem("out-of-range", "must be at least 1")),
+            ("suspect", 0.0 < self.suspect < 1.0, Problem("out-of-range", "must be between 0 and 1")),
+            ("lower", 0.0 < self.lower <= 1.0, Problem("out-of-range", "must be above 0 and up to 1")),
             ("hidden_power", 0.0 < self.hidden_power < np.inf, positive),
-            ("like", 1.0 <= self.like < np.inf, "must be at least 1 and finite"),
+            ("like", 1.0 <= self.like < np.inf, Problem("out-of-range", "must be at least 1 and finite")),
             *(
                 (name, 0.0 <= getattr(self, name) < np.inf, zero)
                 for name in ("hidden_charge", "commission_s", "stability", "unread_std_percent")
@@ -121,7 +124,11 @@ class SequentialOptions:
         ]
         refuse(
             [
-                *(f"{name} is {getattr(self, name)}; it {what}" for name, sound, what in wanted if not sound),
+                *(
+                    Problem(what.code, f"{name} is {getattr(self, name)}; it {what}")
+                    for name, sound, what in wanted
+                    if not sound
+                ),
                 *judging_problems(self.settled, self.widest, self.v2_limits),
             ]
         )
@@ -368,10 +375,12 @@ def _check(plant: Plant, doubt: LoadDoubt, step_s: float, most: int | None) -> N
     meters, customers = plant.meters, plant.feeder.bus.size
     if meters.size < _FEWEST:
         why = f"{meters.size} meters; at least {_FEWEST} are needed to outvote one"
-        raise NotObservable(meters.tolist(), meters.size, why)
+        raise NotObservable(meters.tolist(), meters.size, why, code="too-few-meters")
     more = []
     if doubt.p.shape != (customers,) or doubt.q.shape != (customers,):
-        more.append(f"doubt is given for {doubt.p.size} and {doubt.q.size} customers of {customers}")
+        more.append(
+            Problem("shape", f"doubt is given for {doubt.p.size} and {doubt.q.size} customers of {customers}")
+        )
     check_plant(plant, max_attacked=0 if most is None else most, step_s=step_s, more=more)
 
 
@@ -388,7 +397,9 @@ def _proof(lure: Lure) -> Certificate:
         found = contraction(lure, rate=_RATE * float(np.min(-np.diagonal(lure.A))))
     margin = verify(found, lure)
     if not margin > 0:
-        raise DesignInfeasible(f"{found.kind} certificate", "it fails its verification", margin)
+        raise DesignInfeasible(
+            f"{found.kind} certificate", "it fails its verification", margin, code="not-verified"
+        )
     return found
 
 

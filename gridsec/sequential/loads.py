@@ -18,7 +18,7 @@ import numpy as np
 from gridsec.accuracy import MeterAccuracy
 from gridsec.arrays import Floats, Ints
 from gridsec.droop import Droop
-from gridsec.errors import refuse
+from gridsec.errors import Problem, refuse
 from gridsec.network import Network, Power, bus_voltages, by_place, covariance, one_busbar, variances
 from gridsec.sequential.conditional import Prior
 
@@ -70,15 +70,17 @@ class LoadDoubt:
 
     def __post_init__(self) -> None:
         problems = [
-            f"{name} must be finite and not negative"
+            Problem("negative", f"{name} must be finite and not negative")
             for name in ("p", "q")
             if not (np.isfinite(getattr(self, name)).all() and (getattr(self, name) >= 0).all())
         ]
         if not 0 < self.time_s <= LONGEST_S:
             most = f"at most {LONGEST_S:g}; what never changes is `lasting`"
-            problems.append(f"time_s is {self.time_s}; it must be positive and {most}")
+            problems.append(
+                Problem("out-of-range", f"time_s is {self.time_s}; it must be positive and {most}")
+            )
         problems += [
-            f"{name} is {getattr(self, name)}; it must be from 0 to 1"
+            Problem("out-of-range", f"{name} is {getattr(self, name)}; it must be from 0 to 1")
             for name in ("common_p", "common_q", "lasting", "together")
             if not (np.greater_equal(getattr(self, name), 0) & np.less_equal(getattr(self, name), 1)).all()
         ]

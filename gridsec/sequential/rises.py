@@ -15,6 +15,7 @@ from math import log
 import numpy as np
 from scipy.special import chdtri, ndtri
 
+from gridsec import errors
 from gridsec.arrays import Bools, Floats, Ints, frozen, submatrix
 
 # Determinants are positive; rounding may make them less.
@@ -80,7 +81,9 @@ class Lies:
 
     def __post_init__(self) -> None:
         if min(self.size, self.amplitude, self.differ) <= 0.0:
-            raise ValueError("size, amplitude and differ must be positive")
+            raise errors.InputInvalid(
+                [errors.Problem("not-positive", "size, amplitude and differ must be positive")]
+            )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,7 +117,9 @@ class FalsePowers:
         square = self.R.shape == self.X.shape == (count, count)
         felt = self.felt is None or self.felt.shape == (min(MOST, count), count)
         if not (square and self.q.shape == self.p.shape and felt):
-            raise ValueError("R, X, p, q and felt must be of the same meters")
+            raise errors.InputInvalid(
+                [errors.Problem("shape", "R, X, p, q and felt must be of the same meters")]
+            )
 
     def claimed(self, p: Floats, q: Floats) -> FalsePowers:
         """For the same meters, other powers: what depends on the feeder alone is prepared once for all.
@@ -243,7 +248,7 @@ class Problem:
             If there are no false powers.
         """
         if self.false is None:
-            raise ValueError("there are no false powers")
+            raise errors.InputInvalid([errors.Problem("missing", "there are no false powers")])
         return strongest(self.false.R) if self.false.felt is None else self.false.felt
 
     def quiet(self, g: Floats, diagonal: Floats) -> bool:
@@ -328,7 +333,7 @@ class Problem:
     def _columns(self, c: int) -> Floats:
         """B of a customer, a row for each power, (2, p)."""
         if self.false is None:
-            raise ValueError("there are no false powers")
+            raise errors.InputInvalid([errors.Problem("missing", "there are no false powers")])
         return np.stack([self.false.R[:, c] * self.false.p[c], self.false.X[:, c] * self.false.q[c]])
 
     def settle(self, at: State) -> None:

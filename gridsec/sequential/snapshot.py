@@ -34,6 +34,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import lapack
 
+from gridsec import errors
 from gridsec.arrays import Bools, Floats, submatrix
 from gridsec.sequential.alike import Set, alike, worth
 from gridsec.sequential.conditional import Prior
@@ -124,7 +125,9 @@ def identify(
         If `false` is of other meters.
     """
     if false is not None and false.p.size != live.size:
-        raise ValueError(f"false powers of {false.p.size} meters cannot explain {live.size}")
+        raise errors.InputInvalid(
+            [errors.Problem("shape", f"false powers of {false.p.size} meters cannot explain {live.size}")]
+        )
     lies = Lies() if lies is None else lies
     if not live.any():
         none = np.zeros(0, dtype=np.bool_)

@@ -139,7 +139,9 @@ def _phased(feeder: PhasedFeeder) -> Network:
             if not change > _TOL:
                 break
     if tree.half.any() and not change <= _TOL:
-        raise DesignInfeasible("voltages of the feeder without load", "its charging is too much")
+        raise DesignInfeasible(
+            "voltages of the feeder without load", "its charging is too much", code="no-solution"
+        )
     source = np.concatenate([ROTATION[tree.phase], ROTATION])
     turned = source[:, None, None] * V / ROTATION[:, None]
     every = turned.transpose(2, 1, 0).reshape(len(feeder.buses), count + 3)
@@ -312,7 +314,9 @@ def sensitivity(net: Network, s: Complex, V: Complex) -> Sensitivity:
         If there is no solution there.
     """
     if not np.isfinite(V).all():
-        raise DesignInfeasible("sensitivities of the feeder", "the AC power flow has no solution there")
+        raise DesignInfeasible(
+            "sensitivities of the feeder", "the AC power flow has no solution there", code="no-solution"
+        )
     relative = net.Z / V[:, None] / np.conj(V)
     M = relative * np.conj(s)
     sources = [each / V for each in net.of_busbar.T]
@@ -446,7 +450,9 @@ def _radius(gain: Floats, s: Floats, away: Floats, source: Floats) -> Floats:
             break
     r = (1.0 + _GROWTH) * r
     if not (np.all(r < 0.9) and np.all(reach(r) <= r)):
-        raise DesignInfeasible("voltages over all powers in the box", "it reaches too near to collapse")
+        raise DesignInfeasible(
+            "voltages over all powers in the box", "it reaches too near to collapse", code="no-solution"
+        )
     return r
 
 
@@ -457,7 +463,9 @@ def _neumann(feedback: Floats) -> Floats:
     # x = (I - F)^-1 1 with x >= 1 and F x < x proves it, by Perron and Frobenius.
     x = inverse @ np.ones(size)
     if not (np.all(x >= 0.5) and np.all(feedback @ x < x)):
-        raise DesignInfeasible("sensitivities over all powers in the box", "it reaches too near to collapse")
+        raise DesignInfeasible(
+            "sensitivities over all powers in the box", "it reaches too near to collapse", code="no-solution"
+        )
     return np.asarray(np.maximum(inverse, 0.0))
 
 

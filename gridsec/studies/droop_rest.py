@@ -175,7 +175,9 @@ def at_rest(net: Network, droop: Droop, loads: Box) -> Band:
     inverse = np.linalg.inv(np.eye(len(back)) - back)
     ones = inverse @ np.ones(len(back))
     if not (np.all(ones >= 0.5) and np.all(back @ ones < ones)):
-        raise DesignInfeasible("voltages of the fleet at rest", "the loop gain may be 1 or more")
+        raise DesignInfeasible(
+            "voltages of the fleet at rest", "the loop gain may be 1 or more", code="unstable"
+        )
     # A busbar that rises lifts all voltages; how much of it the fleet takes back is counted like a load's.
     busbar_high = np.abs(given.dv_dv0) + given.v0_error
     U = np.maximum(inverse, 0.0) @ np.column_stack([np.abs(J) + off, busbar_high])
@@ -186,7 +188,9 @@ def at_rest(net: Network, droop: Droop, loads: Box) -> Band:
     ends = np.stack([loads.p_low + 1j * loads.q_low, loads.p_high + 1j * loads.q_high])
     v = np.abs(rest(net, droop, ends, np.array([loads.v0_low, loads.v0_high]))[1])
     if not np.isfinite(v).all():
-        raise DesignInfeasible("voltages of the fleet at rest", "no equilibrium at a corner of the box")
+        raise DesignInfeasible(
+            "voltages of the fleet at rest", "no equilibrium at a corner of the box", code="no-solution"
+        )
     return Band(np.maximum(v[0] + wrong - _SLACK, given.low), np.minimum(v[1] - wrong + _SLACK, given.high))
 
 

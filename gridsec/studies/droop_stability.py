@@ -23,6 +23,7 @@ from scipy.linalg import LinAlgError, solve_continuous_are, solve_discrete_are
 
 from gridsec.arrays import Floats, Ints, spectral_radius
 from gridsec.droop import Droop, voltage_curve
+from gridsec.errors import InputInvalid, Problem
 from gridsec.studies.droop_network import Box, Complex, Network, Region, region
 
 __all__ = [
@@ -64,11 +65,27 @@ class Update:
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.interval_s) and self.interval_s >= 0.0):
-            raise ValueError(f"interval is {self.interval_s} s; it must be a number that is not negative")
+            raise InputInvalid(
+                [
+                    Problem(
+                        "negative",
+                        f"interval is {self.interval_s} s; it must be a number that is not negative",
+                    )
+                ]
+            )
         if self.dead < 0:
-            raise ValueError(f"dead time is {self.dead} intervals; it must not be negative")
+            raise InputInvalid(
+                [Problem("negative", f"dead time is {self.dead} intervals; it must not be negative")]
+            )
         if self.dead and not self.interval_s:
-            raise ValueError("continuous filters have no dead time here; give a short interval instead")
+            raise InputInvalid(
+                [
+                    Problem(
+                        "inconsistent",
+                        "continuous filters have no dead time here; give a short interval instead",
+                    )
+                ]
+            )
 
     def share(self, tau: Floats) -> Floats:
         """`alpha`, the share of the way to the set-point that an inverter goes in one interval, (m,)."""

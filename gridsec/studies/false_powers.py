@@ -123,5 +123,7 @@ def _choose(given: FalsePowers, meter: int, liars: int, honest: Bools) -> tuple[
         options={"mip_rel_gap": 1e-6, "presolve": False},
     )
     if found.x is None:
-        raise DesignInfeasible("largest lie with false powers that fits to an honest feeder", found.message)
+        raise DesignInfeasible(
+            "largest lie with false powers that fits to an honest feeder", found.message, code="no-solution"
+        )
     return found.x[k:] > 0.5, 2.0 * size * float(-found.mip_dual_bound) + own

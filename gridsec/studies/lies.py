@@ -23,7 +23,7 @@ import numpy as np
 from scipy.optimize import Bounds, LinearConstraint, linprog, milp
 
 from gridsec.arrays import Bools, Floats, Ints
-from gridsec.errors import DesignInfeasible
+from gridsec.errors import DesignInfeasible, InputInvalid, Problem
 
 __all__ = ["Box", "Fit", "largest_lie", "worst_error"]
 
@@ -53,11 +53,19 @@ class Box:
 
     def __post_init__(self) -> None:
         if self.reading.shape != self.meters.shape or self.effect.ndim != 2:
-            raise ValueError(f"{self.reading.size} errors of {self.meters.size} readings")
+            raise InputInvalid(
+                [Problem("shape", f"{self.reading.size} errors of {self.meters.size} readings")]
+            )
         if not (
             np.isfinite(self.effect).all() and np.isfinite(self.reading).all() and (self.reading > 0).all()
         ):
-            raise ValueError("effects must be finite, and errors of readings finite and positive")
+            raise InputInvalid(
+                [
+                    Problem(
+                        "not-positive", "effects must be finite, and errors of readings finite and positive"
+                    )
+                ]
+            )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -171,7 +179,7 @@ def _choose(
         options={"mip_rel_gap": 1e-6},
     )
     if found.x is None:
-        raise DesignInfeasible("largest lie that fits to an honest feeder", found.message)
+        raise DesignInfeasible("largest lie that fits to an honest feeder", found.message, code="no-solution")
     chosen = np.zeros(p, dtype=np.bool_)
     chosen[who] = found.x[k:] > 0.5
     return chosen, float(-found.mip_dual_bound)
@@ -188,5 +196,5 @@ def _reach(scaled: Floats, row: Floats) -> Floats:
         bounds=(-1.0, 1.0),
     )
     if found.x is None:
-        raise DesignInfeasible("largest lie that fits to an honest feeder", found.message)
+        raise DesignInfeasible("largest lie that fits to an honest feeder", found.message, code="no-solution")
     return np.asarray(found.x)

@@ -22,6 +22,7 @@ from scipy.linalg import qr
 from scipy.sparse.csgraph import connected_components
 
 from gridsec.arrays import Bools, Floats, Ints, unit_rows
+from gridsec.errors import InputInvalid, Problem
 from gridsec.index import Index, Sparsest, eigenspaces, fewest, kernel, linearise
 from gridsec.index.blocks import MOST_NODES, Matrix
 from gridsec.index.rows import fewest_rows
@@ -198,7 +199,7 @@ def fewest_meters(
     bound = none if honest is None else honest[:p] & ~silent
     free = np.flatnonzero(~bound & ~silent)
     if must is not None and p and must not in free:
-        raise ValueError(f"meter {must} must lie, but is honest or silent")
+        raise InputInvalid([Problem("inconsistent", f"meter {must} must lie, but is honest or silent")])
     at = None if must is None else int(np.searchsorted(free, must))
     best = Index(np.inf, np.zeros(0, dtype=np.intp), np.zeros(0))
     for space, seen in zip(given.spaces, given.seen, strict=True):

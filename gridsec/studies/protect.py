@@ -40,6 +40,7 @@ class Unprotectable(DesignInfeasible):
         super().__init__(
             "protection of meters",
             f"an attack by meters {liars.tolist()} succeeds, and none of them can be protected",
+            code="unprotectable",
         )
 
 
@@ -182,7 +183,7 @@ def _hit(attacks: list[Ints], never: Bools) -> Bools:
         options={"mip_rel_gap": 0.0},
     )
     if found.x is None or found.status != 0:
-        raise DesignInfeasible("protection of meters", found.message)
+        raise DesignInfeasible("protection of meters", found.message, code="no-solution")
     return np.asarray(found.x > 0.5)
 
 
@@ -219,5 +220,5 @@ def _least(attacks: list[Ints], never: Bools) -> int:
         bounds=[(0.0, 0.0 if fixed else 1.0) for fixed in never],
     )
     if found.fun is None:
-        raise DesignInfeasible("protection of meters", found.message)
+        raise DesignInfeasible("protection of meters", found.message, code="no-solution")
     return int(np.ceil(found.fun - 1e-6))

@@ -15,7 +15,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, frozen
 from gridsec.choices import no_choice
-from gridsec.errors import refuse
+from gridsec.errors import InputInvalid, Problem, refuse
 from gridsec.lmi.discrete import DiscreteOptions, discrete_circles
 from gridsec.lmi.discrete_bounds import DirectProof
 from gridsec.lmi.sampled import DiscreteLure
@@ -121,9 +121,23 @@ def bank(
         If `max_attacked` is below 1, or not exactly one of `options` and `proof` is given.
     """
     if max_attacked < 1:
-        raise ValueError("max_attacked must be at least 1: without liars there is nothing to isolate")
+        raise InputInvalid(
+            [
+                Problem(
+                    "out-of-range",
+                    "max_attacked must be at least 1: without liars there is nothing to isolate",
+                )
+            ]
+        )
     if (options is None) == (proof is None):
-        raise ValueError("give options for gains by matrix inequality, or a proof for direct injection")
+        raise InputInvalid(
+            [
+                Problem(
+                    "inconsistent",
+                    "give options for gains by matrix inequality, or a proof for direct injection",
+                )
+            ]
+        )
     masks = bank_masks(len(system.C), max_attacked, most=most)
     if proof is not None:
         return tuple(circle_discrete.design(system, mask, gains=proof) for mask in masks)
@@ -185,7 +199,14 @@ def design(
     sets = subsets(p, max_attacked, most=MOST_OBSERVERS)
     wanted = bank_masks(p, max_attacked)
     if not np.array_equal(np.stack([one.trusted for one in observers]), wanted):
-        raise ValueError(f"no bank for {p} meters and {max_attacked} liars, in the order of `bank_masks`")
+        raise InputInvalid(
+            [
+                Problem(
+                    "wrong-design",
+                    f"no bank for {p} meters and {max_attacked} liars, in the order of `bank_masks`",
+                )
+            ]
+        )
     gamma = np.array([one.noise_gain for one in observers]) if gains is None else np.asarray(gains)
     sizes = {"noise": noise, "start": start, "epsilon": epsilon, "unknown": unknown}
     problems = _problems(sizes, gamma, len(observers), length)
@@ -194,7 +215,13 @@ def design(
     if unknown > 0.0:
         level = level + np.array([one.unknown_gain for one in observers]) * unknown
     if not np.all(np.isfinite(level)):
-        raise ValueError("an observer has no finite bound of its error: nothing would ever exceed it")
+        raise InputInvalid(
+            [
+                Problem(
+                    "not-finite", "an observer has no finite bound of its error: nothing would ever exceed it"
+                )
+            ]
+        )
     large, small = level[1 : 1 + sets.count_large], level[1 + sets.count_large :]
     spread = np.broadcast_to(small, sets.parent.shape).ravel()[sets.pairs].max(axis=1)
     return WindowDesign(
@@ -211,18 +238,20 @@ def design(
     )
 
 
-def _problems(sizes: dict[str, float], gains: Floats, observers: int, length: int) -> list[str]:
+def _problems(sizes: dict[str, float], gains: Floats, observers: int, length: int) -> list[Problem]:
     """What is wrong with the numbers that thresholds are made of."""
     numbers = {**{name: np.array(size) for name, size in sizes.items()}, "gains": gains}
     problems = [
-        f"{name} must be finite and not negative, got {value.tolist()}"
+        Problem("negative", f"{name} must be finite and not negative, got {value.tolist()}")
         for name, value in numbers.items()
         if not np.all(np.isfinite(value) & (value >= 0.0))
     ]
     if gains.shape != (observers,):
-        problems.append(f"gains have the shape {gains.shape}; one for each of {observers} observers")
+        problems.append(
+            Problem("shape", f"gains have the shape {gains.shape}; one for each of {observers} observers")
+        )
     if length < 1:
-        problems.append("a window has at least one step")
+        problems.append(Problem("out-of-range", "a window has at least one step"))
     return problems
 
 

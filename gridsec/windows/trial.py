@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gridsec.arrays import Floats, frozen
-from gridsec.errors import refuse
+from gridsec.errors import Problem, refuse
 from gridsec.lmi.sampled import advance as advance_plant
 from gridsec.lmi.sampled import measure
 from gridsec.observers.circle_discrete import advance
@@ -93,7 +93,7 @@ def calibrate(design: WindowDesign, honest: Trace) -> WindowDesign:
     first = design.settling
     measures = {"pi": honest.pi[..., first:], "pi_sets": honest.pi_sets[..., first:, :]}
     refuse(
-        f"{name} has no finite numbers alone from step {first} on"
+        Problem("not-finite", f"{name} has no finite numbers alone from step {first} on")
         for name, found in measures.items()
         if not (found.size and np.isfinite(found).all())
     )

@@ -28,6 +28,8 @@ from gridsec.attack import (
     most_affected,
     reach,
 )
+from gridsec.errors import InputInvalid
+from tests.codes import refused
 
 METERS = 5
 WHO = np.array([1, 3])
@@ -182,28 +184,28 @@ def test_reach_covers_every_look_into_the_past() -> None:
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
+    ("make", "code"),
     [
-        (lambda: Stuck(np.array([], dtype=np.intp), ON, OFF), "non-empty"),
-        (lambda: Stuck(np.array([1, 1]), ON, OFF), "different"),
-        (lambda: Stuck(np.array([-1]), ON, OFF), "different indices"),
-        (lambda: Stuck(WHO, OFF, ON), "begin before it ends"),
-        (lambda: Stuck(WHO, np.nan, OFF), "begin before it ends"),
-        (lambda: Replay(WHO, ON, OFF, delay_s=0.0), "positive delay"),
-        (lambda: Bias(WHO, ON, OFF, size=np.array([0.1])), "2 meters"),
-        (lambda: Bias(WHO, ON, OFF, size=np.array([0.1, np.nan])), "finite"),
-        (lambda: Scaling(WHO, ON, OFF, factor=np.zeros(3)), "2 meters"),
+        (lambda: Stuck(np.array([], dtype=np.intp), ON, OFF), "shape"),
+        (lambda: Stuck(np.array([1, 1]), ON, OFF), "duplicate"),
+        (lambda: Stuck(np.array([-1]), ON, OFF), "unknown-index"),
+        (lambda: Stuck(WHO, OFF, ON), "order"),
+        (lambda: Stuck(WHO, np.nan, OFF), "order"),
+        (lambda: Replay(WHO, ON, OFF, delay_s=0.0), "not-positive"),
+        (lambda: Bias(WHO, ON, OFF, size=np.array([0.1])), "shape"),
+        (lambda: Bias(WHO, ON, OFF, size=np.array([0.1, np.nan])), "not-finite"),
+        (lambda: Scaling(WHO, ON, OFF, factor=np.zeros(3)), "shape"),
         (lambda: Drift(WHO, ON, OFF, rate=np.ones(2), limit=np.array([1.0, -1.0])), "negative"),
-        (lambda: Random(WHO, ON, OFF, low=np.ones(2), high=np.zeros(2), hold_s=1.0, seed=0), "low <= high"),
-        (lambda: Random(WHO, ON, OFF, low=np.zeros(2), high=np.ones(2), hold_s=0.0, seed=0), "hold time"),
+        (lambda: Random(WHO, ON, OFF, low=np.ones(2), high=np.zeros(2), hold_s=1.0, seed=0), "order"),
+        (lambda: Random(WHO, ON, OFF, low=np.zeros(2), high=np.ones(2), hold_s=0.0, seed=0), "not-positive"),
         (
             lambda: Coordinated(WHO, ON, OFF, shift=np.zeros(2), p_shift=np.zeros(2), q_shift=np.zeros(1)),
-            "2 meters",
+            "shape",
         ),
     ],
 )
-def test_nonsense_is_refused(make: Callable[[], Attack], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
+def test_nonsense_is_refused(make: Callable[[], Attack], code: str) -> None:
+    with refused(InputInvalid, code):
         make()
 
 
@@ -224,9 +226,9 @@ def test_a_sized_pattern_moves_every_chosen_meter_by_at_least_the_size(
 
 
 def test_a_meter_that_feels_nothing_cannot_be_moved() -> None:
-    with pytest.raises(ValueError, match="does not feel"):
+    with refused(InputInvalid, "no-effect"):
         coordinate(np.array([0.0, 1.0]), np.array([0, 1]), 0.03)
-    with pytest.raises(ValueError, match="cannot choose 3 of 2"):
+    with refused(InputInvalid, "out-of-range"):
         most_affected(np.ones(2), 3)
 
 

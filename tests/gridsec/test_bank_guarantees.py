@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 
 from gridsec import bank as banks
 from gridsec import lure as lures
-from gridsec.errors import DesignInfeasible
+from gridsec.errors import DesignInfeasible, InputInvalid
 from gridsec.feeder import lindistflow
 from gridsec.lure import Lure, close_loop, equilibrium
+from tests.codes import refused
 from tests.gridsec.small_banks import (
     CASES,
     loop_step,
@@ -238,17 +239,17 @@ class TestGuarantees:
     def test_degenerate_gains_are_refused(self) -> None:
         lure = plant(np.random.default_rng(12), customers=3)
         gains = banks.direct_gains(lure, banks.subsets(3, 1, most=100).masks())
-        with pytest.raises(DesignInfeasible, match="detect nothing"):
+        with refused(DesignInfeasible, "degenerate"):
             banks.design(lure, 1, gains=banks.Gains(gains.L * 0.0, gains.K * 0.0))
 
     def test_gains_must_fit_their_sets(self) -> None:
         lure = plant(np.random.default_rng(13), customers=3)
         gains = banks.direct_gains(lure, banks.subsets(3, 1, most=100).masks())
-        with pytest.raises(ValueError, match="outside its set"):
+        with refused(InputInvalid, "wrong-design"):
             banks.design(lure, 1, gains=banks.Gains(gains.L, np.ones_like(gains.K)))
-        with pytest.raises(ValueError, match="shapes"):
+        with refused(InputInvalid, "shape"):
             banks.design(lure, 1, gains=banks.Gains(gains.L[:2], gains.K[:2]))
-        with pytest.raises(ValueError, match="finite"):
+        with refused(InputInvalid, "not-finite"):
             banks.design(lure, 1, gains=banks.Gains(gains.L, gains.K * np.nan))
 
     def test_output_injection(self) -> None:
@@ -284,7 +285,7 @@ class TestGuarantees:
             slope=lure.slope,
             phi=lure.phi,
         )
-        with pytest.raises(ValueError, match="T\\^-1"):
+        with refused(InputInvalid, "wrong-form"):
             banks.design(other, 1)
         strange = Lure(
             A=lure.A,

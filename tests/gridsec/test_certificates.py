@@ -26,6 +26,7 @@ from gridsec.droop import Droop, fleet
 from gridsec.errors import DesignInfeasible
 from gridsec.feeder import Feeder, lindistflow
 from gridsec.lure import Lure, close_loop
+from tests.codes import refused
 from tests.gridsec.certified import norm, seeds
 from tests.gridsec.radial import random_feeder, random_loop
 
@@ -108,7 +109,7 @@ def test_asymmetry_is_charged_for() -> None:
 
 def test_strong_asymmetry_at_high_gain_is_refused() -> None:
     _, droop, lure = random_loop(8, gain=5.0)
-    with pytest.raises(DesignInfeasible, match="reactance certificate"):
+    with refused(DesignInfeasible, "unstable"):
         reactance(asymmetric(lure, droop, 8, 3.0))
 
 
@@ -124,7 +125,7 @@ def test_small_gain_decays_whatever_the_time_constants(
     _, droop, lure = random_loop(seed, gain=gain, spread=spread)
     lure = asymmetric(lure, droop, seed, amount)
     if spectral_radius(lure.slope[:, None] * np.abs(lure.H)) >= 1:
-        with pytest.raises(DesignInfeasible, match="loop gain is too large"):
+        with refused(DesignInfeasible, "unstable"):
             small_gain(lure)
         return
     certificate = small_gain(lure)
@@ -190,13 +191,12 @@ def test_time_constants_too_far_apart() -> None:
     own = np.array([0, 1])
     droop = fleet(own, "ieee1547-b", np.full(2, 5000.0), 100.0, tau=np.array([0.2, 20.0]))
     lure = close_loop(feeder, droop, own)
-    with pytest.raises(DesignInfeasible, match="reactance") as caught:
+    with refused(DesignInfeasible, "unstable") as caught:
         reactance(lure)
     assert caught.value.margin is not None
     assert caught.value.margin < 0
-    with pytest.raises(DesignInfeasible, match="small-gain") as caught:
+    with refused(DesignInfeasible, "no-certificate"):
         certify(lure)
-    assert "reactance" in str(caught.value)
     # The certificate of the same fleet with one common tau is a forgery here, and verify says so ...
     honest = close_loop(feeder, fleet(own, "ieee1547-b", np.full(2, 5000.0), 100.0, tau=np.full(2, 2.0)), own)
     certificate = reactance(honest)
@@ -253,12 +253,12 @@ def test_forgeries_are_caught(seed: int) -> None:
         for claimed in (0.0, -1e6, -np.inf, np.inf, np.nan):
             assert verify(replace(certificate, rate=claimed), lure) == -np.inf
         if lure.slope.size > 1:
-            with pytest.raises(DesignInfeasible, match="do not fit"):
+            with refused(DesignInfeasible, "wrong-form"):
                 verify(replace(certificate, P=certificate.P[:1]), lure)
-        with pytest.raises(DesignInfeasible, match="do not fit"):
+        with refused(DesignInfeasible, "wrong-form"):
             verify(replace(certificate, kind="hearsay"), lure)
     forged = reactance(lure)
-    with pytest.raises(DesignInfeasible, match="fails its verification"):
+    with refused(DesignInfeasible, "not-verified"):
         quadratic(lure, forged.P, forged.multiplier, -1.0, kind="reactance", status="")
     assert verify(replace(forged, multiplier=0.0 * forged.multiplier), lure) == -np.inf
     if lure.slope.size > 1:
@@ -285,7 +285,7 @@ def test_single_inverter_in_closed_form() -> None:
     assert certificate.margin == pytest.approx(0.1)
     assert certificate.noise == pytest.approx(slope / 0.9)
     assert certificate.load == pytest.approx(np.sqrt(slope / (s * tau) / (2 * 0.9 / tau)))
-    with pytest.raises(DesignInfeasible, match="fails its verification") as caught:
+    with refused(DesignInfeasible, "not-verified") as caught:
         quadratic(lure, one, np.array([1 / (s * tau)]), 1.1 / tau, kind="lmi", status="by hand")
     assert caught.value.margin == pytest.approx(-0.1)
     # Small gain: rate (1 - s slope) / tau less the back-off, gain slope / that.
@@ -331,9 +331,9 @@ def test_other_systems_are_refused() -> None:
     eye = np.eye(2)
     lure = Lure(-eye, 2 * eye, -eye, eye, 0 * eye, eye, eye, np.ones(2), np.tanh)
     for attempt in (reactance, small_gain):
-        with pytest.raises(DesignInfeasible, match="not T x'"):
+        with refused(DesignInfeasible, "wrong-form"):
             attempt(lure)
-    with pytest.raises(DesignInfeasible, match="not T x'"):
+    with refused(DesignInfeasible, "no-certificate"):
         certify(replace(lure, G=eye, B=eye))
 
 

@@ -17,6 +17,7 @@ from gridsec.designs import cached, design_key, from_bytes, to_bytes
 from gridsec.errors import DesignInfeasible
 from gridsec.gains import CircleGains, CircleOptions, margin, options_for
 from gridsec.lmi import solve_many
+from tests.codes import refused
 from tests.gridsec.plants import line
 
 STREET = line(4)
@@ -168,18 +169,16 @@ def repacked(designs: tuple[CircleGains, ...], change: Any) -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("change", "why"),
+    "change",
     [
-        (lambda a: a.update(format=np.array("something else")), "unknown format"),
-        (lambda a: a.pop("3/K"), "cannot be read"),
-        (lambda a: a.update(load=np.array("text")), "cannot be read"),
+        lambda a: a.update(format=np.array("something else")),
+        lambda a: a.pop("3/K"),
+        lambda a: a.update(load=np.array("text")),
     ],
 )
-def test_an_archive_of_something_else_is_refused(
-    designs: tuple[CircleGains, ...], change: Any, why: str
-) -> None:
-    with pytest.raises(DesignInfeasible, match=why):
+def test_an_archive_of_something_else_is_refused(designs: tuple[CircleGains, ...], change: Any) -> None:
+    with refused(DesignInfeasible, "unreadable"):
         from_bytes(repacked(designs, change))
     plain = b"no archive at all"
-    with pytest.raises(DesignInfeasible, match="cannot be read"):
+    with refused(DesignInfeasible, "unreadable"):
         from_bytes(hashlib.sha256(plain).digest() + plain)

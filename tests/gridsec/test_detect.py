@@ -15,7 +15,9 @@ from gridsec import detect
 from gridsec.accuracy import MeterAccuracy, busbar_error, reading_error
 from gridsec.detect import ErrorBound, Motion, Uncertainty
 from gridsec.droop import PRESETS, fleet
+from gridsec.errors import InputInvalid
 from gridsec.feeder import lindistflow
+from tests.codes import refused
 from tests.gridsec.street import make_plant, random_tree
 
 
@@ -75,18 +77,18 @@ class TestReadingError:
         assert busbar_error(accuracy(busbar_class=1.0), 1.0, 3.0) == np.inf
 
     @pytest.mark.parametrize(
-        "changes",
+        ("changes", "codes"),
         [
-            {"class_fraction": np.array([0.005])},
-            {"resolution": np.array([-1.0, 0.0])},
-            {"jitter": np.array([np.nan, 0.0])},
-            {"jitter": np.zeros((2, 1))},
-            {"busbar_class": -0.1},
-            {"busbar_jitter": float("inf")},
+            ({"class_fraction": np.array([0.005])}, ("shape", "shape")),
+            ({"resolution": np.array([-1.0, 0.0])}, ("negative",)),
+            ({"jitter": np.array([np.nan, 0.0])}, ("negative",)),
+            ({"jitter": np.zeros((2, 1))}, ("shape",)),
+            ({"busbar_class": -0.1}, ("negative",)),
+            ({"busbar_jitter": float("inf")}, ("negative",)),
         ],
     )
-    def test_wrong_descriptions(self, changes: dict[str, object]) -> None:
-        with pytest.raises(ValueError, match="must"):
+    def test_wrong_descriptions(self, changes: dict[str, object], codes: tuple[str, ...]) -> None:
+        with refused(InputInvalid, *codes):
             accuracy(**changes)
 
 

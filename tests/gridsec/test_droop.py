@@ -12,6 +12,7 @@ from hypothesis import assume, given
 from gridsec.droop import PRESETS, Droop, capped, curve_gap, fleet, preset, voltage_curve
 from gridsec.errors import FeederInvalid
 from gridsec.studies.droop_stability import enlarged, steepened
+from tests.codes import refused
 
 seeds = st.integers(0, 100_000)
 
@@ -227,24 +228,24 @@ def test_no_inverters_at_all() -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "text"),
+    ("change", "codes"),
     [
-        ({"v": [[0.9, 1.0, 0.95, 1.1]]}, "ascending"),
-        ({"v": [[0.0, 0.9, 1.0, 1.1]]}, "positive"),
-        ({"q": [[0.1, 0.2, 0.0, -0.1]]}, "must not increase"),
-        ({"v": [[0.9, 0.9, 1.0, 1.1]]}, "jumps"),
-        ({"q": [[0.1, 0.0, 0.0, np.nan]]}, "finite"),
-        ({"tau": [0.0]}, "inverter 0: time constant"),
-        ({"tau": [np.inf]}, "time constant"),
-        ({"tau": [1.0, 1.0]}, "tau has shape"),
-        ({"vbar": 0.0}, "vbar"),
-        ({"rating": [0.09]}, "asks for more than the rating"),
-        ({"rating": [np.nan]}, "asks for more than the rating"),
-        ({"rating": [0.2, 0.2]}, "rating has shape"),
-        ({"customer": [-1]}, "customer"),
+        ({"v": [[0.9, 1.0, 0.95, 1.1]]}, ("order",)),
+        ({"v": [[0.0, 0.9, 1.0, 1.1]]}, ("order",)),
+        ({"q": [[0.1, 0.2, 0.0, -0.1]]}, ("not-monotone",)),
+        ({"v": [[0.9, 0.9, 1.0, 1.1]]}, ("not-monotone",)),
+        ({"q": [[0.1, 0.0, 0.0, np.nan]]}, ("not-finite",)),
+        ({"tau": [0.0]}, ("not-positive",)),
+        ({"tau": [np.inf]}, ("not-positive",)),
+        ({"tau": [1.0, 1.0]}, ("shape", "shape")),
+        ({"vbar": 0.0}, ("not-positive",)),
+        ({"rating": [0.09]}, ("above-rating",)),
+        ({"rating": [np.nan]}, ("above-rating",)),
+        ({"rating": [0.2, 0.2]}, ("shape",)),
+        ({"customer": [-1]}, ("unknown-index",)),
     ],
 )
-def test_impossible_curves_are_refused(change: dict[str, object], text: str) -> None:
+def test_impossible_curves_are_refused(change: dict[str, object], codes: tuple[str, ...]) -> None:
     good: dict[str, object] = {
         "customer": [0],
         "v": [[0.9, 0.98, 1.02, 1.1]],
@@ -252,7 +253,7 @@ def test_impossible_curves_are_refused(change: dict[str, object], text: str) -> 
         "tau": [2.0],
         "vbar": 1.0,
     }
-    with pytest.raises(FeederInvalid, match=text):
+    with refused(FeederInvalid, *codes):
         Droop(**(good | change))
 
 
@@ -260,31 +261,30 @@ def test_every_problem_of_a_fleet_is_named_at_once() -> None:
     v, q = np.array([[0.9, 0.98, 1.02, 1.1]] * 3), np.array([[0.1, 0.0, 0.0, -0.1]] * 3)
     v[1] = v[1, ::-1]
     q[2, 0] = np.inf
-    with pytest.raises(FeederInvalid) as caught:
+    with refused(FeederInvalid, "not-finite", "order", "not-positive", "not-positive") as caught:
         Droop(np.arange(3), v, q, np.array([0.0, 1.0, -1.0]))
-    said = [problem.split(";")[0] for problem in caught.value.problems]
-    assert sorted(said) == [
-        "inverter 0: time constant must be positive",
-        "inverter 1: voltages must be positive and ascending",
-        "inverter 2: breakpoints must be finite",
-        "inverter 2: time constant must be positive",
+    assert [problem.split(":")[0] for problem in caught.value.problems] == [
+        "inverter 2",
+        "inverter 1",
+        "inverter 0",
+        "inverter 2",
     ]
 
 
 @pytest.mark.parametrize(
-    ("arguments", "text"),
+    ("arguments", "code"),
     [
-        ({"names": "ieee1547-x"}, "does not exist"),
-        ({"names": ["vde4105"] * 3}, "lengths differ"),
-        ({"rated_kva": np.array([5.0, 0.0])}, "must be positive"),
-        ({"capability": "square"}, "must be 'fixed'"),
-        ({"capability": "circular"}, "must be 'fixed'"),
-        ({"capability": "circular", "p_gen": np.array([0.0, 0.06])}, "inverter 1 generates above"),
+        ({"names": "ieee1547-x"}, "unknown-name"),
+        ({"names": ["vde4105"] * 3}, "shape"),
+        ({"rated_kva": np.array([5.0, 0.0])}, "not-positive"),
+        ({"capability": "square"}, "unknown-name"),
+        ({"capability": "circular"}, "missing"),
+        ({"capability": "circular", "p_gen": np.array([0.0, 0.06])}, "above-rating"),
     ],
 )
-def test_impossible_fleets_are_refused(arguments: dict[str, object], text: str) -> None:
+def test_impossible_fleets_are_refused(arguments: dict[str, object], code: str) -> None:
     good: dict[str, object] = {"customer": np.array([0, 1]), "names": "vde4105", "rated_kva": np.full(2, 5.0)}
-    with pytest.raises(FeederInvalid, match=text):
+    with refused(FeederInvalid, code):
         fleet(base_kva=100.0, **(good | arguments))
 
 

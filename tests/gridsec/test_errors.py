@@ -2,9 +2,42 @@
 
 from __future__ import annotations
 
+import pickle
+
 import pytest
 
-from gridsec.errors import DesignInfeasible, FeederInvalid, GridsecError, NotObservable
+from gridsec.errors import (
+    DesignInfeasible,
+    FeederInvalid,
+    GridsecError,
+    InputInvalid,
+    NotObservable,
+    Problem,
+    refuse,
+)
+from tests.codes import refused
+
+
+def test_a_problem_is_its_sentence_with_a_code() -> None:
+    problem = Problem("shape", "A has shape (2,)")
+    assert problem == "A has shape (2,)"
+    again = pickle.loads(pickle.dumps(problem))
+    assert (again, again.code) == (problem, "shape")
+
+
+@pytest.mark.parametrize("kind", [FeederInvalid, InputInvalid])
+def test_codes_follow_the_problems(kind: type[FeederInvalid | InputInvalid]) -> None:
+    error = kind([Problem("shape", "first"), "second", Problem("order", "third")])
+    assert error.codes == ("shape", "", "order")
+    assert error.problems == ("first", "second", "third")
+
+
+def test_refuse_raises_only_with_problems() -> None:
+    refuse([])
+    with refused(InputInvalid, "shape", "order") as caught:
+        refuse(Problem(code, f"{code} is wrong") for code in ("shape", "order"))
+    assert str(caught.value) == "shape is wrong; order is wrong"
+    assert isinstance(caught.value, ValueError)
 
 
 def test_feeder_invalid_names_every_problem() -> None:
@@ -17,6 +50,8 @@ def test_feeder_invalid_names_every_problem() -> None:
 def test_not_observable_carries_the_subset() -> None:
     error = NotObservable((3, 1), 2, "needs three meters")
     assert (error.subset, error.rank, str(error)) == ((3, 1), 2, "needs three meters")
+    assert error.code == "not-observable"
+    assert NotObservable((), 0, "no meters", code="too-few-meters").code == "too-few-meters"
 
 
 def test_design_infeasible_says_what_and_by_how_much() -> None:
@@ -24,6 +59,8 @@ def test_design_infeasible_says_what_and_by_how_much() -> None:
     assert (error.what, error.status, error.margin) == ("small gain", "too large", -0.25)
     assert str(error) == "small gain: too large, margin -0.25"
     assert str(DesignInfeasible("a", "b")) == "a: b"
+    assert error.code == "design-infeasible"
+    assert DesignInfeasible("a", "b", code="unstable").code == "unstable"
 
 
 @pytest.mark.parametrize("kind", [FeederInvalid, NotObservable, DesignInfeasible])

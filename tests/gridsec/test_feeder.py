@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from gridsec.errors import FeederInvalid
+from gridsec.errors import FeederInvalid, InputInvalid
 from gridsec.feeder import (
     Feeder,
     bus_voltages,
@@ -21,6 +21,7 @@ from gridsec.feeder import (
     model_error_bound,
     squared_voltages,
 )
+from tests.codes import refused
 from tests.gridsec.radial import random_feeder, sweep
 
 seeds = st.integers(0, 100_000)
@@ -225,7 +226,7 @@ def test_charging_alone_lifts_the_end_of_a_cable() -> None:
 def test_at_least_one_step() -> None:
     feeder = random_feeder(0)
     still = np.zeros(len(feeder.customers))
-    with pytest.raises(ValueError, match="at least 1"):
+    with refused(InputInvalid, "out-of-range"):
         loss_correction(feeder, still, still, 1.0, steps=0)
 
 
@@ -292,7 +293,9 @@ def test_every_problem_is_named_at_once() -> None:
     good = random_feeder(7, customers=3)
     bad_r, bad_parent = good.r.copy(), good.parent.copy()
     bad_r[0], bad_parent[-1] = -1.0, len(good.parent)
-    with pytest.raises(FeederInvalid) as caught:
+    with refused(
+        FeederInvalid, "not-positive", "negative", "not-radial", "unknown-index", "unknown-index", "duplicate"
+    ):
         replace(
             good,
             r=bad_r,
@@ -301,17 +304,6 @@ def test_every_problem_is_named_at_once() -> None:
             base_kva=0.0,
             customers=("a", "a", "b"),
         )
-    text = str(caught.value)
-    assert len(caught.value.problems) == 6
-    for part in (
-        "r is -1.0",
-        "does not precede",
-        "bus 99",
-        "bus -1",
-        "base_kva is 0.0",
-        "'a' is named 2 times",
-    ):
-        assert part in text
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -1e-9])
@@ -320,17 +312,18 @@ def test_unphysical_branches_are_refused(what: str, value: float) -> None:
     good = random_feeder(7)
     bad = getattr(good, what).copy()
     bad[-1] = value
-    with pytest.raises(FeederInvalid, match=what):
+    with refused(FeederInvalid, "negative") as caught:
         replace(good, **{what: bad})
+    assert f": {what} is " in caught.value.problems[0]
 
 
 def test_branches_without_impedance_are_refused() -> None:
     good = random_feeder(7)
-    with pytest.raises(FeederInvalid, match="fuse the two buses"):
+    with refused(FeederInvalid, *["zero-impedance"] * good.parent.size):
         replace(good, r=0 * good.r, x=0 * good.x)
 
 
 def test_lengths_must_fit() -> None:
     good = random_feeder(7)
-    with pytest.raises(FeederInvalid, match="buses has shape"):
+    with refused(FeederInvalid, "shape"):
         replace(good, buses=good.buses[:-1])

@@ -18,7 +18,7 @@ from feeders.powerflow import PowerFlow
 from gridsec import isolation
 from gridsec.arrays import Floats
 from gridsec.droop import Droop, curve_gap, voltage_curve
-from gridsec.errors import DesignInfeasible, NotObservable
+from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable
 from gridsec.feeder import lindistflow, loss_correction
 from gridsec.isolation import (
     Isolation,
@@ -35,6 +35,7 @@ from gridsec.lure import close_loop, known_input
 from gridsec.observers.unknown_input import UnknownInputPlant, exact, inverters, obstruction
 from gridsec.online import Cause, Decision
 from gridsec.papers import yang2021, yang2021_feeder
+from tests.codes import refused
 
 STEPS = 500
 ALL4 = np.ones(4, dtype=np.bool_)
@@ -125,9 +126,9 @@ def test_company_and_disagreement_are_those_of_the_definition() -> None:
 
 
 def test_too_few_sensors_or_inputs() -> None:
-    with pytest.raises(NotObservable, match="4 sensors of which 2"):
+    with refused(NotObservable, "too-few-meters"):
         members(3, 4, 1, 2)
-    with pytest.raises(NotObservable, match="3 inputs of which 2"):
+    with refused(NotObservable, "too-few-meters"):
         members(3, 4, 2, 1)
 
 
@@ -251,7 +252,7 @@ def test_missing_members_withdraw_the_verdict_but_not_the_estimate() -> None:
 
 def test_a_bank_without_any_large_member_is_refused() -> None:
     plant = yang2021_feeder.plant((3, 6), (0, 1, 2), 1e-6)
-    with pytest.raises(DesignInfeasible, match=r"no (member|large one) exists"):
+    with refused(DesignInfeasible, "no-solution"):
         isolation.design(plant, max_inputs=2, max_sensors=1)
 
 
@@ -475,7 +476,7 @@ def test_reports_of_the_inverters_are_sensors_too() -> None:
             x = advance(plant.system, x, u)
         bounds.append(answer.bound)
     assert np.all(bounds[1] < 0.7 * bounds[0])
-    with pytest.raises(ValueError, match="errors of reports"):
+    with refused(InputInvalid, "shape"):
         inverters(
             lure, 1.0, np.arange(3), reading_error=error, u_error=np.zeros(13), curve_error=np.zeros(3),
             span=span, reports=np.arange(3), report_error=np.zeros(2),

@@ -18,6 +18,7 @@ from gridsec.errors import DesignInfeasible
 from gridsec.gains import CircleGains, CircleOptions, circle_matrix, margin, options_for
 from gridsec.lmi import circle, contraction, prove, settle, solve_many
 from gridsec.lure import Lure
+from tests.codes import refused
 from tests.gridsec.plants import Street, line, shared, street, tree
 
 RATE = 0.25
@@ -214,13 +215,13 @@ def test_the_gain_falls_with_the_noise_until_the_design_is_blind() -> None:
     gains = [float(np.sum(design(of, [0, 2, 4], noise=s).sensitivity)) for s in (1e-5, 5e-4, 1e-3)]
     assert gains[0] > gains[1] > gains[2] > 0.0
     for noise in (0.1, 1e3, 1e8):
-        with pytest.raises(DesignInfeasible, match="degenerate"):
+        with refused(DesignInfeasible, "degenerate"):
             design(of, [0, 2, 4], noise=noise)
 
 
 def test_minimising_the_attack_gain_alone_is_refused_with_an_explanation() -> None:
     of = line(5)
-    with pytest.raises(DesignInfeasible, match=r"L = K = 0.*ignores its meters"):
+    with refused(DesignInfeasible, "degenerate"):
         design(of, [0, 1, 2], load=np.zeros((5, 5)))
 
 
@@ -355,7 +356,7 @@ def test_noise_below_the_load_error_gives_one_and_above_it_zero(ratio: float) ->
     size = 1e-2
     g = circle(lure, [0], rate=0.1, noise=ratio * size, load=np.array([size]), weight=np.eye(1))
     np.testing.assert_allclose(g.K, 1.0, atol=1e-2)
-    with pytest.raises(DesignInfeasible, match="degenerate"):
+    with refused(DesignInfeasible, "degenerate"):
         circle(lure, [0], rate=0.1, noise=size / ratio, load=np.array([size]), weight=np.eye(1))
 
 
@@ -374,7 +375,7 @@ def test_given_gains_are_proven_as_they_are_or_not_at_all() -> None:
     np.testing.assert_array_equal(g.L, 0.0)
     assert margin(of.lure, g.J, g) > 0.0
     # Positive feedback of the reading into the state: no certificate can exist.
-    with pytest.raises(DesignInfeasible, match="no solution"):
+    with refused(DesignInfeasible, "no-solution"):
         prove(of.lure, J, -1e3 * of.lure.C[J].T, K, options)
 
 
@@ -400,22 +401,22 @@ def test_the_contraction_certificate_holds_for_every_set_and_every_slope(seed: i
 
 
 def test_a_contraction_rate_that_no_inverter_has_is_refused() -> None:
-    with pytest.raises(DesignInfeasible, match=r"0.6/s.*no solution"):
+    with refused(DesignInfeasible, "no-solution"):
         contraction(line(4).lure, rate=0.6)
 
 
 def test_a_rate_that_no_inverter_has_is_refused() -> None:
-    with pytest.raises(DesignInfeasible, match="no solution"):
+    with refused(DesignInfeasible, "no-solution"):
         design(line(4), [0, 1], rate=0.6)
 
 
 def test_without_a_trusted_meter_there_is_nothing_to_design() -> None:
-    with pytest.raises(DesignInfeasible, match="no trusted meter"):
+    with refused(DesignInfeasible, "nothing-to-design"):
         design(line(3), [])
 
 
 def test_a_weight_of_zero_is_refused() -> None:
-    with pytest.raises(DesignInfeasible, match="weight"):
+    with refused(DesignInfeasible, "nothing-to-design"):
         design(line(3), [0, 1], weight=np.zeros((3, 3)))
 
 
@@ -431,7 +432,7 @@ def test_a_small_violation_is_repaired_and_a_large_one_refused() -> None:
     assert repaired.mu == pytest.approx(shaved.mu * (1 + repaired.backoff))
     assert repaired.margin == margin(of.lure, g.J, repaired) > 0.0
     np.testing.assert_array_equal(repaired.K, g.K)
-    with pytest.raises(DesignInfeasible, match="rebuilt inequality is violated") as caught:
+    with refused(DesignInfeasible, "not-verified") as caught:
         settle(of.lure, replace(g, mu=g.mu * 0.5), "test")
     assert caught.value.margin is not None
     assert caught.value.margin < 0.0
@@ -460,7 +461,7 @@ def test_a_flat_curve_is_left_out() -> None:
 
 def test_without_any_curve_there_is_nothing_to_hear() -> None:
     of = line(3)
-    with pytest.raises(DesignInfeasible, match=r"degenerate|weight"):
+    with refused(DesignInfeasible, "degenerate"):
         circle(replace(of.lure, slope=np.zeros(3)), [0, 1], rate=RATE, noise=NOISE, load=of.load)
 
 
@@ -485,5 +486,5 @@ def test_a_failure_in_a_worker_arrives_with_its_name() -> None:
     options = CircleOptions(rate=0.6, noise=np.full(4, NOISE), load=of.load, weight=np.eye(4), floor=0.0)
     subsets = [(0, 1, 2), (1, 2, 3), (0, 1), (1, 2)]
     for workers in (1, 2):
-        with pytest.raises(DesignInfeasible, match=r"meters \[.*no solution"):
+        with refused(DesignInfeasible, "no-solution"):
             solve_many(of.lure, subsets, options, workers=workers)

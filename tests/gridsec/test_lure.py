@@ -14,10 +14,11 @@ from scipy.optimize import minimize
 
 from gridsec.arrays import spectral_radius
 from gridsec.droop import PRESETS, Droop, fleet
-from gridsec.errors import DesignInfeasible, FeederInvalid
+from gridsec.errors import DesignInfeasible, FeederInvalid, InputInvalid
 from gridsec.feeder import lindistflow, loss_correction, squared_voltages
 from gridsec.lure import POLICY, Lure, advance, close_loop, equilibrium, known_input, step, transition
 from gridsec.newton import settle
+from tests.codes import refused
 from tests.gridsec.radial import random_feeder, random_loop
 
 seeds = st.integers(0, 100_000)
@@ -219,7 +220,7 @@ def test_no_inverters_in_batches(lead: tuple[int, ...]) -> None:
 @pytest.mark.parametrize("h", [-1.0, np.nan, np.inf])
 def test_impossible_steps_are_refused(h: float) -> None:
     _, _, lure = random_loop(2, gain=1.0)
-    with pytest.raises(ValueError, match="no step"):
+    with refused(InputInvalid, "negative"):
         transition(lure, h)
 
 
@@ -299,7 +300,7 @@ def test_settle_with_another_feedback_for_every_row() -> None:
 
 def test_what_cannot_settle_says_so() -> None:
     _, droop, lure = random_loop(8, gain=2.0)
-    with pytest.raises(DesignInfeasible, match="1 Newton step"):
+    with refused(DesignInfeasible, "not-converged"):
         equilibrium(lure, np.full(lure.F.shape[1], 0.1), tol=0.0, max_iter=1)
     assert droop.tau.size == lure.slope.size
 
@@ -317,17 +318,14 @@ def test_no_inverters_at_all() -> None:
 def test_strangers_are_refused() -> None:
     feeder = random_feeder(6, customers=2)
     droop = fleet(np.array([0, 2]), "vde4105", np.full(2, 5.0), 100.0)
-    with pytest.raises(FeederInvalid) as caught:
+    with refused(FeederInvalid, "unknown-index", "unknown-index") as caught:
         close_loop(feeder, droop, np.array([5]))
-    assert caught.value.problems == (
-        "inverter 1: customer 2 does not exist; expected 0 to 1",
-        "meter 0: customer 5 does not exist; expected 0 to 1",
-    )
+    assert [problem.split(":")[0] for problem in caught.value.problems] == ["inverter 1", "meter 0"]
 
 
 def test_matrices_must_fit() -> None:
     eye = np.eye(2)
-    with pytest.raises(ValueError, match="H has shape"):
+    with refused(InputInvalid, "shape"):
         Lure(eye, eye, np.ones((3, 2)), eye, eye, eye, eye, np.ones(2), np.tanh)
 
 

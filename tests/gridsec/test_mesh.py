@@ -18,6 +18,7 @@ from gridsec.errors import FeederInvalid
 from gridsec.feeder import lindistflow
 from gridsec.lure import close_loop
 from gridsec.mesh import MeshedFeeder, admittance, bus_voltages, impedances, model_error_bound
+from tests.codes import refused
 from tests.gridsec.derivatives import derivatives_are
 from tests.gridsec.meshes import ac, random_mesh
 from tests.gridsec.radial import random_feeder
@@ -202,11 +203,8 @@ def test_arrays_cannot_be_changed() -> None:
 
 def test_every_problem_is_named() -> None:
     tree = random_feeder(3)
-    with pytest.raises(FeederInvalid, match=r"r has shape \(1,\); expected \(2,\)|ends has shape"):
+    with refused(FeederInvalid, "shape", "shape", "shape"):
         MeshedFeeder(tree, np.array([[0, 1], [0, 1]]), np.ones(1), np.ones(2), np.ones(2))
     ends = np.array([[0, 99], [1, 1], [0, 1]])
-    with pytest.raises(FeederInvalid) as caught:
+    with refused(FeederInvalid, "unknown-index", "self-loop", "negative", "zero-impedance"):
         MeshedFeeder(tree, ends, np.array([0.1, -1.0, 0.0]), np.array([0.1, 0.1, 0.0]), np.zeros(3))
-    text = str(caught.value)
-    for part in ("bus 99 does not exist", "both ends are bus 1", "r is -1.0", "r and x are both 0"):
-        assert part in text

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gridsec import bank
-from gridsec.errors import DesignInfeasible, NotObservable
+from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable
 from gridsec.gains import CircleGains
 from gridsec.lmi import circle, options_for, prove
 from gridsec.lmi.sampled import DiscreteLure
@@ -20,6 +20,7 @@ from gridsec.observers import high_gain
 from gridsec.observers.high_gain import groups, nearest
 from gridsec.online import Cause, Decision
 from gridsec.stacked import StackedState
+from tests.codes import refused
 from tests.gridsec.observers.bent import bent, truth
 
 A, C = [[0, 1], [0, -1]], [[1, 0], [1, 0], [1, 0], [1, 1], [1, 1]]
@@ -64,9 +65,9 @@ def test_a_discrete_system_moves_as_its_equation_says() -> None:
 
 
 def test_what_does_not_fit_is_refused_by_name() -> None:
-    with pytest.raises(ValueError, match=r"G has shape .*; B has shape"):
+    with refused(InputInvalid, "shape", "shape"):
         Lure.of(A, C, G=[[1]], H=[[1, 0]], B=[[1]], phi=curve, slope=2)
-    with pytest.raises(ValueError, match="D has shape"):
+    with refused(InputInvalid, "shape"):
         DiscreteLure.of(A, C, G=[[0], [1]], H=[[1, 0]], D=[[1]], phi=curve, lower=0, upper=2)
 
 
@@ -74,15 +75,15 @@ def test_a_slope_that_no_proof_can_use_is_refused_with_every_other_problem() -> 
     def own(slope: Any, **more: Any) -> Lure:
         return Lure.of(-np.eye(2), np.eye(2), G=np.eye(2), H=np.eye(2), phi=np.tanh, slope=slope, **more)
 
-    with pytest.raises(ValueError, match="below its lower one"):
+    with refused(InputInvalid, "order"):
         own([-3.0, 0.5])
-    with pytest.raises(ValueError, match="below its lower one"):
+    with refused(InputInvalid, "order"):
         own([1.0, 0.5], lower=[0.0, 0.6])
-    with pytest.raises(ValueError, match="finite"):
+    with refused(InputInvalid, "not-finite"):
         own([np.nan, 0.5])
-    with pytest.raises(ValueError, match=r"B has shape.*finite.*below"):
+    with refused(InputInvalid, "shape", "not-finite", "order"):
         own([np.inf, -1.0], B=[[1.0]])
-    with pytest.raises(ValueError, match=r"A has shape \(2,\); expected 2 axes"):
+    with refused(InputInvalid, "shape"):
         Lure.of([1.0, 2.0], np.eye(2), G=np.eye(2), H=np.eye(2), phi=np.tanh, slope=1.0)
 
 
@@ -106,7 +107,7 @@ def test_a_certificate_of_a_falling_curve_is_kept_where_its_error_grows() -> Non
         options = options_for(lure, rate=0.2, noise=1.0, load=np.zeros(1), weight=np.eye(1))
         return prove(lure, [0], np.array([[0.01]]), np.zeros((1, 1)), options)
 
-    with pytest.raises(DesignInfeasible):
+    with refused(DesignInfeasible, "no-solution"):
         proof(own(0.5, lower=-1))  # -0.5 - 0.01 + 1 > 0: it does grow
     lure = own(1.5, lower=-1)
     made, u, x = proof(lure), np.array([1.5 * np.pi]), np.array([np.pi])
@@ -179,7 +180,7 @@ def test_without_inverses_the_nearest_points_are_taken_for_all_sets_and_the_whol
 
 
 def test_too_few_sensors_are_refused_without_inverses_too() -> None:
-    with pytest.raises(NotObservable, match="more than twice"):
+    with refused(NotObservable, "too-few-meters"):
         high_gain.design(bent(), theta=12.0, noise=2e-4, max_attacked=2, u_low=-0.4, u_high=0.4, step_s=0.02)
 
 

@@ -17,6 +17,7 @@ from gridsec.mesh import MeshedFeeder, PhasedMesh
 from gridsec.mesh.phased import admittance
 from gridsec.network import bus_voltages, hangs_on, model_error_bound, one_busbar
 from gridsec.phases import ROTATION, PhasedFeeder, ThreePhaseFeeder, sequence_matrix
+from tests.codes import refused
 from tests.gridsec.derivatives import derivatives_are
 from tests.gridsec.meshes import random_mesh
 from tests.gridsec.unbalanced import ac_places, admittances, random_phased_mesh
@@ -238,7 +239,7 @@ def test_arrays_cannot_be_changed() -> None:
 
 def test_every_problem_is_named() -> None:
     three = in_phases(random_mesh(3, ties=1, customers=3), 3.0)
-    with pytest.raises(FeederInvalid, match=r"z has shape \(0, 3, 3\); expected \(1, 3, 3\)"):
+    with refused(FeederInvalid, "shape"):
         replace(three, z=three.z[:0])
     tree = replace(three.tree, phases=three.tree.phases.copy())
     ends, some = np.array([[0, 99], [1, 1], [0, 1], [0, 1], [0, 1]]), np.ones((5, 3), dtype=bool)
@@ -247,17 +248,18 @@ def test_every_problem_is_named() -> None:
     z[2] = 0.0
     z[3, 0, 0] = 0.0
     z[4, 0, 1] += 1.0
-    with pytest.raises(FeederInvalid) as caught:
+    with refused(
+        FeederInvalid,
+        "unknown-index",
+        "self-loop",
+        "no-phase",
+        "zero-impedance",
+        "not-symmetric",
+        "not-definite",
+    ) as caught:
         PhasedMesh(tree, ends, some, z, np.zeros((5, 3, 3)))
-    text = str(caught.value)
-    for part in (
-        "tie 0: bus 99 does not exist",
-        "tie 1: both ends are bus 1",
-        "tie 2: it has no phase",
-        "tie 3: a phase without self-impedance",
-        "tie 4: z is not symmetric",
-    ):
-        assert part in text
+    ties = [problem.split(":")[0] for problem in caught.value.problems]
+    assert ties == ["tie 0", "tie 1", "tie 2", "tie 3", "tie 4", "tie 4"]
     lateral = next(
         each
         for each in (random_phased_mesh(seed, ties=0).tree for seed in range(50))
@@ -265,10 +267,10 @@ def test_every_problem_is_named() -> None:
     )
     far = int(np.flatnonzero(~lateral.phases.all(axis=1))[0])
     block = 0.01 * np.eye(3, dtype=complex)[None]
-    with pytest.raises(FeederInvalid, match="phases 'abc' but the other lines bring only"):
+    with refused(FeederInvalid, "absent-phase"):
         PhasedMesh(lateral, np.array([[0, far]]), np.ones((1, 3), dtype=bool), block, np.zeros((1, 3, 3)))
     # Two reactances that cancel around a loop are no lines.
-    with pytest.raises(FeederInvalid, match="the impedances around a loop add up to nothing"):
+    with refused(FeederInvalid, "singular"):
         PhasedMesh(
             replace(lateral, z=1j * np.abs(lateral.z)),
             np.array([[lateral.parent[0], 1]]),
@@ -285,5 +287,5 @@ def test_conductors_without_impedances_of_their_own_have_no_charging(nearly: flo
     block = np.full((1, 3, 3), 0.01 + 0.01j) + nearly * np.eye(3)
     b = np.array([0.01 * np.eye(3)])
     assert np.isfinite(replace(three, z=block).R).all()
-    with pytest.raises(FeederInvalid, match="tie 0: z is singular"):
+    with refused(FeederInvalid, "singular"):
         replace(three, z=block, charging=b)

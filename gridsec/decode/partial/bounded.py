@@ -23,6 +23,7 @@ from gridsec.decode import search
 from gridsec.decode.noise import CorrectionConstants, correct, correction_constants
 from gridsec.decode.search import Decoder
 from gridsec.decode.stacks import Stack
+from gridsec.errors import InputInvalid, Problem
 from gridsec.observers import luenberger
 from gridsec.observers.luenberger import LuenbergerDesign, LuenbergerState
 
@@ -141,7 +142,7 @@ def design(
     blocks = observers.stack.blocks
     size = np.ones(len(blocks)) if scale is None else np.asarray(scale, dtype=np.float64)
     if size.shape != (len(blocks),) or not np.all(np.isfinite(size) & (size > 0.0)):
-        raise ValueError("scale must have one positive number for each sensor")
+        raise InputInvalid([Problem("not-positive", "scale must have one positive number for each sensor")])
     stacked = Stack.of([block / s for block, s in zip(blocks, size, strict=True)])
     decoder = search.design(stacked, max_attacked, tol=tol, left_out=left_out)
     constants = correction_constants(stacked, max_attacked, tol=tol, left_out=decoder.left_out)

@@ -95,9 +95,12 @@ def parity(stack: Stack, kept: Ints, *, tol: float) -> Parity:
     checks = annihilator(phi, tol=tol)
     rank = rows.size - len(checks)
     if rank < stack.unknowns or rows.size <= stack.unknowns:
-        lack = "determine only" if rank < stack.unknowns else "determine without redundancy"
+        lack, code = "determine without redundancy", "no-redundancy"
+        if rank < stack.unknowns:
+            lack, code = "determine only", "not-observable"
         names = np.asarray(kept).tolist()
-        raise NotObservable(names, rank, f"sensors {names} {lack} {rank} of {stack.unknowns} unknowns")
+        why = f"sensors {names} {lack} {rank} of {stack.unknowns} unknowns"
+        raise NotObservable(names, rank, why, code=code)
     inverse: Floats = np.asarray(np.linalg.pinv(phi), dtype=np.float64)
     return Parity(frozen_ints(kept), frozen_ints(rows), frozen(checks), frozen(inverse))
 

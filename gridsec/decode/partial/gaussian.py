@@ -23,6 +23,7 @@ from gridsec.arrays import Bools, Floats, frozen, frozen_ints
 from gridsec.decode.gaussian import Hypotheses, Rule, choose
 from gridsec.decode.partial.fusion import Fused, Parity, fuse, parity
 from gridsec.decode.stacks import MOST_SUBSETS, Stack, require, subsets
+from gridsec.errors import InputInvalid, Problem
 from gridsec.observers import kalman
 from gridsec.observers.kalman import KalmanDesign, KalmanState, Steady
 from gridsec.observers.parts import heard
@@ -180,7 +181,14 @@ def design(
         If `max_attacked` is below 1, or `false_alarm` not inside (0, 1).
     """
     if max_attacked < 1 or not 0.0 < false_alarm < 1.0:
-        raise ValueError(f"max_attacked is {max_attacked} (>= 1), false_alarm {false_alarm} (in (0, 1))")
+        raise InputInvalid(
+            [
+                Problem(
+                    "out-of-range",
+                    f"max_attacked is {max_attacked} (>= 1), false_alarm {false_alarm} (in (0, 1))",
+                )
+            ]
+        )
     stacked = Stack.of(filters.stack.blocks)
     zero = float(np.sqrt(tol))
     require(stacked, 2 * max_attacked, zero, f"undoing {max_attacked} errors")
@@ -305,7 +313,9 @@ def decode(design: GaussianDesign, state: GaussianState) -> tuple[GaussianState,
 
 def _require_all(y: Floats, seen: Bools | None) -> None:
     if not np.all(heard(y, seen)):
-        raise ValueError("filters with stationary gains need every reading; design without `steady`")
+        raise InputInvalid(
+            [Problem("missing", "filters with stationary gains need every reading; design without `steady`")]
+        )
 
 
 def _score(fused: Fused, z: Floats) -> float:

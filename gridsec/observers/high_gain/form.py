@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints
-from gridsec.errors import NotObservable
+from gridsec.errors import InputInvalid, NotObservable, Problem
 from gridsec.observers.high_gain.constants import Slopes
 from gridsec.observers.high_gain.intervals import Interval, interval, supremum
 
@@ -200,10 +200,14 @@ class System:
 
     def __post_init__(self) -> None:
         if not self.partials:
-            raise NotObservable((), 0, "a system without sensors shows nothing of its state")
+            raise NotObservable(
+                (), 0, "a system without sensors shows nothing of its state", code="too-few-meters"
+            )
         widths = {partial.inputs for partial in self.partials}
         if len(widths) != 1:
-            raise ValueError(f"all sensors share the inputs, but they count {sorted(widths)} of them")
+            raise InputInvalid(
+                [Problem("shape", f"all sensors share the inputs, but they count {sorted(widths)} of them")]
+            )
         object.__setattr__(self, "x_bound", np.atleast_1d(np.asarray(self.x_bound, dtype=np.float64)))
         sizes = np.array([partial.size for partial in self.partials])
         object.__setattr__(self, "mask", np.arange(sizes.max())[None, :] < sizes[:, None])
@@ -416,7 +420,9 @@ def linear(A: Floats, B: Floats, C: Floats, x_bound: Floats, *, tolerance: float
     parts = []
     for i, row in enumerate(C):
         if not row.any():
-            raise NotObservable((i,), 0, f"sensor {i} measures nothing: its row of C is zero")
+            raise NotObservable(
+                (i,), 0, f"sensor {i} measures nothing: its row of C is zero", code="zero-output"
+            )
         kept = [row]
         while True:
             ahead = kept[-1] @ A

@@ -18,7 +18,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, frozen, not_negative
 from gridsec.choices import no_choice
-from gridsec.errors import DesignInfeasible, NotObservable, refuse
+from gridsec.errors import DesignInfeasible, NotObservable, Problem, refuse
 from gridsec.observers.high_gain.constants import (
     Decay,
     decay_componentwise,
@@ -183,7 +183,12 @@ def design(
     """
     p, m = len(system.partials), system.partials[0].inputs
     if not p > 2 * max_attacked >= 0:
-        raise NotObservable(range(p), p, f"{p} sensors, {max_attacked} attacked: more than twice are needed")
+        raise NotObservable(
+            range(p),
+            p,
+            f"{p} sensors, {max_attacked} attacked: more than twice are needed",
+            code="too-few-meters",
+        )
     refuse(_problems(lowest, search, decay))
     thetas = np.broadcast_to(np.asarray(theta, dtype=np.float64), (p,))
     noises = np.broadcast_to(not_negative("noise", noise), (p,))
@@ -221,7 +226,11 @@ def _problems(lowest: float, search: str, decay: str | Sequence[Decay]) -> list[
     wrong += no_choice("decay", _DECAYS, decay) if isinstance(decay, str) else []
     return [
         *wrong,
-        *([f"lowest is {lowest}; a lower bound of gains is not negative"] if lowest < 0.0 else []),
+        *(
+            [Problem("negative", f"lowest is {lowest}; a lower bound of gains is not negative")]
+            if lowest < 0.0
+            else []
+        ),
     ]
 
 
@@ -242,7 +251,10 @@ def _inverses(
         return tuple(nearest(system, group, accept=accept) for group in wanted), whole
     if len(given) != len(set(wanted)) or {inverse.sensors for inverse in given} != set(wanted):
         raise NotObservable(
-            range(p), p, f"a left inverse for each set of {p - max_attacked} sensors is needed"
+            range(p),
+            p,
+            f"a left inverse for each set of {p - max_attacked} sensors is needed",
+            code="missing",
         )
     return tuple(given), whole
 
@@ -265,14 +277,19 @@ def _constants(
 def _margins(system: System, theta: Floats, low: Floats, high: Floats) -> tuple[Floats, bool]:
     if np.any(theta < 1.0):
         raise DesignInfeasible(
-            "partial high-gain observers", "theta must be at least 1", float(theta.min()) - 1.0
+            "partial high-gain observers",
+            "theta must be at least 1",
+            float(theta.min()) - 1.0,
+            code="out-of-range",
         )
     ranges = [slopes(partial, low, high) for partial in system.partials]
     margins = np.array([margin(part, float(th)) for part, th in zip(ranges, theta, strict=True)])
     if not np.all(margins > 0.0):
         bad = int(np.argmin(margins))
         what = f"partial observer of sensor {bad}"
-        raise DesignInfeasible(what, f"theta = {theta[bad]:g} is too small for Lemma 1", float(margins[bad]))
+        raise DesignInfeasible(
+            what, f"theta = {theta[bad]:g} is too small for Lemma 1", float(margins[bad]), code="unstable"
+        )
     return margins, all(part.proven for part in ranges)
 
 

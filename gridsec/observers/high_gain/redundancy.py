@@ -135,7 +135,9 @@ def redundancy(system: System, missing: int, *, samples: int = 2000, seed: int =
     for group in combinations(range(p), max(p - missing, 0)):
         entries = sum(system.partials[i].size for i in group)
         if entries < system.n:
-            raise NotObservable(group, entries, f"{entries} entries cannot determine {system.n} states")
+            raise NotObservable(
+                group, entries, f"{entries} entries cannot determine {system.n} states", code="too-few-meters"
+            )
         smallest = np.linalg.svd(system.jacobian(points, group), compute_uv=False)[:, -1].min()
         best = min(best, (float(smallest), group))
         quotient = lower_sampled(

@@ -214,9 +214,9 @@ def _chain(i: int, output: Expression, drift: list[Expression], probe: _Probe) -
         low, high = int(ranks.min()), int(ranks.max())
         if low != high:
             why = f"the rank of sensor {i}'s observable part changes between {low} and {high} in the box"
-            raise NotObservable((i,), low, why)
+            raise NotObservable((i,), low, why, code="rank-changes")
         if high == 0:
-            raise NotObservable((i,), 0, f"sensor {i} does not depend on the state")
+            raise NotObservable((i,), 0, f"sensor {i} does not depend on the state", code="zero-output")
         if high < len(chain):
             return chain
         chain.append(lie(chain[-1], drift, probe.x))
@@ -241,7 +241,7 @@ def _check_triangular(
                     f"sensor {i} is not uniformly observable: row {j + 1} of beta depends on more than the "
                     f"first {j + 1} entries of z, so that some inputs hide what others show"
                 )
-                raise NotObservable((i,), len(phi), why)
+                raise NotObservable((i,), len(phi), why, code="not-uniform")
 
 
 def _match(

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, frozen
-from gridsec.errors import DesignInfeasible, refuse
+from gridsec.errors import DesignInfeasible, Problem, refuse
 from gridsec.lmi.unknown_input import ErrorSystem, Multiplier, UnknownInputGains, UnknownInputTemplate
 from gridsec.observers.unknown_input.plant import (
     Missing,
@@ -140,7 +140,11 @@ def design(
     ValueError
         If no rate is given, or there is no such multiplier.
     """
-    refuse([] if len(rates) else ["rates are empty; at least one contraction has to be tried"])
+    refuse(
+        []
+        if len(rates)
+        else [Problem("missing", "rates are empty; at least one contraction has to be tried")]
+    )
     templates: dict[tuple[int, int], UnknownInputTemplate] = {}
     made: list[tuple[Pair, ErrorSystem, UnknownInputGains]] = []
     missing: list[Missing] = []
@@ -155,7 +159,9 @@ def design(
             found = outcome
         missing.append(found)
     if not made:
-        raise DesignInfeasible("bank of unknown-input observers", f"no member exists: {missing[0].why}")
+        raise DesignInfeasible(
+            "bank of unknown-input observers", f"no member exists: {missing[0].why}", code="no-solution"
+        )
     return _stack(plant, made, tuple(missing), rounding)
 
 

@@ -20,7 +20,7 @@ from typing import Literal
 import numpy as np
 
 from gridsec.arrays import Floats, Ints, frozen
-from gridsec.errors import DesignInfeasible, refuse
+from gridsec.errors import DesignInfeasible, InputInvalid, Problem, refuse
 from gridsec.lmi.sampled import DiscreteLure, sample
 from gridsec.lmi.unknown_input import ErrorSystem
 from gridsec.lure import Lure
@@ -66,15 +66,23 @@ class UnknownInputPlant:
         n, p = len(self.system.A), len(self.system.C)
         problems = []
         if self.inputs.ndim != 2 or len(self.inputs) != n or not self.inputs.shape[1]:
-            problems.append(f"inputs has shape {self.inputs.shape}; expected ({n}, r) with r > 0")
+            problems.append(
+                Problem("shape", f"inputs has shape {self.inputs.shape}; expected ({n}, r) with r > 0")
+            )
         elif np.linalg.matrix_rank(self.inputs) < self.inputs.shape[1]:
-            problems.append("the columns of inputs are dependent: no reconstruction could tell them apart")
+            problems.append(
+                Problem(
+                    "singular", "the columns of inputs are dependent: no reconstruction could tell them apart"
+                )
+            )
         if self.noise.shape != (p,) or not (np.all(self.noise > 0.0) or np.all(self.noise == 0.0)):
-            problems.append(f"noise must be of shape ({p},), all positive or all zero")
+            problems.append(
+                Problem("not-positive", f"noise must be of shape ({p},), all positive or all zero")
+            )
         if self.drift.ndim != 2 or len(self.drift) != n:
-            problems.append(f"drift has shape {self.drift.shape}; expected ({n}, d)")
+            problems.append(Problem("shape", f"drift has shape {self.drift.shape}; expected ({n}, d)"))
         if self.span.shape != (n,) or not np.all(self.span > 0.0):
-            problems.append(f"span must be positive, of shape ({n},)")
+            problems.append(Problem("not-positive", f"span must be positive, of shape ({n},)"))
         refuse(problems)
 
     @property
@@ -156,7 +164,9 @@ def inverters(
     told = np.zeros(0, dtype=np.intp) if reports is None else np.asarray(reports, dtype=np.intp)
     error = np.zeros(0) if report_error is None else np.asarray(report_error, dtype=np.float64)
     if told.size != error.size:
-        raise ValueError(f"{told.size} inverters report, but {error.size} errors of reports are given")
+        raise InputInvalid(
+            [Problem("shape", f"{told.size} inverters report, but {error.size} errors of reports are given")]
+        )
     whole = DiscreteLure(
         A=system.A,
         G=system.G,
@@ -269,7 +279,7 @@ def worst_zero(plant: UnknownInputPlant, pair: Pair) -> float:
     live = np.flatnonzero(system.slope > 0.0)
     if live.size > _CORNERS:
         raise DesignInfeasible(
-            "zeros at all corners of the slopes", f"{live.size} nonlinearities are too many"
+            "zeros at all corners of the slopes", f"{live.size} nonlinearities are too many", code="too-many"
         )
     worst = 0.0
     for ends in product((0, 1), repeat=live.size):

@@ -18,6 +18,7 @@ from gridsec.decode.sparse import (
 )
 from gridsec.errors import DesignInfeasible
 from gridsec.lmi.pursuit import group_pursuit
+from tests.codes import refused
 
 TOL = 1e-9
 
@@ -138,9 +139,9 @@ def test_nothing_to_find_and_nothing_possible() -> None:
     F = np.array([[1.0, 0, 0], [1.0, 0, 0]])
     assert not basis_pursuit(F, np.zeros(2)).any()
     assert not group_pursuit(F, np.zeros(2), np.array([3])).any()
-    with pytest.raises(DesignInfeasible, match="basis pursuit"):
+    with refused(DesignInfeasible, "no-solution"):
         basis_pursuit(F, np.array([1.0, 2.0]))
-    with pytest.raises(DesignInfeasible, match="stacked basis pursuit"):
+    with refused(DesignInfeasible, "no-solution"):
         group_pursuit(F, np.array([1.0, 2.0]), np.array([1, 2]))
 
 

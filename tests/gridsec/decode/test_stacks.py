@@ -22,7 +22,8 @@ from gridsec.decode import (
     spark,
 )
 from gridsec.decode.stacks import masked, require, subsets
-from gridsec.errors import DesignInfeasible, NotObservable
+from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable
+from tests.codes import refused
 
 TOL = 1e-9
 
@@ -168,19 +169,19 @@ def test_stack_with_blocks_of_all_heights() -> None:
     assert stack.blocks().shape == (3, 2, 2)
     assert np.array_equal(stack.blocks()[2], [[0, 3], [0, 0]])
     assert np.array_equal(masked(stack, np.array([[1, 2]]))[0], [[0, 0], [0, 0], [0, 3]])
-    with pytest.raises(ValueError, match="heights sum to 4"):
+    with refused(InputInvalid, "shape"):
         Stack(np.eye(3), np.array([2, 2]))
-    with pytest.raises(ValueError, match="one height"):
+    with refused(InputInvalid, "shape"):
         Stack(np.eye(3), np.array([4, -1]))
 
 
 def test_refusals_name_the_sensors_and_the_counts() -> None:
     C = np.array([[1.0, 0], [1, 0], [1, 0], [0, 1], [0, 1]])
-    with pytest.raises(NotObservable, match=r"without sensors \[3, 4\] it is not") as caught:
+    with refused(NotObservable, "not-observable") as caught:
         require(Stack.of_rows(C), 2, TOL, "undoing 1 errors")
     assert caught.value.subset == (0, 1, 2)
     assert caught.value.rank == 1
-    with pytest.raises(DesignInfeasible, match="184756 subsets; at most 1000"):
+    with refused(DesignInfeasible, "too-many"):
         subsets(20, 10, 1000)
     assert subsets(4, 2, 6).tolist() == [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]
     assert subsets(4, 0, 6).shape == (1, 0)

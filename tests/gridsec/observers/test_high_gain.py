@@ -29,6 +29,7 @@ from gridsec.observers.high_gain.constants import (
 )
 from gridsec.observers.high_gain.field import advance, field, gains, transition
 from gridsec.observers.high_gain.form import at, jacobian_at, largest, sat, slopes
+from tests.codes import refused
 from tests.gridsec.observers.bent import bent, oscillator, oscillator_input
 
 
@@ -230,9 +231,9 @@ def test_linear_systems_always_decompose(seed: int) -> None:
 
 
 def test_sensors_without_a_row_are_refused() -> None:
-    with pytest.raises(NotObservable, match="sensor 1 measures nothing"):
+    with refused(NotObservable, "zero-output"):
         linear(np.eye(2), np.ones((2, 1)), np.array([[1.0, 0.0], [0.0, 0.0]]), 1.0)
-    with pytest.raises(NotObservable, match="without sensors"):
+    with refused(NotObservable, "too-few-meters"):
         System(np.ones(2), ())
 
 

@@ -17,6 +17,7 @@ from gridsec.index import asymptotic_index
 from gridsec.observers import kalman, luenberger
 from gridsec.observers.luenberger import Bounds
 from gridsec.papers import lee2018, three_inertia
+from tests.codes import refused
 
 PLANT = three_inertia.plant()
 
@@ -151,7 +152,7 @@ def test_dedicated_observers_decide_by_majority_and_two_of_them_cannot() -> None
         _, out = bounded.step(made, state, y, np.zeros(1))
         assert np.flatnonzero(out.disagree).tolist() == [liar]
         assert abs(out.x[0] - 2.0) <= out.bound < 0.05
-    with pytest.raises(NotObservable):
+    with refused(NotObservable, "not-observable"):
         deadbeat(2, 1)
 
 

@@ -7,10 +7,12 @@ import itertools
 import numpy as np
 import pytest
 
+from gridsec.errors import InputInvalid
 from gridsec.isolation import design
 from gridsec.lmi.sampled import advance
 from gridsec.observers.unknown_input import obstruction
 from gridsec.papers import yang2021, yang2021_feeder
+from tests.codes import refused
 from tests.gridsec.papers.made import made
 
 
@@ -139,7 +141,7 @@ def test_the_line_is_that_of_the_files() -> None:
     np.testing.assert_array_equal(theirs.parent, ours.parent)
     np.testing.assert_allclose(theirs.r, ours.r, rtol=1e-5)
     np.testing.assert_allclose(theirs.x, ours.x, rtol=1e-5)
-    with pytest.raises(ValueError, match="only 1 and 2"):
+    with refused(InputInvalid, "out-of-range"):
         yang2021.plant(3)
 
 

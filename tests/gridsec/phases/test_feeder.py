@@ -12,6 +12,7 @@ from hypothesis import given
 
 from gridsec.errors import FeederInvalid
 from gridsec.phases import ThreePhaseFeeder, sequence_matrix
+from tests.codes import refused
 from tests.gridsec.unbalanced import random_three_phase
 
 
@@ -68,33 +69,36 @@ def changed(block: int, place: tuple[int, int], value: complex) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "codes"),
     [
-        ({"z": np.zeros((2, 3, 3))}, "z has shape"),
-        ({"base_volt": 0.0}, "base_volt is 0.0"),
-        ({"base_kva": np.nan}, "base_kva is nan"),
-        ({"parent": np.array([0, 2, 1])}, "parent 2 does not precede it"),
-        ({"z": changed(0, (0, 1), 1.0)}, "z is not symmetric"),
-        ({"z": changed(0, (0, 1), np.nan)}, "z is not finite"),
-        ({"z": changed(2, (0, 0), 0.1)}, "z is not 0 on a phase that is absent"),
-        ({"z": changed(2, (1, 1), 0.0)}, "a phase without self-impedance"),
-        ({"z": changed(2, (1, 1), -0.1)}, "its resistances generate power"),
-        ({"charging": np.full((3, 3, 3), np.inf)}, "charging is not finite"),
-        ({"phases": np.array([[1, 0, 1], [1, 0, 1], [1, 0, 1], [0, 1, 0]])}, "only 'ac' arrive at 'b1'"),
-        ({"phases": np.array([[1, 1, 1], [1, 1, 1], [1, 1, 1], [0, 0, 0]])}, "it has no phase"),
-        ({"bus": np.array([2, 4, 1])}, "bus 4 does not exist"),
-        ({"bus": np.array([3, 3, 1])}, "phases 'abc' but bus 'b3' has only 'b'"),
-        ({"connected": np.zeros((3, 3), dtype=bool)}, "is connected to no phase"),
-        ({"customers": ("x", "x", "y")}, "'x' is named 2 times"),
+        ({"z": np.zeros((2, 3, 3))}, ("shape",)),
+        ({"base_volt": 0.0}, ("not-positive",)),
+        ({"base_kva": np.nan}, ("not-positive",)),
+        ({"parent": np.array([0, 2, 1])}, ("not-radial",)),
+        ({"z": changed(0, (0, 1), 1.0)}, ("not-symmetric", "not-definite")),
+        ({"z": changed(0, (0, 1), np.nan)}, ("not-finite",)),
+        ({"z": changed(2, (0, 0), 0.1)}, ("absent-phase",)),
+        ({"z": changed(2, (1, 1), 0.0)}, ("zero-impedance",)),
+        ({"z": changed(2, (1, 1), -0.1)}, ("not-definite",)),
+        ({"charging": np.full((3, 3, 3), np.inf)}, ("not-finite",) * 3),
+        ({"phases": np.array([[1, 0, 1], [1, 0, 1], [1, 0, 1], [0, 1, 0]])}, ("absent-phase",) * 4),
+        (
+            {"phases": np.array([[1, 1, 1], [1, 1, 1], [1, 1, 1], [0, 0, 0]])},
+            ("no-phase", "absent-phase", "absent-phase"),
+        ),
+        ({"bus": np.array([2, 4, 1])}, ("unknown-index",)),
+        ({"bus": np.array([3, 3, 1])}, ("absent-phase",)),
+        ({"connected": np.zeros((3, 3), dtype=bool)}, ("no-phase",) * 3),
+        ({"customers": ("x", "x", "y")}, ("duplicate",)),
     ],
 )
-def test_problems_are_named(changes: dict[str, Any], said: str) -> None:
-    with pytest.raises(FeederInvalid) as caught:
+def test_problems_are_named(changes: dict[str, Any], codes: tuple[str, ...]) -> None:
+    with refused(FeederInvalid, *codes):
         street(**changes)
-    assert any(said in problem for problem in caught.value.problems)
 
 
 def test_all_problems_at_once() -> None:
-    with pytest.raises(FeederInvalid) as caught:
+    with refused(
+        FeederInvalid, "not-positive", "zero-impedance", "unknown-index", "unknown-index", "unknown-index"
+    ):
         replace(street(), base_volt=-1.0, bus=np.array([9, 9, 9]), z=changed(2, (1, 1), 0.0))
-    assert len(caught.value.problems) == 5

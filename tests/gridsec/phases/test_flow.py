@@ -11,6 +11,7 @@ from hypothesis import given, settings
 
 from gridsec import feeder as balanced
 from gridsec.arrays import Floats
+from gridsec.errors import InputInvalid
 from gridsec.phases import (
     ThreePhaseFeeder,
     bus_voltages,
@@ -23,6 +24,7 @@ from gridsec.phases import (
     sequence_matrix,
     squared_voltages,
 )
+from tests.codes import refused
 from tests.gridsec.radial import random_feeder
 from tests.gridsec.unbalanced import power_flow, random_three_phase
 
@@ -314,5 +316,5 @@ def test_a_correction_has_a_step() -> None:
     feeder = random_three_phase(1)
     none = np.zeros(feeder.of.size)
     for correct in (loss_correction, corrected, sensitivities):
-        with pytest.raises(ValueError, match="steps is 0"):
+        with refused(InputInvalid, "out-of-range"):
             correct(feeder, none, none, np.ones(3), steps=0)

@@ -10,10 +10,12 @@ import pytest
 from gridsec import sequential
 from gridsec.accuracy import MeterAccuracy
 from gridsec.droop import fleet
+from gridsec.errors import InputInvalid
 from gridsec.online import Decision, Frame
 from gridsec.plant import Plant
 from gridsec.sequential import LoadDoubt, SequentialDesign, SequentialOptions, SequentialState
 from gridsec.sequential.commission import Learned, from_arrays, nothing, to_arrays
+from tests.codes import refused
 from tests.gridsec.sequential.test_monitor import prepare, watch
 from tests.gridsec.street import BASE_KVA, Street, accuracy, make_plant
 
@@ -234,7 +236,7 @@ def test_what_is_learned_survives_where_nothing_is_ever_learned() -> None:
     for name in ("bias", "variance", "allowed", "at"):
         np.testing.assert_array_equal(getattr(after.learned, name), getattr(before.learned, name))
     learning = prepare(make_plant(np.random.default_rng(3), customers=5), commission_s=100.0)
-    with pytest.raises(ValueError, match="neither learned nor being learned"):
+    with refused(InputInvalid, "inconsistent"):
         from_arrays(learning, to_arrays(before))
 
 

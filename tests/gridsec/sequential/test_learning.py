@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from gridsec import sequential
+from gridsec.errors import InputInvalid
 from gridsec.online import Frame, PowerOrigin
 from gridsec.sequential import (
     Commission,
@@ -31,6 +32,7 @@ from gridsec.sequential.commission import (
 )
 from gridsec.sequential.doubts import none
 from gridsec.sequential.learning import Tick, counts
+from tests.codes import refused
 from tests.gridsec.sequential.test_monitor import prepare, watch
 from tests.gridsec.street import Street, make_plant
 
@@ -289,5 +291,8 @@ def test_times_that_cannot_be_are_refused(name: str, value: float) -> None:
     design, _ = scene()
     arrays: dict[str, Any] = to_arrays(init(design, 0.0).commission)
     arrays[name] = np.where(OTHERS, 0.0, value)
-    with pytest.raises(ValueError, match=rf"{name} is not a time \(meters {ODD}\)"):
+    with refused(InputInvalid, "negative") as caught:
         from_arrays(design, arrays)
+    (problem,) = caught.value.problems
+    assert problem.startswith(name)
+    assert problem.endswith(f"(meters {ODD})")

@@ -1,0 +1,332 @@
+"""Codes of errors: docs/error-codes.md against the source, and a sentence for each code."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import gridsec
+from gridsec import bank, monitor
+from gridsec.arrays import not_negative
+from gridsec.attack import Bias, Replay, Stuck, coordinate
+from gridsec.certificates import certify
+from gridsec.decode import Stack, gaussian, stacks
+from gridsec.decode.probability import bound_for
+from gridsec.designs import from_bytes
+from gridsec.droop import Droop, fleet, preset
+from gridsec.errors import DesignInfeasible, FeederInvalid, InputInvalid, NotObservable
+from gridsec.families import windowed
+from gridsec.feeder import Feeder, loss_correction
+from gridsec.gains import refuse_blind
+from gridsec.lmi import options_for
+from gridsec.lmi.discrete import discrete_contraction
+from gridsec.lmi.pursuit import group_pursuit
+from gridsec.lmi.sampled import DiscreteLure
+from gridsec.lure import close_loop
+from gridsec.mesh import MeshedFeeder
+from gridsec.observers import circle, luenberger
+from gridsec.observers.high_gain import given as given_inverse
+from gridsec.observers.high_gain import linear
+from gridsec.observers.high_gain.inverse import check, corners_and_interior
+from gridsec.observers.high_gain.symbolic import decompose
+from gridsec.observers.unknown_input import exact
+from gridsec.papers import uniformly_observable, yang2021
+from gridsec.phases import PhasedFeeder, ThreePhaseFeeder
+from gridsec.plant import Options
+from gridsec.sequential import LoadDoubt, SequentialOptions
+from gridsec.studies.droop_stability import Update
+from gridsec.studies.protect import fewest_protected
+from gridsec.subsets import subsets
+from tests.codes import codes_of
+from tests.gridsec.plants import line
+from tests.gridsec.radial import random_feeder
+from tests.gridsec.street import accuracy, make_plant
+from tests.gridsec.unbalanced import random_three_phase
+
+PACKAGE = Path(gridsec.__file__).parent
+PAGE = PACKAGE.parent / "docs" / "error-codes.md"
+GOLDEN = Path(__file__).parent / "golden" / "errors.txt"
+ROW = re.compile(r"^\| `([a-z-]+)` \| (.+) \|$", re.MULTILINE)
+CODE = re.compile(r"[a-z]+(-[a-z]+)*")
+WHO = np.array([0, 1])
+
+
+def texts(node: ast.expr) -> Iterator[str]:
+    """Strings that an expression states: a constant, or both values of a choice."""
+    if isinstance(node, ast.IfExp):
+        yield from texts(node.body)
+        yield from texts(node.orelse)
+    elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+        yield node.value
+
+
+def codes(source: str) -> set[str]:
+    """Literal codes of a module: of `Problem(...)`, of arguments `code=...` and their defaults."""
+    out: set[str] = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Call):
+            name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+            if name == "Problem" and node.args:
+                out.update(texts(node.args[0]))
+            for each in node.keywords:
+                if each.arg == "code":
+                    out.update(texts(each.value))
+        elif isinstance(node, ast.arguments):
+            for argument, default in zip(node.kwonlyargs, node.kw_defaults, strict=True):
+                if argument.arg == "code" and default is not None:
+                    out.update(texts(default))
+    return out
+
+
+def used() -> set[str]:
+    """Codes of the package."""
+    return set().union(*(codes(path.read_text("utf-8")) for path in PACKAGE.rglob("*.py")))
+
+
+def listed() -> list[str]:
+    """Codes of the page, row by row."""
+    return [match[1] for match in ROW.finditer(PAGE.read_text("utf-8"))]
+
+
+def test_literals_are_found() -> None:
+    source = """
+Problem("a" if x == "no" else "b", "text")
+errors.Problem("c", f"{x}")
+Problem(one.code, "no")
+raise Other("no", code="d")
+def f(x, *, code: str = "e", other: str = "no"): ...
+"""
+    assert codes(source) == {"a", "b", "c", "d", "e"}
+
+
+def test_the_page_lists_the_codes_of_the_source() -> None:
+    assert listed() == sorted(used())
+    assert all(CODE.fullmatch(code) for code in listed())
+
+
+def test_wrong_input_in_the_package_has_codes() -> None:
+    plain = re.compile(r"raise ValueError\(")
+    assert [str(path) for path in PACKAGE.rglob("*.py") if plain.search(path.read_text("utf-8"))] == []
+
+
+def far_apart() -> Any:
+    """Two inverters at one line with time constants of 0.2 s and 20 s."""
+    feeder = Feeder(
+        name="street", parent=np.array([0, 1]), r=np.full(2, 0.01), x=np.full(2, 0.02), bus=np.array([1, 2]),
+        customers=("near", "far"), buses=("0", "1", "2"), base_volt=230.0, base_kva=100.0,
+        charging=np.zeros(2),
+    )  # fmt: skip
+    droop = fleet(WHO, "ieee1547-b", np.full(2, 5000.0), 100.0, tau=np.array([0.2, 20.0]))
+    return close_loop(feeder, droop, WHO)
+
+
+def sampled(A: float, lower: float = 0.0) -> DiscreteLure:
+    return DiscreteLure.of([[A]], [[1.0]], G=[[1.0]], H=[[1.0]], phi=np.tanh, lower=lower, upper=1.0)
+
+
+def three_phases(**changes: Any) -> ThreePhaseFeeder:
+    return replace(random_three_phase(1, charging=0.0), **changes)
+
+
+def changed_block(row: int, column: int, value: float) -> Any:
+    z = random_three_phase(1, charging=0.0).z.copy()
+    z[0, row, column] += value
+    return z
+
+
+def broken_feeder() -> Feeder:
+    good = random_feeder(7, customers=3)
+    r = np.array([-1.0, *good.r[1:]])
+    return replace(good, r=r, bus=np.array([0, 99, -1]), base_kva=0.0, customers=("a", "a", "b"))
+
+
+def broken_fleet() -> Droop:
+    v, q = np.array([[0.9, 0.98, 1.02, 1.1]] * 3), np.array([[0.1, 0.0, 0.0, -0.1]] * 3)
+    v[1] = v[1, ::-1]
+    q[2, 0] = np.inf
+    return Droop(np.arange(3), v, q, np.array([0.0, 1.0, -1.0]))
+
+
+def late_parent() -> Feeder:
+    feeder = random_feeder(3)
+    return replace(feeder, parent=np.array([*feeder.parent[:-1], feeder.parent.size]))
+
+
+def foreign_gains() -> Any:
+    """Gains from all meters for observers of two and of one."""
+    lure = line(3).lure
+    given = bank.direct_gains(lure, subsets(3, 1, most=1000).masks())
+    return bank.design(lure, 1, gains=replace(given, K=np.ones_like(given.K)))
+
+
+def absent_phase() -> Any:
+    """Self-impedance of a phase that a line of a single phase lacks."""
+    feeder = random_three_phase(1, charging=0.0)
+    k, phase = np.argwhere(~feeder.phases[1:])[0]
+    z = feeder.z.copy()
+    z[k, phase, phase] = 0.1
+    return replace(feeder, z=z)
+
+
+def rising() -> Droop:
+    v, q = np.array([[0.9, 0.98, 1.02, 1.1]]), np.array([[0.1, 0.2, 0.0, -0.1]])
+    return Droop(np.array([0]), v, q, np.array([2.0]))
+
+
+def symbolic(kind: str) -> Any:
+    """Refusals of the symbolic decomposition; x1 depends on the input, or only where x1 is positive."""
+    sympy = pytest.importorskip("sympy", reason="sympy is not installed; this sentence is not tested")
+    a, b = sympy.symbols("a b")
+    if kind == "hidden":
+        return decompose([b, -b], [[b], [0]], [a], [a, b], x_bound=1.0)
+    half = sympy.Piecewise((b * a**2, a > 0), (0, True))
+    return decompose([half, -b], [0, 0], [a], [a, b], x_bound=1.0)
+
+
+def no_left_inverse() -> Any:
+    model = uniformly_observable.system()
+    wrong = given_inverse(model, (1, 2, 3), lambda z: 0.0 * z[..., :3], factor=1.0)
+    return check(model, wrong, corners_and_interior(model), tolerance=1e-6)
+
+
+def unstable() -> Any:
+    bounds = luenberger.Bounds(0.1, np.array([0.1]), np.eye(2))
+    A, B, C = np.diag([1.1, 0.5]), np.zeros((2, 1)), np.array([[1.0, 1.0]])
+    return luenberger.design(A, B, C, bounds, slowest=0.0, tol=1e-9, gains=[np.zeros(2)])
+
+
+def generating() -> Any:
+    return fleet(np.array([0]), "vde4105", np.array([5.0]), 100.0, capability="circular", p_gen=np.array([1]))
+
+
+def stack(rank: int) -> Stack:
+    return Stack.of_rows(np.eye(3)[:rank])
+
+
+def street(**changes: Any) -> Any:
+    return replace(make_plant(np.random.default_rng(0), customers=5), **changes)
+
+
+CALLS: dict[str, Callable[[], Any]] = {
+    "power above the rating": generating,
+    "blind gains": lambda: refuse_blind(np.array([0, 3]), np.zeros(2)),
+    "meters twice": lambda: Stuck(np.array([1, 1]), 0.0, 1.0),
+    "dead time of a continuous filter": lambda: Update(0.0, 1),
+    "gains without options": lambda: circle.design(line(3).lure, np.ones(3, np.bool_), gains="lmi"),
+    "negative noise": lambda: not_negative("noise", -1.0),
+    "time constants too far apart": lambda: certify(far_apart()),
+    "a pattern of zero": lambda: coordinate(np.array([0.0, 1.0]), WHO, 0.03),
+    "as many readings as states": lambda: gaussian.design_test(stack(3), np.eye(3)),
+    "unstable without meters": lambda: discrete_contraction(sampled(2.0), decays=0.9),
+    "probability too near to 1": lambda: bound_for(
+        Stack.of([np.eye(2)]), np.diag([1.0, 1e-6]), 1.0 - 1e-15, tol=1e-6
+    ),
+    "covariance of zeros": lambda: gaussian.design_test(stack(3), np.zeros((3, 3))),
+    "bias of NaN": lambda: Bias(WHO, 0.0, 1.0, size=np.array([0.1, np.nan])),
+    "half a loss correction": lambda: street(loss_correction=0.5),
+    "rising curve": rising,
+    "too few sensors kept": lambda: gaussian.design_test(stack(3), np.eye(3), np.array([0, 1])),
+    "replay without delay": lambda: Replay(WHO, 0.0, 1.0, delay_s=0.0),
+    "parent after its branch": late_parent,
+    "unequal mutual impedances": lambda: three_phases(z=changed_block(0, 1, 0.001)),
+    "states that an input hides": lambda: symbolic("hidden"),
+    "wrong left inverse": no_left_inverse,
+    "no attacked meter": lambda: windowed.design(street(), max_attacked=0, step_s=1.0),
+    "attack that ends first": lambda: Stuck(WHO, 1.0, 0.0),
+    "no step of a loss correction": lambda: loss_correction(
+        random_feeder(0, customers=2), np.zeros(2), np.zeros(2), 1.0, steps=0
+    ),
+    "customer on no phase": lambda: three_phases(
+        connected=np.zeros_like(random_three_phase(1, charging=0.0).connected)
+    ),
+    "customer on three phases": lambda: PhasedFeeder(random_three_phase(1, charging=0.0)),
+    "impedance of an absent phase": absent_phase,
+    "observable on one side": lambda: symbolic("half"),
+    "tie from a bus to itself": lambda: MeshedFeeder(
+        random_feeder(3), np.array([[1, 1]]), np.ones(1), np.ones(1), np.zeros(1)
+    ),
+    "heights of a stack": lambda: Stack(np.eye(3), np.array([2, 2])),
+    "dependent inputs": lambda: exact(yang2021.plant(1).system, np.ones((2, 2))),
+    "entries of 1e200": lambda: group_pursuit(np.array([[1e200, 1.0]]), np.ones(1), np.array([1, 1])),
+    "two liars of three": lambda: subsets(3, 2, most=1000),
+    "subsets of 20 sensors": lambda: stacks.subsets(20, 10, most=1000),
+    "customers outside the feeder": lambda: close_loop(
+        random_feeder(6, customers=2),
+        fleet(np.array([0, 2]), "vde4105", np.full(2, 5.0), 100.0),
+        np.array([5]),
+    ),
+    "preset": lambda: preset("ieee1547-x"),
+    "attack by unprotected meters": lambda: fewest_protected(
+        lambda protected: None if protected[:2].any() else WHO, 3, never=np.array([True, True, False])
+    ),
+    "bytes of no archive": lambda: from_bytes(bytes(64)),
+    "gains of zero": unstable,
+    "gains from other meters": foreign_gains,
+    "slopes above zero": lambda: discrete_contraction(sampled(0.5, lower=0.5), decays=0.9),
+    "line without impedance": lambda: MeshedFeeder(
+        random_feeder(3), np.array([[0, 1]]), np.zeros(1), np.zeros(1), np.zeros(1)
+    ),
+    "plant and numbers of a monitor": lambda: monitor.design(
+        street(meters=np.array([-1, 3, 3])), max_attacked=-1, step_s=0.0
+    ),
+    "options of a monitor": lambda: Options(
+        np.nan, confirm=0, release=0, settled=0.0, tie=-1.0, widest=np.nan, v2_limits=(2.0, 1.0)
+    ),
+    "options of the sequential monitor": lambda: SequentialOptions(
+        alarms_per_year=0.0, scales_s=(np.nan,), enough=0.0, several=-1, release=0, suspect=1.0, like=0.5
+    ),
+    "uncertainty of loads": lambda: LoadDoubt(
+        np.array([-1.0]), np.array([np.nan]), 0.0, common_p=2.0, common_q=-1.0
+    ),
+    "accuracy of meters": lambda: replace(
+        accuracy(2), class_fraction=np.array([np.nan, 0.0]), resolution=-np.ones(3), busbar_class=-1.0
+    ),
+    "radial feeder": broken_feeder,
+    "fleet of three": broken_fleet,
+    "options of a matrix inequality": lambda: options_for(
+        line(3).lure, rate=0.0, noise=-1.0, load=np.full(3, np.inf), floor=1.0
+    ),
+    "row of zeros": lambda: linear(np.eye(2), np.ones((2, 1)), np.diag([1.0, 0.0]), np.ones(2)),
+}
+
+
+def golden() -> dict[str, list[str]]:
+    """Lines of the golden file by call, without the call."""
+    out: dict[str, list[str]] = {}
+    for each in GOLDEN.read_text("utf-8").splitlines():
+        call, rest = each.split(" | ", 1)
+        out.setdefault(call, []).append(rest)
+    return out
+
+
+def lines(made: Callable[[], Any]) -> list[str]:
+    """Class, code and sentence of each problem that a call raises."""
+    try:
+        made()
+    except (InputInvalid, FeederInvalid, NotObservable, DesignInfeasible) as caught:
+        error = caught
+    else:
+        pytest.fail("the call is not refused")
+    sentences = error.problems if isinstance(error, InputInvalid | FeederInvalid) else (str(error),)
+    found = zip(codes_of(error), sentences, strict=True)
+    return [f"{type(error).__name__} | {code} | {sentence}" for code, sentence in found]
+
+
+@pytest.mark.parametrize("call", CALLS)
+def test_sentences(call: str) -> None:
+    assert lines(CALLS[call]) == golden()[call]
+
+
+def test_the_golden_file_has_a_sentence_for_each_code() -> None:
+    assert golden().keys() == CALLS.keys()
+    found = Counter(each.split(" | ")[1] for rest in golden().values() for each in rest)
+    # The default of DesignInfeasible: every call of the package states a code.
+    assert found.keys() == used() - {"design-infeasible"}
