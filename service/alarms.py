@@ -287,7 +287,11 @@ def _explains_more(now: Evidence, before: Evidence) -> bool:
     error, told = now.data_error, before.data_error
     if error is None or told is None:
         return error is not None
-    return (error.kind, set(error.customers)) != (told.kind, set(told.customers))
+    return (error.kind, set(error.customers), error.proposed) != (
+        told.kind,
+        set(told.customers),
+        told.proposed,
+    )
 
 
 def _remembered(alarm: Alarm, rules: AlarmRules, t: float) -> bool:

@@ -407,7 +407,7 @@ class Aligner:
         if behind > self.rules.backlog:
             self._skip(first, self._resume(first + behind))
             # A skipped tick is no evidence of silence: it was not formed.
-            self._resumed = self._time(first + behind)
+            self._resumed = self._time(self._number())
         while True:
             t = self._time(self._number())
             if now < t or (self._waiting and now < t + self.rules.grace_s):

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Final
 
+import structlog
+
 from feeders.load import Site, plant
 from gridsec.network import InPhases
 from gridsec.online import Estimate, Frame, Verdict
@@ -13,6 +15,8 @@ from gridsec.studies import data_errors
 from gridsec.studies.data_errors import DataError, DataErrorKind
 
 __all__ = ["DataErrorReport", "DataErrors"]
+
+_log = structlog.get_logger("gridsec.data_errors")
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +86,14 @@ class DataErrors:
             self._design, self._designed = self._prepared(), True
         if self._design is None:
             return None
-        self._window = data_errors.follow(self._design, self._window, frame, estimate.x, accused)
+        try:
+            self._window = data_errors.follow(self._design, self._window, frame, estimate.x, accused)
+        except Exception:  # noqa: BLE001 - a hint never costs the verdict beside it
+            _log.exception(
+                "errors of the feeder's files are no longer compared", feeder=self._site.feeder.name
+            )
+            self._design = None
+            return None
         error = self._window.error
         if error is None or not accused[list(error.meters)].any():
             return None

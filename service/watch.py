@@ -323,6 +323,7 @@ class Watch:
         """
         state, before, believed = self._state, copy(self.commissioning), copy(self.suspicions)
         self._state = self.commissioning.renew(state, meters, t, who, reason)
+        self._data_errors.renew()
         self.suspicions.forget(meters, t)
 
         def take_back() -> None:

@@ -69,6 +69,13 @@ COMMON: Final = 0.5
 MODEL_STD: Final = 2e-4
 """Error of the power flow that is not of the loads, squared pu: what the loss correction leaves."""
 
+PLAUSIBLE_V2: Final = (0.25, 2.25)
+"""Squared voltages of half and of one and a half of nominal, pu. Beyond them a claimed power is absurd, and
+the block decides nothing."""
+
+KEPT_FACTORS: Final = 4
+"""Pairs of Cholesky factors in memory: 36 MB at `MOST_PLACES`."""
+
 FAR_SIGMAS: Final = 4.0
 """Standard deviations beyond which a change of places does not explain an accused meter."""
 
@@ -481,6 +488,19 @@ class _Scene:
     fixed: Floats  # (k, k) covariance of the means
     varying: Floats  # (k, k) covariance of the changes
     attacked: dict[bytes, float] = field(default_factory=dict)  # misfit of H_a, by the meters compared
+    factors: dict[bytes, tuple[Floats, Floats]] = field(default_factory=dict)  # of both covariances, likewise
+
+    def factored(self, use: Ints) -> tuple[Floats, Floats]:
+        """Lower Cholesky factors of `fixed` and `varying` of some meters; most changes compare the same."""
+        key = use.tobytes()
+        if key not in self.factors:
+            if len(self.factors) == KEPT_FACTORS:
+                self.factors.clear()
+            self.factors[key] = (
+                _factor(self.fixed[np.ix_(use, use)]),
+                _factor(self.varying[np.ix_(use, use)]),
+            )
+        return self.factors[key]
 
 
 def compare(design: DataErrorDesign, rows: Rows, held: DataError | None = None) -> DataError | None:
@@ -517,7 +537,9 @@ def _scene(design: DataErrorDesign, rows: Rows) -> _Scene | None:
     heard = np.isfinite(rows.y)
     k = np.flatnonzero(heard.mean(axis=0) >= _HEARD)
     read = rows.read.mean(axis=0) >= _HEARD
-    whole = heard[:, k].all(axis=1) & rows.read[:, read].all(axis=1) & np.isfinite(rows.model).all(axis=1)
+    low, high = PLAUSIBLE_V2
+    possible = ((rows.model >= low) & (rows.model <= high)).all(axis=1)
+    whole = heard[:, k].all(axis=1) & rows.read[:, read].all(axis=1) & possible
     if np.count_nonzero(whole) < FEWEST_BLOCKS:
         return None
     rows = _some(rows, np.asarray(whole))
@@ -676,7 +698,7 @@ def _gain(
     moved = np.isin(scene.design.plant.meters[scene.meters], customers)
     use = np.flatnonzero(~(far & scene.accused & ~moved))
     explained = scene.accused[use]
-    fixed, varying = (_factor(m[np.ix_(use, use)]) for m in (scene.fixed, scene.varying))
+    fixed, varying = scene.factored(use)
     most = float(chdtri(use.size, RISK))
     of_mean, left = _squared(fixed, mean[None, use]), _squared(varying, (rest - mean)[:, use])
     if sure and (of_mean > most or left > most * len(rest)):

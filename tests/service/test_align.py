@@ -234,6 +234,15 @@ def test_a_long_gap_is_skipped_and_counted() -> None:
     assert all(b.t > a_.t for a_, b in zip(w.ticks, w.ticks[1:], strict=False))
 
 
+def test_silence_by_the_clock_of_the_readings_counts_from_the_end_of_the_skip() -> None:
+    a = aligner(Clock.EVENTS)
+    rows = [reading(m, T0 + k) for k in range(20) for m in ALL]
+    rows += [reading(m, T0 + 2 * BACKLOG_TICKS + k) for k in range(5) for m in ALL]
+    ticks = events(a, rows)
+    assert sum(tick.skipped for tick in ticks) > BACKLOG_TICKS / 2
+    assert sum(bool(tick.silent) for tick in ticks) > BACKLOG_TICKS - 30
+
+
 def test_skipped_ticks_are_no_evidence_of_silence() -> None:
     w = Wall(Aligner(METERS, rules(1.0, 10.0, live=True)), T0 - 0.5)
     for k in range(20):

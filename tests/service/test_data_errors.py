@@ -9,11 +9,12 @@ import pytest
 
 from benchmarks.calibrate_exchanges import truth_of
 from feeders import estimators
-from feeders.load import Site, from_tables, to_frame
+from feeders.load import Site, from_tables, load, to_frame
 from feeders.recording import read_recording, record
 from feeders.scenario import Scenario, simulate, snapshots
 from feeders.schema import FeederTables, write
 from gridsec.online import Cause
+from gridsec.studies import data_errors
 from service.alarms import AlarmBook, AlarmKind, AlarmRules, Change, acknowledge, advance, conditions
 from service.alarms import from_json as alarm_from_json
 from service.alarms import to_json as alarm_to_json
@@ -162,3 +163,53 @@ def test_the_window_begins_anew_with_a_new_design(files: Site) -> None:
     at = [k for k, hint in enumerate(hints) if hint is not None]
     assert at
     assert len(at) == 1
+
+
+@pytest.mark.parametrize(("j", "p_share", "q_share"), [(2, 0.0, 0.99), (5, 0.9, -0.99)])
+def test_an_absurd_register_beside_a_false_voltage_breaks_nothing(
+    j: int, p_share: float, q_share: float
+) -> None:
+    """The model's squared voltages by such a register are negative: these blocks decide nothing."""
+    made = load("cigre-lv").tables
+    monitor = replace(made.meta.monitor, tick_s=60.0, silence_s=180.0)
+    site = from_tables(replace(made, meta=replace(made.meta, monitor=monitor)))
+    credible = (site.loads.credible * site.feeder.base_kva)[site.meters]
+    watcher, errors = estimators.design(site), DataErrors(site)
+    taken = list(snapshots(simulate(site, Scenario(seed=1, duration_s=1200.0, dt_s=60.0))))
+    state = watcher.init(taken[0].t - 60.0)
+    for k, each in enumerate(taken):
+        v, p, q = each.v_volt.copy(), each.p_kw.copy(), each.q_kvar.copy()
+        if k > 2:
+            v[j], q[j] = 1.05 * v[j], q_share * credible[j]
+            p[j] = p_share * credible[j] or p[j]
+        frame = to_frame(site, replace(each, v_volt=v, p_kw=p, q_kvar=q))
+        state, estimate, verdict = watcher.step(state, frame)
+        errors.follow(frame, estimate, verdict)
+    rows = errors._window.rows
+    assert rows is not None
+    assert rows.model.min() < 0.0
+    assert errors._design is not None
+
+
+def test_a_defect_of_the_comparison_costs_no_verdict(
+    files: Site, results: list[TickResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object) -> None:
+        raise FloatingPointError("a defect")
+
+    monkeypatch.setattr(data_errors, "follow", broken)
+    recording = record(from_tables(tables(exchanged=False)), SCENE, tmp_path / "day.parquet")
+    without = list(replay(files, read_recording(recording.path).readings(), Tally()))
+    assert [one.report.verdict for one in without] == [one.report.verdict for one in results]
+    assert any(one.report.data_error is not None for one in results)
+    assert not any(one.report.data_error is not None for one in without)
+
+
+def test_the_alarm_follows_a_hint_at_another_place_of_the_same_customer() -> None:
+    book, changes = AlarmBook(FEEDER), []
+    moved = replace(ERROR, proposed=("bus b3",))
+    for k, error in enumerate([ERROR] * 5 + [moved] * 2):
+        t, now = accused(k, error)
+        book, transitions = advance(book, RULES, now, t)
+        changes += [(k, item.change) for item in transitions]
+    assert changes == [(2, Change.RAISED), (5, Change.UPDATED)]
