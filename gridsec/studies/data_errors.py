@@ -48,8 +48,8 @@ MOST_BLOCKS: Final = 60
 """Blocks of the window: one hour of one-second readings, 15 hours of quarter-hours."""
 
 MOST_PLACES: Final = 400
-"""Places up to which the comparison runs: it takes 0.4 s once in a block then. In feeders of more places those
-of customers' buses are the candidates."""
+"""Places up to which the comparison runs: it takes 0.4 s once in a block then. In feeders of more
+places, those of the customers' buses are the candidates."""
 
 MOST_ACCUSED: Final = 12
 """Accused meters with places of their own to try, the furthest off first: it bounds the time of a block."""
