@@ -36,6 +36,7 @@ def meshed_net() -> Any:
     return net
 
 
+@pytest.mark.acceptance
 def test_a_pandapower_net_with_rings_is_as_pandapower_solves_it(tmp_path: Path) -> None:
     net, path = meshed_net(), tmp_path / "net.json"
     pp.to_json(net, str(path))

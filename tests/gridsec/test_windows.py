@@ -235,6 +235,7 @@ class TestPropositions:
             assert found.decided.all()
             assert not found.suspects.any()
 
+    @pytest.mark.acceptance
     @settings(max_examples=25, deadline=None)
     @given(seed=SEEDS, size=st.floats(1.0, 1e4), liars=st.sampled_from([1, 2]))
     def test_2_large_errors_are_detected(self, seed: int, size: float, liars: int) -> None:
@@ -253,6 +254,7 @@ class TestPropositions:
         in_window = large[: found.size * d.length].reshape(found.size, -1).any(axis=1)
         assert np.all(found[in_window])
 
+    @pytest.mark.acceptance
     @settings(max_examples=25, deadline=None)
     @given(
         seed=SEEDS,

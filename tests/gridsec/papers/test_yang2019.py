@@ -72,6 +72,7 @@ def by_the_book(
     return sets, np.stack(kept), gains
 
 
+@pytest.mark.canary("1-1.0")
 @pytest.mark.parametrize(("sensor", "size"), [(1, 0.7), (1, 1.0), (2, 2.0), (2, 5.0)])
 def test_the_recipe_of_the_paper_finds_nothing_in_its_own_settings(sensor: int, size: float) -> None:
     """Algorithms 1 and 2, (8), (10), (17), (19) and (21) written out; gains by simulation, epsilon = 0."""
