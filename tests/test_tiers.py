@@ -75,7 +75,9 @@ def test_a_tier_is_selected_by_its_marker(tier: str) -> None:
         timeout=120,
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    cases = {line.partition("[")[2].rstrip("]") for line in done.stdout.splitlines() if "says_something[" in line}
+    cases = {
+        line.partition("[")[2].rstrip("]") for line in done.stdout.splitlines() if "says_something[" in line
+    }
     tutorials = {path.stem for path in (TESTS.parent / "docs" / "tutorials").glob("*.py")}
     assert len(tutorials) > 1
     assert cases == ({"redundancy"} if tier == "not acceptance" else tutorials - {"redundancy"})
