@@ -388,7 +388,6 @@ def test_whoever_stops_listening_stops_the_processes() -> None:
     assert not multiprocessing.active_children()
 
 
-@pytest.mark.acceptance
 def test_a_dask_cluster_gives_the_same_also_when_a_worker_is_killed(here: Campaign) -> None:
     distributed = pytest.importorskip("distributed")
     killed: list[int] = []
