@@ -266,6 +266,7 @@ def test_what_is_no_number_is_told_and_not_a_traceback() -> None:
         assert part in str(caught.value), part
 
 
+@pytest.mark.acceptance
 def test_a_source_without_solution_is_converted_and_not_checked(tmp_path: Path) -> None:
     net = village()
     net.load.loc[0, "p_mw"] = 90.0

@@ -117,6 +117,7 @@ def test_a_station_without_lines_stays_a_customer(tmp_path: Path) -> None:
     assert done.check.exact
 
 
+@pytest.mark.acceptance
 def test_a_loop_through_stations(tmp_path: Path) -> None:
     """Closed on the low side: radial as it was, a mesh when asked, and never one of different ratios."""
     net = village()

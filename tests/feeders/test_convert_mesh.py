@@ -129,6 +129,7 @@ def test_the_ieee_13_node_feeder_with_three_loops(lie: Lie | None, tmp_path: Pat
     assert not found.accused.any()
 
 
+@pytest.mark.acceptance
 def test_the_option_changes_nothing_of_a_radial_network(tmp_path: Path) -> None:
     path = tmp_path / "net.json"
     pp.to_json(networks.case33bw(), str(path))

@@ -466,6 +466,7 @@ def test_without_any_curve_there_is_nothing_to_hear() -> None:
         circle(replace(of.lure, slope=np.zeros(3)), [0, 1], rate=RATE, noise=NOISE, load=of.load)
 
 
+@pytest.mark.acceptance
 def test_several_processes_find_what_one_finds() -> None:
     of = line(4)
     subsets = [c for size in (3, 2) for c in itertools.combinations(range(4), size)]

@@ -449,6 +449,7 @@ class TestOnline:
 
 
 class TestCalibration:
+    @pytest.mark.acceptance
     def test_largest_of_honest_runs(self) -> None:
         at = yang2019.levels()
         honest = yang2019.trial(at.proven, sensor=None, size=0.0, runs=40, seed=77)
@@ -472,6 +473,7 @@ class TestCalibration:
         with pytest.raises(ValueError, match="from step 9"):
             windows.calibrate(replace(d, settling=9), trace)
 
+    @pytest.mark.acceptance
     def test_calibrated_thresholds_are_no_bounds(self) -> None:
         """Constant noise of the same size raises a false alarm at once, not so above the proven threshold."""
         at = yang2019.levels()

@@ -408,6 +408,7 @@ def test_a_signal_ends_the_service_in_time_even_with_a_stream_open(number: int, 
         assert "Traceback" not in (tmp_path / "log").read_text()
 
 
+@pytest.mark.acceptance
 def test_the_service_of_a_starter_that_has_gone_ends(tmp_path: Path) -> None:
     with serving(tmp_path, "--until-eof") as (child, _url, _zenoh):
         assert child.stdin is not None

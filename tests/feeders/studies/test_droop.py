@@ -337,6 +337,7 @@ def test_line_ratings_limit_what_is_hosted() -> None:
     assert found["line_percent"] == pytest.approx(100.0, abs=0.5)
 
 
+@pytest.mark.acceptance
 def test_the_study_has_all_tables_and_goes_on_from_its_journal(tmp_path: Path) -> None:
     site = village()
     options = DroopOptions(presets=("vde4105",), tau_factors=(0.1,), hosting=True, draws=2)

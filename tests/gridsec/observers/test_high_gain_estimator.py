@@ -118,6 +118,7 @@ def test_search_walks_through_the_sets_at_once_or_one_by_one() -> None:
     assert together[-1].sigma == singly[-1].sigma == 2
 
 
+@pytest.mark.acceptance
 def test_two_liars_leave_no_answer_and_say_so() -> None:
     added = lambda t: (t[:, None] >= 4.0) * np.array([0.5, -0.7, 0.0])  # noqa: E731
     _, _, outcomes, _ = watch(estimator(), added)

@@ -19,6 +19,7 @@ def result() -> Reproduction:
     return made("yang2019")
 
 
+@pytest.mark.acceptance
 def test_every_claim_is_met_or_explained(result: Reproduction) -> None:
     assert result.paper == "yang2019"
     assert not result.unexplained
@@ -27,6 +28,7 @@ def test_every_claim_is_met_or_explained(result: Reproduction) -> None:
     assert {claim.where for claim in result.unmet} == figures | errata
 
 
+@pytest.mark.acceptance
 def test_the_rows_of_the_four_figures_say_that_the_recipe_gives_zero(result: Reproduction) -> None:
     rows = [claim for claim in result.claims if claim.where.startswith("Figure ")]
     assert len(rows) == 4
@@ -178,6 +180,7 @@ def test_survivors_isolate_what_the_majority_misses() -> None:
         assert kept[-1] > 0.95
 
 
+@pytest.mark.acceptance
 def test_figures(result: Reproduction) -> None:
     figures = {figure.name: figure for figure in result.figures}
     for index in (1, 2, 3, 4):

@@ -14,6 +14,7 @@ from gridsec.papers import yang2021, yang2021_feeder
 from tests.gridsec.papers.made import made
 
 
+@pytest.mark.acceptance
 def test_every_claim_that_is_not_met_has_a_reason() -> None:
     found = made("yang2021")
     assert found.paper == "yang2021"
