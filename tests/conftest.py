@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 import hypothesis
 import pytest
 
+from tests.tiers import COLLECTED, assign
+
 if TYPE_CHECKING:
     from coverage import Coverage
 
@@ -31,7 +33,7 @@ MEASURED = (
     *("gridsec/*", "contracts/*", "service/test_alarms.py"),
     *("feeders/studies/test_calibrate*", "feeders/studies/test_droop*"),
 )
-"""The tests that by themselves, without the slow ones, have to cover what coverage is asked of."""
+"""Files of tests that coverage traces, except the tests that are marked `no_cover`."""
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -40,11 +42,10 @@ def pytest_xdist_auto_num_workers() -> int:
     return (os.cpu_count() or 1) + 1
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Let coverage trace no slow tests: others are to cover what it is asked of."""
-    for item in items:
-        if item.get_closest_marker("slow"):
-            item.add_marker("no_cover")
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Assign the tiers before -m selects one of them."""
+    config.stash[COLLECTED] = assign(items)
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -13,6 +13,7 @@ FOLDER = Path(__file__).resolve().parents[1] / "docs" / "tutorials"
 SCRIPTS = sorted(FOLDER.glob("*.py"))
 
 
+@pytest.mark.canary("redundancy")
 @pytest.mark.parametrize("script", SCRIPTS, ids=[script.stem for script in SCRIPTS])
 def test_a_tutorial_runs_and_says_something(script: Path, tmp_path: Path) -> None:
     environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MPLBACKEND": "agg"}

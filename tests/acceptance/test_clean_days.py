@@ -42,7 +42,7 @@ LOW_VOLTAGE = (
 )
 
 
-@pytest.mark.slow
+@pytest.mark.canary("kerber-dorfnetz-12")
 @pytest.mark.parametrize(
     ("feeder", "hour"),
     # The large ones take their time: a night or an afternoon each.
@@ -140,6 +140,7 @@ def test_the_benchmark_counts_alarms_and_tells_which_are_right() -> None:
     assert not seen.false
 
 
+@pytest.mark.acceptance
 def test_the_benchmark_fails_where_there_are_more_alarms_than_asked_for(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -16,7 +16,7 @@ from gridsec.online import Cause, Decision
 ONSET_S = 30.0
 
 
-@pytest.mark.slow
+@pytest.mark.canary("1.0")
 @pytest.mark.parametrize("size", [1.0, 2.0])
 def test_a_power_that_is_false_is_told_as_a_power(size: float) -> None:
     """CIGRE LV with its 6 meters, where one load moves half of them: AC power flow, eight runs."""

@@ -19,7 +19,7 @@ RUNS = [
 ]
 
 
-@pytest.mark.slow
+@pytest.mark.canary("white, +-1 %-0.6")
 @pytest.mark.parametrize(("cell", "kw"), RUNS, ids=lambda value: getattr(value, "name", str(value)))
 def test_everybody_who_lies_and_nobody_else(cell: Cell, kw: float) -> None:
     outcome = run(cell, 1, "ieee-european-lv", kw)

@@ -136,6 +136,7 @@ class Watch:
         return verdict
 
 
+@pytest.mark.canary("900.0-simbench-lv-rural1-True", "1.0-cigre-lv-False")
 @pytest.mark.parametrize("bank", [True, False])
 @pytest.mark.parametrize("name", names())
 @pytest.mark.parametrize("step_s", [1.0, 900.0])
@@ -157,6 +158,7 @@ def test_no_alignment_of_honest_errors_is_an_attack(name: str, step_s: float, ba
 SMALL = ("cigre-lv", "kerber-landnetz", "simbench-lv-rural1")
 
 
+@pytest.mark.canary("simbench-lv-rural1-True")
 @pytest.mark.parametrize(
     ("name", "bank"), [(name, True) for name in names()] + [(name, False) for name in SMALL]
 )
@@ -222,6 +224,7 @@ def hidden(name: str, percent: float) -> int:
     return missed
 
 
+@pytest.mark.canary("cigre-lv")
 @pytest.mark.parametrize("name", names())
 def test_smallest_lie_that_is_named_in_every_alignment(name: str) -> None:
     """Droop curves at work and at rest, at head, middle and end. Half a percent less can hide."""

@@ -59,6 +59,7 @@ def original(name: str) -> tuple[Any, int]:
 # --- the project's own feeders ------------------------------------------------------------------
 
 
+@pytest.mark.canary("kerber-landnetz")
 @pytest.mark.parametrize("name", FROM_PANDAPOWER)
 def test_recipe_builds_the_committed_folder(name: str, tmp_path: Path) -> None:
     done = convert(name, tmp_path / "out")
@@ -72,6 +73,7 @@ def test_recipe_builds_the_committed_folder(name: str, tmp_path: Path) -> None:
     assert done.check.exact
 
 
+@pytest.mark.canary("simbench-lv-rural3")
 @pytest.mark.usefixtures("simbench_tables")
 @pytest.mark.parametrize("name", FROM_SIMBENCH)
 def test_recipe_builds_the_committed_simbench_folder(name: str, tmp_path: Path) -> None:
@@ -83,6 +85,7 @@ def test_recipe_builds_the_committed_simbench_folder(name: str, tmp_path: Path) 
         assert (tmp_path / "out" / file).read_text() == (committed / file).read_text(), file
 
 
+@pytest.mark.canary("cigre-lv")
 @pytest.mark.parametrize("name", BALANCED)
 def test_impedances_are_pandapowers_own(name: str) -> None:
     """Z between customers from the inverse of pandapower's admittance matrix, without cable charging."""
@@ -109,6 +112,7 @@ def test_impedances_are_pandapowers_own(name: str) -> None:
     )
 
 
+@pytest.mark.canary("cigre-lv")
 @pytest.mark.parametrize("name", BALANCED)
 def test_ids_loads_and_charging_are_kept(name: str) -> None:
     net, root = original(name)
@@ -290,8 +294,8 @@ def test_any_pandapower_network_by_name(tmp_path: Path) -> None:
     assert load(tmp_path / "cable").feeder.name == "cable"
 
 
+@pytest.mark.acceptance
 @pytest.mark.usefixtures("simbench_tables")
-@pytest.mark.slow
 def test_simbench_code_alone_medium_voltage(tmp_path: Path) -> None:
     done = convert("1-MV-comm--0-sw", tmp_path / "mv")
     assert done.check is not None

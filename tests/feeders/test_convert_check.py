@@ -25,6 +25,7 @@ from gridsec.errors import FeederInvalid, GridsecError
 from tests.feeders.foreign import pgm
 
 
+@pytest.mark.canary("create_cigre_network_mv-Bus 12-3")
 @pytest.mark.parametrize(
     ("maker", "root", "buses"),
     [
@@ -118,7 +119,7 @@ def test_loop_is_named_and_opened_when_asked(tmp_path: Path) -> None:
     assert check_against_source(str(path), tmp_path / "x", root="root").largest_pu < 1e-3
 
 
-@pytest.mark.slow
+@pytest.mark.acceptance
 def test_single_phases_with_generators_and_a_folder_again(tmp_path: Path) -> None:
     net = networks.ieee_european_lv_asymmetric("on_peak_566")
     pp.create_asymmetric_sgen(net, 200, p_b_mw=0.004, q_b_mvar=0.0, name="roof")
@@ -265,6 +266,7 @@ def test_what_is_no_number_is_told_and_not_a_traceback() -> None:
         assert part in str(caught.value), part
 
 
+@pytest.mark.acceptance
 def test_a_source_without_solution_is_converted_and_not_checked(tmp_path: Path) -> None:
     net = village()
     net.load.loc[0, "p_mw"] = 90.0
@@ -299,6 +301,7 @@ def test_what_is_doubtful_is_accepted_from_a_source_with_a_solution_only(tmp_pat
     assert "form a loop" not in str(caught.value)
 
 
+@pytest.mark.acceptance
 def test_a_feeder_without_solution_is_told(tmp_path: Path) -> None:
     path = tmp_path / "village.json"
     pp.to_json(village(), str(path))

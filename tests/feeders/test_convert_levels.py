@@ -22,6 +22,7 @@ def stations(tables: FeederTables) -> dict[str, float]:
     return {row.line: row.to_volt for row in tables.lines if row.to_volt is not None}
 
 
+@pytest.mark.canary("pandapower:create_cigre_network_mv-Bus 0-15-11547.0")
 @pytest.mark.usefixtures("simbench_tables")
 @pytest.mark.parametrize(
     ("source", "root", "buses", "behind"),
@@ -29,7 +30,7 @@ def stations(tables: FeederTables) -> dict[str, float]:
         ("pandapower:example_multivoltage", "Bus MV0", 20, 230.94),
         ("pandapower:create_cigre_network_mv", "Bus 0", 15, 11547.0),
         ("pandapower:mv_oberrhein", "58", 70, 11547.0),
-        pytest.param("simbench:1-MVLV-rural-1.108-0-sw", None, 0, 230.94, marks=pytest.mark.slow),
+        ("simbench:1-MVLV-rural-1.108-0-sw", None, 0, 230.94),
     ],
 )
 def test_pandapowers_networks(
@@ -46,6 +47,7 @@ def test_pandapowers_networks(
     assert (site.nominal_volt != site.feeder.base_volt).any()
 
 
+@pytest.mark.canary("-2")
 @pytest.mark.parametrize("tap", [-2, 1])
 def test_a_station_with_everything(tap: int, tmp_path: Path) -> None:
     """Iron, magnetising current, taps, rated voltages beside the nominal ones, a vector group, twice."""
@@ -115,6 +117,7 @@ def test_a_station_without_lines_stays_a_customer(tmp_path: Path) -> None:
     assert done.check.exact
 
 
+@pytest.mark.acceptance
 def test_a_loop_through_stations(tmp_path: Path) -> None:
     """Closed on the low side: radial as it was, a mesh when asked, and never one of different ratios."""
     net = village()

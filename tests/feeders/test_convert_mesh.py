@@ -36,6 +36,7 @@ def meshed_net() -> Any:
     return net
 
 
+@pytest.mark.acceptance
 def test_a_pandapower_net_with_rings_is_as_pandapower_solves_it(tmp_path: Path) -> None:
     net, path = meshed_net(), tmp_path / "net.json"
     pp.to_json(net, str(path))
@@ -128,6 +129,7 @@ def test_the_ieee_13_node_feeder_with_three_loops(lie: Lie | None, tmp_path: Pat
     assert not found.accused.any()
 
 
+@pytest.mark.acceptance
 def test_the_option_changes_nothing_of_a_radial_network(tmp_path: Path) -> None:
     path = tmp_path / "net.json"
     pp.to_json(networks.case33bw(), str(path))

@@ -55,7 +55,7 @@ def test_voltages_are_opendss_own(buses: int, balanced: bool, tmp_path: Path) ->
     assert {each.done for each in done.changes} == {"left out"}
 
 
-@pytest.mark.slow
+@pytest.mark.canary("True-False")
 @pytest.mark.parametrize(("balanced", "poles"), [(True, False), (False, False), (False, True)])
 def test_large_networks(balanced: bool, poles: bool, tmp_path: Path) -> None:
     source = opendss(tmp_path / "city.dss", 600, balanced=balanced, poles=poles)

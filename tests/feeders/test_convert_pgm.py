@@ -65,7 +65,7 @@ def test_voltages_are_power_grid_models_own(nodes: int, balanced: bool, tmp_path
     assert [each.done for each in done.changes] == ["left out"]
 
 
-@pytest.mark.slow
+@pytest.mark.acceptance
 def test_large_network(tmp_path: Path) -> None:
     done = convert(str(pgm(tmp_path / "city.json", 1000, balanced=True)), tmp_path / "city")
     assert done.check is not None

@@ -52,6 +52,7 @@ def left_out(done: Conversion) -> dict[str, str]:
     return {each.element: each.effect for each in done.changes if each.done == "left out"}
 
 
+@pytest.mark.canary("False-True")
 @pytest.mark.parametrize("phased", [False, True])
 @pytest.mark.parametrize("by_line", [False, True])
 def test_a_bus_out_of_service_carries_nothing(phased: bool, by_line: bool, tmp_path: Path) -> None:

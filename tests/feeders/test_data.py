@@ -117,6 +117,7 @@ def ac_net(site: Site) -> Any:
     return net
 
 
+@pytest.mark.canary("kerber-landnetz")
 @every_feeder
 def test_corrected_lindistflow_is_within_its_stated_error_of_ac(name: str) -> None:
     site = load(name)

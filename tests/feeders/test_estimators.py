@@ -54,6 +54,7 @@ def test_an_estimator_watches_three_phases(name: str) -> None:
         assert named == set(attack.meters.tolist())
 
 
+@pytest.mark.canary("windowed-bank")
 @pytest.mark.parametrize("name", ["exact-bank", "windowed-bank", "set-search", "partial-observers"])
 def test_a_real_feeder_in_three_phases_has_a_bank(name: str) -> None:
     watcher = design(choose(load("ieee-european-lv"), estimator=name, max_attacked=1))
@@ -110,6 +111,7 @@ def test_both_name_exactly_the_liar(estimator: str, tmp_path: Path) -> None:
     assert decisions[Decision.CLEAN] >= 20
 
 
+@pytest.mark.acceptance
 def test_kept_designs_are_used_again(tmp_path: Path) -> None:
     site = choose(load(SMALL), estimator=LMI)
     first = design(site, where=tmp_path)

@@ -217,6 +217,7 @@ def moment(seed: int, rng: np.random.Generator, **how: float) -> Scenario:
     return Scenario(seed=seed, start=MONDAYS[season] + into, profile_s=into, season=season, **how)
 
 
+@pytest.mark.canary("rural1")
 @pytest.mark.parametrize(("site", "gain"), [(CIGRE, 0.95), (RURAL, 0.75)], ids=["cigre", "rural1"])
 def test_forecasts_make_reconstructions_better_and_say_how_good_they_are(site: Site, gain: float) -> None:
     """Three meters removed, forty moments of four seasons, each with meters and loads of its own."""

@@ -118,6 +118,7 @@ def course(loop: ClosedLoop, before: Loads, after: Loads, times: np.ndarray) -> 
     return np.array(out)
 
 
+@pytest.mark.canary("1.0-8.0")
 @pytest.mark.parametrize(("gain", "order"), [(1.0, 8.0), (12.0, 3.0)])
 def test_steps_follow_the_differential_equation_in_second_order(gain: float, order: float) -> None:
     loop = closed_loop(strong(gain))

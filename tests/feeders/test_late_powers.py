@@ -110,6 +110,7 @@ def test_a_stated_interval_is_in_design_and_frames_alike(site: Site) -> None:
     assert (older.p_origin == PowerOrigin.LATE).all()
 
 
+@pytest.mark.canary("p_interval_s")
 @pytest.mark.parametrize("stated", ["t_power", "p_interval_s"])
 def test_kettles_and_cars_accuse_nobody_once_the_age_is_stated(stated: str) -> None:
     """Powers 60 s old: without the age honest meters are named in these runs, with it none."""

@@ -211,6 +211,7 @@ def test_two_lines_in_parallel_are_watched_and_studied_as_one_of_half_the_impeda
         )
 
 
+@pytest.mark.canary("partial-observers")
 @pytest.mark.parametrize(
     "name", ["exact-bank", "windowed-bank", "set-search", "partial-observers", "unknown-input"]
 )

@@ -111,6 +111,7 @@ def error(sample: Sample, estimate: Estimate) -> Floats:
     return np.asarray(np.abs(estimate.v2 - (sample.v_volt / site().customer_volt) ** 2))
 
 
+@pytest.mark.canary("1")
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_colluding_meters_that_withhold_powers_are_never_clean_beyond_the_bound(seed: int) -> None:
     """A third of the meters: voltages 9 to 15 V off, and no single limit shows it."""

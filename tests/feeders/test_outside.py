@@ -101,6 +101,7 @@ def test_what_a_design_says_on_purpose_is_passed_on_and_all_else_is_one_line() -
         assert told.value.__cause__ is other
 
 
+@pytest.mark.acceptance
 def test_a_broken_one_leaves_the_others_alone(place: Path) -> None:
     install(place, "pkg_f", "raise RuntimeError('out of order')", "broken = pkg_f:FAMILY")
     install(place, "pkg_g", GOOD.replace("lambda s, j: s", "lambda s, j: s.nothing"), "mine = pkg_g:FAMILY")

@@ -276,6 +276,7 @@ def outcome(site: Site, lie: Lie | None, seconds: float, meters: Meters = Meters
     return judge(design(trial.stated), trial, settling_s=3.0)
 
 
+@pytest.mark.canary("ring-3-bias-3.0")
 @pytest.mark.parametrize(
     ("make", "count", "trick", "percent"),
     [
@@ -295,6 +296,7 @@ def test_liars_are_named_and_nobody_else(
     assert np.percentile(found.error_all, 95) < 0.3
 
 
+@pytest.mark.canary("real")
 @pytest.mark.parametrize("meters", [Meters.WHITE, Meters.REAL])
 def test_clean_is_clean(meters: Meters) -> None:
     found = outcome(european(), None, 10.0, meters)
@@ -303,6 +305,7 @@ def test_clean_is_clean(meters: Meters) -> None:
     assert not found.undecided[15:].any()
 
 
+@pytest.mark.canary("partial-observers")
 @pytest.mark.parametrize(
     "name", ["exact-bank", "windowed-bank", "set-search", "partial-observers", "unknown-input"]
 )

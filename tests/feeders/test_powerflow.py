@@ -57,6 +57,7 @@ NETWORKS: dict[str, tuple[Callable[[], Any], int | None]] = {
 }
 
 
+@pytest.mark.canary("cigre-lv")
 @pytest.mark.parametrize("name", NETWORKS)
 def test_agrees_with_pandapower(name: str) -> None:
     grid, net, buses = solved_pandapower(*NETWORKS[name])

@@ -23,6 +23,7 @@ from tests.gridsec.unbalanced import power_flow, random_three_phase
 BUNDLED = ["kerber-landnetz", "kerber-dorfnetz", "kerber-vorstadtnetz", "cigre-lv", "simbench-lv-rural3"]
 
 
+@pytest.mark.canary("off_peak_1")
 @pytest.mark.parametrize("scenario", ["on_peak_566", "off_peak_1", "off_peak_1440"])
 def test_agrees_with_pandapower(scenario: str) -> None:
     net = networks.ieee_european_lv_asymmetric(scenario)

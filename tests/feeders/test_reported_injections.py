@@ -32,6 +32,7 @@ class Reporting(World):
         return replace(super().snapshot(lies), q_kvar=net + wrong * error)
 
 
+@pytest.mark.canary("900.0-simbench-lv-rural1", "1.0-cigre-lv")
 @pytest.mark.parametrize("name", WITH_INVERTERS)
 @pytest.mark.parametrize("step_s", [1.0, 900.0])
 def test_honest_errors_at_their_ends_never_accuse_an_inverter(name: str, step_s: float) -> None:
@@ -101,6 +102,7 @@ def watched(
         yield frame, verdict, int(np.argmax(truth.inverters)) if truth.inverters.any() else -1
 
 
+@pytest.mark.canary("0-cigre-lv", "1-simbench-lv-rural1")
 @pytest.mark.parametrize("name", [name for name in WITH_INVERTERS if name != "kerber-vorstadtnetz"])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_an_inverter_off_its_curve_is_never_clean_and_nobody_else_is_accused(name: str, seed: int) -> None:

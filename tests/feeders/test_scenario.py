@@ -210,6 +210,7 @@ def test_snapshots_hold_what_arrived() -> None:
         assert frame.seen.sum() == len(set(by_meter) - {BUSBAR})
 
 
+@pytest.mark.canary("kerber-landnetz")
 @pytest.mark.parametrize("name", ["village", *names()])
 def test_the_truth_lies_inside_what_a_frame_claims(name: str) -> None:
     """Loads, powers and their stated intervals: what estimators build their thresholds on."""

@@ -37,6 +37,7 @@ def test_every_tick_solves_the_power_flow(site: Site) -> None:
     assert [one.readings for one in again] == [one.readings for one in samples]
 
 
+@pytest.mark.acceptance
 def test_phases_of_the_busbar_differ_by_what_is_asked_for(site: Site) -> None:
     quiet = Variation(busbar_spread_pu=0.0, tap_step_pu=0.0, busbar_unbalance_pu=0.01)
 

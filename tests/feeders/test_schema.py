@@ -175,6 +175,7 @@ def test_valid_tables_round_trip(tables: FeederTables) -> None:
     assert from_json(json.loads(json.dumps(to_json(tables)))) == tables
 
 
+@pytest.mark.acceptance
 @given(tables=feeders())
 def test_valid_tables_round_trip_through_files(
     tables: FeederTables, tmp_path_factory: pytest.TempPathFactory

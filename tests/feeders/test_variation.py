@@ -56,6 +56,7 @@ def test_fluctuation_does_not_depend_on_how_it_is_asked() -> None:
     assert np.any(Fluctuation(3, Stream.LOAD, 3, 10.0).at(t) != expected)
 
 
+@pytest.mark.acceptance
 def test_loads_stay_inside_what_the_files_promise() -> None:
     site = village()
     base = site.feeder.base_kva
@@ -95,6 +96,7 @@ def with_profiles(wave: str, pv: str) -> Site:
     return from_tables(replace(tables(), customers=rows))
 
 
+@pytest.mark.canary("spring")
 @pytest.mark.parametrize("season", Season)
 def test_without_fast_variation_the_profiles_come_back(season: Season) -> None:
     profiles = library(season)
@@ -148,6 +150,7 @@ def test_readings_of_a_second_are_no_staircase() -> None:
     assert np.all(np.diff(demand.p_kw[:, drawing], axis=0) != 0.0)
 
 
+@pytest.mark.acceptance
 def test_busbar_keeps_its_mean_and_steps_with_the_taps() -> None:
     site = village()
     t = START + np.arange(0.0, 3 * 86400.0, 10.0)

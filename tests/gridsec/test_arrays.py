@@ -79,6 +79,7 @@ def _exact_integrals(y: float) -> tuple[float, float, float]:
     )
 
 
+@pytest.mark.acceptance
 @given(st.floats(-12.0, 2.0))
 def test_exponential_integrals_match_the_exact_series(y: float) -> None:
     for got, exact in zip(exponential_integrals(np.array([y])), _exact_integrals(y), strict=True):

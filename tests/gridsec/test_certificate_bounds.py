@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hypothesis.strategies as st
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from scipy.integrate import solve_ivp
 
@@ -78,6 +79,7 @@ def test_gains_bound_the_error(seed: int, gain: float, kind: str, sizes: tuple[f
     assert np.all(norm(certificate, e) <= allowed * (1 + 1e-6) + 1e-9)
 
 
+@pytest.mark.acceptance
 @settings(max_examples=40)
 @given(
     seed=seeds,

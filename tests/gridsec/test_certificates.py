@@ -337,6 +337,7 @@ def test_other_systems_are_refused() -> None:
         certify(replace(lure, G=eye, B=eye))
 
 
+@pytest.mark.canary("create_kerber_dorfnetz")
 @pytest.mark.parametrize(
     "name",
     [

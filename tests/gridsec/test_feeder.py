@@ -262,6 +262,7 @@ def from_pandapower(
     return feeder, loads.p_mw.to_numpy() * 1e3 / base_kva, loads.q_mvar.to_numpy() * 1e3 / base_kva, order
 
 
+@pytest.mark.canary("0.5-case33bw")
 @pytest.mark.parametrize(
     "name", ["create_kerber_landnetz_freileitung_1", "create_kerber_dorfnetz", "case33bw"]
 )

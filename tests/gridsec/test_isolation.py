@@ -455,6 +455,7 @@ def test_meters_of_an_accuracy_class_are_not_exact_enough() -> None:
     assert all(np.all(np.abs(a.x - x) <= a.bound) for a, x in zip(run.answers, run.x, strict=True))
 
 
+@pytest.mark.acceptance
 def test_reports_of_the_inverters_are_sensors_too() -> None:
     """With their own reactive power reported, the inverters can be told apart by worse meters."""
     feeder = yang2021_feeder

@@ -124,6 +124,7 @@ def nothing(size: int) -> Signal:
 PLANTS = {"line": line(5), "tree": tree(), "shared": shared()}
 
 
+@pytest.mark.canary("J1-line")
 @pytest.mark.parametrize("name", PLANTS)
 @pytest.mark.parametrize("J", [[0, 1, 2, 3], [1, 3], [2]])
 def test_the_error_decays_at_least_at_the_certified_rate(name: str, J: list[int]) -> None:
@@ -140,6 +141,7 @@ def test_the_error_decays_at_least_at_the_certified_rate(name: str, J: list[int]
         assert np.all(norm <= norm[0] * np.exp(-g.alpha * times) * (1 + 1e-6) + 1e-9 * norm[0])
 
 
+@pytest.mark.canary("shared")
 @pytest.mark.parametrize("name", PLANTS)
 def test_the_error_bound_holds_under_attack_noise_and_wrong_loads(name: str) -> None:
     """V(t) <= exp(-2 alpha t) V(0) + (mu sup |n + a|^2 + mu_delta sup |delta|^2) / (2 alpha)."""
@@ -465,6 +467,7 @@ def test_without_any_curve_there_is_nothing_to_hear() -> None:
         circle(replace(of.lure, slope=np.zeros(3)), [0, 1], rate=RATE, noise=NOISE, load=of.load)
 
 
+@pytest.mark.acceptance
 def test_several_processes_find_what_one_finds() -> None:
     of = line(4)
     subsets = [c for size in (3, 2) for c in itertools.combinations(range(4), size)]

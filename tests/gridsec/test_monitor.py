@@ -88,6 +88,7 @@ class TestHonestStreets:
 
 @pytest.mark.no_cover  # long runs of what other tests cover
 class TestLiars:
+    @pytest.mark.acceptance
     @settings(max_examples=25)
     @given(
         seed=st.integers(0, 2**32 - 1),
@@ -120,6 +121,7 @@ class TestLiars:
         assert all(verdict.suspects[liars].all() for _, verdict in answers[: release - 1])
         assert decisions(answers)[release - 1 :] == [Decision.CLEAN] * 4
 
+    @pytest.mark.acceptance
     @settings(max_examples=25)
     @given(
         seed=st.integers(0, 2**32 - 1), M=st.integers(1, 3), size=st.sampled_from([0.006, 0.02, 0.5, 50.0])

@@ -289,6 +289,7 @@ class TestDesign:
         assert design.certificate.kind == "lmi"
         watch(Street(plant, rng, load_kw=0.5), design, 20)
 
+    @pytest.mark.acceptance
     @settings(max_examples=15)
     @given(seed=st.integers(0, 2**32 - 1), h=st.sampled_from([1.0, 10.0, 50.0]))
     def test_time_constants_from_a_millisecond_to_days(self, seed: int, h: float) -> None:

@@ -70,6 +70,7 @@ def made_for(street_plant: object, most: int = 1, h: float = 1.0) -> PartialDesi
 
 
 class TestStreets:
+    @pytest.mark.acceptance
     @settings(max_examples=25, deadline=None)
     @given(
         seed=st.integers(0, 2**32 - 1),

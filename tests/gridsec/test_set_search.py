@@ -96,7 +96,8 @@ def test_exactly_the_liar_is_named_and_readmitted(feeder: str) -> None:
     assert not state.dropped.any()
 
 
-@pytest.mark.slow
+@pytest.mark.acceptance
+@pytest.mark.no_cover  # a long run of what other tests cover
 def test_a_clean_hour_names_nobody() -> None:
     site = choose(load("simbench-lv-rural1"), estimator="set-search", max_attacked=2)
     watcher = design(site)

@@ -301,6 +301,7 @@ def watch(
 class TestOnStreets:
     """AC power flow, droop inverters, meters with fixed errors, resolution and jitter."""
 
+    @pytest.mark.canary("1.0-least_squares", "1.0-fewest", "1.0-pursue", "1.0-match")
     @pytest.mark.parametrize("h", [1.0, 60.0, 900.0])
     def test_nobody_is_named_where_nobody_lies(self, decoder: Decoder, h: float) -> None:
         for seed in range(3):
@@ -415,6 +416,7 @@ class TestOnStreets:
 
         watch(Street(plant, rng), prepare(plant, decoder), 6, change=spoil)
 
+    @pytest.mark.canary("least_squares")
     def test_the_standard_deviation_is_about_right(self, decoder: Decoder) -> None:
         ratio = []
         for seed in range(12):

@@ -150,7 +150,8 @@ def test_exactly_the_liar_is_named_on_a_real_feeder(feeder: str) -> None:
     assert decisions[Decision.CLEAN] == 60 - LENGTH + 1
 
 
-@pytest.mark.slow
+@pytest.mark.acceptance
+@pytest.mark.no_cover  # a long run of what other tests cover
 def test_a_clean_hour_names_nobody() -> None:
     site = choose(load("cigre-lv"), estimator="windowed-bank")
     watcher = design(site)

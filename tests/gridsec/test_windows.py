@@ -238,6 +238,7 @@ class TestPropositions:
             assert found.decided.all()
             assert not found.suspects.any()
 
+    @pytest.mark.acceptance
     @settings(max_examples=25, deadline=None)
     @given(seed=SEEDS, size=st.floats(1.0, 1e4), liars=st.sampled_from([1, 2]))
     def test_2_large_errors_are_detected(self, seed: int, size: float, liars: int) -> None:
@@ -256,6 +257,7 @@ class TestPropositions:
         in_window = large[: found.size * d.length].reshape(found.size, -1).any(axis=1)
         assert np.all(found[in_window])
 
+    @pytest.mark.acceptance
     @settings(max_examples=25, deadline=None)
     @given(
         seed=SEEDS,
@@ -450,6 +452,7 @@ class TestOnline:
 
 
 class TestCalibration:
+    @pytest.mark.acceptance
     def test_largest_of_honest_runs(self) -> None:
         at = yang2019.levels()
         honest = yang2019.trial(at.proven, sensor=None, size=0.0, runs=40, seed=77)
@@ -473,6 +476,7 @@ class TestCalibration:
         with refused(InputInvalid, "not-finite", "not-finite"):
             windows.calibrate(replace(d, settling=9), trace)
 
+    @pytest.mark.acceptance
     def test_calibrated_thresholds_are_no_bounds(self) -> None:
         """Constant noise of the same size raises a false alarm at once, not so above the proven threshold."""
         at = yang2019.levels()

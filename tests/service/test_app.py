@@ -227,6 +227,7 @@ def test_readings_every_quarter_of_an_hour(site: Site, tmp_path: Path) -> None:
         assert live.metric("gridsec_ticks_total", verdict="undecided") <= 3
 
 
+@pytest.mark.acceptance
 def test_wall_clock(site: Site, tmp_path: Path) -> None:
     """Readings in real time: reports follow; old readings are refused."""
     start = float(int(time.time())) + 1.0
@@ -292,6 +293,7 @@ def test_names_given_are_names_of_the_service(tmp_path: Path) -> None:
         assert asked == [409, 421]
 
 
+@pytest.mark.acceptance
 def test_feeders_over_rest_have_an_end_and_stay_deleted(tmp_path: Path) -> None:
     tables = [to_json(load("kerber-landnetz").tables) for _ in range(3)]
     for k, one in enumerate(tables):
@@ -350,6 +352,7 @@ def test_a_stored_feeder_that_cannot_be_loaded_any_more_is_shown_until_somebody_
         assert {f["name"] for f in live.get("/api/v1/feeders")["feeders"]} == {FEEDER, "village"}
 
 
+@pytest.mark.acceptance
 def test_alarms_that_the_database_does_not_take_are_not_hidden(site: Site, tmp_path: Path) -> None:
     """While it refuses, the list says that it does not know all, and why."""
     attacks = random_attacks(site, 6, "bias", 1, 0.03, t_on=START + 10, t_off=START + 1000)
@@ -368,6 +371,7 @@ def test_alarms_that_the_database_does_not_take_are_not_hidden(site: Site, tmp_p
         assert (again.json()["unstored"], again.json()["problem"]) == (0, None)
 
 
+@pytest.mark.canary("sqlite")
 @both
 def test_garbage_on_an_odd_key_holds_up_no_alarm(site: Site, url: str, tmp_path: Path) -> None:
     attacks = random_attacks(site, 6, "bias", 1, 0.03, t_on=START + 10, t_off=START + 1000)

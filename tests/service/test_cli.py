@@ -143,6 +143,7 @@ def test_an_http_port_in_use(tmp_path: Path) -> None:
     assert re.search("variable_ignored.*GRIDSEC_MAX_SKEW_S.*GRIDSEC_MAX_SKEW", message)
 
 
+@pytest.mark.acceptance
 def test_a_zenoh_port_in_use(tmp_path: Path) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
@@ -162,6 +163,7 @@ def test_a_database_that_cannot_be_written(gridsec: Run, tmp_path: Path) -> None
         assert url in refused(4, gridsec("serve", "--feeder", FEEDER, "--database", url))
 
 
+@pytest.mark.acceptance
 def test_a_database_that_another_service_writes(tmp_path: Path) -> None:
     with serving(tmp_path):
         database = f"sqlite:///{tmp_path / 'gridsec.db'}"
@@ -193,6 +195,7 @@ def test_wrong_settings_are_all_named(gridsec: Run, monkeypatch: pytest.MonkeyPa
     assert "--clock or GRIDSEC_CLOCK" in message
 
 
+@pytest.mark.acceptance
 def test_nobody_to_connect_to(gridsec: Run) -> None:
     end = f"tcp/127.0.0.1:{free_port()}"
     assert end in refused(5, gridsec("simulate", FEEDER, "--connect", end, "--duration", "1"))
@@ -390,6 +393,7 @@ def test_a_wrong_inverter_is_recorded_and_raises_its_alarm(gridsec: Run, tmp_pat
     assert {a["meter"] for a in alarms if a["kind"] == "meter-manipulated"} == lying
 
 
+@pytest.mark.canary("15")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_service_in_time_even_with_a_stream_open(number: int, tmp_path: Path) -> None:
     with serving(tmp_path) as (child, url, zenoh):
@@ -404,6 +408,7 @@ def test_a_signal_ends_the_service_in_time_even_with_a_stream_open(number: int, 
         assert "Traceback" not in (tmp_path / "log").read_text()
 
 
+@pytest.mark.acceptance
 def test_the_service_of_a_starter_that_has_gone_ends(tmp_path: Path) -> None:
     with serving(tmp_path, "--until-eof") as (child, _url, _zenoh):
         assert child.stdin is not None
@@ -412,6 +417,7 @@ def test_the_service_of_a_starter_that_has_gone_ends(tmp_path: Path) -> None:
         assert child.returncode == 0
 
 
+@pytest.mark.acceptance
 def test_an_acknowledged_alarm_survives_kill_9(tmp_path: Path) -> None:
     site = load(FEEDER)
     start = 1_795_212_000.0
@@ -439,6 +445,7 @@ def test_an_acknowledged_alarm_survives_kill_9(tmp_path: Path) -> None:
         assert [a["id"] for a in httpx.get(f"{url}/api/v1/alarms").json()["alarms"]] == [alarm["id"]]
 
 
+@pytest.mark.canary("False")
 @pytest.mark.parametrize("disk", [True, False])
 def test_a_log_that_cannot_be_written_stops_nothing(tmp_path: Path, disk: bool) -> None:
     """A full disk, or a pipe whose reader has gone."""
@@ -480,7 +487,7 @@ def test_simulate_onto_zenoh_in_step_with_a_service(gridsec: Run, tmp_path: Path
         assert 'outcome="accepted"} 1680.0' in httpx.get(f"{url}/metrics").text
 
 
-@pytest.mark.slow
+@pytest.mark.acceptance
 def test_demo_shows_and_checks(gridsec: Run) -> None:
     """A short demo; the port of the web page is taken, so it has to find another."""
     with socket.socket() as taken:

@@ -33,6 +33,7 @@ def test_the_answer_is_told_and_its_tables_are_written(
     assert journal.read_text(encoding="utf-8").count("\n") > 10
 
 
+@pytest.mark.acceptance
 def test_a_feeder_without_inverters_says_which_option_helps(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -16,6 +16,7 @@ from tests.service.commands import command, plain
 run = command("feeders")
 
 
+@pytest.mark.acceptance
 def test_a_bank_by_matrix_inequality_is_designed_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

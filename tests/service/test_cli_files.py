@@ -124,6 +124,7 @@ def test_options_are_stronger_than_the_files(
     np.testing.assert_array_equal(written["onset_s"], expected["onset_s"])
 
 
+@pytest.mark.acceptance
 def test_a_report_takes_limits_of_the_busbar_and_a_preset(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -201,6 +201,7 @@ def serving(folder: Path, feeder: Path) -> Iterator[tuple[subprocess.Popen[str],
                 child.stdout.close()
 
 
+@pytest.mark.acceptance
 def test_kill_9_does_not_make_it_forget(site: Site, tmp_path: Path) -> None:
     folder = tmp_path / FEEDER
     write(site.tables, folder)
@@ -326,6 +327,7 @@ def test_a_clock_that_is_set_back_costs_nothing_that_was_learned(
 # ------------------------------------------------------------ replaced meters
 
 
+@pytest.mark.acceptance
 def test_a_replaced_meter_is_learned_anew_and_the_others_stay(tmp_path: Path) -> None:
     """One reading a minute; the old meter reads 0.45 % too much, the new one 0.1 % too little."""
     slow = variant(load(FEEDER), tick_s=60.0, silence_s=180.0, commission_s=5 * 3600.0)

@@ -94,6 +94,7 @@ def test_the_alarm_that_stands_is_updated_once(results: list[TickResult]) -> Non
         AlarmModel.model_validate(alarm_to_json(t.alarm))
 
 
+@pytest.mark.acceptance
 def test_rest_shows_the_hint_of_a_live_feeder(tmp_path: Path, results: list[TickResult]) -> None:
     """A feeder folder with exchanged phases, readings over zenoh: the same hint as in the replay."""
     write(tables(exchanged=True), tmp_path / NAME)

@@ -86,6 +86,7 @@ def changes(live: InProcess, alarm_id: str) -> list[str]:
     return [event["change"] for event in live.get(f"/api/v1/alarms/{alarm_id}/events")["events"]]
 
 
+@pytest.mark.acceptance
 @pytest.mark.postgresql
 def test_an_acknowledgement_in_a_frozen_postgresql_stops_nothing(cluster: Cluster, tmp_path: Path) -> None:
     with watching(tmp_path, cluster.database()) as (live, alarm_id):
@@ -164,6 +165,7 @@ def test_a_commit_without_an_answer_is_told_by_its_key(cluster: Cluster) -> None
         assert store.commit([raised(an_alarm(1))], key=3)[0] > 2
 
 
+@pytest.mark.acceptance
 @pytest.mark.postgresql
 def test_a_call_before_the_commit_is_not_stored(cluster: Cluster) -> None:
     alarm = an_alarm()
@@ -179,6 +181,7 @@ def test_a_call_before_the_commit_is_not_stored(cluster: Cluster) -> None:
         assert store.active() == [alarm]
 
 
+@pytest.mark.acceptance
 @pytest.mark.postgresql
 def test_an_acknowledgement_of_unknown_outcome_is_repeated(cluster: Cluster, tmp_path: Path) -> None:
     with watching(tmp_path, cluster.database()) as (live, alarm_id):
@@ -204,6 +207,7 @@ def test_an_acknowledgement_of_unknown_outcome_is_repeated(cluster: Cluster, tmp
         assert live.metric("gridsec_transitions_unstored") == 0
 
 
+@pytest.mark.acceptance
 def test_a_locked_sqlite_file_stops_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A write that hangs, as on a disk that does not answer: there the wait for it has the limit."""
     monkeypatch.setattr(connect, "BUSY_S", 30.0)
@@ -228,6 +232,7 @@ def test_a_locked_sqlite_file_stops_nothing(tmp_path: Path, monkeypatch: pytest.
         assert changes(live, alarm_id).count("acknowledged") == 1
 
 
+@pytest.mark.acceptance
 @pytest.mark.postgresql
 def test_an_alarm_that_changes_while_its_acknowledgement_is_stored(cluster: Cluster, tmp_path: Path) -> None:
     """It clears by the judging that goes on: what is stored after the acknowledgement still has it."""
@@ -249,6 +254,7 @@ def site() -> Site:
     return load(FEEDER)
 
 
+@pytest.mark.acceptance
 @pytest.mark.postgresql
 def test_a_feeder_is_put_and_deleted_around_a_freeze(cluster: Cluster, tmp_path: Path, site: Site) -> None:
     tables = to_json(site.tables)

@@ -183,7 +183,8 @@ def test_a_port_in_use_is_named() -> None:
         pass
 
 
-def test_nobody_there_is_named() -> None:
+def test_nobody_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ingest, "_OPEN_TIMEOUT_MS", 500)
     end = f"tcp/127.0.0.1:{free_port()}"
     config = BusConfig("client", connect=(end,))
     with pytest.raises(BusUnavailable, match=end), Meters(config, "gridsec"):

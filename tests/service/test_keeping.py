@@ -136,6 +136,7 @@ def _read(master: int) -> bytes:
         return b""
 
 
+@pytest.mark.acceptance
 def test_sigterm_ends_all_processes_of_a_campaign_and_it_goes_on(
     cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -245,6 +246,7 @@ with keeping("any", "village", Path(sys.argv[1])) as kept:
 """
 
 
+@pytest.mark.acceptance
 def test_a_solver_that_hears_no_signal_is_ended_all_the_same(tmp_path: Path) -> None:
     journal = tmp_path / "journal"
     words = [sys.executable, "-c", DEAF, str(journal)]

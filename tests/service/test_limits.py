@@ -114,6 +114,7 @@ def test_300_connections_without_a_complete_request_keep_nobody_out(small: Serve
     assert len(small.lines()) - lines <= LOG_LINES
 
 
+@pytest.mark.acceptance
 def test_an_incomplete_header_has_a_time_out(small: Served) -> None:
     with small.connect() as one:
         begun = time.monotonic()
@@ -142,6 +143,7 @@ def test_the_soft_limit_becomes_the_hard_limit(small: Served) -> None:
     assert resource.prlimit(small.process.pid, resource.RLIMIT_NOFILE) == (DESCRIPTORS, DESCRIPTORS)
 
 
+@pytest.mark.acceptance
 def test_without_a_descriptor_left_accepting_waits_and_recovers(tmp_path: Path) -> None:
     with served(tmp_path) as small:
         lines = len(small.lines())
@@ -184,6 +186,7 @@ sys.stdin.read()
 a thread of zenoh alive."""
 
 
+@pytest.mark.acceptance
 def test_real_zenoh_sessions_are_bounded_and_leave_http_alone(tmp_path: Path) -> None:
     hard = 160
     most = Shares.of(hard).sessions

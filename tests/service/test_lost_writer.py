@@ -98,6 +98,7 @@ def test_an_sqlite_writer_after_another_one(tmp_path: Path) -> None:
         assert [alarm.id for alarm in first.active()] == [an_alarm().id]
 
 
+@pytest.mark.acceptance
 @pytest.mark.postgresql
 def test_a_heartbeat_keeps_an_idle_writer(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(postgresql, "IDLE_S", IDLE_S)
@@ -146,6 +147,7 @@ def settled(url: str) -> int:
         return 0 if row is None else int(row[0])
 
 
+@pytest.mark.acceptance
 @pytest.mark.postgresql
 def test_a_stopped_service_ends_when_it_goes_on_after_the_next_one(cluster: Cluster, tmp_path: Path) -> None:
     url, log = cluster.database(), tmp_path / "log"
@@ -166,6 +168,7 @@ def test_a_stopped_service_ends_when_it_goes_on_after_the_next_one(cluster: Clus
         assert an_alarm(1) in third.active()
 
 
+@pytest.mark.acceptance
 @pytest.mark.postgresql
 def test_a_service_whose_session_was_terminated_ends(cluster: Cluster, tmp_path: Path) -> None:
     url, log = cluster.database(), tmp_path / "log"

@@ -254,6 +254,7 @@ def _markers(state: dict[str, Any]) -> Iterable[bool]:
             yield entry["model_only"]
 
 
+@pytest.mark.acceptance
 def test_rest_streams_and_zenoh_mark_it_before_the_first_reading(tmp_path: Path) -> None:
     with service(tmp_path, clock="wall") as live:
         until(lambda: live.get("/readyz")["ok"] if live.http.get("/readyz").is_success else False)

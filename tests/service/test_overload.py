@@ -101,6 +101,7 @@ def used(live: InProcess) -> float:
     return sum(float(line.rpartition(" ")[2]) for line in lines if line.startswith("gridsec_readings_total"))
 
 
+@pytest.mark.acceptance
 def test_three_times_what_is_sustained_is_judged_and_over_within_ten_seconds(
     tmp_path: Path, site: Site
 ) -> None:
@@ -128,6 +129,7 @@ def test_three_times_what_is_sustained_is_judged_and_over_within_ten_seconds(
         assert time.monotonic() - begun < RECOVERY_S
 
 
+@pytest.mark.canary("7200.0")
 @pytest.mark.parametrize("leap_s", [HOURS, -HOURS])
 def test_a_leap_of_two_hours_is_over_within_ten_seconds(tmp_path: Path, site: Site, leap_s: float) -> None:
     shift = [0.0]
@@ -180,6 +182,7 @@ def ended_after(process: subprocess.Popen[bytes]) -> float:
     return time.monotonic() - begun
 
 
+@pytest.mark.acceptance
 @pytest.mark.parametrize("wait_s", [1.2, 2.0])
 def test_sigterm_while_a_leap_is_caught_up(tmp_path: Path, site: Site, wait_s: float) -> None:
     """A machine that does much else ends slowly without a leap as well."""
@@ -214,6 +217,7 @@ def ready(client: httpx.Client) -> bool:
         return False
 
 
+@pytest.mark.acceptance
 @pytest.mark.postgresql
 def test_sigterm_while_a_commit_hangs(tmp_path: Path, cluster: Cluster) -> None:
     """The database's processes stand still: the last commit is given up, and the end is on time."""
@@ -243,6 +247,7 @@ def test_sigterm_while_a_commit_hangs(tmp_path: Path, cluster: Cluster) -> None:
     assert "did not" in (tmp_path / "log").read_text()
 
 
+@pytest.mark.canary("0.3")
 @pytest.mark.parametrize("wait_s", [0.3, 1.5, 3.0, 4.5])
 def test_sigterm_during_the_start_and_the_design(tmp_path: Path, wait_s: float) -> None:
     command = [str(Path(sys.executable).parent / "gridsec"), "serve", "--feeder", "kerber-vorstadtnetz"]

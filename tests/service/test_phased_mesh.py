@@ -45,6 +45,7 @@ def test_the_layout_is_a_tree_and_its_tie() -> None:
     assert {customer.phase for customer in found.customers} == {"a", "b", "c"}
 
 
+@pytest.mark.acceptance
 def test_the_service_names_the_liars(scenario: Scenario, tmp_path: Path) -> None:
     site = european()
     samples, state = served(site, scenario, tmp_path, NAME)

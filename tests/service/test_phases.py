@@ -111,6 +111,7 @@ def test_a_recording_keeps_the_phases_and_is_replayed(site: Site, scenario: Scen
     assert +tally.readings == {"accepted": len(sent)}
 
 
+@pytest.mark.acceptance
 def test_the_service_names_the_liars_with_their_phases(
     site: Site, scenario: Scenario, tmp_path: Path
 ) -> None:

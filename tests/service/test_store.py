@@ -232,6 +232,7 @@ def every(step_s: float, begin: float, end: float, feeder: str = "village") -> l
 SHORT = HistoryRules(step_s=0.0, keep_s=100.0)
 
 
+@pytest.mark.canary("150.0-sqlite", "10000000.0-sqlite")
 @both
 @pytest.mark.parametrize("leap_s", [150.0, 1e7])
 def test_a_clock_that_leaps_costs_no_history_unless_it_goes_on(

@@ -361,6 +361,7 @@ WRITER = """
 """
 
 
+@pytest.mark.canary("postgresql")
 @both
 def test_nothing_acknowledged_is_lost_by_a_kill(url: str, family: str) -> None:
     code = textwrap.dedent(WRITER).format(url=url, tests=str(Path.cwd()))

@@ -112,6 +112,7 @@ def test_undecided_and_silent(site: Site) -> None:
     expect(page.locator(".alarm")).to_contain_text("Data loss")
 
 
+@pytest.mark.canary("phone")
 @pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
 def test_who_is_in_doubt_or_not_judged_is_not_honest(site: Site, size: dict[str, int]) -> None:
     report = site.village.report(T0, cause=Cause.SILENT_METERS)
@@ -165,6 +166,7 @@ def test_limits_have_shapes(site: Site) -> None:
     assert len(shapes) == 3
 
 
+@pytest.mark.canary("light")
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_low_is_blue_and_high_is_orange(site: Site, scheme: str) -> None:
     site.tick(T0, 1, volts={"H1": 222.0, "H2": 230.94, "H3": 240.0})
@@ -225,6 +227,7 @@ def test_a_tick_without_a_reconstruction_does_not_flatten_the_trend(site: Site) 
     assert all(220 < float(text) < 240 for text in axis)
 
 
+@pytest.mark.acceptance
 def test_looking_again_makes_no_trend_longer_than_an_hour(site: Site) -> None:
     for k in range(900):
         site.tick(T0 + 10 * k)
@@ -315,6 +318,7 @@ def test_ids_are_text_and_nothing_else(site_of: Callable[..., Site], village: ty
     assert page.locator("main img, dialog img, main script").count() == 0
 
 
+@pytest.mark.canary("phone")
 @pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
 def test_146_customers_can_be_told_apart(
     site_of: Callable[..., Site], village: type, size: dict[str, int]
@@ -520,6 +524,7 @@ def test_nothing_comes_from_elsewhere() -> None:
         assert not foreign.search(text), file
 
 
+@pytest.mark.canary("phone")
 @pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
 def test_values_of_the_model_alone_do_not_look_measured(site: Site, size: dict[str, int]) -> None:
     def silence(t: float, measured: float | None) -> None:

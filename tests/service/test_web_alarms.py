@@ -71,6 +71,7 @@ def test_an_error_of_the_files_stands_beside_the_accusation(site: Site) -> None:
     expect(page.locator("#detail-card")).to_contain_text("bus drop-9")
 
 
+@pytest.mark.canary("size0")
 @pytest.mark.parametrize("size", [DESKTOP, PHONE])
 def test_a_busbar_meter_that_lies_is_marked(site: Site, size: dict[str, int]) -> None:
     """In words and shapes, wherever a suspect meter is; and everything is as before once it is believed."""
@@ -258,6 +259,7 @@ def test_an_alarm_that_overtakes_the_list_stays(site: Site) -> None:
     expect(page.locator(".alarm")).to_have_count(1)
 
 
+@pytest.mark.acceptance
 def test_a_list_that_cannot_be_loaded_is_said_and_asked_for_again(site: Site) -> None:
     site.tick(T0, 4, lies={"H3": 9.0}, silent=("H5",))
     page = site.open()
@@ -280,6 +282,7 @@ def test_a_list_that_cannot_be_loaded_is_said_and_asked_for_again(site: Site) ->
     expect(page.locator(".alarm")).to_have_count(2)
 
 
+@pytest.mark.acceptance
 def test_a_list_that_may_not_be_complete_says_so(site: Site) -> None:
     site.tick(T0)
     page = site.open()
@@ -409,6 +412,7 @@ def test_a_state_that_is_old_when_it_comes_is_not_live(site: Site) -> None:
     expect(page.locator("#decision")).to_have_text("CLEAN")
 
 
+@pytest.mark.acceptance
 def test_alarms_that_come_no_more_look_old_while_states_go_on(site: Site) -> None:
     site.tick(T0, 4, lies={"H3": 9.0})
     site.expected = "net::ERR_"

@@ -34,6 +34,7 @@ from tests.feeders.studies.calibrate_cases import (
 TABLES = CIGRE.tables
 
 
+@pytest.mark.acceptance
 def test_clean_recordings_lead_to_no_proposal_and_intervals_cover(tmp_path: Path) -> None:
     z, powers, proposals = [], [], 0
     for seed in range(12):
@@ -99,6 +100,7 @@ def test_biases_of_the_size_of_the_class_are_found(tmp_path: Path) -> None:
     assert (rows.drop(["m02", "m05"])["verdict"] == "within error").all()
 
 
+@pytest.mark.canary("0.0049-biased")
 @pytest.mark.parametrize(("bias", "verdict"), [(0.0049, "biased"), (0.0075, "outside its class")])
 def test_the_class_of_the_busbars_meter_counts(bias: float, verdict: str, tmp_path: Path) -> None:
     """Classes 0.5 and 0.1; the busbar's meter is off by nearly its class the other way."""
@@ -137,6 +139,7 @@ def test_lines_in_series_cannot_be_told_apart_and_are_not_corrected(tmp_path: Pa
     assert "Line R2-R3" in found.lines.set_index("lines").loc["Line R1-R2", "same"]
 
 
+@pytest.mark.canary("bias")
 @pytest.mark.parametrize(
     "lie",
     [
@@ -156,6 +159,7 @@ def test_a_meter_whose_error_changes_is_excluded_and_leads_to_no_correction(
     assert found.customers.set_index("meter").loc["m03", "verdict"] == "excluded"
 
 
+@pytest.mark.canary("stuck-1")
 @pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.parametrize(
     ("meter", "lie"),
@@ -174,6 +178,7 @@ def test_no_lie_becomes_a_correction(meter: int, lie: Attack, seed: int, tmp_pat
     assert found.corrections == ()
 
 
+@pytest.mark.acceptance
 def test_an_error_of_the_files_is_found_beside_a_lie(tmp_path: Path) -> None:
     lie = Stuck(np.array([2]), START + 5 * 900.0, np.inf)
     wrong = site(shortened(TABLES, "Line R6-R16", 1.4))
@@ -186,6 +191,7 @@ def test_an_error_of_the_files_is_found_beside_a_lie(tmp_path: Path) -> None:
     pd.testing.assert_frame_equal(again.proposals, found.proposals)
 
 
+@pytest.mark.canary("1080-20.0")
 @pytest.mark.parametrize(("ticks", "dt_s"), [(3600, 2.0), (1080, 20.0)])
 def test_short_intervals(ticks: int, dt_s: float, tmp_path: Path) -> None:
     wrong = site(swapped(TABLES, "Load R11", "Load R16"))
@@ -193,6 +199,7 @@ def test_short_intervals(ticks: int, dt_s: float, tmp_path: Path) -> None:
     assert found.proposals["kind"].tolist() == ["swap"]
 
 
+@pytest.mark.acceptance
 def test_a_wrong_phase_is_found(tmp_path: Path) -> None:
     tables = find("ieee-european-lv")
     readings = three_phase_readings(three_phase(tables), seed=1, ticks=64, dt_s=900.0, hidden_kw=0.1)
@@ -220,6 +227,7 @@ def test_what_was_not_looked_for_is_not_as_in_the_files(tmp_path: Path) -> None:
     assert set(found.customers["verdict"]) <= {"as in the files", "cannot be told"}
 
 
+@pytest.mark.acceptance
 def test_phases_of_the_busbar_that_are_apart_are_no_errors_of_meters(tmp_path: Path) -> None:
     """0.6 % above and below: with readings of each phase nothing is wrong, without them nothing is said."""
     given = three_phase(find("ieee-european-lv"))
@@ -246,6 +254,7 @@ def test_where_there_is_nothing_to_look_for_nothing_is_found(tmp_path: Path) -> 
         assert set(found.meters["verdict"]) == {"excluded"}
 
 
+@pytest.mark.acceptance
 def test_an_interrupted_study_goes_on_and_another_ones_journal_is_refused(tmp_path: Path) -> None:
     readings = recorded(tmp_path, scenario(1))
     wrong = site(moved(TABLES, "Load R15", "Bus R17"))

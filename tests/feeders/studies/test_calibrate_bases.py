@@ -78,6 +78,7 @@ def found_in(
     return calibrate(from_tables(files), record(from_tables(truth), given, folder / "readings.parquet"))
 
 
+@pytest.mark.canary("tapped")
 @pytest.mark.parametrize("make", [tapped, headed])
 def test_planted_errors_are_found_and_nothing_else(make: Change, tmp_path: Path) -> None:
     """Two meters are exchanged and a customer is elsewhere, both across a tap; a line is longer."""
@@ -94,6 +95,7 @@ def test_planted_errors_are_found_and_nothing_else(make: Change, tmp_path: Path)
     assert found.meters["bias_percent"].abs().max() < 1.5
 
 
+@pytest.mark.canary("tapped")
 @pytest.mark.parametrize("make", [tapped, headed, stepped])
 def test_biases_are_found_and_files_that_are_right_are_left(make: Change, tmp_path: Path) -> None:
     truth = make(plain())

@@ -169,6 +169,7 @@ def test_a_customer_on_a_service_line_of_another_phase_is_found_and_no_meter_exc
     assert corrected(wrong, found) == street()
 
 
+@pytest.mark.acceptance
 def test_a_lateral_of_several_customers_moves_as_one() -> None:
     wrong = on(street(), {"u": "c", "u1": "c", "u2": "c", "s3": "a"})
     found = calibrate(three_phase(wrong), days())
@@ -179,6 +180,7 @@ def test_a_lateral_of_several_customers_moves_as_one() -> None:
     assert corrected(wrong, found) == street()
 
 
+@pytest.mark.acceptance
 def test_of_a_customer_with_a_wrong_bus_and_phase_one_place_is_proposed() -> None:
     """Its service line, on which nobody is then, stays as it is in the files."""
     tables = street()

@@ -81,6 +81,7 @@ def test_a_plan_of_the_files_counts_in_readings() -> None:
     assert Plan.of(rare, duration_s=9000.0).onset_s == (900.0, 2700.0)
 
 
+@pytest.mark.acceptance
 def test_rows_are_what_full_plays_show_where_powers_are_those_of_the_files() -> None:
     plan = replace(PLAN, scenes=2, load_error=None, alarms_per_year=(1.0,))
     assert full_plays_show_every_row(campaign(SITE, plan)) > {CLEAN, "coordinated-power"}
@@ -132,6 +133,7 @@ def test_lies_are_as_large_as_they_are_said_to_be(here: Campaign) -> None:
     assert told.loc[["inverter"], "lie_volt"].isna().all()
 
 
+@pytest.mark.canary("stations")
 @pytest.mark.parametrize("site", [village(), from_tables(stations.tables())], ids=["taps", "stations"])
 def test_lies_behind_taps_are_those_of_the_full_play(site: Site) -> None:
     """In volts, whether a lie is put upon the scene or the scene is played anew with it."""
@@ -241,6 +243,7 @@ def test_settings_reach_the_estimator() -> None:
             campaign(SITE, replace(PLAN, settings=(("max_attacked", wrong),)))
 
 
+@pytest.mark.acceptance
 def test_lies_inside_the_class_are_named_once_meters_are_learned() -> None:
     """A meter of class 0.5 that changes by 0.7 % may only be told when its own fixed error is known."""
     kinds = (Kind("bias", Trick.BIAS, (0.7,)),)
@@ -321,6 +324,7 @@ def test_false_names_per_year() -> None:
 # ---------------------------------------------------------------------------------------------- runners
 
 
+@pytest.mark.acceptance
 def test_a_killed_process_loses_nothing(here: Campaign, tmp_path: Path) -> None:
     killed: list[int] = []
 
@@ -366,6 +370,7 @@ def kills_whoever_waits(first: Path, piece: int) -> int:
     return piece
 
 
+@pytest.mark.acceptance
 def test_who_dies_with_nothing_in_hand_keeps_nobody_waiting(tmp_path: Path) -> None:
     work = partial(kills_whoever_waits, tmp_path / "pid")
     assert sorted(Processes(2).run(work, [0, 1])) == [(0, 0), (1, 1)]

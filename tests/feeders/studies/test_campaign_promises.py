@@ -25,6 +25,7 @@ from gridsec.online import Estimate, Frame, Verdict
 from tests.feeders.studies.campaigns import PLAN, SITE
 
 
+@pytest.mark.acceptance
 def test_promised_sizes_are_kept() -> None:
     """Nobody is named because of a hidden lie, no large one is missed, under full AC power flow: 200 lies."""
     plan = replace(
@@ -90,6 +91,7 @@ def crying_wolf(site: Site) -> Watcher:
     return replace(watcher, family=replace(watcher.family, step=step))
 
 
+@pytest.mark.acceptance
 def test_broken_promises_are_counted_against_the_same_scene_without_the_lie(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

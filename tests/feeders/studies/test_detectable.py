@@ -38,7 +38,7 @@ def test_the_monitor_keeps_what_is_promised_on_a_small_feeder(cigre: Detectable)
     assert rehearse(CIGRE, cigre, trials=40, seed=3) == Rehearsal(40, 0, 0, 0)
 
 
-@pytest.mark.slow
+@pytest.mark.acceptance
 def test_the_monitor_keeps_what_is_promised() -> None:
     assert rehearse(RURAL, rural_sizes(), trials=120, seed=1) == Rehearsal(120, 0, 0, 0)
 

@@ -18,6 +18,7 @@ PROGRAMS = re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)
 STUDIES = [re.findall(r"feeders\.studies\.(\w+)", program)[0] for program in PROGRAMS]
 
 
+@pytest.mark.canary("redundancy0", "protect")
 @pytest.mark.parametrize("program", PROGRAMS, ids=STUDIES)
 def test_programs_run(program: str, capsys: pytest.CaptureFixture[str]) -> None:
     exec(compile(program, "docs/studies.md", "exec"), {})
@@ -52,7 +53,6 @@ def test_numbers_of_protect() -> None:
     assert f"largest hidden lie, V: {found.before:.4g} before, {found.after:.4g} after" in PAGE
 
 
-@pytest.mark.slow
 def test_numbers_of_detectable() -> None:
     found = rural_sizes()
     names = ["hidden", "noticed", "named", "fits", "identified"]

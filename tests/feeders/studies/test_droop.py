@@ -138,7 +138,8 @@ def run_together(
     return np.where(collapsed, np.inf, np.where(moved < 0.5 * before, 0.0, moved))
 
 
-@pytest.mark.slow
+@pytest.mark.canary("5-True")
+@pytest.mark.no_cover  # a long run of what other tests cover
 @pytest.mark.parametrize(("feeders", "phased"), [(FEEDERS, False), (FEEDERS // 2, True)])
 def test_the_verdict_is_that_of_the_simulation_in_200_fleets_around_the_edge(
     feeders: int, phased: bool
@@ -336,6 +337,7 @@ def test_line_ratings_limit_what_is_hosted() -> None:
     assert found["line_percent"] == pytest.approx(100.0, abs=0.5)
 
 
+@pytest.mark.acceptance
 def test_the_study_has_all_tables_and_goes_on_from_its_journal(tmp_path: Path) -> None:
     site = village()
     options = DroopOptions(presets=("vde4105",), tau_factors=(0.1,), hosting=True, draws=2)

@@ -71,6 +71,7 @@ def volts_by_hand(tables: FeederTables) -> Floats:
     return np.array([v[row.bus]["abc".index(row.phases[0])] for row in tables.customers])
 
 
+@pytest.mark.canary("taps in phases")
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_verdict_is_that_of_the_simulation_in_volts(kind: str) -> None:
     told: dict[tuple[Verdict, bool], int] = {}
@@ -100,6 +101,7 @@ def test_the_verdict_is_that_of_the_simulation_in_volts(kind: str) -> None:
     assert min(told[Verdict.STABLE, False], told[Verdict.UNSTABLE, True]) >= 5
 
 
+@pytest.mark.canary("taps in phases")
 @pytest.mark.parametrize("kind", KINDS)
 def test_curves_and_limits_are_those_of_the_nominal_voltage(kind: str) -> None:
     """Whether a band is kept, and what is hosted, by a fleet whose curves are simulated in volts."""
@@ -199,6 +201,7 @@ def stepped(tables: FeederTables) -> FeederTables:
     return replace(tables, meta=replace(tables.meta, voltage_volt=6350.0), lines=lines)
 
 
+@pytest.mark.canary("stepped")
 @pytest.mark.parametrize("change", [lambda tables: tables, in_phases, stepped])
 def test_a_tap_at_the_head_is_another_voltage_of_the_busbar(
     change: Callable[[FeederTables], FeederTables],
@@ -235,6 +238,7 @@ def test_volts_of_a_simulation_are_those_of_the_power_flow() -> None:
     assert row["worst_customer"] == site.feeder.customers[int(np.argmax(np.abs(still - 230.0)))]
 
 
+@pytest.mark.acceptance
 def test_two_lines_in_parallel_are_one_of_half_the_impedance() -> None:
     """Every line closes a loop with its twin, behind a tap; each carries half, and may."""
     tables = village_tables()

@@ -160,6 +160,7 @@ def test_the_usual_goal_is_what_says_something_of_the_feeder() -> None:
         protect(RURAL, max_attacked=1, lie_volt=-1.0)
 
 
+@pytest.mark.acceptance
 def test_containment_is_the_fewest_by_trying_all_on_a_small_feeder() -> None:
     """Oracle: all 64 protections of six meters; false powers only make lies larger."""
     site = load("cigre-lv")

@@ -81,7 +81,7 @@ def test_lies_that_fit_are_those_of_each_phase() -> None:
             assert errors[k] == pytest.approx(worst_error(each, i, 1).size, rel=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.acceptance
 def test_the_monitor_keeps_what_is_promised_in_three_phases() -> None:
     site = from_tables(mixed("cigre-lv", coupled=True))
     found = detectable(site, max_attacked=2)

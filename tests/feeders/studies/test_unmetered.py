@@ -59,6 +59,7 @@ def test_whoever_has_no_meter_hides_lies_of_others(found: Detectable) -> None:
     assert (error[1] > 4.0 * error[0])[unmetered(CIGRE)].all()
 
 
+@pytest.mark.acceptance
 def test_lies_of_the_noticed_size_are_noticed_and_hidden_ones_are_not(found: Detectable) -> None:
     """60 lies: none slips through although nobody knows half of the loads."""
     watcher, base = design(CIGRE), CIGRE.customer_volt[CIGRE.meters]
@@ -89,6 +90,7 @@ def test_the_monitor_keeps_what_is_promised_where_nobody_meters(found: Detectabl
     assert rehearse(CIGRE, found, trials=12, seed=2) == Rehearsal(12, 0, 0, 0)
 
 
+@pytest.mark.acceptance
 def test_errors_under_the_worst_collusions_are_covered_on_a_metered_feeder() -> None:
     """Two liars push each customer's voltage as far as the program finds, with all and parts of its lies."""
     site = load("cigre-lv")
@@ -132,6 +134,7 @@ def test_watchers_of_trials_are_not_told_what_nobody_meters() -> None:
     assert [row.p_std_kw is None for row in stated] == some.tolist()
 
 
+@pytest.mark.acceptance
 def test_campaigns_do_not_tell_either() -> None:
     """Voltages at customers without meters are off by volts, and no honest meter is named for it."""
     plan = Plan(

@@ -24,6 +24,7 @@ from tests.gridsec.observers.discrete_lures import gains_of, mask, sine
 
 
 class TestMonteCarlo:
+    @pytest.mark.acceptance
     def test_never_above_the_proven_gain_and_worth_what_it_says(self) -> None:
         bank = yang2019.bank()
         found = yang2019.simulated_gains(bank, runs=60, seed=1)

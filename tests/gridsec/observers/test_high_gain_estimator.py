@@ -41,6 +41,7 @@ def on_second(size: float, start: float = 4.0) -> Any:
     return added
 
 
+@pytest.mark.canary("componentwise")
 @pytest.mark.parametrize("decay", ["componentwise", "kim2018"])
 def test_honest_sensors_are_never_suspected_and_bounds_hold(decay: Any) -> None:
     made = estimator(decay=decay)
@@ -68,6 +69,7 @@ def test_bounds_are_those_of_12_and_14(decay: Any) -> None:
     assert got[0] == pytest.approx(2.0 * made.decays[0].eta)
 
 
+@pytest.mark.canary("10000.0")
 @pytest.mark.parametrize("size", [0.02, -0.3, 1e4, 1e300])
 def test_attacks_are_seen_named_and_left_out(size: float) -> None:
     made = estimator()
@@ -106,6 +108,7 @@ def test_a_sensor_is_named_only_beyond_what_the_error_of_the_estimate_explains()
         assert out.suspects.tolist() == named
 
 
+@pytest.mark.acceptance
 def test_search_walks_through_the_sets_at_once_or_one_by_one() -> None:
     # Sensor 2 is in the first two sets, {1, 2} and {0, 2}.
     added = lambda t: 0.5 * (t[:, None] >= 4.0) * np.array([0.0, 0.0, 1.0])  # noqa: E731
@@ -116,6 +119,7 @@ def test_search_walks_through_the_sets_at_once_or_one_by_one() -> None:
     assert together[-1].sigma == singly[-1].sigma == 2
 
 
+@pytest.mark.acceptance
 def test_two_liars_leave_no_answer_and_say_so() -> None:
     added = lambda t: (t[:, None] >= 4.0) * np.array([0.5, -0.7, 0.0])  # noqa: E731
     _, _, outcomes, _ = watch(estimator(), added)
@@ -124,6 +128,7 @@ def test_two_liars_leave_no_answer_and_say_so() -> None:
     assert outcomes[-1].bound == np.inf
 
 
+@pytest.mark.acceptance
 def test_unseen_sensors_have_no_influence_and_come_back() -> None:
     made = estimator()
     t, x, u = truth(8.0)

@@ -203,6 +203,7 @@ def test_residual_of_the_nearest_point_is_at_most_root_n_times_the_error(seed: i
     assert np.abs(back - x).max() <= kappa_detect(psi.factor, example.lowest()) * size * (1.0 + 1e-6)
 
 
+@pytest.mark.acceptance
 @settings(max_examples=120, deadline=None)
 @given(
     seed=st.integers(0, 100_000),

@@ -187,6 +187,7 @@ def test_honest_errors_stay_within_the_bound_also_with_readings_missing(
             assert sizes.max() <= limit[i] * (1.0 + 1e-9) + 1e-7 * np.abs(x).max()
 
 
+@pytest.mark.acceptance
 @given(seeds)
 @settings(max_examples=20, deadline=None)
 def test_envelope_and_the_papers_own_bound_all_powers_and_sums(seed: int) -> None:

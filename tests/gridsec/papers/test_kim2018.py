@@ -161,6 +161,7 @@ def test_two_redundant_observability_is_proven_and_not_contradicted() -> None:
     assert all(np.linalg.matrix_rank(model.jacobian(x, [i])).max() < 3 for i in range(4))
 
 
+@pytest.mark.acceptance
 def test_the_printed_estimator_obeys_theorem_2() -> None:
     made = example.printed_design("all")
     for seed, size in ((1, 5.0), (2, 0.5), (3, 50.0), (4, 1e5)):
@@ -191,6 +192,7 @@ def test_reset_keeps_an_unbounded_attack_inside_the_bound() -> None:
     assert not any(np.delete(outcome.reset, 2).any() for outcome in run.outcomes)
 
 
+@pytest.mark.acceptance
 def test_nearest_point_inverses_see_attacks_that_the_printed_factor_hides() -> None:
     def small(t: np.ndarray) -> np.ndarray:
         return 0.005 * (t >= 6.0)[:, None] * np.eye(4)[2]

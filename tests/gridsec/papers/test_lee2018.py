@@ -22,6 +22,7 @@ from tests.codes import refused
 PLANT = three_inertia.plant()
 
 
+@pytest.mark.acceptance
 def test_every_claim_of_chapter_4_comes_out_or_has_its_reason() -> None:
     found = lee2018.chapter4()
     assert all(claim.met or claim.why for claim in found.claims)
@@ -72,6 +73,7 @@ def test_index_three_by_brute_force_over_sensors() -> None:
     assert not error_correctable(Stack.of(made.observers.stack.blocks), 2, tol=1e-6)
 
 
+@pytest.mark.canary("0.0")
 @pytest.mark.parametrize("slowest", [three_inertia.SLOWEST, 0.0])
 def test_bound_holds_for_both_decompositions_and_several_seeds(slowest: float) -> None:
     made = three_inertia.estimator(PLANT, slowest=slowest)

@@ -19,6 +19,7 @@ ROOT = Path(__file__).resolve().parents[3]
 run = command("reproduce")
 
 
+@pytest.mark.canary("kim2018")
 @pytest.mark.parametrize("paper", PAPERS)
 def test_no_paper_fails(
     paper: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -19,6 +19,7 @@ def result() -> Reproduction:
     return made("yang2019")
 
 
+@pytest.mark.acceptance
 def test_every_claim_is_met_or_explained(result: Reproduction) -> None:
     assert result.paper == "yang2019"
     assert not result.unexplained
@@ -27,6 +28,7 @@ def test_every_claim_is_met_or_explained(result: Reproduction) -> None:
     assert {claim.where for claim in result.unmet} == figures | errata
 
 
+@pytest.mark.acceptance
 def test_the_rows_of_the_four_figures_say_that_the_recipe_gives_zero(result: Reproduction) -> None:
     rows = [claim for claim in result.claims if claim.where.startswith("Figure ")]
     assert len(rows) == 4
@@ -72,6 +74,7 @@ def by_the_book(
     return sets, np.stack(kept), gains
 
 
+@pytest.mark.canary("1-1.0")
 @pytest.mark.parametrize(("sensor", "size"), [(1, 0.7), (1, 1.0), (2, 2.0), (2, 5.0)])
 def test_the_recipe_of_the_paper_finds_nothing_in_its_own_settings(sensor: int, size: float) -> None:
     """Algorithms 1 and 2, (8), (10), (17), (19) and (21) written out; gains by simulation, epsilon = 0."""
@@ -177,6 +180,7 @@ def test_survivors_isolate_what_the_majority_misses() -> None:
         assert kept[-1] > 0.95
 
 
+@pytest.mark.acceptance
 def test_figures(result: Reproduction) -> None:
     figures = {figure.name: figure for figure in result.figures}
     for index in (1, 2, 3, 4):

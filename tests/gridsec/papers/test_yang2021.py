@@ -16,6 +16,7 @@ from tests.codes import refused
 from tests.gridsec.papers.made import made
 
 
+@pytest.mark.acceptance
 def test_every_claim_that_is_not_met_has_a_reason() -> None:
     found = made("yang2021")
     assert found.paper == "yang2021"

@@ -107,6 +107,7 @@ def test_what_the_quadratic_norm_claims_of_asymmetric_systems_is_so(seed: int, g
     decays(certificate, droop, lure, seed)
 
 
+@pytest.mark.canary("2.3")
 @pytest.mark.parametrize("kva", [2.3, 4.6])
 def test_european_feeder_with_an_inverter_everywhere(kva: float) -> None:
     feeder = load_three_phase("ieee-european-lv").feeder
@@ -129,6 +130,7 @@ def test_too_large_a_fleet_has_no_certificate() -> None:
             attempt(lure)
 
 
+@pytest.mark.canary("0.5-1.05")
 @pytest.mark.parametrize(("sun", "busbar"), [(0.9, 1.04), (0.5, 1.05), (0.0, 0.95)])
 def test_inverters_rest_where_the_asymmetric_power_flow_rests(sun: float, busbar: float) -> None:
     """Single-phase inverters on the European feeder: equilibrium of the model and of the AC equations."""

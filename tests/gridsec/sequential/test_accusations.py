@@ -17,6 +17,14 @@ RUNS = [
 ]
 
 
+@pytest.mark.canary(
+    "majority-14",
+    "phases-busbar-0",
+    "phases-lateral-93",
+    "drift-38",
+    "contiguous-low-0",
+    "false-power-1",
+)
 @pytest.mark.parametrize(("situation", "seed"), RUNS)
 def test_no_honest_meter_is_accused(situation: str, seed: int) -> None:
     assert run(situation, seed).accused == ()

@@ -222,6 +222,7 @@ def quarters() -> tuple[Site, Watcher, Days]:
 class TestQuartersOfAnHour:
     """AC power flow as the truth; the measured rates are in docs/theory-sequential.md."""
 
+    @pytest.mark.canary("voltage 1 tick early-clock-shift")
     @pytest.mark.parametrize(
         ("lie", "kind"),
         [

@@ -117,6 +117,7 @@ def test_a_busbar_that_goes_on_lying_is_not_believed_again(
     assert distrusted(design, state).busbar_named[0] == ever
 
 
+@pytest.mark.canary("1.0-1")
 @pytest.mark.parametrize(("scale_s", "need"), [(1.0, 1), (60.0, 48)])
 def test_a_busbar_that_has_become_honest_is_believed_once_it_has_agreed_long_enough(
     begun: tuple[SequentialDesign, Street], scale_s: float, need: int

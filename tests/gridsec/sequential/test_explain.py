@@ -89,6 +89,7 @@ def draw(design: SequentialDesign, seed: int, size: float) -> tuple[Floats, Bool
     return np.asarray(m), lies != 0.0
 
 
+@pytest.mark.canary("0.022")
 @pytest.mark.parametrize("size", [0.018, 0.022])
 def test_where_the_word_of_many_stands_against_that_of_many_nobody_is_sure(size: float) -> None:
     """Seven of fifteen tell the same lie: what they say is as likely as what the others say, or not."""
@@ -129,6 +130,7 @@ def watched(design: SequentialDesign, seed: int, far: int) -> tuple[set[int], se
     return named, {*street.tolist(), *near.tolist()}
 
 
+@pytest.mark.canary("26")
 @pytest.mark.parametrize("seed", [2, 6, 16, 20, 26])
 def test_nobody_of_the_other_side_is_named_by_a_breath_of_noise(seed: int) -> None:
     """Seven of fifteen tell one lie: without a common amount for them, noise tips the scales at some tick."""

@@ -32,6 +32,7 @@ def calm(seed: int = 4) -> tuple[SequentialDesign, Street, SequentialState]:
     return made, street, sequential.init(made, 1000.0, known, None)
 
 
+@pytest.mark.canary("3")
 @pytest.mark.parametrize("every", [2, 3])
 def test_a_busbar_that_is_read_now_and_then_hides_no_small_lie(every: int) -> None:
     """Long means go on, as those of a feeder whose busbar nobody reads, and find what they always find."""
@@ -53,6 +54,7 @@ def test_a_busbar_that_is_read_now_and_then_hides_no_small_lie(every: int) -> No
     assert delays[1] <= delays[0] + 5
 
 
+@pytest.mark.canary("0.0015")
 @pytest.mark.parametrize("size", [0.0015, 0.0018])
 def test_a_named_liar_that_pauses_is_not_believed_for_it(size: float) -> None:
     """Means that spoke against a meter and have too few of its readings have not changed their minds."""
@@ -80,6 +82,7 @@ def white(customers: int, time_s: float) -> tuple[Plant, SequentialDesign]:
     )
 
 
+@pytest.mark.canary("600.0")
 @pytest.mark.parametrize("time_s", [600.0, 86400.0])
 def test_after_a_pause_nothing_is_remembered_of_loads_that_were(time_s: float) -> None:
     """Twelve correlation times: residuals of before say nothing of the loads that there are now."""
@@ -179,6 +182,7 @@ def test_nothing_jumps_when_meters_have_been_learned() -> None:
     assert stds[first + 1] <= 1.05 * stds[first]
 
 
+@pytest.mark.canary("scales1")
 @pytest.mark.parametrize("scales", [(0.0, 5.0, 15.0, 60.0), (15.0, 60.0)])
 def test_metered_injections_are_compared_on_whatever_scales_there_are(scales: tuple[float, ...]) -> None:
     """And when reports stop, and the inverter follows its curve again, it is not accused for ever."""

@@ -167,6 +167,7 @@ class TestWhatIsLearnedUnderDifficulties:
         assert not any(verdict.suspects[honest].any() for _, verdict in answers)
         return state, street
 
+    @pytest.mark.canary("0-p")
     @pytest.mark.parametrize("name", ["v0_squared", "p"])
     @pytest.mark.parametrize("seed", range(3))
     def test_time_in_which_little_is_known_does_not_count(self, name: str, seed: int) -> None:
@@ -182,6 +183,7 @@ class TestWhatIsLearnedUnderDifficulties:
         off = np.abs(state.learned.bias - 2.0 * street.bias)
         assert (off < 3.0 * np.sqrt(state.learned.variance)).all()
 
+    @pytest.mark.acceptance
     def test_a_broken_meter_does_not_keep_the_others_from_being_learned(self) -> None:
         state, street = self.learned(lambda frame: frame, {3: 0.05}, 0)
         honest = np.arange(12) != 3
@@ -190,6 +192,7 @@ class TestWhatIsLearnedUnderDifficulties:
         assert (off < 3.0 * np.sqrt(state.learned.variance))[honest].all()
 
 
+@pytest.mark.canary("0")
 @pytest.mark.parametrize("inverters", [0, 12])
 def test_states_are_values(inverters: int) -> None:
     """A step leaves the state that it begins from as it was, and one that was kept goes on just the same."""

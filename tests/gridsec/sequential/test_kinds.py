@@ -229,6 +229,7 @@ class TestHonestMeters:
             assert not repeats.lags(memory).any()
         assert memory.longest.max() >= 8
 
+    @pytest.mark.canary("0.3")
     @pytest.mark.parametrize("share", [0.0, 0.1, 0.3])
     def test_meters_calmer_than_promised_in_a_still_night(self, share: float) -> None:
         """The data sheet says 0.05 %, the meter has hardly any jitter, the voltage wanders slowly."""
@@ -309,6 +310,7 @@ class TestFeeders:
             out.append(seen)
         return out
 
+    @pytest.mark.canary("coordinated-coordinated")
     @pytest.mark.parametrize(
         ("kind", "look"),
         [
@@ -330,6 +332,7 @@ class TestFeeders:
             assert len(seen.named) == 2
             assert max(seen.named.values()) <= SOON_S[kind]
 
+    @pytest.mark.canary("21")
     @pytest.mark.parametrize("seed", [20, 21])
     def test_clocks_that_are_off_are_recognised(self, street: tuple[Site, Watcher], seed: int) -> None:
         site, watcher = street
@@ -339,6 +342,7 @@ class TestFeeders:
         assert not seen.honest
         assert CLOCK_S != DELAY_S
 
+    @pytest.mark.canary("1.0-1.0")
     @pytest.mark.parametrize("jitter", [1.0, 0.2, 0.0])
     @pytest.mark.parametrize("hour", [12.0, 1.0])
     def test_honest_meters_are_not_called_anything(
@@ -375,6 +379,7 @@ class TestFeeders:
         assert looks[0] == {Kind.STUCK}
         assert looks[-1] == {Kind.OFFSET}
 
+    @pytest.mark.canary("1")
     @pytest.mark.parametrize("seed", [1, 5, 6])
     def test_kinds_belong_to_named_meters_and_are_forgotten_with_them(
         self, street: tuple[Site, Watcher], seed: int

@@ -102,6 +102,7 @@ class TestHonestStreets:
         estimate = answers[-1][0]
         assert (np.abs(estimate.v2 - street.truth()) <= estimate.bound).all()
 
+    @pytest.mark.acceptance
     def test_the_standard_deviation_is_about_right(self) -> None:
         """Over many streets, the error in standard deviations is neither large nor tiny."""
         ratio = []
@@ -126,6 +127,7 @@ class TestHonestStreets:
 
 
 class TestLiars:
+    @pytest.mark.canary("0")
     @pytest.mark.parametrize("seed", range(6))
     def test_a_third_of_the_meters_is_named_and_nobody_else(self, seed: int) -> None:
         rng = np.random.default_rng([11, seed])
@@ -241,6 +243,7 @@ class TestGaps:
         assert verdict.decision is Decision.UNDECIDED
         np.testing.assert_array_equal(estimate.v2, answers[-1][0].v2)
 
+    @pytest.mark.acceptance
     @settings(max_examples=15, deadline=None)
     @given(seed=st.integers(0, 2**32 - 1))
     def test_absurd_frames_raise_nothing(self, seed: int) -> None:

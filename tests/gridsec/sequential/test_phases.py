@@ -142,6 +142,7 @@ class TestPhasesThatDoNotTouch:
             np.array(whole.tails) * (3.0 * tests - 2.0), 3.0 * tests * np.array(alone.tails), rtol=1e-12
         )
 
+    @pytest.mark.canary("lies0-True")
     @pytest.mark.parametrize("meshed", [False, True])
     @pytest.mark.parametrize(
         "lies",
@@ -217,6 +218,7 @@ class TestTheEuropeanFeeder:
             profile_s=300_000.0,
         )
 
+    @pytest.mark.acceptance
     def test_the_prior_is_the_covariance_of_the_power_flow(self) -> None:
         site = self.trial(None).stated
         assert isinstance(site.feeder, PhasedFeeder)
@@ -234,6 +236,7 @@ class TestTheEuropeanFeeder:
         assert np.linalg.norm(expected[apart]) > 0.1 * np.linalg.norm(expected)
         assert np.linalg.norm((found - expected)[apart]) < 0.2 * np.linalg.norm(expected[apart])
 
+    @pytest.mark.acceptance
     def test_eighteen_liars_are_named_and_nobody_else(self) -> None:
         this = self.trial(Lie(Trick.BIAS, 18, 3.0, onset_s=20.0))
         watcher = design_site(this.stated)
@@ -283,6 +286,7 @@ class TestTheEuropeanFeeder:
         assert verdict.cause is Cause.TOO_FEW_METERS
         assert "15 meters report from there; at least 37" in verdict.reason
 
+    @pytest.mark.canary("0.0")
     @pytest.mark.parametrize("said", [None, np.nan, 0.0])
     def test_a_whole_phase_that_lies_is_never_clean_without_its_busbar_voltage(
         self, said: float | None
@@ -298,6 +302,7 @@ class TestTheEuropeanFeeder:
             state, _, verdict = watcher.step(state, replace(frame, y=told, v0_phases=v0))
             assert verdict.decision is not Decision.CLEAN
 
+    @pytest.mark.acceptance
     def test_absurd_frames_get_an_answer(self) -> None:
         this = self.trial(None, 32.0)
         watcher = design_site(this.stated)
@@ -323,6 +328,7 @@ class TestTheEuropeanFeeder:
         assert verdict.decision is Decision.UNDECIDED
 
 
+@pytest.mark.canary("kerber-landnetz")
 @pytest.mark.parametrize("name", ["ieee-european-lv", "kerber-landnetz"])
 def test_a_busbar_that_moved_while_it_was_silent_accuses_nobody(name: str) -> None:
     """A tap changer moves all voltages by 1.25 %, and the busbar's meter tells of it only later."""

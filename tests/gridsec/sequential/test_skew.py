@@ -69,6 +69,7 @@ def test_all_clocks_off_and_a_still_feeder_is_clean_and_liars_are_named() -> Non
     assert state.skew is None
 
 
+@pytest.mark.acceptance
 def test_tap_steps_accuse_no_meter_with_a_measured_offset() -> None:
     """Clocks within 3 s, a tap step every two minutes: without the offsets honest meters are named."""
     unknown, _ = run(0, 480, TAP_PU, measured=False)

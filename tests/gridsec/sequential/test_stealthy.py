@@ -19,6 +19,7 @@ CASES = [
 ]
 
 
+@pytest.mark.canary("kerber-dorfnetz-contiguous-0.5")
 @pytest.mark.parametrize(("feeder", "how", "share"), CASES)
 def test_a_large_error_of_a_stealthy_third_is_not_clean(feeder: str, how: str, share: float) -> None:
     played = run(Setting(feeder, Model.MATCHED, learned=True, seed=1), how, share)

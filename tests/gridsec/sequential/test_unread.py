@@ -22,6 +22,7 @@ from tests.gridsec.street import Street, make_plant
 WHO = np.array([3])
 
 
+@pytest.mark.canary("0.0013-30")
 @pytest.mark.parametrize("back", [30, 999])
 @pytest.mark.parametrize("size", [0.0013, 0.0015])
 def test_a_busbar_that_moves_unread_acquits_nobody(size: float, back: int) -> None:
@@ -64,6 +65,7 @@ def test_powers_are_in_doubt_as_long_as_residuals_are_remembered_that_were_made_
     assert (state.p == 1.0).all()
 
 
+@pytest.mark.canary("60")
 @pytest.mark.parametrize("silent", [60, 120])
 def test_silence_clears_no_inverter(silent: int) -> None:
     """As many readings as without: ticks at which nobody is heard say nothing of anybody."""
@@ -93,6 +95,7 @@ def test_only_those_who_feel_an_inverter_clear_it() -> None:
     assert all(verdict.inverters[1] for _, verdict in answers)
 
 
+@pytest.mark.canary("attack1-500-800")
 @pytest.mark.parametrize(
     ("attack", "restart", "ticks"),
     [(Stuck(WHO, 1_320.0, 9e9), 560, 1_100), (Replay(WHO, 1_420.0, 9e9, delay_s=100.0), 500, 800)],

@@ -74,6 +74,7 @@ def test_alone_it_is_a_division() -> None:
     assert furthest(tight, g).size == pytest.approx(np.max(np.abs(g) / np.abs(rows).max(axis=0)), rel=1e-12)
 
 
+@pytest.mark.acceptance
 def test_a_street_equals_an_integer_program() -> None:
     rng = np.random.default_rng(11)
     far = np.abs(np.subtract.outer(np.arange(20), np.arange(20)))

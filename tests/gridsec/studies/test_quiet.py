@@ -95,6 +95,7 @@ def test_hidden_lies_are_within_the_limits_and_noticeable_ones_are_not(seed: int
         assert (np.abs(offsets(given, m, s)) > given.limit[s]).any(axis=1).all()
 
 
+@pytest.mark.canary("1")
 @pytest.mark.parametrize("seed", range(4))
 def test_no_explanation_that_believes_a_large_liar_is_a_rival(seed: int) -> None:
     """All sets of accused meters, a loosened power with each, in ten draws of errors and of other lies."""

@@ -31,6 +31,7 @@ from tests.service.liars import FEEDER, START, rounds, until
 from tests.service.running import Outlet
 
 
+@pytest.mark.acceptance
 def test_a_write_that_fails_in_an_unforeseen_way_is_shown_and_tried_again(
     site: Site, attacked: list[Sample], path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -184,6 +185,7 @@ def test_what_was_found_before_a_defect_is_not_lost(
         assert "a defect" in live.watches[FEEDER].problem
 
 
+@pytest.mark.canary("False")
 @pytest.mark.parametrize("for_ever", [True, False])
 def test_alarms_of_before_a_defect_in_the_alarms_reach_the_database(
     site: Site, attacked: list[Sample], path: Path, monkeypatch: pytest.MonkeyPatch, for_ever: bool
