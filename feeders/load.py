@@ -28,18 +28,19 @@ from feeders.equipment import (
 from feeders.forecast import Forecast, forecast
 from feeders.late import late
 from feeders.load_phases import spanned, unsupported
+from feeders.registers import registered
 from feeders.schema import CustomerRow, FeederTables, validate
 from feeders.taps import Referred, refer
 from feeders.topology import Edge, Tree, tree
 from gridsec.accuracy import MeterAccuracy
-from gridsec.arrays import Bools, Floats, Ints, frozen
+from gridsec.arrays import Floats, Ints, frozen
 from gridsec.droop import Droop
 from gridsec.errors import FeederInvalid
 from gridsec.feeder import Feeder
 from gridsec.mesh import Meshed, MeshedFeeder, PhasedMesh
 from gridsec.monitor import Plant
 from gridsec.network import Network
-from gridsec.online import Frame, PowerOrigin
+from gridsec.online import Frame
 from gridsec.phases import PHASES, PhasedFeeder, ThreePhaseFeeder
 
 __all__ = [
@@ -352,7 +353,8 @@ def to_frame(site: Site, snapshot: Snapshot) -> Frame:
     Active power: a register of f = `p_error_percent` and steps of 2 h shows r; the truth is within
     ``(f |r| + h) / (1 - f)`` of it. Beyond the customer's largest load or generation it is believed less and
     less, and at twice of that not at all: a load that is not there is the cover of colluding voltage meters,
-    and a connection limits what it can pretend. Where there is no reading, or one that is not finite or
+    and a connection limits what it can pretend. Without a finite bound of the model error it is not used
+    (`feeders.registers`). Where there is no reading, or one that is not finite or
     beyond anything the customer could draw, all that is known is the interval from full generation without
     load to full load without generation. Its middle is p; `p_std_kw` of a customer without a meter says how
     far from that the truth is, and the half-width is `sqrt(3)` of it if that is less. With
@@ -382,18 +384,7 @@ def to_frame(site: Site, snapshot: Snapshot) -> Frame:
     aged = late(site, snapshot)
     if aged is not None:
         metered[aged.useless] = np.nan
-    known = np.abs(metered) <= model.credible  # False for NaN
-    p = np.where(known, metered, 0.5 * (model.load_peak - model.pv_peak))
-    beyond = np.maximum(p - model.load_peak, 0.0) + np.maximum(-p - model.pv_peak, 0.0)
-    doubt = np.minimum(2.0 * beyond, np.abs(p))
-    p_error = np.where(known, model.p_fraction * np.abs(p) + model.p_floor + doubt, model.p_unread)
-    low = np.maximum(p - p_error, 0.0)
-    most = np.minimum(p + p_error + model.pv_peak, model.load_peak)
-    high = np.maximum(np.maximum(most, p + p_error), 0.0)
-    q_low = low * model.tan_min - model.q_floor
-    q_high = high * model.tan_max + model.q_floor
-    q_error = 0.5 * (q_high - q_low)
-
+    load = registered(site, metered)
     q_net = np.full(model.load_peak.size, np.nan)
     q_net[site.meters] = -snapshot.q_kvar / base_kva
     q_net[~(np.abs(q_net) <= model.credible)] = np.nan
@@ -403,25 +394,18 @@ def to_frame(site: Site, snapshot: Snapshot) -> Frame:
         y=y,
         seen=seen,
         v0_squared=v0_squared,
-        p=-p,
-        p_error=p_error,
-        q=-0.5 * (q_low + q_high),
-        q_error=np.where(known, q_error, np.minimum(q_error, model.q_unread)),
+        p=-load.p,
+        p_error=load.p_error,
+        q=-load.q,
+        q_error=load.q_error,
         q_net=q_net,
         q_net_error=np.maximum(model.q_error, model.q_fraction * size),
         v0_phases=v0_phases,
-        p_origin=_origin(metered, known, beyond),
+        p_origin=load.origin,
         clock_offset=snapshot.clock_offset_s,
     )
-    frame = frame if site.forecast is None else site.forecast.fill(frame, ~known)
+    frame = frame if site.forecast is None else site.forecast.fill(frame, ~load.known)
     return frame if aged is None else aged.widen(site, frame)
-
-
-def _origin(metered: Floats, known: Bools, beyond: Floats) -> Ints:
-    """`PowerOrigin` of the powers, (N,)."""
-    excess = (known & (beyond > 0.0)) | (np.isfinite(metered) & ~known)
-    read = np.where(known, PowerOrigin.READ, PowerOrigin.UNREAD)
-    return np.where(excess, PowerOrigin.BEYOND, read).astype(np.intp)
 
 
 def _busbar(v0_volt: Floats | float, base_volt: float) -> tuple[float, Floats | None]:

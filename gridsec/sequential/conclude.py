@@ -105,7 +105,7 @@ def conclude(
     said = _beside_meters(design, inverters, differs, amounts, tick.rivals, open_, said)
     said = _unexplained(tick.seen.misfit, said)
     if not (tick.rivals or open_ or all_of(state.doubts.vouched)):
-        said = _unread(design, ~state.doubts.vouched[max(s, 0)], estimate, said)
+        said = _unread(design, tick.frame, ~state.doubts.vouched[max(s, 0)], estimate, said)
     decision, cause, reason = said
     verdict = Verdict(
         decision,
@@ -297,7 +297,7 @@ def _unexplained(misfit: tuple[bool, ...], said: _Said) -> _Said:
     return Decision.UNDECIDED, Cause.MISFIT, sentence
 
 
-def _unread(design: SequentialDesign, unread: Bools, estimate: Estimate, said: _Said) -> _Said:
+def _unread(design: SequentialDesign, frame: Frame, unread: Bools, estimate: Estimate, said: _Said) -> _Said:
     """The answer, unless a voltage beside a power that is not read is known too badly to be called clean."""
     if said[1] not in _MILD or not any_of(unread):
         return said
@@ -307,7 +307,9 @@ def _unread(design: SequentialDesign, unread: Bools, estimate: Estimate, said: _
     wide = unread & ~(percent <= limit)
     if not any_of(wide):
         return said
-    return Decision.UNDECIDED, Cause.MISSING_POWERS, words.unread(design.names, wide, percent, limit)
+    origins = np.zeros(frame.p.size, dtype=np.intp) if frame.p_origin is None else frame.p_origin
+    sentence = words.unread(design.names, wide, origins[at], percent, limit)
+    return Decision.UNDECIDED, Cause.MISSING_POWERS, sentence
 
 
 _DEAD = 1e-2

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats
-from gridsec.online import Explanation
+from gridsec.arrays import Bools, Floats, Ints
+from gridsec.online import Explanation, PowerOrigin
 from gridsec.phases.feeder import PHASES
 from gridsec.sequential.design import SequentialDesign
 
@@ -58,8 +58,8 @@ def busbar_off(off: Floats, v0_squared: Floats, which: Bools) -> str:
     return f"reads {abs(worst):.1f} % {'more' if worst > 0 else 'less'} than the meters of the feeder say"
 
 
-def unread(names: tuple[str, ...], which: Bools, percent: Floats, limit: float) -> str:
-    """The customers whose power is missing and whose voltage is therefore not known well enough.
+def unread(names: tuple[str, ...], which: Bools, origins: Ints, percent: Floats, limit: float) -> str:
+    """The customers without a usable active power, and the precision of the voltage there.
 
     Parameters
     ----------
@@ -67,17 +67,31 @@ def unread(names: tuple[str, ...], which: Bools, percent: Floats, limit: float) 
         Customers of the meters.
     which : (p,)
         Meters in question.
+    origins : (p,)
+        `PowerOrigin` of their powers at this frame.
     percent : (p,)
         Standard deviation of the voltage, % of nominal.
     limit
-        Largest one that is allowed, % of nominal.
+        Largest permitted standard deviation, % of nominal.
     """
-    who = _list([name for name, one in zip(names, which, strict=True) if one])
-    worst = percent[which].max()
+    parts = []
+    for origin, sentence in _ORIGINS.items():
+        here = [name for name, one in zip(names, which & (origins == origin), strict=True) if one]
+        if here:
+            parts.append(sentence.format(_list(here)))
     return (
-        f"No active power of the same moment from {who}: the voltage there is known to {worst:.2g} % "
-        f"(standard deviation), and `[monitor] unread_std_percent` allows {limit:g} %."
+        f"{' '.join(parts)} The standard deviation of the voltage there is {percent[which].max():.2g} %; "
+        f"`[monitor] unread_std_percent` permits {limit:g} %."
     )
+
+
+_ORIGINS = {
+    PowerOrigin.UNREAD: "No active power from {}.",
+    PowerOrigin.LATE: "The active power of {} is older than the voltage.",
+    PowerOrigin.BEYOND: "The active power of {} is beyond the declared range.",
+    PowerOrigin.READ: "The running mean contains earlier ticks without a usable active power of {}.",
+}
+"""Sentence per origin. `READ`: the power is usable again, and the mean still contains ticks without it."""
 
 
 # So many explanations, and so many names in each, are told in a sentence.

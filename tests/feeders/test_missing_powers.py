@@ -175,6 +175,30 @@ def test_the_reason_names_the_setting_and_a_larger_one_is_clean() -> None:
     assert answer.decision is Decision.CLEAN
 
 
+@pytest.mark.parametrize(
+    ("how", "sentence"),
+    [
+        (omitted, "No active power from "),
+        (late, "The active power of {} is older than the voltage."),
+        (beyond, "The active power of {} is beyond the declared range."),
+        (absurd, "The active power of {} is beyond the declared range."),
+    ],
+)
+def test_the_reason_states_the_origin_of_the_power(
+    how: Callable[[Snapshot, Bools], Snapshot], sentence: str
+) -> None:
+    """Every power is missing in the same way."""
+    starts, _, ends = sentence.partition("{}")
+    reasons = {
+        verdict.reason
+        for _, _, verdict in watch(0, np.ones(site().meters.size, dtype=np.bool_), lying=False, how=how)
+        if verdict.cause is Cause.MISSING_POWERS
+    }
+    assert reasons
+    assert all(reason.startswith(starts) and ends in reason for reason in reasons)
+    assert all(any(name in reason for name in design_of().names) for reason in reasons)
+
+
 def test_one_power_that_comes_back_is_forgotten() -> None:
     """A minute after the last withheld power the answer is that of a monitor with all powers."""
     gone = street(LIARS, 1)
