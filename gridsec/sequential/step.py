@@ -122,9 +122,10 @@ def _clocks(design: SequentialDesign, state: SequentialState, frame: Frame, v2: 
         return state
     need = np.array([needed(design, s) for s in range(len(design.lengths))])
     noise = design.white / need[:, None] + state.learned.variance
-    skew = follow_clocks(design, before, frame.clock_offset, v2, noise)
+    skew = follow_clocks(design, before, state.ticks, frame.clock_offset, v2, noise)
     none = np.zeros(noise.shape)
     old, new = (none if each is None else each.variance for each in (before, skew))
+    # Variances change only at ticks at which their scale is due: no further look follows from that.
     same = (old == new).all(axis=1).tolist()
     fits = tuple(fit if one else None for fit, one in zip(state.fits, same, strict=True))
     return changed(state, skew=skew, fits=fits)
