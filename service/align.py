@@ -234,7 +234,7 @@ class Aligner:
         self._arrivals = 0
         self._active: OrderedDict[str | None, float] = OrderedDict()
         self._claims: list[float] = []
-        self._clocks = ClockOffsets((*self.meters, None), rules.tick_s)
+        self._clocks = ClockOffsets((*self.meters, None), rules.tick_s, rules.silence_s)
         self._offsets: tuple[float | None, ...] = ()
 
     # ---------------------------------------------------------------- in
@@ -507,7 +507,7 @@ class Aligner:
         )
         skipped, self._skipped = self._skipped, 0
         if self._number() % OFFSETS_TICKS == 0:
-            found = self._clocks.measured()
+            found = self._clocks.measured(t)
             self._offsets = tuple(found.get(meter) for meter in self.meters) if found else ()
         readings = tuple(seen[meter] for meter in self.meters)
         return Tick(t, readings, seen[None], silent, skipped, self._offsets)

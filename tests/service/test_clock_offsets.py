@@ -72,51 +72,67 @@ def test_only_the_wall_clock_measures() -> None:
 
 
 def test_a_backlog_at_one_instant_counts_once_with_its_newest_stamp() -> None:
-    clocks = ClockOffsets((*METERS, None), 1.0)
+    clocks = ClockOffsets((*METERS, None), 1.0, 30.0)
     for k in range(FEWEST):
         for one in (*METERS, None):
             clocks.note(one, T0 + k, T0 + k + 0.1)
         # Sixty readings of the last minute at once: each instant is one arrival.
         for age in range(60, 0, -1):
             clocks.note("d", T0 + k - age, T0 + k + 0.1)
-    assert clocks.measured() == {}
+    assert clocks.measured(T0 + FEWEST) == {}
 
 
 def test_too_few_arrivals_or_sources_measure_nothing_and_a_set_clock_forgets() -> None:
-    few, lonely = ClockOffsets((*METERS, None), 1.0), ClockOffsets(("a", None), 1.0)
+    few, lonely = ClockOffsets((*METERS, None), 1.0, 30.0), ClockOffsets(("a", None), 1.0, 30.0)
     for k in range(FEWEST - 1):
         for one in (*METERS, None):
             few.note(one, T0 + k + (3.0 if one == "a" else 0.0), T0 + k)
     for k in range(KEPT):
         lonely.note("a", T0 + k + 3.0, T0 + k)
         lonely.note(None, T0 + k, T0 + k)
-    assert few.measured() == {} == lonely.measured()
+    assert few.measured(T0 + FEWEST) == {} == lonely.measured(T0 + KEPT)
     for one in (*METERS, None):
-        few.note(one, T0 + 99.0 + (3.0 if one == "a" else 0.0), T0 + 99.0)
-    assert few.measured() == {"a": 3.0}
+        few.note(one, T0 + 20.0 + (3.0 if one == "a" else 0.0), T0 + 20.0)
+    assert few.measured(T0 + 20.0) == {"a": 3.0}
     few.forget()
-    assert few.measured() == {}
+    assert few.measured(T0 + 20.0) == {}
+
+
+def test_silent_sources_do_not_count_when_the_service_clock_is_set() -> None:
+    """Five of nine sources fall silent, then the service's clock leaps by 2 s: the four clocks are right."""
+    clocks = ClockOffsets((*METERS, None), 1.0, 30.0)
+    for k in range(300):
+        live = (*METERS, None) if k < 100 else METERS[:4]
+        for one in live:
+            clocks.note(one, T0 + k, T0 + k + (0.1 if k < 140 else 2.1))
+        if k >= 140:
+            assert clocks.measured(T0 + k) == {}
+    # A source that reports again begins with new delays.
+    for k in range(300, 300 + FEWEST):
+        for one in METERS[:5]:
+            clocks.note(one, T0 + k, T0 + k + 2.1)
+        assert clocks.measured(T0 + k) == {}
 
 
 def test_an_offset_stays_reported_down_to_half_of_the_limit() -> None:
     """No alarm flaps about the limit of 0.5 s."""
-    clocks, now = ClockOffsets((*METERS, None), 1.0), T0
+    clocks, now = ClockOffsets((*METERS, None), 1.0, 30.0), T0
     for offset, reported in ((0.4, False), (0.6, True), (0.4, True), (0.2, False), (0.4, False)):
         for _ in range(KEPT):
             now += 1.0
             for one in (*METERS, None):
                 clocks.note(one, now + (offset if one == "a" else 0.0), now)
-        assert ("a" in clocks.measured()) is reported, offset
+        assert ("a" in clocks.measured(now)) is reported, offset
 
 
 def test_ways_that_vary_more_than_the_offset_hide_it() -> None:
-    rng, clocks = random.Random(3), ClockOffsets((*METERS, None), 1.0)
+    rng, clocks = random.Random(3), ClockOffsets((*METERS, None), 1.0, 30.0)
     for k in range(KEPT):
         for one in (*METERS, None):
             late = rng.uniform(0.0, 10.0) if one == "a" else 0.1
             clocks.note(one, T0 + k, T0 + k + late)
         clocks.note("b", T0 + k + 0.5, T0 + k + 0.6)
-    measured = clocks.measured()
+    measured = clocks.measured(T0 + KEPT)
     assert "b" not in measured
     assert set(measured) <= {"a"}
 
