@@ -98,11 +98,12 @@ def _look(design: SequentialDesign, state: SequentialState, frame: Frame) -> _Lo
     copies = repeated(kinds) * (design.decoder is None)
     x, free, lag = _inverters(design, state, frame, heard, doubts.sizes)
     q, v2_bus = _voltages(design, frame, heard, x)
-    state = _clocks(design, state, frame, v2_bus[design.prior.meters])
-    residual = heard.y - v2_bus[design.prior.meters] - state.learned.bias
     if state.x is not None and frame.t - state.t >= design.lengths[-1] * design.step_s:
         # After a pause as long as the longest scale loads are others: nothing is remembered.
-        state = changed(state, window=empty(design.lengths, residual.size), fits=(None,) * len(state.fits))
+        window = empty(design.lengths, heard.y.size)
+        state = changed(state, window=window, fits=(None,) * len(state.fits), skew=None)
+    state = _clocks(design, state, frame, v2_bus[design.prior.meters])
+    residual = heard.y - v2_bus[design.prior.meters] - state.learned.bias
     window = push(state.window, design.lengths, residual, heard.live)
     swing = _swing(design, v2_bus, heard.v0_squared)
     if state.ticks % _STALE == 0 or swing > max(_GROWN * state.swing, _CALM):

@@ -120,6 +120,26 @@ def test_all_clocks_off_and_a_still_feeder_is_clean_and_liars_are_named() -> Non
     assert state.skew is None
 
 
+def test_a_pause_that_empties_the_window_ends_the_changes_before_it() -> None:
+    """The busbar's voltage changes during the pause; a shorter pause keeps all changes."""
+    plant = make_plant(np.random.default_rng(3), customers=P, drop=0.02)
+    made, street = prepare(plant), Street(plant, np.random.default_rng(4))
+    longest, offset = made.lengths[-1], np.full(P, 2.0)
+    for pause, fresh in ((longest - 1, False), (longest, True)):
+        state, t = init(made, street.t - 1.0), street.t
+        for k in range(40):
+            frame, rise = street.frame(), 0.02 * (k % 2)
+            frame = replace(frame, t=t + k, v0_squared=frame.v0_squared + rise, y=frame.y + rise)
+            state, _, _ = step(made, state, replace(frame, clock_offset=offset))
+        assert state.skew is not None
+        assert (state.skew.moved > 0.0).any()
+        frame = replace(street.frame(), t=t + 39.0 + pause, clock_offset=offset)
+        state, _, _ = step(made, state, replace(frame, v0_squared=frame.v0_squared + 0.05, y=frame.y + 0.05))
+        assert state.skew is not None
+        assert (not state.skew.moved.any()) is fresh
+        assert (len(state.skew.model) == 1) is fresh
+
+
 def test_tap_steps_accuse_no_meter_with_a_measured_offset() -> None:
     """Clocks within 3 s, a tap step every two minutes: without the offsets honest meters are named."""
     unknown, _ = run(0, 480, TAP_PU, measured=False)
