@@ -24,6 +24,7 @@ from gridsec.sequential.drive import Free, ahead, drive
 from gridsec.sequential.examine import Examined, ended, examine
 from gridsec.sequential.heard import Heard, clean, possible
 from gridsec.sequential.kinds import Kinds, describe, listen, repeated
+from gridsec.sequential.moment import present
 from gridsec.sequential.naming import name, supported
 from gridsec.sequential.scales import Scales, needed
 from gridsec.sequential.skew import follow as follow_clocks
@@ -77,7 +78,7 @@ def step(
     """
     if not np.isfinite(frame.t) or (state.x is not None and not frame.t > state.t):
         return state, *_unused(design, state, frame)
-    frame = possible(design, frame)
+    state, frame = _present(design, state, possible(design, frame))
     look = _look(design, state, frame)
     while look.seen.busbar is not None:
         # As if nobody read it at this tick either.
@@ -98,7 +99,7 @@ def _look(design: SequentialDesign, state: SequentialState, frame: Frame) -> _Lo
     copies = repeated(kinds) * (design.decoder is None)
     x, free, lag = _inverters(design, state, frame, heard, doubts.sizes)
     q, v2_bus = _voltages(design, frame, heard, x)
-    if state.x is not None and frame.t - state.t >= design.lengths[-1] * design.step_s:
+    if _paused(design, state, frame):
         # After a pause as long as the longest scale loads are others: nothing is remembered.
         window = empty(design.lengths, heard.y.size)
         state = changed(state, window=window, fits=(None,) * len(state.fits), skew=None)
@@ -114,6 +115,18 @@ def _look(design: SequentialDesign, state: SequentialState, frame: Frame) -> _Lo
     powers = Powers(frame, q, heard.told, heard.v0_squared, state.trust.trusted, doubts.sizes)
     seen = examine(design, now, state.model_error + transient, Honest(powers, lag.error))
     return _Look(state, heard, doubts, kinds, copies, x, free, lag, q, v2_bus, residual, transient, now, seen)
+
+
+def _paused(design: SequentialDesign, state: SequentialState, frame: Frame) -> bool:
+    """A pause as long as the longest scale."""
+    return state.x is not None and frame.t - state.t >= design.lengths[-1] * design.step_s
+
+
+def _present(design: SequentialDesign, state: SequentialState, frame: Frame) -> tuple[SequentialState, Frame]:
+    """The frame without a busbar's reading of another moment, and the state with the readings of this one."""
+    before = None if _paused(design, state, frame) else state.moment
+    moment, frame = present(design, before, frame, state.trust.trusted, state.v0_squared)
+    return state if moment is before is state.moment else changed(state, moment=moment), frame
 
 
 def _clocks(design: SequentialDesign, state: SequentialState, frame: Frame, v2: Floats) -> SequentialState:

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from feeders.load import load
+from feeders.load import load, to_frame
 from service.alarms import AlarmBook
 from service.align import OFFSETS_TICKS, Aligner, Clock, Tick, rules
 from service.clock_offsets import FEWEST, KEPT, ClockOffsets
 from service.conditions import AlarmKind, Severity, conditions
 from service.reading import Reading
 from service.report import to_json
+from service.voltages import snapshot
 from service.watch import Watch, align_rules, design
 from tests.service.reports import meter, report
 
@@ -145,6 +147,29 @@ def test_an_offset_is_a_minor_condition_with_its_seconds(offset: float, words: s
     assert found.known
     assert words in found.reason
     assert [m["clock_offset_s"] for m in to_json(now)["meters"]] == [None, offset]
+
+
+def test_the_clock_of_the_busbar_meter_is_measured_and_shown() -> None:
+    """Ahead by 2 s: ticks, snapshot, alarm of the substation, REST; no meter has an offset."""
+    site = load("cigre-lv")
+    watch = Watch(site, align_rules(site, Clock.WALL), AlarmBook(site.feeder.name))
+    watch.install(design(site))
+    rng, raised = random.Random(6), []
+    for k in range(3 * OFFSETS_TICKS + 10):
+        now = T0 + k + rng.uniform(0.05, 0.2)
+        for one in (*site.meter_ids, None):
+            stamp = T0 + k + (2.0 if one is None else 0.0)
+            volt = site.tables.meta.voltage_volt
+            _, results = watch.take(Reading(site.feeder.name, one, stamp, volt, 0.0, 0.0), now)
+            raised += [t.alarm for result in results for t in result.transitions]
+    assert ("substation", AlarmKind.CLOCK_OFFSET) in {(one.meter, one.kind) for one in raised}
+    assert watch.report is not None
+    shown = to_json(watch.report)
+    assert shown["busbar"]["clock_offset_s"] == pytest.approx(2.0, abs=0.15)
+    assert {m["clock_offset_s"] for m in shown["meters"]} == {None}
+    tick = Tick(T0, (None,) * len(site.meter_ids), None, (), busbar_offset=2.0)
+    assert to_frame(site, snapshot(site, tick)).busbar_offset == 2.0
+    assert np.isnan(to_frame(site, snapshot(site, replace(tick, busbar_offset=None))).busbar_offset)
 
 
 def test_a_watched_feeder_raises_the_alarm_and_shows_the_offset() -> None:

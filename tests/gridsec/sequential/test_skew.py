@@ -10,9 +10,13 @@ import numpy as np
 import pytest
 
 from benchmarks.clock_offsets import TAP_PU, run
+from benchmarks.late_powers import site, watcher, world
+from feeders.load import Snapshot, to_frame
+from feeders.scenario import START
 from gridsec.online import Decision
 from gridsec.sequential import init, step
 from gridsec.sequential.examine import Examined, examine
+from gridsec.sequential.moment import present
 from gridsec.sequential.skew import follow
 from tests.gridsec.sequential.test_monitor import prepare
 from tests.gridsec.street import Street, make_plant
@@ -118,6 +122,44 @@ def test_all_clocks_off_and_a_still_feeder_is_clean_and_liars_are_named() -> Non
     assert said[-1].suspects.tolist() == [k == 2 for k in range(P)]
     state, _, verdict = step(made, state, replace(street.frame(), t=street.t + 200.0))
     assert state.skew is None
+
+
+@pytest.mark.parametrize("offset", [-2.0, 4.0])
+def test_tap_steps_accuse_no_busbar_with_a_measured_offset(offset: float) -> None:
+    """Right clocks of the meters. Without the offset the busbar's meter is named."""
+    where, made, truth = site(0.0), watcher(0.0), world(0, 480, TAP_PU)
+    count, before = truth.v.shape[1], len(truth.p_kw) - truth.t.size
+    for measured in (False, True):
+        state, named, attacked = made.init(START), 0, 0
+        for k, t in enumerate(truth.t):
+            v0 = truth.v0[int(np.clip(round(k - offset), 0, truth.t.size - 1))]
+            p = truth.register * truth.p_kw[k + before]
+            said = Snapshot(t, truth.read[k], p, np.full(count, np.nan), v0)
+            said = replace(said, busbar_offset_s=offset if measured else np.nan)
+            state, _, verdict = made.step(state, to_frame(where, said))
+            named += int(verdict.busbar.any())
+            attacked += verdict.decision is Decision.ATTACKED
+        assert (named == 0) is measured
+        assert (attacked == 0) is measured
+
+
+def test_a_reading_of_another_moment_is_left_out_within_the_offset_of_a_step() -> None:
+    """Both directions, a step of the meters and of the busbar's reading."""
+    plant, trusted = make_plant(np.random.default_rng(1), customers=P, drop=0.02), np.ones(P, dtype=np.bool_)
+    made, one = prepare(plant), Street(plant, np.random.default_rng(2)).frame()
+    for offset in (2.5, -2.5):
+        moment, left = None, []
+        for k in range(40):
+            y = np.full(P, 1.0 + 0.03 * (k >= 20))
+            v0 = 1.0 + 0.03 * (k >= 20 + offset)
+            frame = replace(one, y=y, seen=trusted, v0_squared=v0, busbar_offset=offset)
+            moment, out = present(made, moment, frame, trusted, 1.0)
+            left += [k] if np.isnan(out.v0_squared) else []
+        first, last = sorted((20, int(np.ceil(20 + offset))))
+        assert left == list(range(first, last + 4))
+    moment, out = present(made, moment, replace(one, busbar_offset=np.nan), trusted, 1.0)
+    assert moment is None
+    assert np.isfinite(out.v0_squared)
 
 
 def test_a_pause_that_empties_the_window_ends_the_changes_before_it() -> None:
