@@ -6,6 +6,7 @@ the model's (injection positive).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -180,6 +181,8 @@ class Snapshot:
         Age of the powers at the voltage readings beside them, s; NaN, or None for all, where not stated.
     clock_offset_s : (p,) or None
         By how much each meter's clock is ahead, s; NaN, or None for all, where that is not measurable.
+    busbar_offset_s
+        By how much the clock of the busbar's meter is ahead, s; NaN where that is not measurable.
     """
 
     t: float
@@ -189,6 +192,7 @@ class Snapshot:
     v0_volt: Floats | float
     p_age_s: Floats | None = None
     clock_offset_s: Floats | None = None
+    busbar_offset_s: float = math.nan
 
 
 def load(path_or_name: Path | str) -> Site:
@@ -403,6 +407,7 @@ def to_frame(site: Site, snapshot: Snapshot) -> Frame:
         v0_phases=v0_phases,
         p_origin=load.origin,
         clock_offset=snapshot.clock_offset_s,
+        busbar_offset=snapshot.busbar_offset_s,
     )
     frame = frame if site.forecast is None else site.forecast.fill(frame, ~load.known)
     return frame if aged is None else aged.widen(site, frame)

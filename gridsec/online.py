@@ -11,6 +11,7 @@ Outcomes are values. UNDECIDED is an answer of its own: no answer must never loo
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from enum import IntEnum, StrEnum
 
@@ -139,6 +140,8 @@ class Frame:
         meter is not checked by that power.
     clock_offset : (p,) or None
         By how much each meter's clock is ahead, s; NaN, or None for all, where that is not measurable.
+    busbar_offset
+        By how much the clock of the busbar's meter is ahead, s; NaN where that is not measurable.
     """
 
     t: float
@@ -156,6 +159,7 @@ class Frame:
     q_std: Floats | None = None
     p_origin: Ints | None = None
     clock_offset: Floats | None = None
+    busbar_offset: float = math.nan
 
 
 @dataclass(frozen=True, slots=True)

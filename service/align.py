@@ -172,6 +172,8 @@ class Tick:
         Number of ticks directly before this one that are not judged.
     clock_offset : (p,) or ()
         By how much the clock of each meter is ahead, s; None where that is not measurable, () where none is.
+    busbar_offset
+        By how much the clock of the busbar meter is ahead, s; None where that is not measurable.
     """
 
     t: float
@@ -180,6 +182,7 @@ class Tick:
     silent: tuple[tuple[str | None, float], ...]
     skipped: int = 0
     clock_offset: tuple[float | None, ...] = ()
+    busbar_offset: float | None = None
 
 
 @dataclass(slots=True)
@@ -234,8 +237,9 @@ class Aligner:
         self._arrivals = 0
         self._active: OrderedDict[str | None, float] = OrderedDict()
         self._claims: list[float] = []
-        self._clocks = ClockOffsets((*self.meters, None), rules.tick_s)
+        self._clocks = ClockOffsets((*self.meters, None), rules.tick_s, rules.silence_s)
         self._offsets: tuple[float | None, ...] = ()
+        self._busbar_offset: float | None = None
 
     # ---------------------------------------------------------------- in
 
@@ -390,7 +394,7 @@ class Aligner:
                 source.held.clear()
                 source.last_t = source.last_heard = source.last_used = -math.inf
             self._clocks.forget()
-            self._offsets = ()
+            self._offsets, self._busbar_offset = (), None
             self._latest = wall
             self._begin(wall)
         self._latest = max(self._latest, wall)
@@ -507,10 +511,12 @@ class Aligner:
         )
         skipped, self._skipped = self._skipped, 0
         if self._number() % OFFSETS_TICKS == 0:
-            found = self._clocks.measured()
-            self._offsets = tuple(found.get(meter) for meter in self.meters) if found else ()
+            found = self._clocks.measured(t)
+            self._busbar_offset = found.get(None)
+            offsets = tuple(found.get(meter) for meter in self.meters)
+            self._offsets = offsets if any(offsets) else ()
         readings = tuple(seen[meter] for meter in self.meters)
-        return Tick(t, readings, seen[None], silent, skipped, self._offsets)
+        return Tick(t, readings, seen[None], silent, skipped, self._offsets, self._busbar_offset)
 
     def _usable(self, source: _Source, t: float) -> Reading | None:
         index = bisect_left(source.held, math.nextafter(t + self.rules.lead_s, math.inf), key=_time_of)

@@ -47,6 +47,8 @@ class BusbarReport:
         suspect.
     model_only
         `v_volt_estimated` rests on no reading of this tick, see `voltages.Grounds`.
+    clock_offset_s
+        By how much its clock is ahead of the other meters', s; None where that is not measurable.
     """
 
     judged: bool
@@ -58,6 +60,7 @@ class BusbarReport:
     v_volt_estimated: float | None = None
     attack_volt_estimated: float | None = None
     model_only: bool = False
+    clock_offset_s: float | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return what REST's `state` shows."""
@@ -106,6 +109,7 @@ def busbar_report(
         v_volt_estimated=number(estimated),
         attack_volt_estimated=number(attack),
         model_only=not rests_on.measured[k],
+        clock_offset_s=tick.busbar_offset,
     )
 
 

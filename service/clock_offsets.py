@@ -43,12 +43,16 @@ class ClockOffsets:
         Meters, and None for the busbar's meter.
     tick_s
         Interval of the ticks, s.
+    silence_s
+        Time without an arrival after which the delays of a source are forgotten, s. The service's clock may
+        be set meanwhile: delays of sources that no longer report would shift the median of all.
     """
 
-    def __init__(self, sources: Iterable[str | None], tick_s: float) -> None:
+    def __init__(self, sources: Iterable[str | None], tick_s: float, silence_s: float) -> None:
         self._delays: dict[str | None, deque[float]] = {source: deque(maxlen=KEPT) for source in sources}
         self._arrived: dict[str | None, float] = {}
         self._least = max(LEAST_S, LEAST_TICKS * tick_s)
+        self._silence = silence_s
         self._reported: set[str | None] = set()
 
     def note(self, source: str | None, t: float, arrival: float) -> None:
@@ -75,8 +79,17 @@ class ClockOffsets:
         self._arrived.clear()
         self._reported.clear()
 
-    def measured(self) -> Mapping[str | None, float]:
-        """Return the measurable offsets, s; positive where a clock is ahead."""
+    def measured(self, now: float) -> Mapping[str | None, float]:
+        """Return the measurable offsets, s; positive where a clock is ahead.
+
+        Parameters
+        ----------
+        now
+            Wall time, Unix s. Delays of silent sources are forgotten.
+        """
+        for source in [each for each, last in self._arrived.items() if now - last > self._silence]:
+            del self._arrived[source]
+            self._delays[source].clear()
         middle = {source: median(delays) for source, delays in self._delays.items() if len(delays) >= FEWEST}
         if len(middle) < SOURCES:
             self._reported.clear()

@@ -118,7 +118,8 @@ def conditions(report: FeederReport) -> list[Condition]:
       `data-loss` says already why: everybody of whom a reading is missing is silent.
     - `learning-stalled`: the fixed error of a meter is not learned after twice the expected time; one
       condition per feeder. Unknown at a tick without a monitor.
-    - `clock-offset`: the clock of a meter is measurably ahead or behind, or its readings come late.
+    - `clock-offset`: the clock of a meter, or of the busbar's, is measurably ahead or behind, or its readings
+      come late.
 
     Parameters
     ----------
@@ -298,14 +299,14 @@ def _undecided(report: FeederReport) -> Iterable[Condition]:
 
 
 def _clocks(report: FeederReport) -> Iterable[Condition]:
-    for meter in report.meters:
-        offset = meter.clock_offset_s
+    each = [(meter.meter, meter.clock_offset_s) for meter in report.meters]
+    for meter, offset in (*each, (BUSBAR, report.busbar.clock_offset_s)):
         if offset is None:
             continue
         side = "ahead of" if offset > 0.0 else "behind"
         late = "" if offset > 0.0 else ", or its readings come later"
         reason = f"the clock is {abs(offset):.1f} s {side} the other meters'{late}"
-        yield Condition(AlarmKind.CLOCK_OFFSET, report.feeder, meter.meter, Severity.MINOR, reason=reason)
+        yield Condition(AlarmKind.CLOCK_OFFSET, report.feeder, meter, Severity.MINOR, reason=reason)
 
 
 def _learning(report: FeederReport) -> Iterable[Condition]:

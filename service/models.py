@@ -109,6 +109,10 @@ class BusbarMeterState(BaseModel):
         default=None, description="What it reads too much, on average, V; 0 if no suspect."
     )
     model_only: ModelOnly = False
+    clock_offset_s: Number = Field(
+        default=None,
+        description="By how much its clock is ahead of the other meters', s; null where not measurable.",
+    )
 
 
 class CustomerState(BaseModel):

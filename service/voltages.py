@@ -40,6 +40,7 @@ def snapshot(site: Site, tick: Tick) -> Snapshot:
         v0_volt=busbar_volt(site, tick),
         p_age_s=None if np.isnan(age).all() else age,
         clock_offset_s=np.array(tick.clock_offset, dtype=np.float64) if any(tick.clock_offset) else None,
+        busbar_offset_s=nan if tick.busbar_offset is None else tick.busbar_offset,
     )
 
 

@@ -28,7 +28,9 @@ _OFFSETS = 4.0
 _LITTLE = 0.1
 """Variance of a change, as a part of that of a mean, below which it is left out."""
 _STEP = 4.0
-"""Ratio of two variances that are used alike: each other one is a new factorisation."""
+"""Largest ratio of a variance that is used to the one found: each other one is a new factorisation."""
+_HOLD = 4
+"""Smallest number of ticks from one fall of the variances of a scale to the next."""
 _LONGEST = 64
 """Largest number of ticks over which changes are taken."""
 
@@ -44,7 +46,7 @@ class Skew:
     moved : (longest, p)
         c at the last ticks, the newest last, squared pu.
     variance : (s, p)
-        Variance that is added to those of the means, squared pu^2, in powers of `_STEP`.
+        Variance that is added to those of the means, squared pu^2, at most `_STEP` times what is found.
     aside : (s, p)
         Meters that a scale does not judge.
     """
@@ -68,15 +70,22 @@ class Skew:
         return np.asarray(enough.any(axis=0) & self.aside.any(axis=0))
 
 
-def follow(
-    design: SequentialDesign, before: Skew | None, offset_s: Floats | None, v2: Floats, noise: Floats
+def follow(  # noqa: PLR0917  # the tick, and what it brings
+    design: SequentialDesign,
+    before: Skew | None,
+    tick: int,
+    offset_s: Floats | None,
+    v2: Floats,
+    noise: Floats,
 ) -> Skew | None:
-    """Take in one tick; None while no offset is measured.
+    """Take in one tick; None while no offset is measured and no variance is left to take back.
 
     Parameters
     ----------
     design, before
         The design, and the changes so far.
+    tick
+        Number of the tick: variances of a scale change only at ticks at which it is due.
     offset_s : (p,)
         By how much each meter's clock is ahead, s; NaN where that is not measurable.
     v2 : (p,)
@@ -84,10 +93,8 @@ def follow(
     noise : (s, p)
         Variances of the means without offsets, squared pu^2.
     """
-    if offset_s is None:
-        return None
-    size = np.abs(np.nan_to_num(offset_s))
-    if not any_of(size):
+    size = np.zeros(v2.size) if offset_s is None else np.abs(np.nan_to_num(offset_s))
+    if not any_of(size) and (before is None or not any_of(before.variance)):
         return None
     lengths, step = np.array(design.lengths), design.step_s
     ticks = np.where(size > 0.0, np.minimum(np.ceil(size / step) + 1.0, _LONGEST), 0.0)
@@ -97,17 +104,30 @@ def follow(
         change = np.where(ticks >= k, np.maximum(change, np.abs(v2 - old[-k])), change)
     moved = np.zeros((lengths[-1], v2.size)) if before is None else before.moved
     moved = np.vstack([moved[1:], change])
-    mean = np.stack([moved[-length:].mean(axis=0) for length in lengths])
     reach = np.minimum(_OFFSETS * size, lengths[-1] * step)
     aside = lengths[:, None] * step < reach
-    kept = np.zeros_like(noise) if before is None else before.variance
-    return Skew(np.vstack([old, v2])[-_LONGEST:], moved, _variance(mean * mean, noise, kept), aside)
+    variance = np.zeros_like(noise) if before is None else before.variance.copy()
+    for s, length in enumerate(design.lengths):
+        if tick % design.every[s] == 0:
+            mean = moved[-length:].mean(axis=0)
+            # The variance of a meter that the scale does not judge is in no result.
+            found = np.where((size > 0.0) & ~aside[s], mean * mean, 0.0)
+            looks = -(-_HOLD // design.every[s])
+            falls = tick % (looks * design.every[s]) == 0
+            variance[s] = _variance(found, noise[s], variance[s], falls=falls)
+    return Skew(np.vstack([old, v2])[-_LONGEST:], moved, variance, aside)
 
 
-def _variance(found: Floats, noise: Floats, before: Floats) -> Floats:
-    """The variances in powers of `_STEP`, with hysteresis."""
-    wanted = np.where(found > _LITTLE * noise, found, 0.0)
-    with np.errstate(divide="ignore"):
-        raised = _STEP ** np.ceil(np.log(np.where(wanted > 0.0, wanted, 1.0)) / np.log(_STEP))
-    keep = (wanted <= before) & (wanted * _STEP**2 >= before) & (wanted > 0.0)
-    return np.where(keep, before, np.where(wanted > 0.0, raised, 0.0))
+def _variance(found: Floats, noise: Floats, before: Floats, *, falls: bool) -> Floats:
+    """Variances of one scale: the present ones while they are 1 to `_STEP` times those found, (p,).
+
+    Each other variance is a new factorisation of the scale. One out of its range therefore renews all of
+    them, to the middle of the range, and a variance falls at most once in `_HOLD` ticks.
+    """
+    little = _LITTLE * noise
+    wanted = np.where(found > np.where(before > 0.0, little / _STEP, little), found, 0.0)
+    rises, fallen = wanted > before, wanted * _STEP < before
+    if not any_of(rises) and not (falls and any_of(fallen)):
+        return before
+    wanted = wanted * np.sqrt(_STEP)
+    return np.asarray(wanted if falls else np.maximum(wanted, before))

@@ -24,6 +24,7 @@ from gridsec.sequential.doubts import none as no_doubts
 from gridsec.sequential.drive import Free
 from gridsec.sequential.kinds import Kinds
 from gridsec.sequential.kinds import empty as no_kinds
+from gridsec.sequential.moment import Moment
 from gridsec.sequential.release import Released
 from gridsec.sequential.repeats import forget as forget_calm
 from gridsec.sequential.skew import Skew
@@ -126,6 +127,8 @@ class SequentialState:
         What the frames do not know.
     skew
         Changes of the voltages within clock offsets; None while no offset is measured.
+    moment
+        Last readings of all meters; None while the clock offset of the busbar's is not measured.
     learning
         What was gathered of the meters' fixed errors; None once they are known.
     learned
@@ -160,6 +163,7 @@ class SequentialState:
     released: Released | None
     doubts: Doubts
     skew: Skew | None
+    moment: Moment | None
     learning: Learning | None
     learned: Learned
     model_error: Floats
@@ -226,6 +230,7 @@ def init(
         released=None,
         doubts=no_doubts(design),
         skew=None,
+        moment=None,
         learning=known.learning,
         learned=known.learned,
         model_error=np.zeros(p),

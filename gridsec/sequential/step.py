@@ -24,6 +24,7 @@ from gridsec.sequential.drive import Free, ahead, drive
 from gridsec.sequential.examine import Examined, ended, examine
 from gridsec.sequential.heard import Heard, clean, possible
 from gridsec.sequential.kinds import Kinds, describe, listen, repeated
+from gridsec.sequential.moment import present
 from gridsec.sequential.naming import name, supported
 from gridsec.sequential.scales import Scales, needed
 from gridsec.sequential.skew import follow as follow_clocks
@@ -77,7 +78,7 @@ def step(
     """
     if not np.isfinite(frame.t) or (state.x is not None and not frame.t > state.t):
         return state, *_unused(design, state, frame)
-    frame = possible(design, frame)
+    state, frame = _present(design, state, possible(design, frame))
     look = _look(design, state, frame)
     while look.seen.busbar is not None:
         # As if nobody read it at this tick either.
@@ -98,11 +99,12 @@ def _look(design: SequentialDesign, state: SequentialState, frame: Frame) -> _Lo
     copies = repeated(kinds) * (design.decoder is None)
     x, free, lag = _inverters(design, state, frame, heard, doubts.sizes)
     q, v2_bus = _voltages(design, frame, heard, x)
+    if _paused(design, state, frame):
+        # After a pause as long as the longest scale loads are others: nothing is remembered.
+        window = empty(design.lengths, heard.y.size)
+        state = changed(state, window=window, fits=(None,) * len(state.fits), skew=None)
     state = _clocks(design, state, frame, v2_bus[design.prior.meters])
     residual = heard.y - v2_bus[design.prior.meters] - state.learned.bias
-    if state.x is not None and frame.t - state.t >= design.lengths[-1] * design.step_s:
-        # After a pause as long as the longest scale loads are others: nothing is remembered.
-        state = changed(state, window=empty(design.lengths, residual.size), fits=(None,) * len(state.fits))
     window = push(state.window, design.lengths, residual, heard.live)
     swing = _swing(design, v2_bus, heard.v0_squared)
     if state.ticks % _STALE == 0 or swing > max(_GROWN * state.swing, _CALM):
@@ -115,6 +117,18 @@ def _look(design: SequentialDesign, state: SequentialState, frame: Frame) -> _Lo
     return _Look(state, heard, doubts, kinds, copies, x, free, lag, q, v2_bus, residual, transient, now, seen)
 
 
+def _paused(design: SequentialDesign, state: SequentialState, frame: Frame) -> bool:
+    """A pause as long as the longest scale."""
+    return state.x is not None and frame.t - state.t >= design.lengths[-1] * design.step_s
+
+
+def _present(design: SequentialDesign, state: SequentialState, frame: Frame) -> tuple[SequentialState, Frame]:
+    """The frame without a busbar's reading of another moment, and the state with the readings of this one."""
+    before = None if _paused(design, state, frame) else state.moment
+    moment, frame = present(design, before, frame, state.trust.trusted, state.v0_squared)
+    return state if moment is before is state.moment else changed(state, moment=moment), frame
+
+
 def _clocks(design: SequentialDesign, state: SequentialState, frame: Frame, v2: Floats) -> SequentialState:
     """The state with the voltages' changes within clock offsets, and without fits of other variances."""
     before = state.skew
@@ -122,9 +136,10 @@ def _clocks(design: SequentialDesign, state: SequentialState, frame: Frame, v2: 
         return state
     need = np.array([needed(design, s) for s in range(len(design.lengths))])
     noise = design.white / need[:, None] + state.learned.variance
-    skew = follow_clocks(design, before, frame.clock_offset, v2, noise)
+    skew = follow_clocks(design, before, state.ticks, frame.clock_offset, v2, noise)
     none = np.zeros(noise.shape)
     old, new = (none if each is None else each.variance for each in (before, skew))
+    # Variances change only at ticks at which their scale is due: no further look follows from that.
     same = (old == new).all(axis=1).tolist()
     fits = tuple(fit if one else None for fit, one in zip(state.fits, same, strict=True))
     return changed(state, skew=skew, fits=fits)

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from feeders.load import load
+from feeders.load import load, to_frame
 from service.alarms import AlarmBook
 from service.align import OFFSETS_TICKS, Aligner, Clock, Tick, rules
 from service.clock_offsets import FEWEST, KEPT, ClockOffsets
 from service.conditions import AlarmKind, Severity, conditions
 from service.reading import Reading
 from service.report import to_json
+from service.voltages import snapshot
 from service.watch import Watch, align_rules, design
 from tests.service.reports import meter, report
 
@@ -72,51 +74,67 @@ def test_only_the_wall_clock_measures() -> None:
 
 
 def test_a_backlog_at_one_instant_counts_once_with_its_newest_stamp() -> None:
-    clocks = ClockOffsets((*METERS, None), 1.0)
+    clocks = ClockOffsets((*METERS, None), 1.0, 30.0)
     for k in range(FEWEST):
         for one in (*METERS, None):
             clocks.note(one, T0 + k, T0 + k + 0.1)
         # Sixty readings of the last minute at once: each instant is one arrival.
         for age in range(60, 0, -1):
             clocks.note("d", T0 + k - age, T0 + k + 0.1)
-    assert clocks.measured() == {}
+    assert clocks.measured(T0 + FEWEST) == {}
 
 
 def test_too_few_arrivals_or_sources_measure_nothing_and_a_set_clock_forgets() -> None:
-    few, lonely = ClockOffsets((*METERS, None), 1.0), ClockOffsets(("a", None), 1.0)
+    few, lonely = ClockOffsets((*METERS, None), 1.0, 30.0), ClockOffsets(("a", None), 1.0, 30.0)
     for k in range(FEWEST - 1):
         for one in (*METERS, None):
             few.note(one, T0 + k + (3.0 if one == "a" else 0.0), T0 + k)
     for k in range(KEPT):
         lonely.note("a", T0 + k + 3.0, T0 + k)
         lonely.note(None, T0 + k, T0 + k)
-    assert few.measured() == {} == lonely.measured()
+    assert few.measured(T0 + FEWEST) == {} == lonely.measured(T0 + KEPT)
     for one in (*METERS, None):
-        few.note(one, T0 + 99.0 + (3.0 if one == "a" else 0.0), T0 + 99.0)
-    assert few.measured() == {"a": 3.0}
+        few.note(one, T0 + 20.0 + (3.0 if one == "a" else 0.0), T0 + 20.0)
+    assert few.measured(T0 + 20.0) == {"a": 3.0}
     few.forget()
-    assert few.measured() == {}
+    assert few.measured(T0 + 20.0) == {}
+
+
+def test_silent_sources_do_not_count_when_the_service_clock_is_set() -> None:
+    """Five of nine sources fall silent, then the service's clock leaps by 2 s: the four clocks are right."""
+    clocks = ClockOffsets((*METERS, None), 1.0, 30.0)
+    for k in range(300):
+        live = (*METERS, None) if k < 100 else METERS[:4]
+        for one in live:
+            clocks.note(one, T0 + k, T0 + k + (0.1 if k < 140 else 2.1))
+        if k >= 140:
+            assert clocks.measured(T0 + k) == {}
+    # A source that reports again begins with new delays.
+    for k in range(300, 300 + FEWEST):
+        for one in METERS[:5]:
+            clocks.note(one, T0 + k, T0 + k + 2.1)
+        assert clocks.measured(T0 + k) == {}
 
 
 def test_an_offset_stays_reported_down_to_half_of_the_limit() -> None:
     """No alarm flaps about the limit of 0.5 s."""
-    clocks, now = ClockOffsets((*METERS, None), 1.0), T0
+    clocks, now = ClockOffsets((*METERS, None), 1.0, 30.0), T0
     for offset, reported in ((0.4, False), (0.6, True), (0.4, True), (0.2, False), (0.4, False)):
         for _ in range(KEPT):
             now += 1.0
             for one in (*METERS, None):
                 clocks.note(one, now + (offset if one == "a" else 0.0), now)
-        assert ("a" in clocks.measured()) is reported, offset
+        assert ("a" in clocks.measured(now)) is reported, offset
 
 
 def test_ways_that_vary_more_than_the_offset_hide_it() -> None:
-    rng, clocks = random.Random(3), ClockOffsets((*METERS, None), 1.0)
+    rng, clocks = random.Random(3), ClockOffsets((*METERS, None), 1.0, 30.0)
     for k in range(KEPT):
         for one in (*METERS, None):
             late = rng.uniform(0.0, 10.0) if one == "a" else 0.1
             clocks.note(one, T0 + k, T0 + k + late)
         clocks.note("b", T0 + k + 0.5, T0 + k + 0.6)
-    measured = clocks.measured()
+    measured = clocks.measured(T0 + KEPT)
     assert "b" not in measured
     assert set(measured) <= {"a"}
 
@@ -129,6 +147,29 @@ def test_an_offset_is_a_minor_condition_with_its_seconds(offset: float, words: s
     assert found.known
     assert words in found.reason
     assert [m["clock_offset_s"] for m in to_json(now)["meters"]] == [None, offset]
+
+
+def test_the_clock_of_the_busbar_meter_is_measured_and_shown() -> None:
+    """Ahead by 2 s: ticks, snapshot, alarm of the substation, REST; no meter has an offset."""
+    site = load("cigre-lv")
+    watch = Watch(site, align_rules(site, Clock.WALL), AlarmBook(site.feeder.name))
+    watch.install(design(site))
+    rng, raised = random.Random(6), []
+    for k in range(3 * OFFSETS_TICKS + 10):
+        now = T0 + k + rng.uniform(0.05, 0.2)
+        for one in (*site.meter_ids, None):
+            stamp = T0 + k + (2.0 if one is None else 0.0)
+            volt = site.tables.meta.voltage_volt
+            _, results = watch.take(Reading(site.feeder.name, one, stamp, volt, 0.0, 0.0), now)
+            raised += [t.alarm for result in results for t in result.transitions]
+    assert ("substation", AlarmKind.CLOCK_OFFSET) in {(one.meter, one.kind) for one in raised}
+    assert watch.report is not None
+    shown = to_json(watch.report)
+    assert shown["busbar"]["clock_offset_s"] == pytest.approx(2.0, abs=0.15)
+    assert {m["clock_offset_s"] for m in shown["meters"]} == {None}
+    tick = Tick(T0, (None,) * len(site.meter_ids), None, (), busbar_offset=2.0)
+    assert to_frame(site, snapshot(site, tick)).busbar_offset == 2.0
+    assert np.isnan(to_frame(site, snapshot(site, replace(tick, busbar_offset=None))).busbar_offset)
 
 
 def test_a_watched_feeder_raises_the_alarm_and_shows_the_offset() -> None:
