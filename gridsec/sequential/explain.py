@@ -348,9 +348,9 @@ class Search:
                 continue
             taken.append(first.meters)
             end, other = self._off_alike(best, base, [first])
-            yield other
-            for second in self._neighbourhoods(end.fit, best)[: _PARTS - 1]:
-                yield self._off_alike(best, base, [first, second])[1]
+            seconds = self._neighbourhoods(end.fit, best)[: _PARTS - 1]
+            more = (self._off_alike(best, base, [first, second])[1] for second in seconds)
+            yield from (each for each in (other, *more) if self._admissible(each))
 
     def _neighbourhoods(self, every: Fit, best: Solution) -> list[_Group]:
         """Groups of nearest meters that gain more than they cost, best first.
