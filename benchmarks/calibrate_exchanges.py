@@ -35,17 +35,15 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 
+from benchmarks import calibrate_intervals as intervals
 from benchmarks._arguments import count, positive
 from feeders.equipment import find
 from feeders.load import from_tables
 from feeders.load_phases import three_phase
-from feeders.meters import Channel, MeterErrors
 from feeders.recording import Recording, record
-from feeders.scenario import Scenario
 from feeders.schema import FeederTables
 from feeders.studies.calibrate import Calibrate, calibrate
 from feeders.studies.calibrate_corrections import Kind, apply, longer
-from feeders.variation import Variation
 
 FEEDERS: Final = ("cigre-lv", "kerber-landnetz", "simbench-lv-rural1")
 ERRORS: Final = ("none", "phases", "rotated", "phase", "meters", "bus", "length")
@@ -59,12 +57,9 @@ NEAR: Final = 0.15
 
 
 @dataclass(frozen=True, slots=True)
-class Recorded:
-    """Length of a recording, days; interval of the readings, s; hidden loads, kW; searched kinds."""
+class Recorded(intervals.Recorded):
+    """The same, and the searched kinds."""
 
-    days: float
-    step_s: float
-    hidden_kw: float
     kinds: tuple[Kind, ...] = tuple(Kind)
 
 
@@ -105,16 +100,7 @@ def truth_of(name: str) -> FeederTables:
 
 def recorded(truth: FeederTables, what: Recorded, seed: int, folder: Path) -> Recording:
     """Readings of the true feeder."""
-    given = Scenario(
-        seed=seed,
-        duration_s=what.days * 86_400.0,
-        dt_s=what.step_s,
-        profile_s=0.0,
-        variation=Variation(hidden_kw=what.hidden_kw, hidden_kvar=0.5 * what.hidden_kw),
-        errors=MeterErrors(report_q=seed % 2 == 1),
-        channel=Channel(loss=0.02),
-    )
-    return record(from_tables(truth), given, folder / "readings.parquet")
+    return record(from_tables(truth), what.scenario(seed), folder / "readings.parquet")
 
 
 def planted(truth: FeederTables, error: str, seed: int) -> tuple[FeederTables, str]:

@@ -44,18 +44,22 @@ class Recorded:
     step_s: float
     hidden_kw: float
 
+    def scenario(self, seed: int) -> Scenario:
+        """Clean readings with 2 % losses; reactive powers are reported with odd seeds."""
+        return Scenario(
+            seed=seed,
+            duration_s=self.days * 86_400.0,
+            dt_s=self.step_s,
+            profile_s=0.0,
+            variation=Variation(hidden_kw=self.hidden_kw, hidden_kvar=0.5 * self.hidden_kw),
+            errors=MeterErrors(report_q=seed % 2 == 1),
+            channel=Channel(loss=0.02),
+        )
+
 
 def errors(site: Site, what: Recorded, seed: int, folder: Path) -> tuple[Floats, bool]:
     """Errors of one calibration's estimates in their standard errors, and whether anything was proposed."""
-    given = Scenario(
-        seed=seed,
-        duration_s=what.days * 86_400.0,
-        dt_s=what.step_s,
-        profile_s=0.0,
-        variation=Variation(hidden_kw=what.hidden_kw, hidden_kvar=0.5 * what.hidden_kw),
-        errors=MeterErrors(report_q=seed % 2 == 1),
-        channel=Channel(loss=0.02),
-    )
+    given = what.scenario(seed)
     found = calibrate(site, record(site, given, folder / "readings.parquet"))
     meters = Meters(site, given.errors, given.channel, seed)
     bias = 100.0 * (meters.bias - meters.busbar_bias)

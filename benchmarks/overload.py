@@ -63,7 +63,7 @@ NOISE_VOLT = 0.02
 
 @dataclass(frozen=True)
 class Load:
-    """What all meters send: keys, and for each simulated second the fields besides the time."""
+    """Readings of all meters: keys, and for each simulated second the fields besides the time."""
 
     keys: tuple[str, ...]
     fields: tuple[tuple[tuple[float, float | None], ...], ...]
@@ -182,7 +182,7 @@ class Sender(threading.Thread):
                 now = time.monotonic()
                 if now < due:
                     time.sleep(due - now)
-                # What could not be sent in time is not made up for.
+                # Late readings are dropped: a burst later would hide the overload.
                 due = max(due, now - 0.1) + 1.0 / self.rate
                 place = number % len(self.load.keys)
                 row = self.load.fields[int(now - begun) % len(self.load.fields)]

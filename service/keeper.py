@@ -121,7 +121,7 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """What came of a job: event numbers if it was stored, what was read, or what went wrong."""
+    """Result of a job: event numbers if it was stored, values read, or the error."""
 
     numbers: tuple[int, ...] | None = None
     marked: bool = False
@@ -215,7 +215,7 @@ class Keeper:
 
     @property
     def takes_commands(self) -> bool:
-        """Whether a command can be sent, or is refused at once because the database is known to be away."""
+        """True if a command can be sent, or is refused at once because the database is known to be away."""
         return self.problem is not None or not self.storing
 
     def store(

@@ -326,7 +326,7 @@ class Rounds:
 
     @property
     def behind(self) -> bool:
-        """Whether ticks that are due wait for the next round."""
+        """True while due ticks wait for the next round."""
         return any(watch.pending for watch in self.watches.values())
 
     def _place(self, samples: Iterable[Sample]) -> list[Rejected]:

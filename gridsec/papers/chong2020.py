@@ -387,7 +387,7 @@ def exact_start(of: Design = "(12)") -> Run:
 
 
 def reproduce() -> Reproduction:
-    """What the paper proves, on its setting, for both designs of the observers."""
+    """Bounds of the paper on its setting, for both designs of the observers."""
     sets = sum(
         1
         for size in range(CUSTOMERS - 2 * LIARS, CUSTOMERS + 1)

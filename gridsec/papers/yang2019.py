@@ -237,7 +237,7 @@ class Setting:
 
     @property
     def isolates(self) -> bool:
-        """Whether Algorithm 2 runs; otherwise Algorithm 1."""
+        """True for Algorithm 2, False for Algorithm 1."""
         return self.sensor == ISOLATED
 
     @property

@@ -28,7 +28,7 @@ from gridsec.sequential.conditional import Fit, Judged
 
 
 def inconsistent(now: Fit, judged: Judged, model: Floats, tail: float) -> bool:
-    """Whether the misfit of the trusted meters is beyond its limit; O(p), O(p^2) close to the limit.
+    """True where the misfit of the trusted meters is beyond its limit; O(p), O(p^2) close to the limit.
 
     Parameters
     ----------

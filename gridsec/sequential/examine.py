@@ -160,7 +160,7 @@ def _own(trust: Trust) -> Trust:
 
 
 def _all_alike(design: SequentialDesign, here: Scale, now: Fit, view: View, honest: Honest) -> bool:
-    """Whether honest errors at their ends, all in the direction Q m, explain the misfit ``m^T Q m``."""
+    """True where honest errors at their ends, all in the direction Q m, explain ``m^T Q m``."""
     at = indices(now.trusted)
     v = view.judged.weights[at, None]
     error = busbar_errors(design.plant, honest.powers.v0_squared, design.sigmas[0])

@@ -406,7 +406,7 @@ class Search:
         return end, replace(other, cost=best.cost + price - self._prices(best) + worse)
 
     def _admissible(self, found: Explanation) -> bool:
-        """Whether as many meters stay trusted as may be manipulated."""
+        """True where at least `most` meters stay trusted."""
         return bool(np.count_nonzero(self.here.enough & found.trusted) >= self.design.most)
 
     def _closer(self, group: Ints, other: Solution) -> Explanation:

@@ -22,7 +22,6 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, any_of
 from gridsec.frames import busbar_errors
-from gridsec.network import hangs_on
 from gridsec.online import Frame
 from gridsec.sequential.design import SequentialDesign
 
@@ -78,7 +77,7 @@ def present(
     if before is None or before.busbar.shape[1] != said.size:
         before = Moment(np.zeros((0, said.size)), np.zeros((0, y.size)))
     allowed = np.atleast_1d(np.asarray(busbar_errors(design.plant, v0_squared, design.sigmas[0])))
-    here = hangs_on(design.plant.feeder)[design.plant.meters].astype(np.bool_) & trusted[:, None]
+    here = (design.hangs_on > 0.0) & trusted[:, None]
     moved: Bools = np.asarray(_beyond(said - before.busbar[-ticks:], allowed).any(axis=0))
     for phase in range(here.shape[1]):
         change = (y - before.y[-ticks:])[:, here[:, phase]]

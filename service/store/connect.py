@@ -190,7 +190,7 @@ class Connections:
 
     @staticmethod
     def _closed_before(error: sa.exc.DBAPIError) -> bool:
-        """Whether a call failed at once, because its connection had been closed."""
+        """True if a call failed at once because its connection had been closed."""
         if not error.connection_invalidated:
             return False
         from service.store.postgresql import NoAnswer

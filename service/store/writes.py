@@ -106,7 +106,7 @@ class Store(Reader):
 
     @property
     def lost(self) -> WriterLost | None:
-        """Why this store writes nothing more, or None; costs nothing."""
+        """Reason for which this store writes nothing more, or None; without a call to the database."""
         return self._connections.lost
 
     def _beat(self, every_s: float) -> None:
@@ -340,7 +340,7 @@ class Store(Reader):
 
 
 def _stored_before(connection: sa.Connection, key: int) -> bool:
-    """Whether the last commit had this key; the transaction has it from here on."""
+    """True if the last commit had this key; the transaction has it from here on."""
     changed = connection.execute(WRITER.update().values(commits=key).where(WRITER.c.commits != key))
     return changed.rowcount == 0
 

@@ -56,7 +56,7 @@ def files() -> Site:
 
 @pytest.fixture(scope="module")
 def results(files: Site, tmp_path_factory: pytest.TempPathFactory) -> list[TickResult]:
-    """What the service makes of half an hour of the true feeder with these files."""
+    """Results of the service for half an hour of the true feeder with these files."""
     path = tmp_path_factory.mktemp("day") / "day.parquet"
     recording = record(from_tables(tables(exchanged=False)), SCENE, path)
     return list(replay(files, read_recording(recording.path).readings(), Tally()))

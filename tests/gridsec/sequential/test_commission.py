@@ -55,7 +55,7 @@ def one(k: int) -> Bools:
 
 
 def summed(total: Floats, count: Ints, time_s: Floats, since: Floats) -> Learning:
-    """What was gathered at ticks that all counted."""
+    """Sums over ticks that all counted."""
     start = begin(np.ones(P, dtype=np.bool_), 0.0)
     return replace(start, total=total, count=count, time_s=time_s, since=since, watched_s=time_s)
 
