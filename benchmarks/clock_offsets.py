@@ -3,12 +3,14 @@
     python -m benchmarks.clock_offsets [runs] [minutes]
 
 The scene of `benchmarks.late_powers`, all powers of the moment of their voltages. Every meter's clock is off
-by a constant within 3 s: at each tick it reports voltage and power of another moment. Offsets from half a
-second on are measured, or none is. With steps the transformer changes its tap by 1.25 % once in two minutes.
+by a constant within 3 s, 15 s or 60 s, or a fifth of them within 60 s and the others within 3 s: at each tick
+it reports voltage and power of another moment. Offsets from half a second on are measured, or none is. With
+steps the transformer changes its tap by 1.25 % once in two minutes.
 
-Columns: runs; runs with an honest meter named; honest meters named; ticks CLEAN, UNDECIDED and ATTACKED, %;
-largest error of a voltage over its standard deviation; named of a third of the meters that reads 3 % wrong,
-with random signs, in the last two minutes. Exits 1 when an honest meter is named and offsets are measured.
+Columns: largest offset, s; runs; runs with an honest meter named; honest meters named; ticks CLEAN, UNDECIDED
+and ATTACKED, %; largest error of a voltage over its standard deviation; named of a third of the meters that
+reads 3 % wrong, with random signs, in the last two minutes. Exits 1 when an honest meter is named and offsets
+are measured.
 """
 
 from __future__ import annotations
@@ -31,8 +33,20 @@ from feeders.scenario import START
 from gridsec.arrays import Floats
 from gridsec.online import Decision
 
-LARGEST_S, LEAST_S = 3.0, 0.5
-"""Largest offset, and the least that is measured, s."""
+LEAST_S = 0.5
+"""Smallest offset that is measured, s."""
+NEAR_S, MIDDLE_S, FAR_S = 3.0, 15.0, 60.0
+"""Largest offsets, s; the last is `--max-skew` of the service."""
+FEW = 0.2
+"""Part of the meters with offsets within `FAR_S` where the others are within `NEAR_S`."""
+CASES = (
+    ("3", NEAR_S, 1.0, False),
+    ("3", NEAR_S, 1.0, True),
+    ("15", MIDDLE_S, 1.0, True),
+    ("60 (a fifth), 3", FAR_S, FEW, True),
+    ("60", FAR_S, 1.0, True),
+)
+"""Name, largest offset, s, part of the meters with it, and whether offsets are measured."""
 TAP_PU = 0.0125
 
 
@@ -44,7 +58,9 @@ def shifted(values: Floats, offset: Floats, k: int, first: int) -> Floats:
     return np.asarray((1.0 - share) * values[low, at] + share * values[high, at])
 
 
-def run(seed: int, duration_s: int, tap_pu: float, *, measured: bool) -> tuple[Counter[str], float]:
+def run(
+    seed: int, duration_s: int, tap_pu: float, largest_s: float = NEAR_S, part: float = 1.0, *, measured: bool
+) -> tuple[Counter[str], float]:
     """Counts of one run, and its largest error over the standard deviation.
 
     Parameters
@@ -53,12 +69,16 @@ def run(seed: int, duration_s: int, tap_pu: float, *, measured: bool) -> tuple[C
         As in `late_powers.world`.
     tap_pu
         Height of a tap step, pu.
+    largest_s, part
+        Largest offset, s, and the part of the meters with it; the others are within `NEAR_S`.
     measured
         Whether frames have the offsets.
     """
     where, made, truth = site(0.0), watcher(0.0), world(seed, duration_s, tap_pu)
     random, count = np.random.default_rng([seed, 63]), truth.v.shape[1]
-    offset = random.uniform(-LARGEST_S, LARGEST_S, count)
+    offset = random.uniform(-largest_s, largest_s, count)
+    few = np.random.default_rng([seed, 64]).random(count) < part
+    offset = np.where(few, offset, offset * (NEAR_S / largest_s))
     told = np.where(np.abs(offset) >= LEAST_S, offset, np.nan) if measured else None
     liars, sign = random.permutation(count) < count // 3, random.choice([-1.0, 1.0], count)
     state, seen, named = made.init(START), Counter[str](), np.zeros((2, count), dtype=np.bool_)
@@ -85,18 +105,21 @@ def run(seed: int, duration_s: int, tap_pu: float, *, measured: bool) -> tuple[C
 
 def main(runs: int, minutes: int) -> int:
     """Print a table; 1 if a limit is missed."""
-    print("| tap steps | offsets | runs | with honest named | honest named | CLEAN % | UNDECIDED % |", end="")
-    print(" ATTACKED % | in std | liars named |\n|" + "---|" * 10)
+    print(
+        "| tap steps | largest, s | offsets | runs | with honest named | honest named | CLEAN % |",
+        end="",
+    )
+    print(" UNDECIDED % | ATTACKED % | in std | liars named |\n|" + "---|" * 11)
     good = True
     for tap_pu in (0.0, TAP_PU):
-        for measured in (False, True):
+        for name, largest_s, part, measured in CASES:
             all_, of_std = Counter[str](), 0.0
             for seed in range(runs):
-                seen, std = run(seed, 60 * minutes, tap_pu, measured=measured)
+                seen, std = run(seed, 60 * minutes, tap_pu, largest_s, part, measured=measured)
                 all_ += seen
                 of_std = max(of_std, std)
             share = [f"{100.0 * all_[each] / all_['ticks']:.1f}" for each in Decision]
-            cells = ["yes" if tap_pu else "no", "measured" if measured else "unknown", f"{runs}"]
+            cells = ["yes" if tap_pu else "no", name, "measured" if measured else "unknown", f"{runs}"]
             cells += [f"{all_['false']}", f"{all_['honest']}", share[0], share[2], share[1], f"{of_std:.1f}"]
             cells += [f"{all_['named']} of {all_['liars']}"]
             print(f"| {' | '.join(cells)} |", flush=True)

@@ -38,6 +38,7 @@ class Cause(StrEnum):
     RESIDUALS = "residuals"
     SETTLING = "settling"
     SILENT_METERS = "silent-meters"
+    CLOCK_OFFSET = "clock-offset"
     MISSING_POWERS = "missing-powers"
     TOO_FEW_METERS = "too-few-meters"
     NO_BUSBAR = "no-busbar"

@@ -232,7 +232,15 @@ def _inverters(report: FeederReport) -> Iterable[Condition]:
 
 # With these causes the reconstruction still is what the design promises: the readings that are there are
 # enough, or the standard deviation is wide. With every other UNDECIDED its bound is not a bound.
-_SOUND = frozenset({Cause.AGREEMENT, Cause.RESIDUALS, Cause.SILENT_METERS, Cause.MISSING_POWERS})
+_SOUND = frozenset(
+    {
+        Cause.AGREEMENT,
+        Cause.RESIDUALS,
+        Cause.SILENT_METERS,
+        Cause.CLOCK_OFFSET,
+        Cause.MISSING_POWERS,
+    }
+)
 
 
 def _voltage_limit(report: FeederReport, meter: MeterReport) -> Iterable[Condition]:
@@ -286,6 +294,8 @@ def _undecided(report: FeederReport) -> Iterable[Condition]:
         gone = [BUSBAR]
     # Who is missing at every other tick is never silent, and nothing else would tell of it.
     told = bool(gone) and {*gone} <= {meter for meter, _ in report.silent}
+    # Each of these meters has an alarm of kind `clock-offset`.
+    told = told or report.cause is Cause.CLOCK_OFFSET
     yield Condition(
         AlarmKind.UNDECIDED,
         report.feeder,

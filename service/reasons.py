@@ -14,7 +14,7 @@ from gridsec.online import Cause, Verdict
 from service.align import Tick
 from service.busbar import busbar_in_words, busbar_off
 
-_NAMING: Final = frozenset({Cause.AMBIGUOUS, Cause.SILENT_METERS, Cause.MISSING_POWERS})
+_NAMING: Final = frozenset({Cause.AMBIGUOUS, Cause.SILENT_METERS, Cause.CLOCK_OFFSET, Cause.MISSING_POWERS})
 """Causes with a sentence of the monitor that names meters by their customers."""
 _SHOWN: Final = 5
 """So many names are listed at most."""

@@ -27,7 +27,7 @@ from gridsec.sequential.examine import Examined
 from gridsec.sequential.heard import Heard
 from gridsec.sequential.release import Released, release
 from gridsec.sequential.scales import needed
-from gridsec.sequential.skew import Skew
+from gridsec.sequential.skew import Skew, largest, unusable
 from gridsec.sequential.state import SequentialState, Trust
 from gridsec.values import changed
 
@@ -106,6 +106,7 @@ def conclude(
     said = _unexplained(tick.seen.misfit, said)
     if not (tick.rivals or open_ or all_of(state.doubts.vouched)):
         said = _unread(design, tick.frame, ~state.doubts.vouched[max(s, 0)], estimate, said)
+    said = _untimely(design, tick.frame, live, said)
     decision, cause, reason = said
     verdict = Verdict(
         decision,
@@ -310,6 +311,18 @@ def _unread(design: SequentialDesign, frame: Frame, unread: Bools, estimate: Est
     origins = np.zeros(frame.p.size, dtype=np.intp) if frame.p_origin is None else frame.p_origin
     sentence = words.unread(design.names, wide, origins[at], percent, limit)
     return Decision.UNDECIDED, Cause.MISSING_POWERS, sentence
+
+
+def _untimely(design: SequentialDesign, frame: Frame, live: Bools, said: _Said) -> _Said:
+    """The answer, with the meters that count as silent for a clock offset that no scale judges."""
+    decision, cause, reason = said
+    far = unusable(design, frame.clock_offset)
+    if far is None or cause not in (Cause.SILENT_METERS, Cause.TOO_FEW_METERS):
+        return said
+    sentence = words.untimely(design.names, far, largest(design))
+    if cause is Cause.SILENT_METERS and not any_of(~live & ~far):
+        return decision, Cause.CLOCK_OFFSET, sentence
+    return decision, cause, f"{reason} {sentence}"
 
 
 _DEAD = 1e-2

@@ -12,6 +12,7 @@ from gridsec.frames import NO_VOLTAGE
 from gridsec.network import InPhases
 from gridsec.online import Frame
 from gridsec.sequential.design import SequentialDesign
+from gridsec.sequential.skew import unusable
 from gridsec.sequential.state import SequentialState
 
 
@@ -50,13 +51,15 @@ class Heard:
 
 
 def possible(design: SequentialDesign, frame: Frame) -> Frame:
-    """The frame with powers that can be: all others are not known.
+    """The frame with powers that can be, and without readings of a moment that no scale covers.
 
     Parameters
     ----------
     design, frame
         The design, and everything known at one tick.
     """
+    far = unusable(design, frame.clock_offset)
+    frame = frame if far is None else replace(frame, seen=frame.seen & ~far)
     p, p_error = _possible(frame.p, frame.p_error, design.most_p)
     q, q_error = _possible(frame.q, frame.q_error, design.most_q)
     if p is frame.p and q is frame.q and p_error is frame.p_error and q_error is frame.q_error:

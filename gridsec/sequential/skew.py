@@ -7,7 +7,8 @@ at most the change of its voltage meanwhile, by the model
 
 h being the interval of the ticks. The mean over a scale is off by at most the mean of c_j, whose square is
 added to the variance of the meter's mean. Around a step of the busbar's voltage all these meters are off
-together, so a meter is not judged on scales shorter than `_OFFSETS` offsets, but for the longest scale.
+together, so no scale shorter than `_OFFSETS` offsets judges the meter. A reading with an offset that no scale
+judges is used like a missing one.
 
 References
 ----------
@@ -17,6 +18,7 @@ docs/theory-sequential.md, section 3.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import ceil
 
 import numpy as np
 
@@ -31,8 +33,27 @@ _STEP = 4.0
 """Largest ratio of a variance that is used to the one found: each other one is a new factorisation."""
 _HOLD = 4
 """Smallest number of ticks from one fall of the variances of a scale to the next."""
-_LONGEST = 64
-"""Largest number of ticks over which changes are taken."""
+
+
+def largest(design: SequentialDesign) -> float:
+    """Largest clock offset with a scale that judges the meter, s."""
+    return design.lengths[-1] * design.step_s / _OFFSETS
+
+
+def unusable(design: SequentialDesign, offset_s: Floats | None) -> Bools | None:
+    """Meters with a clock offset that no scale judges, (p,); None for none.
+
+    Parameters
+    ----------
+    design
+        The design.
+    offset_s : (p,)
+        By how much each meter's clock is ahead, s; NaN where that is not measurable.
+    """
+    if offset_s is None:
+        return None
+    far: Bools = np.asarray(np.abs(offset_s) > largest(design))  # False for NaN
+    return far if any_of(far) else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,7 +63,7 @@ class Skew:
     Attributes
     ----------
     model : (k, p)
-        Squared voltages by the model at the last ticks, the newest last, pu.
+        Squared voltages by the model at the last ticks, the newest last, pu; k covers `largest`.
     moved : (longest, p)
         c at the last ticks, the newest last, squared pu.
     variance : (s, p)
@@ -87,25 +108,26 @@ def follow(  # noqa: PLR0917  # the tick, and what it brings
     tick
         Number of the tick: variances of a scale change only at ticks at which it is due.
     offset_s : (p,)
-        By how much each meter's clock is ahead, s; NaN where that is not measurable.
+        By how much each meter's clock is ahead, s; NaN where that is not measurable. Offsets above `largest`
+        count as none: these meters are not read.
     v2 : (p,)
         Squared voltages by the model at the meters, pu.
     noise : (s, p)
         Variances of the means without offsets, squared pu^2.
     """
     size = np.zeros(v2.size) if offset_s is None else np.abs(np.nan_to_num(offset_s))
+    size = np.where(size <= largest(design), size, 0.0)
     if not any_of(size) and (before is None or not any_of(before.variance)):
         return None
     lengths, step = np.array(design.lengths), design.step_s
-    ticks = np.where(size > 0.0, np.minimum(np.ceil(size / step) + 1.0, _LONGEST), 0.0)
+    ticks = np.where(size > 0.0, np.ceil(size / step) + 1.0, 0.0)
     old = np.zeros((0, v2.size)) if before is None else before.model
     change = np.zeros(v2.size)
     for k in range(1, min(int(ticks.max()), len(old)) + 1):
         change = np.where(ticks >= k, np.maximum(change, np.abs(v2 - old[-k])), change)
     moved = np.zeros((lengths[-1], v2.size)) if before is None else before.moved
     moved = np.vstack([moved[1:], change])
-    reach = np.minimum(_OFFSETS * size, lengths[-1] * step)
-    aside = lengths[:, None] * step < reach
+    aside = lengths[:, None] * step < _OFFSETS * size
     variance = np.zeros_like(noise) if before is None else before.variance.copy()
     for s, length in enumerate(design.lengths):
         if tick % design.every[s] == 0:
@@ -115,7 +137,8 @@ def follow(  # noqa: PLR0917  # the tick, and what it brings
             looks = -(-_HOLD // design.every[s])
             falls = tick % (looks * design.every[s]) == 0
             variance[s] = _variance(found, noise[s], variance[s], falls=falls)
-    return Skew(np.vstack([old, v2])[-_LONGEST:], moved, variance, aside)
+    kept = ceil(largest(design) / step) + 1
+    return Skew(np.vstack([old, v2])[-kept:], moved, variance, aside)
 
 
 def _variance(found: Floats, noise: Floats, before: Floats, *, falls: bool) -> Floats:

@@ -94,6 +94,24 @@ _ORIGINS = {
 """Sentence per origin. `READ`: the power is usable again, and the mean still contains ticks without it."""
 
 
+def untimely(names: tuple[str, ...], which: Bools, limit_s: float) -> str:
+    """The meters with readings of another moment.
+
+    Parameters
+    ----------
+    names : (p,)
+        Customers of the meters.
+    which : (p,)
+        Meters in question.
+    limit_s
+        Largest usable clock offset, s.
+    """
+    found = _list([name for name, one in zip(names, which, strict=True) if one])
+    return (
+        f"The clock offset of {found} is above {limit_s:g} s: no scale compares the readings with the feeder."
+    )
+
+
 # So many explanations, and so many names in each, are told in a sentence.
 _SHOWN = 5
 

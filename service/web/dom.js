@@ -41,8 +41,9 @@ export function clock(t, { day = false } = {}) {
   return day || Math.abs(Date.now() - date) > 43200000 ? `${date.toLocaleDateString()} ${time}` : time;
 }
 
-// Without a verdict nothing tells who is honest; but that one meter is silent says nothing against the others.
-export const vouches = ({ verdict, cause }) => verdict !== "undecided" || cause === "silent-meters";
+// Without a verdict no meter is known to be honest. A meter without a usable reading is no evidence against the others.
+export const vouches = ({ verdict, cause }) =>
+  verdict !== "undecided" || cause === "silent-meters" || cause === "clock-offset";
 
 // What a meter is, in one word for people and one for style sheets. Only who was judged can be honest.
 export function status(meter, limits, report) {

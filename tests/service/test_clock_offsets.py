@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from feeders.load import load, to_frame
+from gridsec.online import Cause
 from service.alarms import AlarmBook
 from service.align import OFFSETS_TICKS, Aligner, Clock, Tick, rules
 from service.clock_offsets import FEWEST, KEPT, ClockOffsets
@@ -172,20 +173,30 @@ def test_the_clock_of_the_busbar_meter_is_measured_and_shown() -> None:
     assert np.isnan(to_frame(site, snapshot(site, replace(tick, busbar_offset=None))).busbar_offset)
 
 
-def test_a_watched_feeder_raises_the_alarm_and_shows_the_offset() -> None:
+@pytest.mark.parametrize(("offset", "cause"), [(1.5, Cause.AGREEMENT), (40.0, Cause.CLOCK_OFFSET)])
+def test_a_watched_feeder_raises_the_alarm_and_shows_the_offset(offset: float, cause: Cause) -> None:
+    """An offset that no scale judges: undecided with this cause, and no alarm besides."""
     site = load("cigre-lv")
     watch = Watch(site, align_rules(site, Clock.WALL), AlarmBook(site.feeder.name))
     watch.install(design(site))
     rng, off, kinds = random.Random(5), site.meter_ids[1], []
-    for k in range(3 * OFFSETS_TICKS + 10):
+    for k in range(7 * OFFSETS_TICKS):
         now = T0 + k + rng.uniform(0.05, 0.2)
         for one in (*site.meter_ids, None):
-            stamp = T0 + k + (1.5 if one == off else 0.0)
+            stamp = T0 + k + (offset if one == off else 0.0)
             volt = site.tables.meta.voltage_volt
             _, results = watch.take(Reading(site.feeder.name, one, stamp, volt, 0.0, 0.0), now)
-            kinds += [t.alarm.kind for result in results for t in result.transitions]
+            # Up to the first reading of the meter that serves a tick the meter is silent.
+            kinds += [t.alarm.kind for result in results for t in result.transitions if k > 50]
+            kinds += [
+                t.alarm.kind for result in results for t in result.transitions if t.alarm.subject == off
+            ]
     assert AlarmKind.CLOCK_OFFSET in kinds
+    assert AlarmKind.UNDECIDED not in kinds
     assert watch.report is not None
+    assert watch.report.cause is cause
+    if cause is Cause.CLOCK_OFFSET:
+        assert off in watch.report.reason
     shown = {m.meter: m.clock_offset_s for m in watch.report.meters}
-    assert shown.pop(off) == pytest.approx(1.5, abs=0.15)
+    assert shown.pop(off) == pytest.approx(offset, abs=0.15)
     assert set(shown.values()) == {None}

@@ -13,11 +13,11 @@ from benchmarks.clock_offsets import TAP_PU, run
 from benchmarks.late_powers import site, watcher, world
 from feeders.load import Snapshot, to_frame
 from feeders.scenario import START
-from gridsec.online import Decision
+from gridsec.online import Cause, Decision
 from gridsec.sequential import init, step
 from gridsec.sequential.examine import Examined, examine
 from gridsec.sequential.moment import present
-from gridsec.sequential.skew import follow
+from gridsec.sequential.skew import follow, largest, unusable
 from tests.gridsec.sequential.test_monitor import prepare
 from tests.gridsec.street import Street, make_plant
 
@@ -28,13 +28,16 @@ def test_changes_means_and_scales_are_those_of_the_definition() -> None:
     """Against sums over all pairs of ticks, for random voltages."""
     made = prepare(make_plant(np.random.default_rng(1), customers=P, drop=0.02))
     rng = np.random.default_rng(2)
-    offset = np.array([0.5, -0.9, 2.0, -3.0, 7.0, 40.0, np.nan, 0.0])
+    longest = made.lengths[-1]
+    # The last but three is the largest with a scale that judges it; the next is beyond that.
+    offset = np.array([0.5, -0.9, 2.0, -3.0, longest / 4.0, longest / 4.0 + 0.1, np.nan, 0.0])
+    used = np.where(np.abs(np.nan_to_num(offset)) <= longest / 4.0, np.abs(np.nan_to_num(offset)), 0.0)
     v2, noise = 1.0 + 0.01 * rng.standard_normal((150, P)), np.full((len(made.lengths), P), 1e-9)
     skew, c = None, np.zeros(v2.shape)
     for t, now in enumerate(v2):
         skew = follow(made, skew, t, offset, now, noise)
         for j in range(P):
-            ticks = int(np.ceil(abs(offset[j]))) + 1 if np.nan_to_num(offset[j]) else 0
+            ticks = int(np.ceil(used[j])) + 1 if used[j] else 0
             c[t, j] = max((abs(now[j] - v2[t - k, j]) for k in range(1, min(ticks, t) + 1)), default=0.0)
         assert skew is not None
         np.testing.assert_allclose(skew.moved[-1], c[t], rtol=1e-12)
@@ -43,10 +46,9 @@ def test_changes_means_and_scales_are_those_of_the_definition() -> None:
         last = 149 - 149 % made.every[s]
         square = np.where(skew.aside[s], 0.0, c[last - length + 1 : last + 1].mean(axis=0) ** 2)
         assert (skew.variance[s] >= square * (1.0 - 1e-12))[square > 1e-10].all()
-    longest = made.lengths[-1]
     for s, length in enumerate(made.lengths):
-        expected = (length < 4.0 * np.abs(np.nan_to_num(offset))) & (length < longest)
-        assert skew.aside[s].tolist() == expected.tolist()
+        assert skew.aside[s].tolist() == (length < 4.0 * used).tolist()
+    assert unusable(made, offset).tolist() == [k == 5 for k in range(P)]
 
 
 @pytest.mark.parametrize("offset", [None, np.zeros(P), np.full(P, np.nan)])
@@ -107,10 +109,10 @@ def test_variances_that_cross_a_level_at_each_tick_change_seldom(level: float) -
 
 
 def test_all_clocks_off_and_a_still_feeder_is_clean_and_liars_are_named() -> None:
-    """Offsets of 20 s: the longest scale alone judges, also at ticks without a look at it."""
+    """Offsets of 15 s: the longest scale alone judges, also at ticks without a look at it."""
     plant = make_plant(np.random.default_rng(3), customers=P, drop=0.02)
     made, street = prepare(plant), Street(plant, np.random.default_rng(4))
-    state, offset = init(made, street.t - 1.0), np.full(P, 20.0)
+    state, offset = init(made, street.t - 1.0), np.full(P, largest(made))
     said = []
     for k in range(200):
         frame = replace(street.frame(), t=street.t + k, clock_offset=offset)
@@ -122,6 +124,33 @@ def test_all_clocks_off_and_a_still_feeder_is_clean_and_liars_are_named() -> Non
     assert said[-1].suspects.tolist() == [k == 2 for k in range(P)]
     state, _, verdict = step(made, state, replace(street.frame(), t=street.t + 200.0))
     assert state.skew is None
+
+
+def test_a_meter_with_an_offset_that_no_scale_judges_is_neither_clean_nor_accused() -> None:
+    """The busbar wanders; one clock is 40 s ahead; another meter is manipulated, and one falls silent."""
+    plant = make_plant(np.random.default_rng(3), customers=P, drop=0.02)
+    made, street, rng = prepare(plant), Street(plant, np.random.default_rng(4)), np.random.default_rng(5)
+    state, offset, said = init(made, street.t - 1.0), np.where(np.arange(P) == 6, 40.0, np.nan), []
+    past = [street.frame()] * 40
+    wander = 0.0
+    for k in range(300):
+        wander += rng.normal(0.0, 2e-3) - 0.02 * wander
+        now = street.frame()
+        now = replace(now, t=street.t + k, v0_squared=now.v0_squared + wander, y=now.y + wander)
+        past.append(now)
+        y = np.where(np.arange(P) == 6, past[-41].y, now.y) + 0.05 * ((np.arange(P) == 2) & (k >= 150))
+        seen = now.seen & ~((np.arange(P) == 5) & (100 <= k < 120))
+        state, _, verdict = step(made, state, replace(now, y=y, seen=seen, clock_offset=offset))
+        said.append(verdict)
+    assert not np.any([one.suspects[6] or one.suspects[5] for one in said])
+    assert {one.cause for one in said[70:100]} == {Cause.CLOCK_OFFSET}
+    names = plant.feeder.customers[plant.meters[6]]
+    assert f"clock offset of {names} is above 15 s" in said[99].reason
+    assert said[110].cause is Cause.SILENT_METERS
+    assert "clock offset" in said[110].reason
+    assert all(one.decision is Decision.UNDECIDED for one in said[:150])
+    assert said[-1].suspects.tolist() == [k == 2 for k in range(P)]
+    assert np.isnan(said[-1].score[6])
 
 
 @pytest.mark.parametrize("offset", [-2.0, 4.0])
