@@ -38,9 +38,13 @@ Progress = Callable[[int, int], None]
 class OtherStudy(GridsecError):
     """A journal belongs to another study, feeder, version or to other arguments, or is no journal."""
 
+    code = "other-origin"
+
 
 class InUse(GridsecError):
     """Another process is writing a journal."""
+
+    code = "in-use"
 
 
 class Keeper(Protocol):
