@@ -31,7 +31,7 @@ from gridsec.attack import (
     load_pattern,
     most_affected,
 )
-from gridsec.errors import GridsecError, Problem
+from gridsec.errors import GridsecError, InputInvalid, Problem
 from gridsec.network import Power, busbar_places, columns
 
 if TYPE_CHECKING:
@@ -242,9 +242,9 @@ def fake_load(
     chosen = _affected(site, customer, pattern, meters) if isinstance(meters, int) else meters
     try:
         power = coordinate(pattern, chosen, size)  # pu, to first order; AC has the last word below
-    except ValueError as error:
+    except InputInvalid as error:
         raise NoSuchAttack(
-            f"{site.feeder.name}, load at {site.feeder.customers[customer]}: {error}"
+            f"{site.feeder.name}, load at {site.feeder.customers[customer]}: {error}", code=error.codes[0]
         ) from error
     for _ in range(SIZING_ROUNDS):
         p_kw, q_kvar = loads.p_kw.copy(), loads.q_kvar.copy()

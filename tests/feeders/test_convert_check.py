@@ -19,9 +19,11 @@ from feeders.convert_network import feeder_of
 from feeders.convert_pandapower import from_pandapower
 from feeders.convert_pgm import read_pgm
 from feeders.load_phases import three_phase
+from feeders.powerflow import PowerFlowDiverged
 from feeders.powerflow_unbalanced import UnbalancedPowerFlow
 from feeders.schema import read, write
 from gridsec.errors import FeederInvalid, GridsecError
+from tests.codes import refused
 from tests.feeders.foreign import pgm
 
 
@@ -100,15 +102,16 @@ def test_parallel_transformers_on_a_coupled_busbar_are_one_infeed() -> None:
     check = compare(converted.state, converted.tables)
     assert (check.buses, check.largest_pu < BALANCED_PU) == (5, True)
     net.switch.loc[net.switch.name == "coupler", "closed"] = False
-    with pytest.raises(GridsecError, match="candidates: root, root 2"):
+    with refused(GridsecError, "busbar-unclear") as caught:
         from_pandapower(net, "x")
+    assert "root, root 2" in str(caught.value)
     assert from_pandapower(net, "x", root="root 2").tables.customers[0].customer == "farm"
 
 
 def test_loop_is_named_and_opened_when_asked(tmp_path: Path) -> None:
     path = tmp_path / "ring.json"
     pp.to_json(village(closed=True), str(path))
-    with pytest.raises(FeederInvalid, match=r"form a loop"):
+    with refused(FeederInvalid, "not-radial"):
         convert(str(path), tmp_path / "x", root="root")
     done = convert(str(path), tmp_path / "x", root="root", opened=["ring"])
     assert done.check is not None
@@ -279,7 +282,7 @@ def test_a_source_without_solution_is_converted_and_not_checked(tmp_path: Path) 
     assert "no-load current of transformer T1; without the source's power flow not known" in said
     done = convert(str(path), tmp_path / "y", root="root", one_voltage=True)
     assert "load side of transformer T1; 2 buses; what flows there is not known" in "\n".join(done.notes)
-    with pytest.raises(GridsecError, match="own power flow fails"):
+    with refused(GridsecError, "not-converged"):
         check_against_source(str(path), tmp_path / "x", root="root")
 
 
@@ -310,7 +313,7 @@ def test_a_feeder_without_solution_is_told(tmp_path: Path) -> None:
     weak = tuple(replace(line, r_ohm=100 * line.r_ohm, x_ohm=100 * line.x_ohm) for line in tables.lines)
     meta = replace(tables.meta, accept=("impedance", "ratio", "load"))
     write(replace(tables, meta=meta, lines=weak), tmp_path / "x")
-    with pytest.raises(GridsecError, match="no solution"):
+    with refused(PowerFlowDiverged, "not-converged"):
         check_against_source(str(path), tmp_path / "x", root="root")
 
 

@@ -26,6 +26,7 @@ from gridsec.phases import (
     sensitivities,
     sequence_matrix,
 )
+from tests.codes import refused
 
 CASE = Path(__file__).parent.parent / "cases" / "good" / "single-phase"
 EUROPEAN = "ieee-european-lv"
@@ -211,8 +212,9 @@ def test_what_three_phases_need(line: int, changes: dict[str, float | None], sai
 def test_a_customer_needs_his_phases_at_his_bus() -> None:
     tables = single_phase()
     customers = (*tables.customers[:2], replace(tables.customers[2], phases="c"))
-    with pytest.raises(FeederInvalid, match="phases 'c' but bus '3' has only 'b'"):
+    with refused(FeederInvalid, "absent-phase") as caught:
         three_phase(replace(tables, customers=customers))
+    assert "bus '3'" in str(caught.value)
 
 
 def test_a_switch_fuses_its_buses() -> None:
@@ -228,7 +230,7 @@ def test_nothing_to_watch() -> None:
     lines = tuple(
         replace(line, r_ohm=0.0, x_ohm=0.0, r0_ohm=None, x0_ohm=None, phases="abc") for line in tables.lines
     )
-    with pytest.raises(FeederInvalid, match="no closed line has an impedance"):
+    with refused(FeederInvalid, "nothing-to-design"):
         three_phase(replace(tables, lines=lines))
 
 
@@ -291,8 +293,9 @@ def test_a_site_has_a_customer_and_a_meter_for_each_phase() -> None:
 def test_phases_that_the_format_does_not_have_are_refused(phases: str) -> None:
     tables = find("ieee-european-lv")
     first, *others = tables.customers
-    with pytest.raises(FeederInvalid, match="column phases") as caught:
+    with refused(FeederInvalid, "unknown-name") as caught:
         from_tables(replace(tables, customers=(replace(first, phases=phases), *others)))
+    assert "column phases" in str(caught.value)
     assert len(caught.value.problems) == 1
 
 
@@ -305,7 +308,7 @@ def test_uncertain_powers_are_parted_as_those_of_independent_phases() -> None:
 
 
 def test_there_is_no_such_feeder() -> None:
-    with pytest.raises(FeederInvalid, match="neither such a folder nor such a feeder"):
+    with refused(FeederInvalid, "unknown-name"):
         load_three_phase("no-such-feeder")
 
 

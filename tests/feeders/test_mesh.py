@@ -24,6 +24,7 @@ from feeders.trials import LoadError, Meters, Outcome, Trial, judge
 from gridsec.errors import FeederInvalid
 from gridsec.mesh import MeshedFeeder
 from gridsec.network import bus_voltages, model_error_bound
+from tests.codes import refused
 from tests.feeders import villages
 from tests.feeders.watched import names_the_liar_alone
 
@@ -221,5 +222,5 @@ def test_the_methods_of_the_papers_name_the_liar_alone(name: str) -> None:
 
 @pytest.mark.parametrize("part", [lambda site: site.tree, lambda site: site.balanced])
 def test_what_takes_radial_feeders_says_so(part: Callable[[Site], object]) -> None:
-    with pytest.raises(FeederInvalid, match="closed lines form loops, and this takes radial feeders only"):
+    with refused(FeederInvalid, "not-radial"):
         part(landnetz())
