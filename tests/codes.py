@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar
 
 import pytest
 
-from gridsec.errors import GridsecError, InputInvalid
+from gridsec.errors import GridsecError, InputInvalid, Problem
 
 Coded = TypeVar("Coded", bound=GridsecError | InputInvalid)
+
+
+def codes_of(problems: Iterable[Problem]) -> list[str]:
+    """Codes of problems that a check returns."""
+    return [problem.code for problem in problems]
 
 
 @contextmanager

@@ -336,7 +336,7 @@ def test_a_line_of_a_folder_is_opened_and_what_a_folder_cannot_take_is_refused(t
     opened = {row.line: row.closed for row in read(tmp_path / "b").lines}
     assert opened == {row.line: row.closed and row.line != "line-36" for row in read(tmp_path / "a").lines}
     wrong = {"root": "s", "droop": "vde4105", "one_voltage": True, "opened": ["nosuch"]}
-    with pytest.raises(FeederInvalid) as caught:
+    with refused(FeederInvalid, *["inconsistent"] * 3, "unknown-name") as caught:
         convert(str(tmp_path / "a"), tmp_path / "c", **wrong)  # type: ignore[arg-type]
     assert [problem.split(" is ")[0] for problem in caught.value.problems] == [
         "root",

@@ -122,5 +122,5 @@ def test_a_key_is_no_path(tmp_path: Path) -> None:
 
 
 def test_more_than_half_lying_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(NotObservable):
+    with refused(NotObservable, "too-few-meters"):
         bank_gains(STREET.lure, 2, OPTIONS, workers=1, where=tmp_path)

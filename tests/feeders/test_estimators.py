@@ -70,10 +70,8 @@ def test_too_many_pairs_in_three_phases_are_refused() -> None:
 
 
 def test_every_mistake_is_named() -> None:
-    with pytest.raises(FeederInvalid) as caught:
+    with refused(FeederInvalid, "unknown-name", "negative"):
         choose(load(SMALL), estimator="oracle", max_attacked=-1)
-    assert len(caught.value.problems) == 2
-    assert "'oracle'" in caught.value.problems[0]
 
 
 def test_the_load_columns_are_what_power_flow_does_to_the_voltage() -> None:

@@ -82,8 +82,7 @@ def test_without_the_option_a_loop_is_an_error() -> None:
     radial = replace(tables, meta=replace(tables.meta, meshed=False))
     (problem,) = validate(radial)
     assert problem.startswith("lines: ring, ")
-    for words in ("form a loop; the feeder must be radial", "or meshed to true in feeder.toml"):
-        assert words in problem
+    assert problem.code == "not-radial"
     with refused(FeederInvalid, "not-radial"):
         from_tables(radial)
 
@@ -125,10 +124,9 @@ def test_the_tree_is_of_the_lines_with_the_most_phases() -> None:
 def test_phases_that_only_a_tie_brings_are_refused() -> None:
     tables = dealt()
     parts = tuple(LineRow(f"far {phase}", "n6", "n7", 0.1, 0.05, phases=phase) for phase in "ab")
-    with pytest.raises(FeederInvalid) as caught:
+    with refused(FeederInvalid, "absent-phase") as caught:
         from_tables(replace(tables, lines=(*tables.lines, *parts)))
     assert "line 'far b' closes a loop and brings phase 'b' to 'n7'" in str(caught.value)
-    assert "as one row with a matrix" in str(caught.value)
     matrix = {f"{s}_{p}_ohm": v for p in ("aa", "bb") for s, v in (("r", 0.1), ("x", 0.05))}
     one = LineRow("far", "n6", "n7", 0.1, 0.05, phases="ab", **matrix, r_ab_ohm=0.0, x_ab_ohm=0.0)
     assert from_tables(replace(tables, lines=(*tables.lines, one))).ties.shape == (1, 2)
