@@ -317,7 +317,7 @@ def _channels(tables: FeederTables) -> list[Problem]:
                 Problem(
                     "duplicate",
                     f"{own!r} is already the id of {first[own]}; every id must be unique, as those of "
-                    "the phases of whoever has three",
+                    "the phases of three-phase customers",
                 )
                 for own in ids
                 if own in first

@@ -338,7 +338,7 @@ def _examine(given: raw.Raw) -> Examination:
 
 
 def _capped(problems: list[Problem]) -> tuple[Problem, ...]:
-    """Each problem once, and no more of them than somebody will read."""
+    """Return each problem once, at most MAX_PROBLEMS of them."""
     once = tuple(dict.fromkeys(problems))
     if len(once) <= MAX_PROBLEMS:
         return once

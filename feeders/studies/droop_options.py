@@ -128,7 +128,7 @@ class DroopOptions:
         if self.draws < 0:
             yield Problem("negative", f"{self.draws} random orders; the number must not be negative")
         if self.hosting_customers == ():
-            yield Problem("missing", "new generation is for nobody")
+            yield Problem("missing", "new generation has no customer")
         if not self.hosting:
             usual = {each.name: each.default for each in fields(self)}
             given = [

@@ -413,7 +413,7 @@ def test_options_that_make_no_study_are_named_all_at_once() -> None:
         "band",
         "load is inf",
     )
-    wanted += ("unit of generation is nan", "-1 random orders", "nobody")
+    wanted += ("unit of generation is nan", "-1 random orders", "no customer")
     assert [told.count(part) for part in wanted] == [1] * len(wanted)
     for unit in (0.0, -5.0, math.inf):
         with refused(InputInvalid, "not-positive"):
