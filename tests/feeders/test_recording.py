@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,7 +28,7 @@ from feeders.recording import (
 )
 from feeders.scenario import START, Scenario, Season, by_arrival, simulate
 from feeders.variation import Variation
-from gridsec.errors import InputInvalid
+from gridsec.errors import InputInvalid, Problem
 from tests.codes import refused
 from tests.feeders.villages import village, village_without_inverters
 
@@ -270,3 +271,13 @@ def test_numbers_of_readings_that_are_not_whole_are_named_with_everything_else(t
     for seq in (1.5, np.inf, 1e30):
         with refused(RecordingInvalid, "wrong-type", "not-integer"):
             read_recording(foreign(tmp_path / "a.parquet", seq=[1.0, seq], p_kw=[True, False]))
+
+
+def test_an_error_names_its_place_once_and_survives_pickling() -> None:
+    error = RecordingInvalid(
+        Problem("missing", "no t"), Problem("wrong-type", "no number"), where="a.parquet: "
+    )
+    again = pickle.loads(pickle.dumps(error))
+    for each in (error, again):
+        assert str(each) == "a.parquet: no t; no number"
+        assert each.codes == ("missing", "wrong-type")
