@@ -31,7 +31,7 @@ from gridsec.attack import (
     load_pattern,
     most_affected,
 )
-from gridsec.errors import GridsecError
+from gridsec.errors import GridsecError, InputInvalid, Problem
 from gridsec.network import Power, busbar_places, columns
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ class Kind(StrEnum):
     COORDINATED_POWER = "coordinated-power"
 
 
-def no_size(size: float) -> list[str]:
+def no_size(size: float) -> list[Problem]:
     """Return what is wrong with a size that somebody asks for: one that was said in per cent.
 
     Parameters
@@ -77,11 +77,15 @@ def no_size(size: float) -> list[str]:
     """
     if abs(size) <= LARGEST_SIZE_PU:
         return []
-    return [f"{size:g} is {100.0 * size:g} % of nominal; {size / 100.0:g} is {size:g} %"]
+    return [
+        Problem("out-of-range", f"{size:g} is {100.0 * size:g} % of nominal; {size / 100.0:g} is {size:g} %")
+    ]
 
 
 class NoSuchAttack(GridsecError):
     """An attack of the size asked for cannot be made on this feeder."""
+
+    code = "no-such-attack"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,7 +149,9 @@ def random_attacks(
     """
     kind = Kind(kind)
     if not 0 < count <= site.meters.size:
-        raise NoSuchAttack(f"{site.feeder.name} has {site.meters.size} meters; cannot attack {count}")
+        raise NoSuchAttack(
+            f"{site.feeder.name} has {site.meters.size} meters; cannot attack {count}", code="too-few-meters"
+        )
     random = generator(seed, Stream.ATTACK)
     if kind in (Kind.COORDINATED, Kind.COORDINATED_POWER):
         loads = _typical(site) if scenario is None else present_loads(site, scenario, t_on)
@@ -186,7 +192,10 @@ def busbar_attack(site: Site, kind: Kind | str, size: float, *, t_on: float, t_o
         case Kind.BIAS | Kind.DRIFT as plain:
             return _plain(plain, phases, signed, site, t_on=t_on, t_off=t_off, seed=0)
         case other:
-            raise NoSuchAttack(f"the busbar's meter is manipulated by bias, scaling or drift, not by {other}")
+            raise NoSuchAttack(
+                f"the busbar's meter is manipulated by bias, scaling or drift, not by {other}",
+                code="unknown-name",
+            )
 
 
 def fake_load(
@@ -233,9 +242,9 @@ def fake_load(
     chosen = _affected(site, customer, pattern, meters) if isinstance(meters, int) else meters
     try:
         power = coordinate(pattern, chosen, size)  # pu, to first order; AC has the last word below
-    except ValueError as error:
+    except InputInvalid as error:
         raise NoSuchAttack(
-            f"{site.feeder.name}, load at {site.feeder.customers[customer]}: {error}"
+            f"{site.feeder.name}, load at {site.feeder.customers[customer]}: {error}", code=error.codes[0]
         ) from error
     for _ in range(SIZING_ROUNDS):
         p_kw, q_kvar = loads.p_kw.copy(), loads.q_kvar.copy()
@@ -335,7 +344,7 @@ def _plain(
             low = np.abs(signed)
             attack = Random(meters, t_on, t_off, low=low, high=LARGEST * low, hold_s=1.0, seed=seed)
         case _:
-            raise NoSuchAttack(f"{kind} is not an attack of single meters")
+            raise NoSuchAttack(f"{kind} is not an attack of single meters", code="unknown-name")
     return attack
 
 

@@ -14,6 +14,7 @@ from feeders import levels, matrices, profiles, units
 from feeders.records import Parsed, Report, rows, some
 from feeders.topology import Edge, Tree, tree
 from gridsec.droop import PRESETS
+from gridsec.errors import Problem
 
 if TYPE_CHECKING:
     from feeders.schema import LineRow
@@ -22,7 +23,7 @@ RESERVED_METER = "substation"
 """What the busbar meter is called on the wire and in alarms."""
 
 
-def feeder(parsed: Parsed) -> tuple[list[str], list[str]]:
+def feeder(parsed: Parsed) -> tuple[list[Problem], list[str]]:
     """Return every problem between cells, and notes on what is right but worth knowing."""
     report = Report()
     for check in (_duplicates, _reserved, _limits, _power_factors, _presets, _profiles, _positions, _taps):
@@ -49,8 +50,11 @@ def _duplicates(parsed: Parsed, report: Report) -> None:
                 continue
             if key in first:
                 report.problems.append(
-                    f"{where}, column {column}: {key!r} is already the id of {first[key]}; "
-                    "every id must be unique"
+                    Problem(
+                        "duplicate",
+                        f"{where}, column {column}: {key!r} is already the id of {first[key]}; "
+                        "every id must be unique",
+                    )
                 )
             else:
                 first[key] = where
@@ -65,8 +69,11 @@ def _reserved(parsed: Parsed, report: Report) -> None:
     for where, cells in rows(parsed.customers, "meter"):
         if cells["meter"] == RESERVED_METER:
             report.problems.append(
-                f"{where}, column meter: {RESERVED_METER!r} is what the busbar meter is called; "
-                "expected another id"
+                Problem(
+                    "duplicate",
+                    f"{where}, column meter: {RESERVED_METER!r} is what the busbar meter is called; "
+                    "expected another id",
+                )
             )
 
 
@@ -75,8 +82,11 @@ def _limits(parsed: Parsed, report: Report) -> None:
     low, high = limits.get("v_min_pu"), limits.get("v_max_pu")
     if low is not None and high is not None and low >= high:
         report.problems.append(
-            f"{parsed.place}, [limits]: v_min_pu {low:g} is not below v_max_pu {high:g}; "
-            "expected for example 0.9 and 1.1"
+            Problem(
+                "order",
+                f"{parsed.place}, [limits]: v_min_pu {low:g} is not below v_max_pu {high:g}; "
+                "expected for example 0.9 and 1.1",
+            )
         )
 
 
@@ -92,8 +102,11 @@ def _power_factors(parsed: Parsed, report: Report) -> None:
         low, mid, high = (cells[n] if cells.get(n) is not None else defaults.get(n) for n in names)
         if low is not None and mid is not None and high is not None and not low <= mid <= high:
             report.problems.append(
-                f"{where}: power_factor {mid:g} is not between power_factor_min {low:g} "
-                f"and power_factor_max {high:g}"
+                Problem(
+                    "order",
+                    f"{where}: power_factor {mid:g} is not between power_factor_min {low:g} "
+                    f"and power_factor_max {high:g}",
+                )
             )
 
 
@@ -102,12 +115,18 @@ def _presets(parsed: Parsed, report: Report) -> None:
         preset, rating = cells["droop"], cells.get("inverter_kva")
         if preset and preset not in PRESETS:
             report.problems.append(
-                f"{where}, column droop: {preset!r} is not known; expected one of {', '.join(PRESETS)}"
+                Problem(
+                    "unknown-name",
+                    f"{where}, column droop: {preset!r} is not known; expected one of {', '.join(PRESETS)}",
+                )
             )
         if rating and not preset:
             report.problems.append(
-                f"{where}, column droop: is missing although inverter_kva is {rating:g}; "
-                f"expected one of {', '.join(PRESETS)}"
+                Problem(
+                    "missing",
+                    f"{where}, column droop: is missing although inverter_kva is {rating:g}; "
+                    f"expected one of {', '.join(PRESETS)}",
+                )
             )
         if preset and rating == 0:
             report.notes.append(f"{where}: droop {preset!r} has no effect, inverter_kva is 0")
@@ -119,15 +138,18 @@ def _profiles(parsed: Parsed, report: Report) -> None:
         for where, cells in rows(parsed.customers, column):
             if cells[column] and cells[column] not in names:
                 report.problems.append(
-                    f"{where}, column {column}: {cells[column]!r} is not known; "
-                    f"expected one of {', '.join(names)}, or nothing"
+                    Problem(
+                        "unknown-name",
+                        f"{where}, column {column}: {cells[column]!r} is not known; "
+                        f"expected one of {', '.join(names)}, or nothing",
+                    )
                 )
 
 
 # --- the graph ----------------------------------------------------------------------------------
 
 
-def loops(busbar: str, lines: Iterable[LineRow]) -> list[str]:
+def loops(busbar: str, lines: Iterable[LineRow]) -> list[Problem]:
     """Return what is wrong with the loops of a radial feeder's lines.
 
     Parameters
@@ -154,7 +176,9 @@ def _graph(parsed: Parsed, report: Report) -> tuple[list[Edge], Tree | None]:
         one, other = cells["from_bus"], cells["to_bus"]
         known.update({one: None, other: None})
         if one == other:
-            report.problems.append(f"{where}: from_bus and to_bus are both {one!r}; a line needs two buses")
+            report.problems.append(
+                Problem("self-loop", f"{where}: from_bus and to_bus are both {one!r}; a line needs two buses")
+            )
         elif cells.get("closed", False):
             zero = cells.get("r_ohm") == 0 and cells.get("x_ohm") == 0
             phases = len(cells.get("phases") or "abc")
@@ -167,13 +191,18 @@ def _graph(parsed: Parsed, report: Report) -> tuple[list[Edge], Tree | None]:
     for where, cells in rows(parsed.customers, "bus"):
         if cells["bus"] not in known:
             report.problems.append(
-                f"{where}, column bus: {cells['bus']!r} is not known; no line leads there, "
-                f"and it is not the busbar {busbar!r}"
+                Problem(
+                    "unknown-name",
+                    f"{where}, column bus: {cells['bus']!r} is not known; no line leads there, "
+                    f"and it is not the busbar {busbar!r}",
+                )
             )
     if any(busbar in (edge.from_bus, edge.to_bus) for edge in edges):
         _islands(found, parsed, report)
     else:
-        report.problems.append(f"{parsed.place}, key busbar: no closed line is connected to {busbar!r}")
+        report.problems.append(
+            Problem("not-connected", f"{parsed.place}, key busbar: no closed line is connected to {busbar!r}")
+        )
     _fused(found, report)
     _levels(found, edges, parsed, report)
     return edges, found
@@ -183,7 +212,8 @@ def _levels(found: Tree, edges: list[Edge], parsed: Parsed, report: Report) -> N
     volt = parsed.top("voltage_volt")
     places = {cells["line"]: where for where, cells in rows(parsed.lines, "line")}
     for k, problem in levels.problems(found, edges, volt) if volt is not None else ():
-        report.problems.append(f"{places.get(edges[k].line, 'lines')}, column to_volt: {problem}")
+        where = places.get(edges[k].line, "lines")
+        report.problems.append(Problem(problem.code, f"{where}, column to_volt: {problem}"))
 
 
 def _loops(found: Tree, edges: list[Edge], meshed: bool, report: Report) -> None:
@@ -191,16 +221,22 @@ def _loops(found: Tree, edges: list[Edge], meshed: bool, report: Report) -> None
         names = some([edges[k].line for k in loop])
         if len(loop) == 1:
             report.problems.append(
-                f"lines: {names} is short-circuited, lines without impedance join its two buses; "
-                "set closed to false on one of them"
+                Problem(
+                    "self-loop",
+                    f"lines: {names} is short-circuited, lines without impedance join its two buses; "
+                    "set closed to false on one of them",
+                )
             )
         elif meshed:
             report.notes.append(f"lines: {names} form a loop; {edges[loop[0]].line!r} is drawn as a tie")
         else:
             report.problems.append(
-                f"lines: {names} form a loop; the feeder must be radial: set closed to false on one of them "
-                "(or merge parallel lines into one row), or meshed to true in feeder.toml "
-                "(converters: --meshed) if the loop is really closed"
+                Problem(
+                    "not-radial",
+                    f"lines: {names} form a loop; the feeder must be radial: set closed to false on "
+                    "one of them (or merge parallel lines into one row), or meshed to true in feeder.toml "
+                    "(converters: --meshed) if the loop is really closed",
+                )
             )
 
 
@@ -220,7 +256,7 @@ def _islands(found: Tree, parsed: Parsed, report: Report) -> None:
         text += f" (with {some(customers)})" if customers else ""
         text += f" to the busbar {parsed.top('busbar')!r}"
         text += f"; open here: {some(ties)}" if ties else ""
-        report.problems.append(text)
+        report.problems.append(Problem("not-connected", text))
 
 
 def _fused(found: Tree, report: Report) -> None:
@@ -236,7 +272,10 @@ def _positions(parsed: Parsed, report: Report) -> None:
     for where, cells in rows(parsed.lines, "to_x", "to_y"):
         if (cells["to_x"] is None) != (cells["to_y"] is None):
             report.problems.append(
-                f"{where}, columns to_x and to_y: one of them is missing; expected both or none"
+                Problem(
+                    "missing",
+                    f"{where}, columns to_x and to_y: one of them is missing; expected both or none",
+                )
             )
 
 
@@ -247,6 +286,9 @@ def _taps(parsed: Parsed, report: Report) -> None:
         wanted = [name for phase, name in names.items() if phase in cells["phases"]]
         if given and (given != wanted or cells["tap"] != 1.0):
             report.problems.append(
-                f"{where}, columns {', '.join(given)}: expected {', '.join(wanted)}, those of phases "
-                f"{cells['phases']!r}, and no tap beside them; or tap alone, of all of them"
+                Problem(
+                    "inconsistent",
+                    f"{where}, columns {', '.join(given)}: expected {', '.join(wanted)}, those of phases "
+                    f"{cells['phases']!r}, and no tap beside them; or tap alone, of all of them",
+                )
             )

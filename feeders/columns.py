@@ -15,6 +15,7 @@ from enum import Enum
 from typing import Any, Final
 
 from feeders import outside
+from gridsec.errors import Problem
 
 NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 WORDS_NO_NUMBER = {"nan", "inf", "+inf", "-inf", "infinity", "-infinity", "null", "none", "na", "n/a", "-"}
@@ -91,9 +92,9 @@ class Column:
             limits = " and ".join(f"{word} {value:.10g}" for word, value in parts if value is not None)
         return f"{self.kind.value} {limits}".strip()
 
-    def complaint(self, what: str) -> str:
+    def complaint(self, what: Problem) -> Problem:
         """Return a problem of this column's cell as a sentence, with what would be right."""
-        return f"{what}; expected {self.right} ({self.meaning})"
+        return Problem(what.code, f"{what}; expected {self.right} ({self.meaning})")
 
 
 PHASES = ("abc", "a", "b", "c")
@@ -392,7 +393,7 @@ def shown(cell: object) -> str:
     return text if len(text) <= SHOWN else text[: SHOWN - 1] + "…"
 
 
-def parse(column: Column, cell: object) -> tuple[Any, str | None]:
+def parse(column: Column, cell: object) -> tuple[Any, Problem | None]:
     """Turn one cell into the column's type.
 
     Parameters
@@ -411,7 +412,7 @@ def parse(column: Column, cell: object) -> tuple[Any, str | None]:
         cell = cell.strip()
     if cell is None or (isinstance(cell, str) and cell == ""):
         if column.default is REQUIRED:
-            return BAD, column.complaint("is missing")
+            return BAD, column.complaint(Problem("missing", "is missing"))
         return column.default, None
     value, what = _PARSERS[column.kind](cell)
     if what is not None:
@@ -420,90 +421,99 @@ def parse(column: Column, cell: object) -> tuple[Any, str | None]:
     return (BAD, column.complaint(what)) if what is not None else (value, None)
 
 
-def _outside(column: Column, value: Any) -> str | None:
+def _outside(column: Column, value: Any) -> Problem | None:
     """Return what is wrong with a value of the right type, None if nothing is."""
     if column.choices is not None:
         given: Iterable[Any] = value if isinstance(value, tuple) else (value,)
-        return next((f"{shown(item)} is not known" for item in given if item not in column.choices), None)
+        strange = (item for item in given if item not in column.choices)
+        return next((Problem("unknown-name", f"{shown(item)} is not known") for item in strange), None)
     if not isinstance(value, (int, float)) or isinstance(value, bool):
         return None
     low, above = (-math.inf if limit is None else limit for limit in (column.low, column.above))
     if value < low or (value <= above and column.above is not None):
-        return f"{value:g} is {'negative' if value < 0 else 'too small'}"
+        return (
+            Problem("negative", f"{value:g} is negative")
+            if value < 0
+            else Problem("out-of-range", f"{value:g} is too small")
+        )
     if column.high is not None and value > column.high:
-        return f"{value:g} is too large"
+        return Problem("out-of-range", f"{value:g} is too large")
     return None
 
 
-def _text(cell: object, longest: int = LONGEST_TEXT) -> tuple[Any, str | None]:
+def _text(cell: object, longest: int = LONGEST_TEXT) -> tuple[Any, Problem | None]:
     if not isinstance(cell, str):
-        return BAD, f"{shown(cell)} is not text"
+        return BAD, Problem("wrong-type", f"{shown(cell)} is not text")
     if not cell.isprintable():
-        return BAD, f"{shown(cell)} holds characters that cannot be printed"
+        return BAD, Problem("wrong-text", f"{shown(cell)} holds characters that cannot be printed")
     if len(cell) > longest:
-        return BAD, f"{shown(cell)} is longer than {longest} characters"
+        return BAD, Problem("wrong-text", f"{shown(cell)} is longer than {longest} characters")
     return cell, None
 
 
-def _id(cell: object) -> tuple[Any, str | None]:
+def _id(cell: object) -> tuple[Any, Problem | None]:
     return _text(cell, LONGEST_ID)
 
 
-def _name(cell: object) -> tuple[Any, str | None]:
+def _name(cell: object) -> tuple[Any, Problem | None]:
     if not isinstance(cell, str) or NAME.fullmatch(cell) is None:
-        return BAD, f"{shown(cell)} is not a valid name"
+        return BAD, Problem("wrong-text", f"{shown(cell)} is not a valid name")
     return cell, None
 
 
-def _number(cell: object) -> tuple[Any, str | None]:
+def _number(cell: object) -> tuple[Any, Problem | None]:
     if isinstance(cell, bool) or not isinstance(cell, (int, float, str)):
-        return BAD, f"{shown(cell)} is not a number"
+        return BAD, Problem("wrong-type", f"{shown(cell)} is not a number")
     if isinstance(cell, str) and cell.lower() in WORDS_NO_NUMBER:
-        return BAD, f"{shown(cell)} is not a finite number (leave the cell empty if there is none)"
+        return BAD, Problem(
+            "not-finite", f"{shown(cell)} is not a finite number (leave the cell empty if there is none)"
+        )
     if isinstance(cell, str) and NUMBER.fullmatch(cell) is None:
         comma = NUMBER.fullmatch(cell.replace(",", ".")) is not None
-        return BAD, f"{shown(cell)} is not a number" + (" (decimal point, not comma)" if comma else "")
+        return BAD, Problem(
+            "wrong-type", f"{shown(cell)} is not a number" + (" (decimal point, not comma)" if comma else "")
+        )
     try:
         value = float(cell)
     except OverflowError:
-        return BAD, f"{shown(cell)} is too large for a number"
+        return BAD, Problem("out-of-range", f"{shown(cell)} is too large for a number")
     if not math.isfinite(value):
-        return BAD, f"{shown(cell)} is not a finite number"
+        return BAD, Problem("not-finite", f"{shown(cell)} is not a finite number")
     return value, None
 
 
-def _whole(cell: object) -> tuple[Any, str | None]:
+def _whole(cell: object) -> tuple[Any, Problem | None]:
     value, what = _number(cell)
     if what is not None:
         return value, what
     if value != int(value):
-        return BAD, f"{shown(cell)} is not a whole number"
+        return BAD, Problem("not-integer", f"{shown(cell)} is not a whole number")
     return int(value), None
 
 
-def _truth(cell: object) -> tuple[Any, str | None]:
+def _truth(cell: object) -> tuple[Any, Problem | None]:
     if isinstance(cell, bool):
         return cell, None
     if isinstance(cell, str) and cell.lower() in ("true", "1", "false", "0"):
         return cell.lower() in ("true", "1"), None
-    return BAD, f"{shown(cell)} is neither true nor false"
+    return BAD, Problem("wrong-type", f"{shown(cell)} is neither true nor false")
 
 
-def _pair(cell: object) -> tuple[Any, str | None]:
+def _pair(cell: object) -> tuple[Any, Problem | None]:
     if not isinstance(cell, (list, tuple)) or len(cell) != 2:
-        return BAD, f"{shown(cell)} is not a pair"
+        return BAD, Problem("wrong-type", f"{shown(cell)} is not a pair")
     parsed = [_number(item) for item in cell]
     bad = next((what for _, what in parsed if what is not None), None)
     return (BAD, bad) if bad is not None else (tuple(value for value, _ in parsed), None)
 
 
-def _names(cell: object) -> tuple[Any, str | None]:
+def _names(cell: object) -> tuple[Any, Problem | None]:
     if not isinstance(cell, (list, tuple)) or not all(isinstance(item, str) for item in cell):
-        return BAD, f"{shown(cell)} is not a list of names"
+        return BAD, Problem("wrong-type", f"{shown(cell)} is not a list of names")
     return tuple(cell), None
 
 
-_PARSERS: dict[Kind, Callable[[object], tuple[Any, str | None]]] = {
+_PARSERS: dict[Kind, Callable[[object], tuple[Any, Problem | None]]] = {
     Kind.TEXT: _text,
     Kind.ID: _id,
     Kind.NAME: _name,

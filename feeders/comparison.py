@@ -27,7 +27,7 @@ from feeders.trials import LoadError, Meters, Outcome, Trial, frames, judge
 from feeders.variation import Variation
 from gridsec.arrays import Floats
 from gridsec.choices import no_choice
-from gridsec.errors import DesignInfeasible, GridsecError, NotObservable, refuse
+from gridsec.errors import DesignInfeasible, GridsecError, NotObservable, Problem, refuse
 
 if TYPE_CHECKING:
     from feeders.load import Site
@@ -164,7 +164,11 @@ class Plan:
             [
                 *no_choice("family", FAMILIES, *self.families),
                 *no_choice("case", (case.name for case in CASES), *self.cases),
-                *([] if self.seeds >= 1 else [f"seeds is {self.seeds}; at least one run is needed"]),
+                *(
+                    []
+                    if self.seeds >= 1
+                    else [Problem("not-positive", f"seeds is {self.seeds}; at least one run is needed")]
+                ),
             ]
         )
 
@@ -467,7 +471,7 @@ def splice(text: str, table: str) -> str:
     before, _, rest = text.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not end or text.count(BEGIN) != 1 or text.count(END) != 1:
-        raise GridsecError(f"the document must hold {BEGIN} and, after it, {END}, once each")
+        raise GridsecError(f"the document must hold {BEGIN} and, after it, {END}, once each", code="missing")
     return f"{before}{BEGIN}\n\n{table.strip()}\n\n{END}{after}"
 
 

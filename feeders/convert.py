@@ -35,7 +35,7 @@ from feeders.origin import origin as origin_of
 from feeders.profiles import ENVELOPES, Season
 from feeders.raw import CUSTOMERS_FILE, LINES_FILE, META_FILE
 from feeders.schema import FeederTables, read, write
-from gridsec.errors import FeederInvalid, GridsecError
+from gridsec.errors import FeederInvalid, GridsecError, Problem
 
 PROFILES = "profiles"
 OPENDSS, PGM = "opendss", "power-grid-model"
@@ -216,7 +216,10 @@ def convert(
     problems = _problems(converted.tables)
     if problems:
         raise FeederInvalid(
-            [*problems, *(f"while converting: {note}" for note in sentences(converted.changes))]
+            [
+                *problems,
+                *(Problem("note", f"while converting: {note}") for note in sentences(converted.changes)),
+            ]
         )
     write(converted.tables, folder)
     done = _checked(converted, folder)
@@ -281,7 +284,7 @@ def check_against_source(
     extent = Extent(one_voltage, tables.meta.meshed)
     converted, _ = _converted(source, "check", root=root, opened=opened, extent=extent)
     if converted.state is None:
-        raise GridsecError(converted.unchecked)
+        raise GridsecError(converted.unchecked, code="not-converged")
     return compare(converted.state, tables)
 
 
@@ -403,12 +406,12 @@ def _open(origin: str) -> tuple[Any, str]:
     kind, _, rest = origin.partition(":")
     path = Path(origin)
     if path.suffix.lower() in (".json", ".dss") and not path.is_file():
-        raise SourceUnreadable(f"{origin}: there is no such file")
+        raise SourceUnreadable(f"{origin}: there is no such file", code="missing")
     try:
         import pandapower
         import pandapower.networks
     except ImportError as error:
-        raise GridsecError(f"conversion needs {extra('convert')}") from error
+        raise GridsecError(f"conversion needs {extra('convert')}", code="not-installed") from error
     if (kind == "simbench" and rest) or SIMBENCH_CODE.fullmatch(origin):
         return convert_simbench.grid(rest or origin), "simbench"
     if kind == "pandapower" and rest:
@@ -417,7 +420,8 @@ def _open(origin: str) -> tuple[Any, str]:
         raise SourceUnreadable(
             f"{origin!r} is no source; expected {', '.join(RECIPES)}, pandapower:<network>, "
             "simbench:<code>, a pandapower or power-grid-model JSON file, an OpenDSS master file (.dss), "
-            "or a feeder's folder"
+            "or a feeder's folder",
+            code="unknown-name",
         )
     try:
         with warnings.catch_warnings():
@@ -437,7 +441,7 @@ def _named(name: str) -> Any:
     found = [getattr(networks, maker, None) for maker in (name, f"create_{name}")]
     makers: list[Callable[[], Any]] = [maker for maker in found if callable(maker)]
     if not makers:
-        raise SourceUnreadable(f"pandapower has no network {name!r}")
+        raise SourceUnreadable(f"pandapower has no network {name!r}", code="unknown-name")
     talk = logging.getLogger("pandapower")
     level = talk.level
     talk.setLevel(logging.ERROR)

@@ -13,7 +13,7 @@ from feeders.convert_graph import fused_with
 from feeders.schema import LineRow
 from gridsec.arrays import Phasors
 from gridsec.droop import preset
-from gridsec.errors import FeederInvalid, GridsecError
+from gridsec.errors import FeederInvalid, GridsecError, Problem
 from gridsec.phases import ROTATION
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def chosen(network: Network, find: Callable[[], Busbar], opened: Sequence[str], 
     except GridsecError as error:
         if not problems:
             raise
-        raise FeederInvalid([str(error), *problems]) from error
+        raise FeederInvalid([Problem(error.code, str(error)), *problems]) from error
     if problems:
         raise FeederInvalid(problems)
     return busbar
@@ -138,13 +138,14 @@ def named_bus(network: Network, root: str) -> str:
         bus for bus in network.nominal if bus.lower() == root.lower()
     ]
     if len(hits) != 1:
-        raise GridsecError(f"there is no bus {root!r}")
+        raise GridsecError(f"there is no bus {root!r}", code="unknown-name")
     return hits[0]
 
 
 def _unknown(lines: Iterable[LineRow], opened: Sequence[str]) -> list[str]:
     return [
-        f"there is no line {line!r} to open" for line in sorted(set(opened) - {row.line for row in lines})
+        Problem("unknown-name", f"there is no line {line!r} to open")
+        for line in sorted(set(opened) - {row.line for row in lines})
     ]
 
 

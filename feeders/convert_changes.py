@@ -24,9 +24,13 @@ Done = Literal["left out", "approximated", "changed", "added", "accepted"]
 class BusbarUnclear(GridsecError):
     """There are several buses, or none, that could be the metered busbar."""
 
+    code = "busbar-unclear"
+
 
 class SourceUnreadable(GridsecError):
     """What is to be converted does not exist, or is nothing that can be read as a network."""
+
+    code = "unreadable"
 
 
 @dataclass(frozen=True, slots=True)

@@ -153,7 +153,9 @@ def compare(state: SourceState, tables: FeederTables) -> SourceCheck:
     both = np.isfinite(ours - theirs).any(axis=1)
     common, ours = [bus for bus, compared in zip(common, both, strict=True) if compared], ours[both]
     if not common:
-        raise GridsecError("there is no bus where the source's power flow and the feeder both have a voltage")
+        raise GridsecError(
+            "there is no bus where the source's power flow and the feeder both have a voltage", code="missing"
+        )
     nominal = level[[index[bus] for bus in common]]
     apart = _apart(ours, [state.volts[bus] for bus in common]) / nominal
     found = None

@@ -13,7 +13,7 @@ from feeders.convert_network import Converted
 from feeders.convert_source import feeder_source, versioned
 from feeders.origin import Origin, origin
 from feeders.schema import FeederTables, read
-from gridsec.errors import FeederInvalid
+from gridsec.errors import FeederInvalid, Problem
 
 __all__ = ["from_folder", "source_again"]
 
@@ -55,8 +55,10 @@ def from_folder(
     """
     tables = read(folder)
     given = {"root": root is not None, "droop": droop is not None, "one_voltage": one_voltage}
-    problems = [
-        f"{option} is for networks of other tools; {folder} is a feeder's folder already"
+    problems: list[str] = [
+        Problem(
+            "inconsistent", f"{option} is for networks of other tools; {folder} is a feeder's folder already"
+        )
         for option, value in given.items()
         if value
     ]

@@ -20,6 +20,7 @@ from feeders.convert_graph import Coupling, above_busbar, as_rows, fused_with, r
 from feeders.convert_lines import VOLT_DIGITS, turned
 from feeders.levels import same_level
 from feeders.schema import LineRow
+from gridsec.errors import Problem
 
 if TYPE_CHECKING:
     from feeders.convert_network import Network
@@ -170,7 +171,7 @@ class _Groups:
             self._members[one].append(bus)
 
 
-def levels_of(rows: Iterable[LineRow], nominal: Mapping[str, float]) -> list[str]:
+def levels_of(rows: Iterable[LineRow], nominal: Mapping[str, float]) -> list[Problem]:
     """Return what is wrong with the nominal voltages that lines join.
 
     Parameters
@@ -181,8 +182,11 @@ def levels_of(rows: Iterable[LineRow], nominal: Mapping[str, float]) -> list[str
         Nominal voltages of the buses, V.
     """
     return [
-        f"line {row.line!r} joins the buses {row.from_bus!r} of {nominal[row.from_bus]:.6g} V and "
-        f"{row.to_bus!r} of {nominal[row.to_bus]:.6g} V nominal voltage; expected one voltage"
+        Problem(
+            "inconsistent",
+            f"line {row.line!r} joins the buses {row.from_bus!r} of {nominal[row.from_bus]:.6g} V and "
+            f"{row.to_bus!r} of {nominal[row.to_bus]:.6g} V nominal voltage; expected one voltage",
+        )
         for row in rows
         if row.to_volt is None
         and {row.from_bus, row.to_bus} <= nominal.keys()

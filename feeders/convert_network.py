@@ -25,7 +25,7 @@ from feeders.convert_levels import EVERYTHING, Extent, levels_of, transformed
 from feeders.convert_lines import balanced_charging, merged, turned
 from feeders.schema import FeederMeta, FeederTables, LineRow, LoadDefaults, validate
 from gridsec.arrays import Phasors
-from gridsec.errors import FeederInvalid
+from gridsec.errors import FeederInvalid, Problem
 
 UNFED: Final = "not supplied in the source"
 BEYOND: Final = "supplied in the source, but not through what the feeder has: see what is left out or opened"
@@ -278,17 +278,19 @@ def accepting(tables: FeederTables, changes: list[Change], unchecked: str) -> Fe
     problems = []
     for problem in validate(tables):
         sentence, found, doubt = problem.partition(' (if it is right: accept = ["')
-        problems.append(sentence)
+        problems.append(Problem(problem.code, sentence))
         if found:
             doubts.add(doubt.partition('"')[0])
             changes.append(Change("feeder", sentence, "accepted", "as the source has it"))
     if doubts and unchecked:
-        raise FeederInvalid([*problems, f"{unchecked}; nothing else speaks for what is doubtful"])
+        raise FeederInvalid(
+            [*problems, Problem("doubtful", f"{unchecked}; nothing else speaks for what is doubtful")]
+        )
     accept = tuple(name for name in SUSPICIONS if name in doubts)
     return replace(tables, meta=replace(tables.meta, accept=accept)) if accept else tables
 
 
-def _infeeds(network: Network, rows: list[LineRow], busbar: str, inside: Mapping[str, int]) -> list[str]:
+def _infeeds(network: Network, rows: list[LineRow], busbar: str, inside: Mapping[str, int]) -> list[Problem]:
     """Return what else feeds the feeder besides its busbar."""
     problems = []
     everything = [*rows, *as_rows(network.couplings)]
@@ -296,16 +298,23 @@ def _infeeds(network: Network, rows: list[LineRow], busbar: str, inside: Mapping
     for source in network.sources:
         if source in inside and source != busbar:
             problems.append(
-                f"bus {source!r} has another voltage source; the feeder is fed by its busbar {busbar!r} alone"
+                Problem(
+                    "several-sources",
+                    f"bus {source!r} has another voltage source; the feeder is fed by its busbar "
+                    f"{busbar!r} alone",
+                )
             )
         elif source != busbar:
             above = reached(source, everything, without=fused)
             ways = [bus for bus in inside if bus not in fused and bus in above]
             if ways:
                 problems.append(
-                    f"{len(ways)} of the feeder's buses can be reached from the source {source!r} not only "
-                    f"through the busbar {busbar!r}, among them {', '.join(ways[:5])}: a mesh; "
-                    "open a line of it, or name another busbar with root"
+                    Problem(
+                        "several-sources",
+                        f"{len(ways)} of the feeder's buses can be reached from the source {source!r} "
+                        f"not only through the busbar {busbar!r}, among them {', '.join(ways[:5])}: a mesh; "
+                        "open a line of it, or name another busbar with root",
+                    )
                 )
     return problems
 

@@ -36,7 +36,7 @@ from feeders.convert_opendss_draws import (
 from feeders.extras import extra
 from feeders.schema import LineRow
 from gridsec.arrays import Floats, Phasors
-from gridsec.errors import FeederInvalid, GridsecError
+from gridsec.errors import FeederInvalid, GridsecError, Problem
 
 SOLVER: Final = ("set mode=snap", "set tolerance=1e-11", "set maxiterations=1000", "set maxcontroliter=200")
 CONSTANT_POWER: Final = (
@@ -99,7 +99,7 @@ def _engine() -> Iterator[Any]:
     try:
         from opendssdirect import dss
     except ImportError as error:
-        raise GridsecError(f"OpenDSS files need {extra('convert')}") from error
+        raise GridsecError(f"OpenDSS files need {extra('convert')}", code="not-installed") from error
     here = Path.cwd()
     with tempfile.TemporaryDirectory() as scratch:
         engine = dss.NewContext()
@@ -147,11 +147,11 @@ def _read(dss: Any, path: Path) -> Network:
     dss.Text.Command(f'redirect "{path.resolve()}"')
     if not dss.Basic.NumCircuits():
         raise SourceUnreadable(f"{path}: OpenDSS finds no circuit in it; expected 'new circuit...'")
-    problems: list[str] = []
+    problems: list[Problem] = []
     _run(dss, (*_voltage_bases(dss), *SOLVER))
     found = _solved(dss)
     if not found:
-        raise GridsecError(f"{path}: OpenDSS's own power flow does not converge")
+        raise GridsecError(f"{path}: OpenDSS's own power flow does not converge", code="not-converged")
     elements = [_element(dss, name, problems) for name in dss.Circuit.AllElementNames()]
     changes = voltage_dependence(dss)
     _run(dss, CONSTANT_POWER)
@@ -175,7 +175,9 @@ def _read(dss: Any, path: Path) -> Network:
     for each in elements:
         _take(dss, each, network, problems)
     if problems:
-        raise FeederInvalid(f"{path.name}: {problem}" for problem in dict.fromkeys(problems))
+        raise FeederInvalid(
+            Problem(problem.code, f"{path.name}: {problem}") for problem in dict.fromkeys(problems)
+        )
     return network
 
 
@@ -209,7 +211,7 @@ def _voltage_bases(dss: Any) -> tuple[str, ...]:
     return ("calcvoltagebases",) if named and bare else ()
 
 
-def _nominal(dss: Any, problems: list[str]) -> dict[str, float]:
+def _nominal(dss: Any, problems: list[Problem]) -> dict[str, float]:
     nominal = {}
     for bus in dss.Circuit.AllBusNames():
         dss.Circuit.SetActiveBus(bus)
@@ -217,8 +219,11 @@ def _nominal(dss: Any, problems: list[str]) -> dict[str, float]:
     bare = [bus for bus, volt in nominal.items() if volt <= 0]
     if bare:
         problems.append(
-            f"{len(bare)} bus(es) have no nominal voltage, among them {', '.join(bare[:5])}; "
-            "expected 'set voltagebases=[...]' and 'calcvoltagebases' in the file"
+            Problem(
+                "missing",
+                f"{len(bare)} bus(es) have no nominal voltage, among them {', '.join(bare[:5])}; "
+                "expected 'set voltagebases=[...]' and 'calcvoltagebases' in the file",
+            )
         )
     return nominal
 
@@ -232,7 +237,7 @@ def _positions(dss: Any) -> dict[str, tuple[float, float]]:
     return places
 
 
-def _element(dss: Any, full: str, problems: list[str]) -> Element:
+def _element(dss: Any, full: str, problems: list[Problem]) -> Element:
     dss.Circuit.SetActiveElement(full)
     kind, _, name = full.partition(".")
     kind = kind.lower()
@@ -256,8 +261,11 @@ def _element(dss: Any, full: str, problems: list[str]) -> Element:
         powers.append(power)
     if enabled and kind not in COUPLINGS and any(node > PHASES for here in nodes for node in here):
         problems.append(
-            f"{kind} {name} has a conductor besides the phases 1, 2, 3 and the grounded neutral 0; "
-            "expected none"
+            Problem(
+                "unsupported",
+                f"{kind} {name} has a conductor besides the phases 1, 2, 3 and the grounded neutral 0; "
+                "expected none",
+            )
         )
     on = tuple(k for k in range(len(buses)) if enabled and not element.IsOpen(k + 1, 0))
     return Element(name, kind, buses, nodes, tuple(powers), enabled, on)
@@ -273,7 +281,7 @@ def _build_everything(dss: Any, elements: list[Element]) -> None:
     dss.Solution.BuildYMatrix(1, 0)
 
 
-def _take(dss: Any, each: Element, network: Network, problems: list[str]) -> None:
+def _take(dss: Any, each: Element, network: Network, problems: list[Problem]) -> None:
     """Add an element to the network, or say what becomes of it."""
     label = f"{each.kind} {each.name}"
     if not each.enabled:
@@ -283,7 +291,12 @@ def _take(dss: Any, each: Element, network: Network, problems: list[str]) -> Non
     elif each.kind in SERIES:
         _line(dss, each, network, problems)
     elif each.kind == "capacitor":
-        problems.append(f"{label} is in series between {each.buses[0]} and {each.buses[1]}; expected a shunt")
+        problems.append(
+            Problem(
+                "unsupported",
+                f"{label} is in series between {each.buses[0]} and {each.buses[1]}; expected a shunt",
+            )
+        )
     elif each.kind in COUPLINGS:
         line, idle = _regulator(dss, each, network)
         network.couplings.append(Coupling(label, each.buses, each.power_kva, line, idle))
@@ -366,18 +379,23 @@ def _yprim(dss: Any, each: Element) -> Phasors:
     return matrix
 
 
-def _line(dss: Any, each: Element, network: Network, problems: list[str]) -> None:
+def _line(dss: Any, each: Element, network: Network, problems: list[Problem]) -> None:
     """A line or a series reactor: its series impedance and its charging from its primitive admittances."""
     label = each.name if each.kind == "line" else f"{each.kind}.{each.name}"
     here, there = each.nodes
     if here != there or len(set(here)) != len(here) or not all(1 <= node <= PHASES for node in here):
         if all(1 <= node <= PHASES for node in (*here, *there)):
             problems.append(
-                f"line {label} joins the phases {'.'.join(map(str, here))} of {each.buses[0]} to "
-                f"{'.'.join(map(str, there))} of {each.buses[1]}; expected the same phases at both ends"
+                Problem(
+                    "unsupported",
+                    f"line {label} joins the phases {'.'.join(map(str, here))} of {each.buses[0]} to "
+                    f"{'.'.join(map(str, there))} of {each.buses[1]}; expected the same phases at both ends",
+                )
             )
         elif 0 in (*here, *there):
-            problems.append(f"line {label} has a conductor to ground; expected phases 1, 2, 3")
+            problems.append(
+                Problem("unsupported", f"line {label} has a conductor to ground; expected phases 1, 2, 3")
+            )
         return
     matrix, count = _yprim(dss, each), len(here)
     series = np.asarray(
@@ -389,7 +407,9 @@ def _line(dss: Any, each: Element, network: Network, problems: list[str]) -> Non
     order = np.argsort(here)
     phases = np.array(here)[order] - 1
     if min(series.real.diagonal().min(), series.imag.diagonal().min()) < 0:
-        problems.append(f"line {label} has a negative resistance or reactance; expected none")
+        problems.append(
+            Problem("negative", f"line {label} has a negative resistance or reactance; expected none")
+        )
         return
     changes: list[Change] = []
     row = line_row(

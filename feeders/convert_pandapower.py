@@ -169,7 +169,9 @@ def _root(net: Any, network: Network, names: dict[int, str], wanted: str | None)
         named = [i for i in names if str(net.bus.at[i, "name"]) == wanted]
         hits = named or [i for i in names if str(i) == wanted] or [i for i in names if names[i] == wanted]
         if len(hits) != 1:
-            raise GridsecError(f"{len(hits)} buses are called {wanted!r}; give the index of one")
+            raise GridsecError(
+                f"{len(hits)} buses are called {wanted!r}; give the index of one", code="unknown-name"
+            )
         return names[hits[0]]
     if not network.sources:
         raise BusbarUnclear("there is no voltage source in service; name the busbar with --root")

@@ -11,6 +11,8 @@ from typing import Any, Final
 
 import numpy as np
 
+from gridsec.errors import Problem
+
 __all__ = ["CARRIED", "COLUMNS", "ids", "number", "problems_of", "with_truths"]
 
 # Tables that are carried over, or told about one by one; every other row in the feeder earns a note.
@@ -94,7 +96,7 @@ def _clean(name: object) -> str:
     return "".join(c if c.isprintable() else " " for c in text).strip()[:100]
 
 
-def problems_of(net: Any) -> list[str]:
+def problems_of(net: Any) -> list[Problem]:
     """Return everything that keeps a net's tables from being read.
 
     Parameters
@@ -103,12 +105,14 @@ def problems_of(net: Any) -> list[str]:
         What a file held.
     """
     missing = [
-        f"the table {table!r} is missing" for table in COLUMNS if not hasattr(net.get(table), "columns")
+        Problem("missing", f"the table {table!r} is missing")
+        for table in COLUMNS
+        if not hasattr(net.get(table), "columns")
     ]
     if missing:
         return missing
     problems = [
-        f"{table}: the column {column!r} is missing"
+        Problem("missing", f"{table}: the column {column!r} is missing")
         for table, columns in COLUMNS.items()
         for column in columns.split()
         if column not in net[table].columns
@@ -119,28 +123,36 @@ def problems_of(net: Any) -> list[str]:
         ends = [name for name in columns.split() if name == "bus" or name.endswith("_bus")]
         for column in ends:
             strange = net[table].index[~net[table][column].isin(net.bus.index)]
-            problems += [f"{table} {i}: {column} {net[table].at[i, column]} is no bus" for i in strange]
+            problems += [
+                Problem("unknown-index", f"{table} {i}: {column} {net[table].at[i, column]} is no bus")
+                for i in strange
+            ]
     for kind, table in (("b", "bus"), ("l", "line")):
         given = net.switch[net.switch.et == kind]
         strange = given.index[~given.element.isin(net[table].index)]
-        problems += [f"switch {i}: element {net.switch.at[i, 'element']} is no {table}" for i in strange]
+        problems += [
+            Problem("unknown-index", f"switch {i}: element {net.switch.at[i, 'element']} is no {table}")
+            for i in strange
+        ]
     return [*problems, *_numbers(net)]
 
 
-def _numbers(net: Any) -> Iterator[str]:
+def _numbers(net: Any) -> Iterator[Problem]:
     """Whatever is not a number or a truth, or not one that it can be."""
     if not isinstance(net.get("f_hz"), Real) or not 0.0 < net.f_hz < math.inf:
-        yield f"f_hz is {net.get('f_hz')}; expected a frequency"
+        yield Problem("not-positive", f"f_hz is {net.get('f_hz')}; expected a frequency")
     for table, columns in NUMBERS.items():
         for column, wanted in columns.items():
             values = np.asarray([number(cell) for cell in net[table][column]], dtype=np.float64)
             bad = net[table].index[~((values >= LEAST[wanted]) & np.isfinite(values))]
             for i in bad:
-                yield f"{table} {i}: {column} is {net[table].at[i, column]}; expected {wanted}"
+                yield Problem(
+                    "out-of-range", f"{table} {i}: {column} is {net[table].at[i, column]}; expected {wanted}"
+                )
     for table, column in _truths(net):
         for i, cell in net[table][column].items():
             if not _is_truth(cell):
-                yield f"{table} {i}: {column} is {cell}; expected true or false"
+                yield Problem("wrong-type", f"{table} {i}: {column} is {cell}; expected true or false")
 
 
 def with_truths(net: Any) -> Any:

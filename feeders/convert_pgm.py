@@ -31,7 +31,7 @@ from feeders.levels import same_level
 from feeders.records import some
 from feeders.schema import LineRow
 from gridsec.arrays import Floats, Phasors
-from gridsec.errors import FeederInvalid, GridsecError
+from gridsec.errors import FeederInvalid, GridsecError, Problem
 
 OMEGA: Final = 2.0 * np.pi * 50.0
 """power-grid-model's angular frequency; its files do not say another."""
@@ -91,7 +91,10 @@ def read_pgm(path: Path) -> Network:
     )
     problems = validate_input_data(tables, symmetric=symmetric)
     if problems:
-        raise FeederInvalid(f"{path.name}: {problem} Ids: {_shown(problem.ids)}" for problem in problems)
+        raise FeederInvalid(
+            Problem("source-invalid", f"{path.name}: {problem} Ids: {_shown(problem.ids)}")
+            for problem in problems
+        )
     dependent = [kind for kind in (*LOADS, *GENERATORS) if kind in tables and tables[kind]["type"].any()]
     found = _solve(path, tables, symmetric) if dependent else {}
     network = Network(f"power-grid-model {version('power-grid-model')}", [], _nominal(tables))
@@ -130,12 +133,16 @@ def _tables(path: Path) -> Tables:
         ) from error
     tables = {kind.value: rows for kind, rows in data.items()}
     problems = [
-        f"{path.name}: the table {kind!r} is missing" for kind in ("node", "source") if kind not in tables
+        Problem("missing", f"{path.name}: the table {kind!r} is missing")
+        for kind in ("node", "source")
+        if kind not in tables
     ]
     if any(not isinstance(rows, np.ndarray) or rows.ndim != 1 for rows in tables.values()):
-        problems.append(f"{path.name}: is a batch; expected one set of input data")
+        problems.append(Problem("shape", f"{path.name}: is a batch; expected one set of input data"))
     elif any("u_rated" not in (rows.dtype.names or ()) for kind, rows in tables.items() if kind == "node"):
-        problems.append(f"{path.name}: is not of the type 'input'; expected input data")
+        problems.append(
+            Problem("wrong-type", f"{path.name}: is not of the type 'input'; expected input data")
+        )
     if problems:
         raise FeederInvalid(problems)
     return tables
@@ -153,7 +160,9 @@ def _solve(path: Path, tables: Tables, symmetric: bool) -> Tables:
         except Exception as error:  # whatever the foreign solver raises on foreign data
             if tolerance == TOLERANCES[-1]:
                 text = " ".join(str(error).split()).partition(" Try ")[0]
-                raise GridsecError(f"{path}: power-grid-model's own power flow fails: {text}") from error
+                raise GridsecError(
+                    f"{path}: power-grid-model's own power flow fails: {text}", code="not-converged"
+                ) from error
         else:
             return {kind.value: rows for kind, rows in result.items()}
     raise AssertionError("the last tolerance has returned or raised")

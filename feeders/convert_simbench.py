@@ -79,7 +79,9 @@ def grid(code: str) -> Any:
     """
     simbench = _simbench()
     if code not in simbench.collect_all_simbench_codes():
-        raise SourceUnreadable(f"SimBench has no grid {code!r}; a code looks like 1-LV-rural1--0-sw")
+        raise SourceUnreadable(
+            f"SimBench has no grid {code!r}; a code looks like 1-LV-rural1--0-sw", code="unknown-name"
+        )
     return simbench.get_simbench_net(code)
 
 
@@ -114,7 +116,7 @@ def _simbench() -> Any:
     try:
         import simbench
     except ImportError as error:
-        raise GridsecError(f"SimBench grids need {extra('convert')}") from error
+        raise GridsecError(f"SimBench grids need {extra('convert')}", code="not-installed") from error
     return simbench
 
 
@@ -185,7 +187,7 @@ def envelope(p: Floats, q: Floats) -> Envelope:
         bounds=[(0.0, 1.0), (1.0, None), (0.0, None)],
     )
     if not found.success or found.x is None:
-        raise GridsecError(f"no envelope of the load profile: {found.message}")
+        raise GridsecError(f"no envelope of the load profile: {found.message}", code="no-solution")
     low, high, bottom = map(float, found.x)
     # Rounded outwards, and wide enough for the rounded samples of the slices.
     return Envelope(floor(low * 1e3) / 1e3, ceil(high * 1e3) / 1e3, ceil((bottom + 1e-3) * 1e3) / 1e3)

@@ -19,6 +19,7 @@ import numpy as np
 
 from gridsec.bank import MOST_OBSERVERS
 from gridsec.designs import cached
+from gridsec.errors import InputInvalid, Problem
 from gridsec.gains import CircleGains, CircleOptions, stacked
 from gridsec.lure import Lure
 from gridsec.stacked import Gains
@@ -136,7 +137,7 @@ class DesignCache:
 
     def _path(self, key: str) -> Path:
         if not (key.isalnum() and key.isascii()):
-            raise ValueError(f"{key!r} is no key of a design")
+            raise InputInvalid([Problem("wrong-text", f"{key!r} is no key of a design")])
         return self.where / (key + _SUFFIX)
 
     def _prune(self) -> None:

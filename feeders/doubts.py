@@ -13,6 +13,7 @@ from feeders.late import expected
 from feeders.load import Site, Snapshot, to_frame
 from feeders.schema import FeederTables
 from gridsec.arrays import Floats
+from gridsec.errors import InputInvalid, Problem
 from gridsec.online import Frame
 from gridsec.sequential import LoadDoubt
 
@@ -150,9 +151,17 @@ def from_history(error_p: Floats, error_q: Floats, step_s: float) -> LoadDoubt:
         With fewer than three samples, or values that are not finite.
     """
     if error_p.ndim != 2 or error_p.shape != error_q.shape or len(error_p) < _FEWEST:
-        raise ValueError(f"errors of shapes {error_p.shape} and {error_q.shape}; need (T, N) with T >= 3")
+        raise InputInvalid(
+            [
+                Problem(
+                    "shape", f"errors of shapes {error_p.shape} and {error_q.shape}; need (T, N) with T >= 3"
+                )
+            ]
+        )
     if not (np.isfinite(error_p).all() and np.isfinite(error_q).all() and step_s > 0):
-        raise ValueError("errors and their interval must be finite, and the interval positive")
+        raise InputInvalid(
+            [Problem("not-finite", "errors and their interval must be finite, and the interval positive")]
+        )
     return LoadDoubt(
         p=np.sqrt(np.mean(error_p**2, axis=0)),
         q=np.sqrt(np.mean(error_q**2, axis=0)),

@@ -22,7 +22,7 @@ from feeders.topology import Tree
 from gridsec.accuracy import MeterAccuracy
 from gridsec.arrays import Floats, Ints, frozen, frozen_ints
 from gridsec.droop import Droop, fleet
-from gridsec.errors import FeederInvalid
+from gridsec.errors import FeederInvalid, Problem
 
 # An active power this far beyond what a customer can draw or feed in is no measurement of it.
 CREDIBLE_FACTOR = 10.0
@@ -114,7 +114,7 @@ def find(path_or_name: Path | str) -> FeederTables:
     if Path(path_or_name).is_file():
         why = "a file; expected a feeder's folder, or the name of a feeder"
     there, advised = ", ".join(names(balanced=False)), advice(path_or_name)
-    raise FeederInvalid([f"{path_or_name}: {why}; there are {there}{advised}"])
+    raise FeederInvalid([Problem("unknown-name", f"{path_or_name}: {why}; there are {there}{advised}")])
 
 
 def indices(values: Sequence[int]) -> Ints:

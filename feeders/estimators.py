@@ -18,7 +18,7 @@ from feeders.load import Site, from_tables, plant
 from gridsec import monitor, sequential
 from gridsec.arrays import Floats
 from gridsec.certificates import certify
-from gridsec.errors import FeederInvalid
+from gridsec.errors import FeederInvalid, Problem
 from gridsec.families import decoders, partial, set_search, ticks, unknown_input, windowed
 from gridsec.gains import CircleOptions, options_for
 from gridsec.lure import Lure, close_loop
@@ -148,9 +148,13 @@ def choose(site: Site, *, estimator: str | None = None, max_attacked: int | None
     meta = site.tables.meta
     problems = []
     if estimator is not None and estimator not in ESTIMATORS:
-        problems.append(f"estimator {estimator!r} does not exist; there are {', '.join(ESTIMATORS)}")
+        problems.append(
+            Problem(
+                "unknown-name", f"estimator {estimator!r} does not exist; there are {', '.join(ESTIMATORS)}"
+            )
+        )
     if max_attacked is not None and max_attacked < 0:
-        problems.append(f"max_attacked is {max_attacked}; it cannot be negative")
+        problems.append(Problem("negative", f"max_attacked is {max_attacked}; it cannot be negative"))
     if problems:
         raise FeederInvalid(problems)
     changed = replace(

@@ -45,6 +45,8 @@ PROBE_PU: Final = 1e-3
 class NoEquilibrium(GridsecError):
     """The inverters and the feeder found no common answer."""
 
+    code = "not-converged"
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Loads:

@@ -10,6 +10,8 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Final
 
+from gridsec.errors import Problem
+
 if TYPE_CHECKING:
     from feeders.schema import LineRow
     from feeders.topology import Edge, Tree
@@ -72,7 +74,7 @@ def _found(found: Tree, edges: Sequence[Edge | LineRow], volt: float) -> dict[in
     return nominal
 
 
-def problems(found: Tree, edges: Sequence[Edge | LineRow], volt: float) -> Iterator[tuple[int, str]]:
+def problems(found: Tree, edges: Sequence[Edge | LineRow], volt: float) -> Iterator[tuple[int, Problem]]:
     """Yield every line whose `to_volt` cannot be, with what is wrong; arguments as of `nominal_volts`."""
     nominal, known = nominal_volts(found, edges, volt), _found(found, edges, volt).keys()
     above = dict(zip(found.branch, found.parent, strict=True))
@@ -83,11 +85,26 @@ def problems(found: Tree, edges: Sequence[Edge | LineRow], volt: float) -> Itera
         told = nominal[here] if line.to_volt is None else line.to_volt
         backwards = line.to_volt is not None and above.get(k) == there
         if here == there and not same_level(told, nominal[here]):
-            yield k, f"{told:g} on a line without impedance; expected the transformer's r_ohm and x_ohm"
+            yield (
+                k,
+                Problem(
+                    "zero-impedance",
+                    f"{told:g} on a line without impedance; expected the transformer's r_ohm and x_ohm",
+                ),
+            )
         elif backwards and (here not in known or not same_level(told, nominal[there])):
-            yield k, f"{told:g}, but {line.to_bus!r} is on the side of the busbar; {_TURN}"
+            yield (
+                k,
+                Problem("backwards", f"{told:g}, but {line.to_bus!r} is on the side of the busbar; {_TURN}"),
+            )
         elif not same_level(told, nominal[there]):
-            yield k, f"{told:g} V at {line.to_bus!r}, {nominal[there]:g} V around the loop; expected the same"
+            yield (
+                k,
+                Problem(
+                    "inconsistent",
+                    f"{told:g} V at {line.to_bus!r}, {nominal[there]:g} V around the loop; expected the same",
+                ),
+            )
 
 
 _TURN: Final = (

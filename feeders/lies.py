@@ -93,7 +93,9 @@ def manipulations(
     random = generator(scenario.seed, Stream.ATTACK)
     there = site.droop.tau.size if lie.trick is Trick.INVERTER else site.meters.size
     if not 0 < lie.count <= there:
-        raise NoSuchAttack(f"{site.feeder.name} has {there} of what {lie.count} should lie")
+        raise NoSuchAttack(
+            f"{site.feeder.name} has {there} of what {lie.count} should lie", code="too-few-meters"
+        )
     liars = np.sort(random.choice(there, lie.count, replace=False)).astype(np.intp)
     signs = random.choice([-1.0, 1.0], lie.count)
     if lie.trick is Trick.INVERTER:
@@ -106,7 +108,9 @@ def manipulations(
 def _coordinated(site: Site, lie: Lie, scenario: Scenario, t_on: float, t_off: float) -> Attack:
     """All liars tell one story, the trace of a load at a random customer."""
     if not 0 < lie.count <= site.meters.size:
-        raise NoSuchAttack(f"{site.feeder.name} has {site.meters.size} meters; {lie.count} cannot lie")
+        raise NoSuchAttack(
+            f"{site.feeder.name} has {site.meters.size} meters; {lie.count} cannot lie", code="too-few-meters"
+        )
     loads = present_loads(site, scenario, t_on)
     told: list[Attack] = []
     for customer in generator(scenario.seed, Stream.ATTACK).permutation(site.meters):

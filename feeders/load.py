@@ -36,7 +36,7 @@ from feeders.topology import Edge, Tree, tree
 from gridsec.accuracy import MeterAccuracy
 from gridsec.arrays import Floats, Ints, frozen
 from gridsec.droop import Droop
-from gridsec.errors import FeederInvalid
+from gridsec.errors import FeederInvalid, Problem
 from gridsec.feeder import Feeder
 from gridsec.mesh import Meshed, MeshedFeeder, PhasedMesh
 from gridsec.monitor import Plant
@@ -144,7 +144,9 @@ class Site:
             If closed lines form loops.
         """
         if isinstance(self.feeder, Meshed):
-            raise FeederInvalid(["lines: closed lines form loops, and this takes radial feeders only"])
+            raise FeederInvalid(
+                [Problem("not-radial", "lines: closed lines form loops, and this takes radial feeders only")]
+            )
         return self.spanning
 
     @property
@@ -158,7 +160,13 @@ class Site:
         """
         if isinstance(self.tree, Feeder):
             return self.tree
-        raise FeederInvalid(["lines, customers: in three phases, and this takes balanced feeders only"])
+        raise FeederInvalid(
+            [
+                Problem(
+                    "not-balanced", "lines, customers: in three phases, and this takes balanced feeders only"
+                )
+            ]
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -296,7 +304,7 @@ def _parts(row: CustomerRow) -> list[CustomerRow]:
     ]
 
 
-def _channels(tables: FeederTables) -> list[str]:
+def _channels(tables: FeederTables) -> list[Problem]:
     """Ids that customers or meters of three phases give to their phases and that cannot be."""
     problems = []
     for column in (column for column in CUSTOMER_COLUMNS if column.name in {"customer", "meter"}):
@@ -306,13 +314,16 @@ def _channels(tables: FeederTables) -> list[str]:
             ids = [getattr(part, column.name) for part in (_parts(row) if row.phases == "abc" else [row])]
             wrong = [problem for problem in (parse(column, own)[1] for own in ids) if problem]
             wrong += [
-                f"{own!r} is already the id of {first[own]}; every id must be unique, as those of the phases "
-                "of whoever has three"
+                Problem(
+                    "duplicate",
+                    f"{own!r} is already the id of {first[own]}; every id must be unique, as those of "
+                    "the phases of three-phase customers",
+                )
                 for own in ids
                 if own in first
             ]
             if wrong:
-                problems.append(f"{where}, column {column.name}: {wrong[0]}")
+                problems.append(Problem(wrong[0].code, f"{where}, column {column.name}: {wrong[0]}"))
             first.update({own: where for own in ids if own})
     return problems
 
@@ -423,12 +434,17 @@ def _busbar(v0_volt: Floats | float, base_volt: float) -> tuple[float, Floats | 
 # --- building -----------------------------------------------------------------------------------
 
 
-def _unsupported(tables: FeederTables) -> tuple[str, ...]:
+def _unsupported(tables: FeederTables) -> tuple[Problem, ...]:
     """What the format can say and the model cannot do yet."""
     problems = []
     closed = [line for line in tables.lines if line.closed]
     if all(line.r_ohm == line.x_ohm == 0.0 for line in closed):
-        problems.append("lines: no closed line has an impedance; there is nothing to watch below the busbar")
+        problems.append(
+            Problem(
+                "nothing-to-design",
+                "lines: no closed line has an impedance; there is nothing to watch below the busbar",
+            )
+        )
     return tuple(problems)
 
 

@@ -30,7 +30,7 @@ from feeders.topology import Edge, Tree, tree
 from gridsec.accuracy import MeterAccuracy
 from gridsec.arrays import Floats, Ints, Phasors, frozen
 from gridsec.droop import Droop
-from gridsec.errors import FeederInvalid
+from gridsec.errors import FeederInvalid, Problem
 from gridsec.phases import PHASES, ThreePhaseFeeder, sequence_matrix
 
 if TYPE_CHECKING:
@@ -132,7 +132,9 @@ def three_phase(tables: FeederTables) -> ThreePhaseSite:
     """
     site, ties = spanned(tables)
     if ties.ends.size:
-        raise FeederInvalid(["lines: closed lines form loops, and this takes radial feeders only"])
+        raise FeederInvalid(
+            [Problem("not-radial", "lines: closed lines form loops, and this takes radial feeders only")]
+        )
     return site
 
 
@@ -214,12 +216,16 @@ def _blocks(lines: Sequence[LineRow], side: Floats, base_kva: float) -> tuple[Bo
     return present, np.where(both, z, 0.0), np.where(both, charging, 0.0)
 
 
-def _beyond(lines: Sequence[LineRow], ties: Sequence[LineRow], found: Tree) -> list[str]:
+def _beyond(lines: Sequence[LineRow], ties: Sequence[LineRow], found: Tree) -> list[Problem]:
     """Phases that reach a bus only through a line that closes a loop: what the tree cannot say."""
     there = [set(PHASES), *(set(line.phases) for line in lines)]
     return [
-        f"lines, line {tie.line!r} closes a loop and brings phase {phase!r} to {bus!r}, which no line of the "
-        "tree has there; expected lines in parallel of single phases as one row with a matrix"
+        Problem(
+            "absent-phase",
+            f"lines, line {tie.line!r} closes a loop and brings phase {phase!r} to {bus!r}, which no "
+            "line of the "
+            "tree has there; expected lines in parallel of single phases as one row with a matrix",
+        )
         for tie in ties
         for bus in (tie.from_bus, tie.to_bus)
         for phase in tie.phases
@@ -265,7 +271,7 @@ def _why(tables: FeederTables) -> str:
     return f" ({who[0]} makes the feeder one in three phases)" if who else ""
 
 
-def unsupported(tables: FeederTables) -> tuple[str, ...]:
+def unsupported(tables: FeederTables) -> tuple[Problem, ...]:
     """Return what the format can say and the three-phase model cannot do, or needs and does not find.
 
     Parameters
@@ -281,18 +287,39 @@ def unsupported(tables: FeederTables) -> tuple[str, ...]:
         if _fuses(line):
             if line.phases != "abc":
                 problems.append(
-                    f"{where}: phases {line.phases!r} without impedance; a switch must join all three"
+                    Problem(
+                        "absent-phase",
+                        f"{where}: phases {line.phases!r} without impedance; a switch must join all three",
+                    )
                 )
             if line.r0_ohm or line.x0_ohm:
-                problems.append(f"{where}: has an impedance only in the zero sequence; expected both or none")
+                problems.append(
+                    Problem(
+                        "inconsistent",
+                        f"{where}: has an impedance only in the zero sequence; expected both or none",
+                    )
+                )
         elif given == 2 and line.phases == "abc" and line.r0_ohm == line.x0_ohm == 0.0:
-            problems.append(f"{where}: has no impedance in the zero sequence; expected that of its return")
+            problems.append(
+                Problem(
+                    "zero-impedance",
+                    f"{where}: has no impedance in the zero sequence; expected that of its return",
+                )
+            )
         elif given == 1 or (given == 0 and len(line.phases) > 1 and series_ohm(cells_of(line)) is None):
             missing = "r0_ohm" if line.r0_ohm is None else "x0_ohm"
             problems.append(
-                f"{where}, column {missing}: is missing; several phases need the zero sequence or a matrix"
-                + why
+                Problem(
+                    "missing",
+                    f"{where}, column {missing}: is missing; several phases need the zero sequence or "
+                    "a matrix" + why,
+                )
             )
     if all(map(_fuses, closed)):
-        problems.append("lines: no closed line has an impedance; there is nothing to watch below the busbar")
+        problems.append(
+            Problem(
+                "nothing-to-design",
+                "lines: no closed line has an impedance; there is nothing to watch below the busbar",
+            )
+        )
     return tuple(problems)

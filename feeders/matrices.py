@@ -11,6 +11,7 @@ import numpy as np
 from feeders.columns import PAIRS, SERIES_COLUMNS, SHUNT_COLUMNS, Column
 from feeders.records import Parsed, Report, rows
 from gridsec.arrays import Bools, Floats, Phasors
+from gridsec.errors import Problem
 
 if TYPE_CHECKING:
     from feeders.schema import LineRow
@@ -114,15 +115,15 @@ def check(parsed: Parsed, report: Report) -> None:
         for columns, matrix in ((SERIES_COLUMNS, series_ohm(cells)), (SHUNT_COLUMNS, shunt_us(cells))):
             if any(cells[column.name] is not None for column in columns):
                 wrong = [*_layout(cells, columns)] or [*_content(cells, matrix)]
-                report.problems.extend(f"{where}{problem}" for problem in wrong)
+                report.problems.extend(Problem(problem.code, f"{where}{problem}") for problem in wrong)
 
 
-def _layout(cells: Mapping[str, Any], columns: tuple[Column, ...]) -> Iterator[str]:
+def _layout(cells: Mapping[str, Any], columns: tuple[Column, ...]) -> Iterator[Problem]:
     """What is missing, and what is too much."""
     phases = cells["phases"]
     if len(phases) == 1:
         first = next(column.name for column in columns if cells[column.name] is not None)
-        yield f", column {first}: a matrix, but phases is {phases!r}; expected none"
+        yield Problem("inconsistent", f", column {first}: a matrix, but phases is {phases!r}; expected none")
         return
     wanted = {column.name for column in columns if set(column.name.split("_")[1]) <= set(phases)}
     missing = [column.name for column in columns if column.name in wanted and cells[column.name] is None]
@@ -130,12 +131,17 @@ def _layout(cells: Mapping[str, Any], columns: tuple[Column, ...]) -> Iterator[s
         column.name for column in columns if column.name not in wanted and cells[column.name] is not None
     ]
     if missing:
-        yield f", columns {', '.join(missing)}: missing; expected the whole matrix or nothing of it"
+        yield Problem(
+            "missing", f", columns {', '.join(missing)}: missing; expected the whole matrix or nothing of it"
+        )
     if extra:
-        yield f", columns {', '.join(extra)}: of a conductor that is not in phases {phases!r}; expected none"
+        yield Problem(
+            "absent-phase",
+            f", columns {', '.join(extra)}: of a conductor that is not in phases {phases!r}; expected none",
+        )
 
 
-def _content(cells: Mapping[str, Any], whole: Phasors | Floats | None) -> Iterator[str]:
+def _content(cells: Mapping[str, Any], whole: Phasors | Floats | None) -> Iterator[Problem]:
     """What no line can be."""
     if whole is None:
         return
@@ -147,14 +153,29 @@ def _content(cells: Mapping[str, Any], whole: Phasors | Floats | None) -> Iterat
     for name, value in parts:
         if abs(cells[name] - value) > AGREEMENT * largest:
             yield (
-                f", column {name}: {cells[name]:g} is not the positive sequence of the line's matrix; "
-                f"expected {value:.6g}, the mean of its diagonal less that of the rest"
+                Problem(
+                    "inconsistent",
+                    f", column {name}: {cells[name]:g} is not the positive sequence of the line's matrix; "
+                    f"expected {value:.6g}, the mean of its diagonal less that of the rest",
+                )
             )
     if not series and not passive(matrix.real):
-        yield ", columns b_aa_us to b_cc_us: no capacitances; expected a positive semidefinite matrix"
+        yield Problem(
+            "not-definite",
+            ", columns b_aa_us to b_cc_us: no capacitances; expected a positive semidefinite matrix",
+        )
     if series and not passive(matrix.real):
-        yield ", columns r_aa_ohm to r_cc_ohm: generate power; expected a positive semidefinite matrix"
+        yield Problem(
+            "not-definite",
+            ", columns r_aa_ohm to r_cc_ohm: generate power; expected a positive semidefinite matrix",
+        )
     if series and (cells["r0_ohm"] is not None or cells["x0_ohm"] is not None):
-        yield ", columns r0_ohm and x0_ohm: beside a matrix, which says it already; expected one of the two"
+        yield Problem(
+            "inconsistent",
+            ", columns r0_ohm and x0_ohm: beside a matrix, which says it already; expected one of the two",
+        )
     if series and min(np.linalg.svd(matrix, compute_uv=False)[-1], abs(one)) <= ROUNDING * largest:
-        yield ", columns r_aa_ohm to x_cc_ohm: are singular; expected conductors with impedances of their own"
+        yield Problem(
+            "singular",
+            ", columns r_aa_ohm to x_cc_ohm: are singular; expected conductors with impedances of their own",
+        )

@@ -14,6 +14,7 @@ import numpy as np
 
 from feeders.variation import Stream, generator
 from gridsec.arrays import Floats, Ints
+from gridsec.errors import InputInvalid, Problem
 from gridsec.network import InPhases
 
 if TYPE_CHECKING:
@@ -110,10 +111,18 @@ class Channel:
     def __post_init__(self) -> None:
         for name in ("loss", "late", "duplicate"):
             if not 0.0 <= getattr(self, name) <= 1.0:
-                raise ValueError(f"{name} is a probability, got {getattr(self, name)}")
+                raise InputInvalid(
+                    [Problem("out-of-range", f"{name} is a probability, got {getattr(self, name)}")]
+                )
         for name in ("delay_s", "delay_mean_s", "late_s", "clock_s"):
             if not 0.0 <= getattr(self, name) < np.inf:
-                raise ValueError(f"{name} must be finite and not negative, got {getattr(self, name)}")
+                raise InputInvalid(
+                    [
+                        Problem(
+                            "negative", f"{name} must be finite and not negative, got {getattr(self, name)}"
+                        )
+                    ]
+                )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -194,7 +203,9 @@ class Meters:
         self._ids = (*site.meter_ids, BUSBAR)
         unknown = {silence.meter for silence in channel.silences} - set(self._ids)
         if unknown:
-            raise ValueError(f"silences of unknown meters: {', '.join(sorted(unknown))}")
+            raise InputInvalid(
+                [Problem("unknown-name", f"silences of unknown meters: {', '.join(sorted(unknown))}")]
+            )
 
         random = generator(seed, Stream.METER)
         draw = random.uniform(-1.0, 1.0, (3, self.count))

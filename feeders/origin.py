@@ -58,9 +58,11 @@ def origin(path_or_name: Path | str) -> Origin | None:
     try:
         changes = pd.read_csv(folder / CHANGES_FILE, dtype=str, keep_default_na=False)
     except ValueError as error:
-        raise GridsecError(f"{folder / CHANGES_FILE}: {error}") from error
+        raise GridsecError(f"{folder / CHANGES_FILE}: {error}", code="unreadable") from error
     if tuple(changes.columns) != COLUMNS:
-        raise GridsecError(f"{folder / CHANGES_FILE}: expected the columns {', '.join(COLUMNS)}")
+        raise GridsecError(
+            f"{folder / CHANGES_FILE}: expected the columns {', '.join(COLUMNS)}", code="unreadable"
+        )
     told = folder / SOURCE_FILE
     text = told.read_text(encoding="utf-8", errors="replace") if told.is_file() else ""
     source = re.search(r"^- Source: `(.*)`(.*)$", text, re.MULTILINE)

@@ -23,6 +23,8 @@ GROUP: Final = "gridsec.estimators"
 class EstimatorUnusable(GridsecError):
     """Another package offers an estimator that cannot be used."""
 
+    code = "estimator-unusable"
+
 
 _NAME: Final = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
 

@@ -39,6 +39,8 @@ SLACK_VA: Final = 1e16
 class PowerFlowDiverged(GridsecError):
     """The AC equations were not solved: most often the load is beyond what the feeder can carry."""
 
+    code = "not-converged"
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Grid:

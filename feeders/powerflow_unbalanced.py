@@ -26,6 +26,7 @@ from scipy.sparse.linalg import splu
 
 from feeders.powerflow import PowerFlow, PowerFlowDiverged, levels
 from gridsec.arrays import Bools, Floats, Ints, Phasors
+from gridsec.errors import InputInvalid, Problem
 from gridsec.network import InPhases
 
 if TYPE_CHECKING:
@@ -134,7 +135,9 @@ class UnbalancedPowerFlow:
         self._of, self._share = customer, 1.0 / grid.connected.sum(axis=1)[customer]
         self._node = 3 * grid.customer_bus[customer] + phase
         if self._absent[self._node].any():
-            raise ValueError("a customer is connected to a phase that its bus does not have")
+            raise InputInvalid(
+                [Problem("absent-phase", "a customer is connected to a phase that its bus does not have")]
+            )
         loads: Phasors = np.zeros((known.size, customer.size), dtype=np.complex128)
         loads[self._node, np.arange(customer.size)] = 1.0
         free = np.flatnonzero(known)

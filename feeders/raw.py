@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from feeders.columns import shown
+from gridsec.errors import Problem
 
 META_FILE, LINES_FILE, CUSTOMERS_FILE = "feeder.toml", "lines.csv", "customers.csv"
 FOREIGN = re.compile(r".+\.(json|dss)|(pandapower|simbench):.+|.+--[0-9]-(no_)?sw", re.IGNORECASE)
@@ -32,7 +33,7 @@ class Raw:
     lines: Rows | None
     customers_name: str
     customers: Rows | None
-    problems: list[str]
+    problems: list[Problem]
 
 
 def advice(source: object) -> str:
@@ -45,10 +46,14 @@ def from_folder(folder: Path) -> Raw:
     """Read the files of a feeder; what cannot be read is a problem, never an exception."""
     raw = Raw(META_FILE, None, LINES_FILE, None, CUSTOMERS_FILE, None, [])
     if not folder.is_dir():
-        what = "is a file, not a folder" if folder.exists() else "does not exist"
+        there = folder.exists()
+        what = "is a file, not a folder" if there else "does not exist"
         raw.problems.append(
-            f"{folder} {what}; expected a folder with {META_FILE}, {LINES_FILE}, {CUSTOMERS_FILE}"
-            f"{advice(folder)}"
+            Problem(
+                "wrong-type" if there else "missing",
+                f"{folder} {what}; expected a folder with {META_FILE}, {LINES_FILE}, {CUSTOMERS_FILE}"
+                f"{advice(folder)}",
+            )
         )
         return raw
     text = _file_text(folder / META_FILE, raw.problems)
@@ -56,7 +61,7 @@ def from_folder(folder: Path) -> Raw:
         try:
             raw.meta = tomllib.loads(text)
         except (tomllib.TOMLDecodeError, RecursionError) as error:
-            raw.problems.append(f"{META_FILE}: no valid TOML: {error}")
+            raw.problems.append(Problem("unreadable", f"{META_FILE}: no valid TOML: {error}"))
     text = _file_text(folder / LINES_FILE, raw.problems)
     if text is not None:
         raw.lines = _csv_rows(LINES_FILE, text, raw.problems)
@@ -66,44 +71,59 @@ def from_folder(folder: Path) -> Raw:
     return raw
 
 
-def _file_text(path: Path, problems: list[str]) -> str | None:
+def _file_text(path: Path, problems: list[Problem]) -> str | None:
     try:
         if path.stat().st_size > MAX_BYTES:
-            problems.append(f"{path.name}: larger than {MAX_BYTES // 1024**2} MiB; is it the right file?")
+            problems.append(
+                Problem(
+                    "too-many", f"{path.name}: larger than {MAX_BYTES // 1024**2} MiB; is it the right file?"
+                )
+            )
             return None
         data = path.read_bytes()
     except FileNotFoundError:
-        problems.append(f"{path.name}: the file is missing")
+        problems.append(Problem("missing", f"{path.name}: the file is missing"))
         return None
     except OSError as error:
-        problems.append(f"{path.name}: cannot be read: {error.strerror}")
+        problems.append(Problem("unreadable", f"{path.name}: cannot be read: {error.strerror}"))
         return None
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         row = data[: error.start].count(b"\n") + 1
         problems.append(
-            f"{path.name}, row {row}: byte 0x{data[error.start]:02x} is not UTF-8; save it as UTF-8"
+            Problem(
+                "unreadable",
+                f"{path.name}, row {row}: byte 0x{data[error.start]:02x} is not UTF-8; save it as UTF-8",
+            )
         )
         return None
     if not text.strip():
-        problems.append(f"{path.name}: the file is empty")
+        problems.append(Problem("missing", f"{path.name}: the file is empty"))
         return None
     return text
 
 
-def _csv_rows(name: str, text: str, problems: list[str]) -> Rows | None:
+def _csv_rows(name: str, text: str, problems: list[Problem]) -> Rows | None:
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     rows: Rows = []
     try:
         header = [cell.strip() for cell in next(reader)]
         twice = sorted({cell for cell in header if header.count(cell) > 1})
         if twice:
-            problems.append(f"{name}, row 1: column {', '.join(map(shown, twice))} is there more than once")
+            problems.append(
+                Problem(
+                    "duplicate",
+                    f"{name}, row 1: column {', '.join(map(shown, twice))} is there more than once",
+                )
+            )
             return None
         if len(header) == 1 and (";" in header[0] or "\t" in header[0]):
             problems.append(
-                f"{name}, row 1: one single column {shown(header[0])}; separate columns by commas"
+                Problem(
+                    "shape",
+                    f"{name}, row 1: one single column {shown(header[0])}; separate columns by commas",
+                )
             )
             return None
         for cells in reader:
@@ -111,15 +131,18 @@ def _csv_rows(name: str, text: str, problems: list[str]) -> Rows | None:
                 continue
             if len(cells) != len(header):
                 problems.append(
-                    f"{name}, row {reader.line_num}: {len(cells)} cells under {len(header)} columns"
+                    Problem(
+                        "shape",
+                        f"{name}, row {reader.line_num}: {len(cells)} cells under {len(header)} columns",
+                    )
                 )
                 continue
             rows.append((reader.line_num, dict(zip(header, cells, strict=True))))
     except csv.Error as error:
-        problems.append(f"{name}, row {reader.line_num}: no valid CSV: {error}")
+        problems.append(Problem("unreadable", f"{name}, row {reader.line_num}: no valid CSV: {error}"))
         return None
     if not rows:
-        problems.append(f"{name}: there is no row below the header")
+        problems.append(Problem("missing", f"{name}: there is no row below the header"))
         return None
     return rows
 
@@ -128,10 +151,15 @@ def from_object(obj: object) -> Raw:
     """Take the JSON form apart, already decoded; a table is a list of rows or an object of columns."""
     raw = Raw("feeder", None, "lines", None, "customers", None, [])
     if not isinstance(obj, Mapping):
-        raw.problems.append(f"{shown(obj)} is no feeder; expected an object with feeder, lines and customers")
+        raw.problems.append(
+            Problem(
+                "wrong-type",
+                f"{shown(obj)} is no feeder; expected an object with feeder, lines and customers",
+            )
+        )
         return raw
     raw.problems.extend(
-        f"{name}: is missing; expected feeder, lines and customers"
+        Problem("missing", f"{name}: is missing; expected feeder, lines and customers")
         for name in ("feeder", "lines", "customers")
         if obj.get(name) is None
     )
@@ -139,35 +167,39 @@ def from_object(obj: object) -> Raw:
     if isinstance(meta, Mapping):
         raw.meta = meta
     elif meta is not None:
-        raw.problems.append(f"feeder: {shown(meta)} is no object")
+        raw.problems.append(Problem("wrong-type", f"feeder: {shown(meta)} is no object"))
     raw.lines = _json_rows("lines", obj.get("lines"), raw.problems)
     raw.customers = _json_rows("customers", obj.get("customers"), raw.problems)
     return raw
 
 
-def _json_rows(name: str, table: object, problems: list[str]) -> Rows | None:
+def _json_rows(name: str, table: object, problems: list[Problem]) -> Rows | None:
     if table is None:
         return None
     if isinstance(table, Mapping):
         if not all(isinstance(cells, (list, tuple)) for cells in table.values()):
-            problems.append(f"{name}: expected a list of rows, or an object whose columns are lists")
+            problems.append(
+                Problem(
+                    "wrong-type", f"{name}: expected a list of rows, or an object whose columns are lists"
+                )
+            )
             return None
         lengths = {column: len(cells) for column, cells in table.items()}
         if len(set(lengths.values())) > 1:
-            problems.append(f"{name}: columns of different length: {shown(lengths)}")
+            problems.append(Problem("shape", f"{name}: columns of different length: {shown(lengths)}"))
             return None
         count = next(iter(lengths.values()), 0)
         table = [{column: cells[k] for column, cells in table.items()} for k in range(count)]
     if not isinstance(table, (list, tuple)):
-        problems.append(f"{name}: {shown(table)} is no table; expected a list of rows")
+        problems.append(Problem("wrong-type", f"{name}: {shown(table)} is no table; expected a list of rows"))
         return None
     if not table:
-        problems.append(f"{name}: there is no row")
+        problems.append(Problem("missing", f"{name}: there is no row"))
         return None
     rows: Rows = []
     for number, row in enumerate(table, start=1):
         if isinstance(row, Mapping):
             rows.append((number, row))
         else:
-            problems.append(f"{name}, row {number}: {shown(row)} is no object")
+            problems.append(Problem("wrong-type", f"{name}, row {number}: {shown(row)} is no object"))
     return rows

@@ -14,6 +14,7 @@ import math
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
+from functools import partial
 from importlib import metadata
 from itertools import islice
 from pathlib import Path
@@ -28,7 +29,7 @@ from feeders.meters import BUSBAR
 from feeders.scenario import Reading, Sample, Scenario, simulate
 from feeders.scenario_json import scenario_from_json, scenario_to_json
 from gridsec.arrays import Bools, Floats
-from gridsec.errors import GridsecError
+from gridsec.errors import GridsecError, InputInvalid, Problem, Problems
 from gridsec.network import InPhases
 
 if TYPE_CHECKING:
@@ -62,8 +63,25 @@ REGISTERS: Final = ("seq", "p_kw", "q_kvar", "t_power")
 """Columns in which NaN says, as null does, that nothing was reported: tables of floats have nothing else."""
 
 
-class RecordingInvalid(GridsecError):
-    """A file is no recording, or its truth is not there."""
+class RecordingInvalid(Problems, GridsecError):
+    """A file is no recording, or its truth is not there.
+
+    Parameters
+    ----------
+    problems
+        One clause each: what is wrong, and what would be right.
+    where
+        Place of all problems, at the begin of the sentence.
+    """
+
+    def __init__(self, *problems: str, where: str = "") -> None:
+        self.problems = problems
+        self.where = where
+        super().__init__(where + "; ".join(problems))
+
+    def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
+        """Return function and arguments: a pickled error keeps its problems and their place."""
+        return partial(type(self), where=self.where), self.problems
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,9 +165,13 @@ class Recording:
         try:
             table, own = pq.read_table(path), pq.read_schema(self.path)
         except (OSError, pa.ArrowException) as error:
-            raise RecordingInvalid(f"{path}: no truth of this recording: {error}") from error
+            raise RecordingInvalid(
+                Problem("missing", f"{path}: no truth of this recording: {error}")
+            ) from error
         if (table.schema.metadata or {}).get(KEY) != (own.metadata or {}).get(KEY):
-            raise RecordingInvalid(f"{path}: no truth of this recording, but of another one")
+            raise RecordingInvalid(
+                Problem("other-origin", f"{path}: no truth of this recording, but of another one")
+            )
         there = {name: _matrix(table.column(name)) for name in table.column_names}
         # Parquet has no lists without entries: of no inverter, or no meter, there is no column.
         none = np.empty((table.num_rows, 0))
@@ -184,7 +206,7 @@ def record(site: Site, scenario: Scenario, path: Path | str) -> Recording:
         When the files cannot be written.
     """
     if not math.isfinite(scenario.duration_s):
-        raise ValueError("a scenario without an end cannot be recorded")
+        raise InputInvalid([Problem("not-finite", "a scenario without an end cannot be recorded")])
     path = Path(path)
     about = {
         "format": FORMAT,
@@ -230,20 +252,24 @@ def read_recording(path: Path | str) -> Recording:
             schema, count = file.schema_arrow, file.metadata.num_rows
             problems = [*_wrong_columns(schema), *_wrong_numbers(file)]
     except (OSError, pa.ArrowException) as error:
-        raise RecordingInvalid(f"{path}: no recording: {error}") from error
+        raise RecordingInvalid(Problem("unreadable", f"{path}: no recording: {error}")) from error
     if problems:
-        raise RecordingInvalid(f"{path}: {'; '.join(problems)}")
+        raise RecordingInvalid(*problems, where=f"{path}: ")
     timed = "arrival" in schema.names and not pa.types.is_null(schema.field("arrival").type)
     if KEY not in (schema.metadata or {}):
         return Recording(path, count, None, None, None, {}, timed)
     try:
         about = json.loads(schema.metadata[KEY])
         if about["format"] != FORMAT:
-            raise RecordingInvalid(f"{path}: format {about['format']}; this program reads format {FORMAT}")
+            raise RecordingInvalid(
+                Problem("unreadable", f"{path}: format {about['format']}; this program reads format {FORMAT}")
+            )
         scenario = scenario_from_json(about["scenario"])
         return Recording(path, count, about["feeder"], about["digest"], scenario, about["versions"], timed)
     except (ValueError, KeyError, TypeError) as error:
-        raise RecordingInvalid(f"{path}: its metadata cannot be read: {error!r}") from error
+        raise RecordingInvalid(
+            Problem("unreadable", f"{path}: its metadata cannot be read: {error!r}")
+        ) from error
 
 
 def is_simulated(path: Path) -> bool:
@@ -265,10 +291,10 @@ def is_simulated(path: Path) -> bool:
         return False
 
 
-def _wrong_columns(schema: Any) -> list[str]:
+def _wrong_columns(schema: Any) -> list[Problem]:
     """What is wrong with the columns of a file, all at once."""
     missing = [name for name in REQUIRED if name not in schema.names]
-    problems = [f"columns {', '.join(missing)} are missing"] if missing else []
+    problems = [Problem("missing", f"columns {', '.join(missing)} are missing")] if missing else []
     for name in (*READINGS.names, PHASES.name, T_POWER.name):
         if name not in schema.names:
             continue
@@ -282,14 +308,14 @@ def _wrong_columns(schema: Any) -> list[str]:
             fits, expected = _is_number(kind), "Unix time in seconds" if name in _TIMES else "numbers"
         # A column in which nothing is has no type.
         if not fits and not (pa.types.is_null(kind) and name not in REQUIRED):
-            problems.append(f"column {name} is of type {given}; expected {expected}")
+            problems.append(Problem("wrong-type", f"column {name} is of type {given}; expected {expected}"))
     return problems
 
 
 _TIMES: Final = ("t", "arrival", "t_power")
 
 
-def _wrong_numbers(file: Any) -> list[str]:
+def _wrong_numbers(file: Any) -> list[Problem]:
     """What is wrong with the numbers of readings, which tables write as floats where one is missing."""
     if "seq" not in file.schema_arrow.names or not _is_floating(file.schema_arrow.field("seq").type):
         return []
@@ -297,7 +323,7 @@ def _wrong_numbers(file: Any) -> list[str]:
         try:
             _column(batch, "seq")
         except pa.ArrowInvalid as error:
-            return [f"column seq has numbers that are not whole: {error}"]
+            return [Problem("not-integer", f"column seq has numbers that are not whole: {error}")]
     return []
 
 

@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
+from gridsec.errors import Problem
+
 SHOWN = 10
 
 
@@ -49,7 +51,7 @@ class Parsed:
 class Report:
     """What the checks found so far."""
 
-    problems: list[str] = field(default_factory=list)
+    problems: list[Problem] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
 

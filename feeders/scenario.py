@@ -25,7 +25,7 @@ from feeders.variation import Variation
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.attack import Attack, InverterAttack, Reports, apply_all, manipulated, reach
 from gridsec.choices import choice
-from gridsec.errors import refuse
+from gridsec.errors import InputInvalid, Problem, refuse
 from gridsec.network import busbar_places
 
 if TYPE_CHECKING:
@@ -114,17 +114,23 @@ class Scenario:
         own_numbers(self)
         object.__setattr__(self, "season", choice("season", Season, self.season))
         if self.seed < 0:
-            raise ValueError(f"seed must not be negative, got {self.seed}")
+            raise InputInvalid([Problem("negative", f"seed must not be negative, got {self.seed}")])
         if not np.isfinite(self.profile_s):
-            raise ValueError(f"profile_s must be finite, got {self.profile_s}")
+            raise InputInvalid([Problem("not-finite", f"profile_s must be finite, got {self.profile_s}")])
         if not 0.0 <= self.start < LATEST_S:
-            raise ValueError(f"start must be a Unix time in seconds, got {self.start}")
+            raise InputInvalid(
+                [Problem("out-of-range", f"start must be a Unix time in seconds, got {self.start}")]
+            )
         if not self.duration_s > 0.0:
-            raise ValueError(f"duration_s must be positive, got {self.duration_s}")
+            raise InputInvalid(
+                [Problem("not-positive", f"duration_s must be positive, got {self.duration_s}")]
+            )
         if not 0.0 < self.dt_s < np.inf:
-            raise ValueError(f"dt_s must be positive and finite, got {self.dt_s}")
+            raise InputInvalid(
+                [Problem("not-positive", f"dt_s must be positive and finite, got {self.dt_s}")]
+            )
         if self.substep_s is not None and not self.substep_s > 0.0:
-            raise ValueError(f"substep_s must be positive, got {self.substep_s}")
+            raise InputInvalid([Problem("not-positive", f"substep_s must be positive, got {self.substep_s}")])
 
 
 @dataclass(frozen=True, slots=True)
@@ -435,7 +441,10 @@ def check(site: Site, scenario: Scenario) -> None:
     """
     name, phases = site.feeder.name, busbar_places(site.feeder).stop
     problems = [
-        f"an attack names inverter {wrong.inverters.max()}, but {name} has {site.droop.tau.size}"
+        Problem(
+            "unknown-index",
+            f"an attack names inverter {wrong.inverters.max()}, but {name} has {site.droop.tau.size}",
+        )
         for wrong in scenario.inverter_attacks
         if wrong.inverters.max() >= site.droop.tau.size
     ]
@@ -443,18 +452,33 @@ def check(site: Site, scenario: Scenario) -> None:
         attack.meters.max() >= phases or reach(attack, attack.t_off) > 0.0
         for attack in scenario.busbar_attacks
     ):
-        problems.append(f"an attack on the busbar's meter looks back, or names phases that {name} has not")
+        problems.append(
+            Problem(
+                "unknown-index",
+                f"an attack on the busbar's meter looks back, or names phases that {name} has not",
+            )
+        )
     for attack in scenario.attacks:
         if attack.meters.max() >= site.meters.size:
-            problems.append(f"an attack names meter {attack.meters.max()}, but {name} has {site.meters.size}")
+            problems.append(
+                Problem(
+                    "unknown-index",
+                    f"an attack names meter {attack.meters.max()}, but {name} has {site.meters.size}",
+                )
+            )
         then = max(attack.t_on, scenario.start)
         if attack.t_off > then and reach(attack, then) > LONGEST_LOOK_BACK_S:
             back = reach(attack, then)
-            problems.append(f"an attack looks back {back:.0f} s, further than can be played")
+            problems.append(
+                Problem("out-of-range", f"an attack looks back {back:.0f} s, further than can be played")
+            )
     every = (*scenario.attacks, *scenario.busbar_attacks, *scenario.inverter_attacks)
     problems += [
-        f"an attack begins {attack.t_on - scenario.start:g} s after the start, when the scenario of "
-        f"{scenario.duration_s:g} s is over"
+        Problem(
+            "out-of-range",
+            f"an attack begins {attack.t_on - scenario.start:g} s after the start, when the scenario of "
+            f"{scenario.duration_s:g} s is over",
+        )
         for attack in every
         if attack.t_on >= scenario.start + scenario.duration_s
     ]

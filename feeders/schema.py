@@ -29,7 +29,7 @@ from feeders.columns import (
 from feeders.plain import plain
 from feeders.raw import CUSTOMERS_FILE, LINES_FILE, META_FILE, Rows
 from feeders.records import Parsed, Record
-from gridsec.errors import FeederInvalid
+from gridsec.errors import FeederInvalid, Problem
 
 MAX_PROBLEMS = 1000
 SELDOM = frozenset({"forecast", "utc_offset_h"})
@@ -219,11 +219,11 @@ class Examination:
     """
 
     tables: FeederTables | None
-    problems: tuple[str, ...]
+    problems: tuple[Problem, ...]
     notes: tuple[str, ...]
 
 
-def validate(source: FeederTables | Path | str | Mapping[str, Any]) -> tuple[str, ...]:
+def validate(source: FeederTables | Path | str | Mapping[str, Any]) -> tuple[Problem, ...]:
     """Return every problem of a feeder at once, each naming file, row, column and value.
 
     Parameters
@@ -337,15 +337,17 @@ def _examine(given: raw.Raw) -> Examination:
     return Examination(tables, (), tuple(notes))
 
 
-def _capped(problems: list[str]) -> tuple[str, ...]:
-    """Each problem once, and no more of them than somebody will read."""
+def _capped(problems: list[Problem]) -> tuple[Problem, ...]:
+    """Return each problem once, at most MAX_PROBLEMS of them."""
     once = tuple(dict.fromkeys(problems))
     if len(once) <= MAX_PROBLEMS:
         return once
-    return (*once[:MAX_PROBLEMS], f"and {len(once) - MAX_PROBLEMS} more problems")
+    return (*once[:MAX_PROBLEMS], Problem("more", f"and {len(once) - MAX_PROBLEMS} more problems"))
 
 
-def _parse_meta(given: raw.Raw, problems: list[str], notes: list[str]) -> dict[str, dict[str, Any]] | None:
+def _parse_meta(
+    given: raw.Raw, problems: list[Problem], notes: list[str]
+) -> dict[str, dict[str, Any]] | None:
     if given.meta is None:
         return None
     parsed: dict[str, dict[str, Any]] = {}
@@ -353,7 +355,9 @@ def _parse_meta(given: raw.Raw, problems: list[str], notes: list[str]) -> dict[s
     for section, columns in META_COLUMNS.items():
         cells: object = given.meta if section == "" else given.meta.get(section, {})
         if not isinstance(cells, Mapping):
-            problems.append(f"{given.meta_name}, [{section}]: {shown(cells)} is no table of keys")
+            problems.append(
+                Problem("wrong-type", f"{given.meta_name}, [{section}]: {shown(cells)} is no table of keys")
+            )
             cells = {}
         if section:
             unknown.extend(f"{section}.{key}" for key in cells if key not in {c.name for c in columns})
@@ -369,7 +373,7 @@ def _parse_table(
     name: str,
     columns: tuple[Column, ...],
     rows: Rows | None,
-    problems: list[str],
+    problems: list[Problem],
     notes: list[str],
 ) -> list[Record] | None:
     if rows is None:
@@ -379,7 +383,7 @@ def _parse_table(
     for _, row in rows:
         present.update(dict.fromkeys(map(str, row)))
     missing = [c.name for c in columns if c.default is REQUIRED and c.name not in present]
-    problems.extend(f"{name}: the column {column!r} is missing" for column in missing)
+    problems.extend(Problem("missing", f"{name}: the column {column!r} is missing") for column in missing)
     unknown = [column for column in present if column not in known]
     if unknown:
         notes.append(f"{name}: ignored unknown {_listed('column', unknown)}")
@@ -399,7 +403,7 @@ def _can_be_read(key: object) -> TypeGuard[str]:
 
 
 def _parse_cells(
-    where: str, noun: str, columns: Iterable[Column], cells: Mapping[str, Any], problems: list[str]
+    where: str, noun: str, columns: Iterable[Column], cells: Mapping[str, Any], problems: list[Problem]
 ) -> dict[str, Any]:
     """Parse the cells of one row; bad ones are reported and left out."""
     parsed: dict[str, Any] = {}
@@ -408,7 +412,7 @@ def _parse_cells(
         if problem is None:
             parsed[column.name] = value
         else:
-            problems.append(f"{where}, {noun} {column.name}: {problem}")
+            problems.append(Problem(problem.code, f"{where}, {noun} {column.name}: {problem}"))
     return parsed
 
 

@@ -20,7 +20,7 @@ from feeders.levels import nominal_volts
 from feeders.schema import FeederTables, LineRow
 from feeders.topology import Tree
 from gridsec.arrays import Bools, Floats
-from gridsec.errors import FeederInvalid
+from gridsec.errors import FeederInvalid, Problem
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,21 +117,30 @@ def _factors(lines: Sequence[LineRow], found: Tree) -> tuple[Floats, Floats]:
     return bus, branch
 
 
-def _problems(closed: Sequence[LineRow]) -> list[str]:
+def _problems(closed: Sequence[LineRow]) -> list[Problem]:
     out = []
     for line in (line for line in closed if set(line.taps) != {1.0}):
         where = (
             f"lines, line {line.line!r}, column tap: {' '.join(f'{tap:g}' for tap in sorted({*line.taps}))}"
         )
         if line.r_ohm == line.x_ohm == 0.0:
-            out.append(f"{where} on a line without impedance; expected the transformer's r_ohm and x_ohm")
+            out.append(
+                Problem(
+                    "zero-impedance",
+                    f"{where} on a line without impedance; expected the transformer's r_ohm and x_ohm",
+                )
+            )
     return out
 
 
-def _around(ties: Sequence[LineRow], ratio: Floats) -> list[str]:
+def _around(ties: Sequence[LineRow], ratio: Floats) -> list[Problem]:
     """Loops whose taps drive a current around without any load, which the model does not have."""
     return [
-        f"lines, line {line.line!r} closes a loop around which the taps multiply to {far:.6g}; expected 1"
+        Problem(
+            "inconsistent",
+            f"lines, line {line.line!r} closes a loop around which the taps multiply to {far:.6g}; "
+            "expected 1",
+        )
         for line, own in zip(ties, ratio, strict=True)
         if abs((far := _farthest(own[["abc".index(phase) for phase in line.phases]])) - 1.0) > _ROUNDING
     ]

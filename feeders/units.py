@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from feeders.levels import nominal_volts
 from feeders.records import Parsed, Report, rows
 from feeders.topology import Edge, Tree
+from gridsec.errors import Problem
 
 LOW_VOLTAGE = 1000.0
 # Nominal voltages between phases; nobody's voltage to neutral is called like that.
@@ -67,7 +68,9 @@ def _doubt(parsed: Parsed, report: Report, name: str, sentence: str) -> None:
     if parsed.accepted(name):
         report.notes.append(f"accepted: {sentence}")
     else:
-        report.problems.append(f'{sentence} (if it is right: accept = ["{name}"] in feeder.toml)')
+        report.problems.append(
+            Problem("doubtful", f'{sentence} (if it is right: accept = ["{name}"] in feeder.toml)')
+        )
 
 
 def _voltage(parsed: Parsed) -> Doubts:

@@ -6,7 +6,7 @@ Every problem has a stable code beside its sentence. Programs and tests compare 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Self
+from typing import Any, Self
 
 
 class Problem(str):
@@ -35,10 +35,30 @@ class Problem(str):
 
 
 class GridsecError(Exception):
-    """Base of every error that this project raises on purpose."""
+    """Base of every error that this project raises on purpose.
+
+    Parameters
+    ----------
+    args
+        The sentence.
+    code
+        Code of the reason: lower case words joined by hyphens; None: that of the class.
+    """
+
+    code: str = ""
+
+    def __init__(self, *args: object, code: str | None = None) -> None:
+        super().__init__(*args)
+        if code is not None:
+            self.code = code
+
+    @property
+    def codes(self) -> tuple[str, ...]:
+        """Code of the error; one for each problem of an error that lists problems."""
+        return (self.code,)
 
 
-class _Problems:
+class Problems:
     """Problems of an error, all at once."""
 
     problems: tuple[str, ...]
@@ -48,8 +68,12 @@ class _Problems:
         """Code of each problem; empty for a sentence without one."""
         return tuple(getattr(problem, "code", "") for problem in self.problems)
 
+    def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
+        """Return class and arguments: a pickled error keeps its problems."""
+        return type(self), (self.problems,)
 
-class FeederInvalid(_Problems, GridsecError):
+
+class FeederInvalid(Problems, GridsecError):
     """A feeder's description is wrong; `problems` names everything that is wrong with it at once.
 
     Parameters
@@ -65,7 +89,7 @@ class FeederInvalid(_Problems, GridsecError):
         super().__init__("\n  - ".join([head + ":", *self.problems]))
 
 
-class InputInvalid(_Problems, ValueError):
+class InputInvalid(Problems, ValueError):
     """Arguments are wrong; `problems` names everything that is wrong with them at once.
 
     Parameters
@@ -97,8 +121,7 @@ class NotObservable(GridsecError):
     def __init__(self, subset: Iterable[int], rank: int, why: str, *, code: str = "not-observable") -> None:
         self.subset: tuple[int, ...] = tuple(subset)
         self.rank = rank
-        self.code = code
-        super().__init__(why)
+        super().__init__(why, code=code)
 
 
 class DesignInfeasible(GridsecError):
@@ -122,9 +145,8 @@ class DesignInfeasible(GridsecError):
         self.what = what
         self.status = status
         self.margin = margin
-        self.code = code
         tail = "" if margin is None else f", margin {margin:.3g}"
-        super().__init__(f"{what}: {status}{tail}")
+        super().__init__(f"{what}: {status}{tail}", code=code)
 
 
 def refuse(problems: Iterable[str]) -> None:

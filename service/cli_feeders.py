@@ -93,7 +93,7 @@ def feeders_validate(
     invalid = False
     for path in folder:
         found = examine(folder_of(path) or path)
-        problems = found.problems
+        problems: tuple[str, ...] = found.problems
         if found.tables is not None:
             try:
                 from_tables(found.tables)

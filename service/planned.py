@@ -49,7 +49,7 @@ def planned(
     from feeders.studies.campaign_plan import Plan, wrong_settings
     from feeders.trials import LoadError
 
-    problems = wrong_settings(site, chosen.get("settings") or ())
+    problems: list[str] = [*wrong_settings(site, chosen.get("settings") or ())]
     step_s = step or site.tables.meta.monitor.tick_s
     if duration is not None and duration < SHORTEST * step_s:
         problems.append(

@@ -24,7 +24,7 @@ from feeders.studies.calibrate_readings import Frames, blind, frames
 from feeders.studies.calibrate_search import LENGTH_SPREAD, Round, State, Verdict, compare, prepare
 from feeders.studies.calibrate_steps import Search, read
 from feeders.studies.journal import Journal, Progress, Where
-from gridsec.errors import refuse
+from gridsec.errors import InputInvalid, Problem, refuse
 
 if TYPE_CHECKING:
     from feeders.load import Site
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 __all__ = ["Calibrate", "OtherFeeder", "calibrate", "wrong_numbers"]
 
 
-class OtherFeeder(ValueError):
+class OtherFeeder(InputInvalid):
     """A folder holds another feeder than the one that was studied."""
 
 
@@ -120,7 +120,9 @@ class Calibrate:
         """
         tables, target = find(site_folder), Path(out)
         if digest(tables) != self.digest:
-            raise OtherFeeder(f"{site_folder}: not the feeder that was studied, or changed since")
+            raise OtherFeeder(
+                [Problem("other-origin", f"{site_folder}: not the feeder that was studied, or changed since")]
+            )
         if target.exists() and (not target.is_dir() or any(target.iterdir())):
             raise FileExistsError(f"{target}: already there; a corrected copy goes into a new folder")
         for wrong in self.corrections:
@@ -176,7 +178,7 @@ def calibrate(
     """
     problems = wrong_numbers(risk, tolerance)
     if unknown := sorted(set(exclude) - set(site.meter_ids)):
-        problems.append(f"{site.feeder.name} has no meter {', '.join(unknown)}")
+        problems.append(Problem("unknown-name", f"{site.feeder.name} has no meter {', '.join(unknown)}"))
     refuse(problems)
     given = frames(site, readings, exclude=exclude)
     subject = _subject(site, given, risk, tolerance) | {"exclude": sorted(exclude), "kinds": sorted(kinds)}
@@ -212,7 +214,7 @@ def calibrate(
     )
 
 
-def wrong_numbers(risk: float, tolerance: float) -> list[str]:
+def wrong_numbers(risk: float, tolerance: float) -> list[Problem]:
     """Return what is wrong with numbers of a calibration.
 
     Parameters
@@ -222,9 +224,11 @@ def wrong_numbers(risk: float, tolerance: float) -> list[str]:
     """
     problems = []
     if not 0.0 < risk < 1.0:
-        problems.append(f"risk is {risk}; it must be between 0 and 1")
+        problems.append(Problem("out-of-range", f"risk is {risk}; it must be between 0 and 1"))
     if not 0.0 < tolerance < LENGTH_SPREAD:
-        problems.append(f"tolerance is {tolerance}; it must be between 0 and {LENGTH_SPREAD}")
+        problems.append(
+            Problem("out-of-range", f"tolerance is {tolerance}; it must be between 0 and {LENGTH_SPREAD}")
+        )
     return problems
 
 

@@ -16,7 +16,7 @@ from feeders.studies.calibrate_laterals import Lateral, alone, laterals
 from gridsec import phases as three
 from gridsec.arrays import Bools, Floats, Ints, Phasors
 from gridsec.droop import voltage_curve
-from gridsec.errors import FeederInvalid
+from gridsec.errors import FeederInvalid, Problem
 from gridsec.feeder import Feeder, bus_voltages, lindistflow
 from gridsec.mesh import MeshedFeeder, impedances
 from gridsec.phases import PHASES, ThreePhaseFeeder, lindist3flow
@@ -120,8 +120,12 @@ def _site(tables: FeederTables) -> Site | ThreePhaseSite:
     if ties.ends.size:
         raise FeederInvalid(
             [
-                "lines: closed lines form loops, and in three phases calibration takes radial feeders only: "
-                "in a loop a longer line changes all phases everywhere, which it has no model of"
+                Problem(
+                    "not-radial",
+                    "lines: closed lines form loops, and in three phases calibration takes radial "
+                    "feeders only: "
+                    "in a loop a longer line changes all phases everywhere, which it has no model of",
+                )
             ]
         )
     return site

@@ -23,6 +23,7 @@ from feeders.meters import BUSBAR
 from feeders.recording import REQUIRED, RecordingInvalid, read_recording
 from feeders.scenario import LATEST_S
 from gridsec.arrays import Bools, Floats, Ints
+from gridsec.errors import Problem
 from gridsec.phases import PHASES
 
 if TYPE_CHECKING:
@@ -113,7 +114,7 @@ def open_readings(path: Path | str) -> pd.DataFrame | Recording:
         # A converter keeps ids as they are: "NA" and "null" are names like others.
         return pd.read_csv(path, converters={"meter": str})
     except (OSError, ValueError) as error:
-        raise RecordingInvalid(f"{path}: no table of readings: {error}") from error
+        raise RecordingInvalid(Problem("unreadable", f"{path}: no table of readings: {error}")) from error
 
 
 def frames(
@@ -148,10 +149,14 @@ def frames(
     given = open_readings(readings) if isinstance(readings, (Path, str)) else readings
     if not isinstance(given, pd.DataFrame):
         if given.feeder is not None and given.feeder != site.feeder.name:
-            raise RecordingInvalid(f"{given.path}: recorded on {given.feeder}, not on {site.feeder.name}")
+            raise RecordingInvalid(
+                Problem(
+                    "other-origin", f"{given.path}: recorded on {given.feeder}, not on {site.feeder.name}"
+                )
+            )
         given = given.frame()
     missing = [name for name in REQUIRED if name not in given.columns]
-    problems = [f"columns {', '.join(missing)} are missing"] if missing else []
+    problems = [Problem("missing", f"columns {', '.join(missing)} are missing")] if missing else []
     told = {name: _numbers(given[name], problems) for name in NUMBERS if name in given}
     numbers = {name: values for name, values in told.items() if values is not None}
     if "t" in numbers:
@@ -163,22 +168,27 @@ def frames(
     unknown = sorted(set(meter[column.isna()]))
     if unknown:
         shown = ", ".join(unknown[:10]) + (f" and {len(unknown) - 10} more" if len(unknown) > 10 else "")
-        problems.append(f"there are meters that {site.feeder.name} does not have: {shown}")
+        problems.append(
+            Problem("unknown-name", f"there are meters that {site.feeder.name} does not have: {shown}")
+        )
     if "meter" in given and not (column == len(site.meter_ids)).any():
-        problems.append("none of the busbar (an empty meter); nothing to compare with")
+        problems.append(Problem("missing", "none of the busbar (an empty meter); nothing to compare with"))
     if "meter" in given:
         problems += _twice(meter, channels)
         problems += _wrong_units(
             site, numbers, meter.mask(meter.isin(channels), meter.map(channels)), exclude
         )
     if problems:
-        raise RecordingInvalid(f"readings: {'; '.join(problems)}")
+        raise RecordingInvalid(*problems, where="readings: ")
     whole = [site.meter_ids.index(name) for name in dict.fromkeys(channels.values())]
     found = _binned(site, given, numbers, np.asarray(column, dtype=np.intp), whole)
     if site.tables.in_phases and len(blind(site, found.unread)) == len(site.meter_ids):
         raise RecordingInvalid(
-            f"readings: the busbar has no voltages of phase {' and '.join(found.unread)}, and without them "
-            "no meter can be compared; expected v_phases, as [230.1, 230.4, 229.9]"
+            Problem(
+                "missing",
+                f"readings: the busbar has no voltages of phase {' and '.join(found.unread)}, and "
+                "without them no meter can be compared; expected v_phases, as [230.1, 230.4, 229.9]",
+            )
         )
     return found
 
@@ -210,20 +220,23 @@ def _channels(site: Site | ThreePhaseSite) -> dict[str, str]:
     }
 
 
-def _twice(meter: pd.Series, channels: Mapping[str, str]) -> list[str]:
+def _twice(meter: pd.Series, channels: Mapping[str, str]) -> list[Problem]:
     """Meters that are read as a whole and by channels."""
     names = set(meter)
     both = sorted(names & {whole for channel, whole in channels.items() if channel in names})
-    return [f"there are both {one} and channels of it, as {one}-a; expected one of both" for one in both]
+    return [
+        Problem("duplicate", f"there are both {one} and channels of it, as {one}-a; expected one of both")
+        for one in both
+    ]
 
 
-def _numbers(column: pd.Series, problems: list[str]) -> Floats | None:
+def _numbers(column: pd.Series, problems: list[Problem]) -> Floats | None:
     """A column as numbers, NaN where there is none; None, and told, where it holds something else."""
     expected = _EXPECTED.get(str(column.name), "expected numbers")
     if is_numeric_dtype(column) and not is_bool_dtype(column) and not is_complex_dtype(column):
         return column.to_numpy(dtype=np.float64, na_value=np.nan)
     if not (is_object_dtype(column) or is_string_dtype(column)):
-        problems.append(f"{column.name} is of type {column.dtype}; {expected}")
+        problems.append(Problem("wrong-type", f"{column.name} is of type {column.dtype}; {expected}"))
         return None
     text = column.astype("string")
     values = pd.to_numeric(text, errors="coerce").to_numpy(dtype=np.float64, na_value=np.nan)
@@ -231,31 +244,34 @@ def _numbers(column: pd.Series, problems: list[str]) -> Floats | None:
     nothing = text.fillna("").str.strip().str.lower().isin(["", "nan"]).to_numpy()
     wrong = np.flatnonzero(np.isnan(values) & ~nothing)
     if wrong.size:
-        problems.append(f"{column.name} of {_rows(wrong)} is {text.iloc[wrong[0]]!r}; {expected}")
+        problems.append(
+            Problem("wrong-type", f"{column.name} of {_rows(wrong)} is {text.iloc[wrong[0]]!r}; {expected}")
+        )
         return None
     return values
 
 
-def _wrong_times(t: Floats) -> list[str]:
+def _wrong_times(t: Floats) -> list[Problem]:
     """What is wrong with times: those that are none, of another unit, or far from all others."""
     finite = np.isfinite(t)
     plain = finite & (t >= 0.0) & (t < LATEST_S)
     middle = float(np.median(t[plain])) if plain.any() else 0.0
     problems = []
-    for wrong, what in (
-        (~finite, "expected a time"),
-        (finite & ~plain, "expected Unix time in seconds"),
-        (plain & (np.abs(t - middle) > FARTHEST_S), f"more than ten years from the usual {middle:.15g}"),
+    far = plain & (np.abs(t - middle) > FARTHEST_S)
+    for wrong, code, what in (
+        (~finite, "not-finite", "expected a time"),
+        (finite & ~plain, "out-of-range", "expected Unix time in seconds"),
+        (far, "out-of-range", f"more than ten years from the usual {middle:.15g}"),
     ):
         rows = np.flatnonzero(wrong)
         if rows.size:
-            problems.append(f"t of {_rows(rows)} is {t[rows[0]]:.15g}; {what}")
+            problems.append(Problem(code, f"t of {_rows(rows)} is {t[rows[0]]:.15g}; {what}"))
     return problems
 
 
 def _wrong_units(
     site: Site | ThreePhaseSite, numbers: dict[str, Floats], meter: pd.Series, exclude: Collection[str]
-) -> list[str]:
+) -> list[Problem]:
     """Columns that are hardly in their unit: the medians of meters show it, which no short fault moves."""
     nominal = dict(zip(site.meter_ids, site.customer_nominal[site.meters].tolist(), strict=True))
     nominal[BUSBAR] = site.tables.meta.voltage_volt
@@ -280,7 +296,7 @@ def _wrong_units(
         than = (
             f"where {limit:.4g} is nominal" if name == "v_volt" else f"where {limit:.4g} is the most credible"
         )
-        problems.append(f"{name} of {whose} is usually {middle:.4g} {than}; {doubt}")
+        problems.append(Problem("doubtful", f"{name} of {whose} is usually {middle:.4g} {than}; {doubt}"))
     return problems
 
 
@@ -331,8 +347,11 @@ def _binned(
     span, wanted = T * step * together, max(FEWEST_FRAMES * step * together, FEWEST_SPANS * tau)
     if T < FEWEST_FRAMES or span < wanted:
         raise RecordingInvalid(
-            f"too little data: {T} frames over {span / 3600:.3g} h; at least {FEWEST_FRAMES} frames over "
-            f"{wanted / 3600:.3g} h are needed, and days tell more than hours"
+            Problem(
+                "too-little-data",
+                f"too little data: {T} frames over {span / 3600:.3g} h; at least {FEWEST_FRAMES} frames over "
+                f"{wanted / 3600:.3g} h are needed, and days tell more than hours",
+            )
         )
     middle = first + (used * together + 0.5 * (together - 1)) * step
     return Frames(
@@ -359,7 +378,9 @@ def _phases(given: pd.DataFrame, number: Ints, ticks: int) -> Floats:
         ]
         told = np.array(rows, dtype=np.float64).reshape(len(rows), 3)
     except (TypeError, ValueError) as error:
-        raise RecordingInvalid("readings: v_phases are three voltages, as [230.1, 230.4, 229.9]") from error
+        raise RecordingInvalid(
+            Problem("shape", "readings: v_phases are three voltages, as [230.1, 230.4, 229.9]")
+        ) from error
     cell = (number[there, None] * 3 + np.arange(3)).ravel()
     return _means(cell, told.ravel(), (ticks, 3))[0]
 
@@ -397,7 +418,9 @@ def _step(t: Floats, column: Ints) -> float:
     gap = np.diff(t[order])[np.diff(column[order]) == 0]
     gap = gap[gap > 0.0]
     if not gap.size:
-        raise RecordingInvalid("too little data: no meter has two readings at different times")
+        raise RecordingInvalid(
+            Problem("too-little-data", "too little data: no meter has two readings at different times")
+        )
     return float(np.median(gap))
 
 

@@ -38,6 +38,8 @@ ROWS: Final = 2
 class NothingPlayed(GridsecError):
     """Not one scenario of a campaign could be played."""
 
+    code = "nothing-played"
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Campaign:

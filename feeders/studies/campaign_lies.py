@@ -41,7 +41,9 @@ def attacks(
     kind, random = plan.kind(case.kind), np.random.default_rng(case.seed)
     there = site.droop.tau.size if kind.trick is Trick.INVERTER else site.meters.size
     if case.liars > there:
-        raise NoSuchAttack(f"{site.feeder.name} has {there} of what {case.liars} should lie")
+        raise NoSuchAttack(
+            f"{site.feeder.name} has {there} of what {case.liars} should lie", code="too-few-meters"
+        )
     t_on = honest.start + case.onset_s
     t_off = honest.start + min(case.onset_s + plan.lying_s, plan.duration_s)
     if kind.trick in (Trick.COORDINATED, Trick.COORDINATED_POWER):
@@ -55,7 +57,9 @@ def attacks(
         return (), (InverterAttack(some.astype(np.intp), q, t_on, t_off),)
     for sizes in (kind.volts, *kind.together):
         if sizes and len(sizes) != there:
-            raise NoSuchAttack(f"kind {kind.name!r} has sizes for {len(sizes)} meters of {there}")
+            raise NoSuchAttack(
+                f"kind {kind.name!r} has sizes for {len(sizes)} meters of {there}", code="shape"
+            )
     if kind.together:
         told = np.array(kind.together[int(random.integers(len(kind.together)))])
         some, signs = np.flatnonzero(told), random.choice([-1.0, 1.0], 1)

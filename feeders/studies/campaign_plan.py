@@ -26,7 +26,7 @@ from feeders.trials import LoadError, Meters, Trial
 from feeders.variation import Variation
 from gridsec.arrays import Ints
 from gridsec.choices import choice, each_choice
-from gridsec.errors import refuse
+from gridsec.errors import InputInvalid, Problem, refuse
 
 if TYPE_CHECKING:
     from feeders.load import Site
@@ -110,9 +110,18 @@ class Kind:
     def __post_init__(self) -> None:
         object.__setattr__(self, "trick", choice("trick", Trick, self.trick))
         if not self.sizes or self.name == CLEAN:
-            raise ValueError(f"kind {self.name!r} needs a size, and a name other than {CLEAN!r}")
+            raise InputInvalid(
+                [Problem("missing", f"kind {self.name!r} needs a size, and a name other than {CLEAN!r}")]
+            )
         if (self.volts or self.together) and self.trick is not Trick.BIAS:
-            raise ValueError(f"kind {self.name!r}: sizes in volts of each meter are for {Trick.BIAS}")
+            raise InputInvalid(
+                [
+                    Problem(
+                        "inconsistent",
+                        f"kind {self.name!r}: sizes in volts of each meter are for {Trick.BIAS}",
+                    )
+                ]
+            )
 
     def every(self, step_s: float) -> Kind:
         """The same where readings come every so many seconds: ages and rates are counted in readings.
@@ -251,31 +260,43 @@ class Plan:
         set_("meters", choice("meters", Meters, self.meters))
         times = (self.duration_s, self.step_s, *self.onset_s, self.lying_s, self.settling_s, self.learn_s)
         checks = (
-            ("a campaign needs scenes, and a scene scenarios", min(self.scenes, self.together) < 1),
-            ("the seed must not be negative", self.seed < 0),
             (
-                "there are no kinds of lies, numbers of liars or places",
+                Problem("not-positive", "a campaign needs scenes, and a scene scenarios"),
+                min(self.scenes, self.together) < 1,
+            ),
+            (Problem("negative", "the seed must not be negative"), self.seed < 0),
+            (
+                Problem("missing", "there are no kinds of lies, numbers of liars or places"),
                 not self._combined and self.together > 1,
             ),
-            ("numbers of liars must be positive", min((*self.liars, 1)) < 1),
-            ("there are no seasons", not self.seasons),
-            ("kinds of lies need different names", len({k.name for k in self.kinds}) < len(self.kinds)),
+            (Problem("not-positive", "numbers of liars must be positive"), min((*self.liars, 1)) < 1),
+            (Problem("missing", "there are no seasons"), not self.seasons),
             (
-                "a false-alarm rate is missing, or not positive and finite",
+                Problem("duplicate", "kinds of lies need different names"),
+                len({k.name for k in self.kinds}) < len(self.kinds),
+            ),
+            (
+                Problem("not-positive", "a false-alarm rate is missing, or not positive and finite"),
                 not self.alarms_per_year or not all(0.0 < rate < math.inf for rate in self.alarms_per_year),
             ),
-            ("times must be finite numbers", not all(map(math.isfinite, times))),
-            ("step_s and lying_s must be positive", min(self.step_s, self.lying_s) <= 0.0),
+            (Problem("not-finite", "times must be finite numbers"), not all(map(math.isfinite, times))),
             (
-                f"learn_s must be 0 or from {self.learn_step_s:g} s on",
+                Problem("not-positive", "step_s and lying_s must be positive"),
+                min(self.step_s, self.lying_s) <= 0.0,
+            ),
+            (
+                Problem("out-of-range", f"learn_s must be 0 or from {self.learn_step_s:g} s on"),
                 0.0 != self.learn_s < self.learn_step_s,
             ),
             (
-                "lies must begin after the first frame and before the last",
+                Problem("out-of-range", "lies must begin after the first frame and before the last"),
                 not self.step_s <= self.onset_s[0] <= self.onset_s[1] <= self.duration_s - self.step_s,
             ),
             (
-                f"estimator {self.estimator!r} does not exist; there are {', '.join(ESTIMATORS)}",
+                Problem(
+                    "unknown-name",
+                    f"estimator {self.estimator!r} does not exist; there are {', '.join(ESTIMATORS)}",
+                ),
                 self.estimator not in ESTIMATORS,
             ),
         )
@@ -434,7 +455,7 @@ class Plan:
         return told
 
 
-def wrong_settings(site: Site, settings: Iterable[tuple[str, float]]) -> list[str]:
+def wrong_settings(site: Site, settings: Iterable[tuple[str, float]]) -> list[Problem]:
     """Return what is wrong with settings of `[monitor]`, one sentence each.
 
     Parameters
@@ -446,9 +467,9 @@ def wrong_settings(site: Site, settings: Iterable[tuple[str, float]]) -> list[st
     problems = []
     for name, value in settings:
         if name not in known or name in ("estimator", "tick_s", "alarms_per_year"):
-            problems.append(f"{name!r} is no setting of an estimator")
+            problems.append(Problem("unknown-name", f"{name!r} is no setting of an estimator"))
         elif isinstance(known[name], int) and not float(value).is_integer():
-            problems.append(f"{name} is {value}; expected a whole number")
+            problems.append(Problem("not-integer", f"{name} is {value}; expected a whole number"))
     return problems
 
 

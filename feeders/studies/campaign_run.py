@@ -46,9 +46,13 @@ RETRIES: Final = 3
 class WorkerLost(GridsecError):
     """The workers of a piece died again and again."""
 
+    code = "worker-lost"
+
 
 class ClusterUnusable(GridsecError):
     """There is no Dask cluster that could be used."""
+
+    code = "cluster-unusable"
 
 
 class Runner(Protocol):
@@ -194,7 +198,7 @@ class Dask:
         try:
             dask: Any = import_module("distributed")
         except ImportError as error:
-            raise ClusterUnusable(f"a Dask cluster needs {extra('cluster')}") from error
+            raise ClusterUnusable(f"a Dask cluster needs {extra('cluster')}", code="not-installed") from error
         try:
             client = dask.Client(self.address, timeout=self.timeout_s, set_as_default=False)
         except (OSError, ValueError) as error:

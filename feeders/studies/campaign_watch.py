@@ -22,6 +22,7 @@ from feeders.studies.campaign_plan import CLEAN, Case, Plan
 from feeders.trials import Trial, Truth, frames
 from gridsec.arrays import Bools, Floats
 from gridsec.attack import Attack, Coordinated, Reports, apply_all, manipulated, reach
+from gridsec.errors import InputInvalid, Problem
 from gridsec.online import Decision, Frame
 from gridsec.sequential import Commission
 
@@ -78,7 +79,9 @@ def prepare(site: Site, plan: Plan) -> Prepared:
     watchers = _designed(plan, scene.stated)
     learners = _designed(plan, replace(scene, step_s=plan.learn_step_s).stated) if plan.learn_s else {}
     if any(watcher.learner is None for watcher in learners.values()):
-        raise ValueError(f"{plan.estimator} does not learn its meters' fixed errors")
+        raise InputInvalid(
+            [Problem("inconsistent", f"{plan.estimator} does not learn its meters' fixed errors")]
+        )
     return Prepared(site, plan, scene.stated, watchers, learners)
 
 

@@ -25,7 +25,7 @@ from feeders.studies.hidden import Curves
 from feeders.studies.journal import Journal, Progress, Where
 from feeders.studies.operating import SHARE, box, volts_of_lie
 from gridsec.arrays import Floats
-from gridsec.errors import DesignInfeasible
+from gridsec.errors import DesignInfeasible, InputInvalid, Problem
 from gridsec.network import model_error_bound
 from gridsec.sequential import SequentialOptions
 from gridsec.sequential import design as design_sequential
@@ -129,11 +129,17 @@ def detectable(
         If another process is writing it.
     """
     if not 1 <= max_attacked <= site.meters.size:
-        raise ValueError(f"max_attacked is {max_attacked}; it must be from 1 to {site.meters.size}")
+        raise InputInvalid(
+            [
+                Problem(
+                    "out-of-range", f"max_attacked is {max_attacked}; it must be from 1 to {site.meters.size}"
+                )
+            ]
+        )
     if not 0.0 < risk < 1.0:
-        raise ValueError(f"risk is {risk}; it must be between 0 and 1")
+        raise InputInvalid([Problem("out-of-range", f"risk is {risk}; it must be between 0 and 1")])
     if not 0.0 <= share < math.inf:
-        raise ValueError(f"share is {share}; it must be finite and not negative")
+        raise InputInvalid([Problem("negative", f"share is {share}; it must be finite and not negative")])
     subject = {
         "study": "detectable",
         "digest": site.digest,
@@ -265,7 +271,9 @@ def monitor_rule(site: Site, *, risk: float = RISK, share: float = SHARE) -> Rul
     model = model_error_bound(site.feeder, p, q, 1.0)[site.meters]
     if not np.isfinite(model).all():
         raise DesignInfeasible(
-            f"rule of {site.feeder.name}'s monitor", f"no power flow at {share:g} of the peak"
+            f"rule of {site.feeder.name}'s monitor",
+            f"no power flow at {share:g} of the peak",
+            code="not-converged",
         )
     return rule(found, risk=risk, model=model)
 

@@ -35,6 +35,7 @@ from feeders.studies.droop_verdict import (
 )
 from feeders.studies.journal import Progress, Where, worked
 from gridsec.droop import Droop
+from gridsec.errors import refuse
 from gridsec.studies.droop_network import Box
 from gridsec.studies.droop_rest import rest
 from gridsec.studies.droop_stability import Update, enlarged
@@ -163,8 +164,7 @@ def droop(
     """
     given = options or DroopOptions()
     study = _Study(Subject.of(site), chosen_fleet(site, given.preset, given.who), given, seed)
-    if problem := band_problem(*study.limits):  # one limit may be given, and the other the file's
-        raise ValueError(problem)
+    refuse(band_problem(*study.limits))  # one limit may be given, and the other the file's
     subject = {"study": "droop", "digest": site.digest, "seed": seed, "options": asdict(given)}
     done = worked(journal, subject, _tasks(study), progress)
     tables = _tables(site, done)

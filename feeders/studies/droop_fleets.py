@@ -14,7 +14,7 @@ from feeders.studies.bases import Bases
 from feeders.studies.hidden import customer_indices
 from gridsec.arrays import Floats, Ints
 from gridsec.droop import Droop, fleet
-from gridsec.errors import FeederInvalid, refuse
+from gridsec.errors import FeederInvalid, Problem, refuse
 from gridsec.studies.droop_network import Box
 
 if TYPE_CHECKING:
@@ -104,7 +104,14 @@ def equip(
         kept = [k for k, row in enumerate(rows) if who is Who.ALL or row.pv_kw > 0 or row.inverter_kva > 0]
         own = np.array(kept, dtype=np.intp)
     if not own.size:
-        raise FeederInvalid([f"{site.feeder.name}: no customer has generation; equip all (--who all)"])
+        raise FeederInvalid(
+            [
+                Problem(
+                    "nothing-to-design",
+                    f"{site.feeder.name}: no customer has generation; equip all (--who all)",
+                )
+            ]
+        )
     rated = [
         kva or rows[k].inverter_kva or (KVA_PER_KW * rows[k].pv_kw if rows[k].pv_kw > 0 else SMALLEST_KVA)
         for k in own
@@ -151,9 +158,12 @@ def chosen_fleet(site: Site, preset: str | None, who: Who = Who.PV) -> Droop:
     if not site.droop.tau.size:
         raise NoInverters(
             [
-                f"{site.feeder.name} has no droop inverters: fill the columns inverter_kva and droop of its "
-                "customers.csv, or give a preset (--preset ieee1547-b) to equip customers with generation, "
-                "or all (--who all)"
+                Problem(
+                    "nothing-to-design",
+                    f"{site.feeder.name} has no droop inverters: fill the columns inverter_kva and "
+                    "droop of its customers.csv, or give a preset (--preset ieee1547-b) to equip customers "
+                    "with generation, or all (--who all)",
+                )
             ]
         )
     return site.droop
@@ -239,7 +249,7 @@ def box(
     )
 
 
-def range_problem(what: str, low: float, high: float) -> list[str]:
+def range_problem(what: str, low: float, high: float) -> list[Problem]:
     """What is wrong with two limits; empty if nothing is.
 
     Parameters
@@ -249,7 +259,7 @@ def range_problem(what: str, low: float, high: float) -> list[str]:
     """
     if 0.0 <= low <= high < math.inf:
         return []
-    return [f"{what}: from {low:g} to {high:g}; expected two ascending numbers from 0 on"]
+    return [Problem("order", f"{what}: from {low:g} to {high:g}; expected two ascending numbers from 0 on")]
 
 
 def inverter_names(site: Site, droop: Droop, rows: Ints) -> list[str]:

@@ -9,7 +9,7 @@ from typing import Final
 
 from feeders.studies.droop_fleets import Who, range_problem
 from gridsec.droop import PRESETS
-from gridsec.errors import refuse
+from gridsec.errors import InputInvalid, Problem, refuse
 from gridsec.studies.droop_stability import Update
 
 __all__ = ["DroopOptions", "band_problem"]
@@ -92,45 +92,53 @@ class DroopOptions:
         presets = [name for name in (self.preset, *self.presets) if name is not None]
         for name in dict.fromkeys([*presets, *filter(None, self.hosting_presets)]):
             if name not in PRESETS:
-                yield f"there is no preset {name!r}; expected one of {', '.join(PRESETS)}"
+                yield Problem(
+                    "unknown-name", f"there is no preset {name!r}; expected one of {', '.join(PRESETS)}"
+                )
         if self.who not in tuple(Who):
-            yield f"who: {self.who!r}; expected one of {', '.join(Who)}"
+            yield Problem("unknown-name", f"who: {self.who!r}; expected one of {', '.join(Who)}")
         try:
             Update(self.interval_s, self.dead)
-        except ValueError as error:
-            yield str(error)
+        except InputInvalid as error:
+            yield from error.problems
         for times in self.tau_factors:
             if not 0.0 < times < math.inf:
-                yield f"a factor on time constants is {times:g}; it must be a positive number"
+                yield Problem(
+                    "not-positive", f"a factor on time constants is {times:g}; it must be a positive number"
+                )
 
-    def _limit_problems(self) -> Iterator[str]:
+    def _limit_problems(self) -> Iterator[Problem]:
         yield from range_problem("busbar voltage", self.v0_low, self.v0_high)
         if self.v0_low == 0.0:
-            yield "a busbar at 0 pu feeds nothing"
+            yield Problem("not-positive", "a busbar at 0 pu feeds nothing")
         if self.v_min is not None and self.v_max is not None:
-            yield from filter(None, [band_problem(self.v_min, self.v_max)])
+            yield from band_problem(self.v_min, self.v_max)
         shares = {"load": self.load_high, "generation": self.pv_high, "load while hosting": self.hosting_load}
         for what, share in shares.items():
             if not 0.0 <= share < math.inf:
-                yield f"share of the {what} is {share:g}; it must be a number that is not negative"
+                yield Problem(
+                    "negative", f"share of the {what} is {share:g}; it must be a number that is not negative"
+                )
 
-    def _hosting_problems(self) -> Iterator[str]:
+    def _hosting_problems(self) -> Iterator[Problem]:
         if not 0.0 < self.unit_kw < math.inf:
-            yield f"a unit of generation is {self.unit_kw:g} kW; it must be a positive number"
+            yield Problem(
+                "not-positive", f"a unit of generation is {self.unit_kw:g} kW; it must be a positive number"
+            )
         if self.draws < 0:
-            yield f"{self.draws} random orders; the number must not be negative"
+            yield Problem("negative", f"{self.draws} random orders; the number must not be negative")
         if self.hosting_customers == ():
-            yield "new generation is for nobody"
+            yield Problem("missing", "new generation has no customer")
         if not self.hosting:
             usual = {each.name: each.default for each in fields(self)}
             given = [
                 f"{name} ({option})" for name, option in HOSTING.items() if getattr(self, name) != usual[name]
             ]
             if given:
-                yield f"{', '.join(given)}: only with hosting (--hosting)"
+                yield Problem("inconsistent", f"{', '.join(given)}: only with hosting (--hosting)")
 
 
-def band_problem(low: float, high: float) -> str:
+def band_problem(low: float, high: float) -> list[Problem]:
     """What is wrong with a band of voltages; empty if nothing is.
 
     Parameters
@@ -139,5 +147,6 @@ def band_problem(low: float, high: float) -> str:
         Its limits, parts of the nominal voltage.
     """
     if 0.0 < low < high < math.inf:
-        return ""
-    return f"the band from {low:g} to {high:g} is none; expected two ascending voltages, pu"
+        return []
+    text = f"the band from {low:g} to {high:g} is none; expected two ascending voltages, pu"
+    return [Problem("order", text)]

@@ -11,7 +11,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, unit_rows
 from gridsec.choices import choice, no_choice
-from gridsec.errors import refuse
+from gridsec.errors import Problem, refuse
 from gridsec.lure import close_loop
 from gridsec.studies.patterns import Patterns, patterns, unknown_pair, unknown_voltages
 
@@ -206,8 +206,12 @@ def _indices(known: Sequence[str], names: Sequence[str], what: str) -> Ints:
     return np.array([place[name] for name in names], dtype=np.intp)
 
 
-def _strange(known: Sequence[str], names: Sequence[str], what: str) -> list[str]:
+def _strange(known: Sequence[str], names: Sequence[str], what: str) -> list[Problem]:
     there = set(known)
     strange = [name for name in names if name not in there]
     few = ", ".join(list(known)[:5])
-    return [f"there is no {what} {', '.join(map(repr, strange))}; there are {few}, ..."] if strange else []
+    return (
+        [Problem("unknown-name", f"there is no {what} {', '.join(map(repr, strange))}; there are {few}, ...")]
+        if strange
+        else []
+    )

@@ -22,7 +22,7 @@ from typing import Any, Final, Protocol, Self
 
 from feeders.outside import GROUP
 from feeders.plain import plain
-from gridsec.errors import GridsecError
+from gridsec.errors import GridsecError, Problem
 
 if sys.platform == "win32":
     import msvcrt
@@ -38,9 +38,13 @@ Progress = Callable[[int, int], None]
 class OtherStudy(GridsecError):
     """A journal belongs to another study, feeder, version or to other arguments, or is no journal."""
 
+    code = "other-origin"
+
 
 class InUse(GridsecError):
     """Another process is writing a journal."""
+
+    code = "in-use"
 
 
 class Keeper(Protocol):
@@ -259,7 +263,8 @@ def _read(handle: int, path: Path, head: str) -> dict[str, Any]:
         _write(handle, head)
         return {}
     if lines[0] != head.encode():
-        raise OtherStudy(f"{path}: {_other(lines[0].decode(errors='replace'), head)}")
+        why = _other(lines[0].decode(errors="replace"), head)
+        raise OtherStudy(f"{path}: {why}", code=why.code)
     try:
         done = dict(json.loads(line) for line in lines[1:-1])
     except (ValueError, TypeError) as error:
@@ -292,19 +297,22 @@ def remove(path: Path) -> None:
             os.close(handle)
 
 
-def _other(found: str, expected: str) -> str:
+def _other(found: str, expected: str) -> Problem:
     """In what a journal's first line is not the one expected."""
     try:
         theirs, ours = json.loads(found), json.loads(expected)
         same = {key: ours[key] for key in ("versions", "edition")}
         if {**theirs, **same} == ours:
             if theirs.get("versions") == ours["versions"]:
-                return "written before this program was changed; begin a new journal"
+                return Problem(
+                    "other-version", "written before this program was changed; begin a new journal"
+                )
             made = ", ".join(f"{name} {each}" for name, each in theirs.get("versions", {}).items())
-            return f"written with other versions ({made or 'which, it does not say'}); begin a new journal"
+            made = made or "which, it does not say"
+            return Problem("other-version", f"written with other versions ({made}); begin a new journal")
     except (ValueError, TypeError, AttributeError):
         pass
-    return f"not the journal of this study; it begins with {found[:200]!r}"
+    return Problem("other-origin", f"not the journal of this study; it begins with {found[:200]!r}")
 
 
 def worked(

@@ -22,7 +22,7 @@ from feeders.studies.journal import Journal, Where
 from feeders.studies.operating import SHARE, box, false_powers, squared, volts_of_lie
 from gridsec.arrays import Bools, Ints
 from gridsec.choices import choice, no_choice
-from gridsec.errors import DesignInfeasible, refuse
+from gridsec.errors import DesignInfeasible, Problem, refuse
 from gridsec.studies.false_powers import FalsePowers, largest_of
 from gridsec.studies.lies import Box, largest_lie
 from gridsec.studies.patterns import Patterns, fewest_meters
@@ -230,7 +230,8 @@ def protect(
             found = fewest_protected(attacker, fixed.size, never=fixed, exact=exact, progress=progress)
     except Unprotectable as error:
         what = f"protection of {site.feeder.name} ({goal}, M = {max_attacked})"
-        raise DesignInfeasible(what, _unmet([site.meter_ids[j] for j in error.liars])) from error
+        why = _unmet([site.meter_ids[j] for j in error.liars])
+        raise DesignInfeasible(what, why, code="unprotectable") from error
     protected = np.zeros(fixed.size, dtype=np.bool_)
     protected[found.meters] = True
     return Protect(
@@ -282,21 +283,32 @@ def check(
     hiding = goal in (Goal.IDENTIFY, Goal.NOTICE)
     in_volts = goal in (Goal.BOUND, Goal.CONTAIN) or (goal is None and bounded)
     for problem, wrong in (
-        (f"max_attacked is {max_attacked}; it must be at least 1", max_attacked < 1),
+        (Problem("not-positive", f"max_attacked is {max_attacked}; it must be at least 1"), max_attacked < 1),
         (
-            f"lie_volt is {lie_volt}; to bound lies it must be a positive number of volts",
+            Problem(
+                "not-positive", f"lie_volt is {lie_volt}; to bound lies it must be a positive number of volts"
+            ),
             not 0.0 < lie_volt < math.inf and (bounded or goal == Goal.BOUND),
         ),
-        (f"share is {share}; it must be finite and not negative", not 0.0 <= share < math.inf),
-        ("to bound lies the busbar's voltage must be known", in_volts and not busbar_known),
-        (f"lie_volt goes with goals in volts, not with {goal}", bounded and hiding),
-        (f"share goes with goals in volts, not with {goal}", share != SHARE and hiding),
         (
-            "attack goes with goals identify and notice, not with bounds of lies",
+            Problem("negative", f"share is {share}; it must be finite and not negative"),
+            not 0.0 <= share < math.inf,
+        ),
+        (
+            Problem("inconsistent", "to bound lies the busbar's voltage must be known"),
+            in_volts and not busbar_known,
+        ),
+        (Problem("inconsistent", f"lie_volt goes with goals in volts, not with {goal}"), bounded and hiding),
+        (
+            Problem("inconsistent", f"share goes with goals in volts, not with {goal}"),
+            share != SHARE and hiding,
+        ),
+        (
+            Problem("inconsistent", "attack goes with goals identify and notice, not with bounds of lies"),
             in_volts and attack == Attack.ANY,
         ),
         (
-            "unknown powers do not go with bound, for which all are reported truly",
+            Problem("inconsistent", "unknown powers do not go with bound, for which all are reported truly"),
             goal == Goal.BOUND and unknown,
         ),
     ):

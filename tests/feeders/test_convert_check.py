@@ -19,9 +19,11 @@ from feeders.convert_network import feeder_of
 from feeders.convert_pandapower import from_pandapower
 from feeders.convert_pgm import read_pgm
 from feeders.load_phases import three_phase
+from feeders.powerflow import PowerFlowDiverged
 from feeders.powerflow_unbalanced import UnbalancedPowerFlow
 from feeders.schema import read, write
 from gridsec.errors import FeederInvalid, GridsecError
+from tests.codes import refused
 from tests.feeders.foreign import pgm
 
 
@@ -100,15 +102,16 @@ def test_parallel_transformers_on_a_coupled_busbar_are_one_infeed() -> None:
     check = compare(converted.state, converted.tables)
     assert (check.buses, check.largest_pu < BALANCED_PU) == (5, True)
     net.switch.loc[net.switch.name == "coupler", "closed"] = False
-    with pytest.raises(GridsecError, match="candidates: root, root 2"):
+    with refused(GridsecError, "busbar-unclear") as caught:
         from_pandapower(net, "x")
+    assert "root, root 2" in str(caught.value)
     assert from_pandapower(net, "x", root="root 2").tables.customers[0].customer == "farm"
 
 
 def test_loop_is_named_and_opened_when_asked(tmp_path: Path) -> None:
     path = tmp_path / "ring.json"
     pp.to_json(village(closed=True), str(path))
-    with pytest.raises(FeederInvalid, match=r"form a loop"):
+    with refused(FeederInvalid, "not-radial"):
         convert(str(path), tmp_path / "x", root="root")
     done = convert(str(path), tmp_path / "x", root="root", opened=["ring"])
     assert done.check is not None
@@ -161,21 +164,18 @@ def test_all_problems_of_a_net_at_once(tmp_path: Path) -> None:
     net.line.loc[1, "length_km"] = np.nan
     path = tmp_path / "broken.json"
     pp.to_json(net, str(path))
-    with pytest.raises(FeederInvalid) as caught:
+    with refused(FeederInvalid, "unknown-index", "unknown-index", "out-of-range") as caught:
         convert(str(path), tmp_path / "x")
-    assert len(caught.value.problems) == 3
     assert all(part in str(caught.value) for part in ("from_bus 77", "bus 78", "line 1: length_km is nan"))
     net = village()
     del net["trafo3w"], net["shunt"]
     net.line = net.line.drop(columns="df")
-    with pytest.raises(FeederInvalid) as caught:
+    with refused(FeederInvalid, "missing", "missing"):
         from_pandapower(net, "x")
-    assert len(caught.value.problems) == 2
     fresh = village()
     fresh.line = fresh.line.drop(columns=["df", "parallel"])
-    with pytest.raises(FeederInvalid) as caught:
+    with refused(FeederInvalid, "missing", "missing"):
         from_pandapower(fresh, "x")
-    assert len(caught.value.problems) == 2
 
 
 def test_unknown_numbers_and_truths_of_any_table_are_told() -> None:
@@ -188,18 +188,16 @@ def test_unknown_numbers_and_truths_of_any_table_are_told() -> None:
     net.load.loc[0, "in_service"] = np.nan
     net.switch["closed"] = net.switch["closed"].astype(object)
     net.switch.loc[0, "closed"] = None
-    with pytest.raises(FeederInvalid) as caught:
+    with refused(FeederInvalid, *["out-of-range"] * 4, *["wrong-type"] * 2) as caught:
         from_pandapower(net, "x")
-    assert len(caught.value.problems) == 6
-    for part in (
-        "asymmetric_load 0: p_b_mw is nan",
-        "asymmetric_sgen 0: q_c_mvar is nan",
-        "shunt 1: q_mvar is nan",
-        "bus 1: vn_kv is nan; expected above 0",
-        "load 0: in_service is nan; expected true or false",
-        "switch 0: closed is None",
-    ):
-        assert part in str(caught.value), part
+    assert {problem.partition(" is ")[0] for problem in caught.value.problems} == {
+        "asymmetric_load 0: p_b_mw",
+        "asymmetric_sgen 0: q_c_mvar",
+        "shunt 1: q_mvar",
+        "bus 1: vn_kv",
+        "load 0: in_service",
+        "switch 0: closed",
+    }
 
 
 def test_truths_may_be_numbers_and_a_shunt_of_no_power_is_named() -> None:
@@ -216,13 +214,12 @@ def test_truths_may_be_numbers_and_a_shunt_of_no_power_is_named() -> None:
 def test_another_source_hides_no_loop() -> None:
     net = village(closed=True)
     pp.create_ext_grid(net, 3)  # bus B
-    with pytest.raises(FeederInvalid) as caught:
+    with refused(FeederInvalid, "several-sources", "not-radial") as caught:
         from_pandapower(net, "x", root="root")
     source, loop = caught.value.problems
-    assert "bus 'B' has another voltage source" in source
+    assert source.startswith("bus 'B' ")
     assert loop.startswith("lines: ")
-    assert "form a loop" in loop
-    with pytest.raises(FeederInvalid) as caught:
+    with refused(FeederInvalid, "several-sources") as caught:
         from_pandapower(net, "x", root="root", extent=Extent(meshed=True))
     assert caught.value.problems == (source,)
 
@@ -230,17 +227,15 @@ def test_another_source_hides_no_loop() -> None:
 def test_a_wrong_busbar_hides_no_other_wrong_choice(tmp_path: Path) -> None:
     net = village()
     for wrong, count in (({"droop": "nosuch"}, 1), ({"opened": ["no", "none"]}, 2)):
-        with pytest.raises(FeederInvalid) as caught:
+        with refused(FeederInvalid, *["unknown-name"] * count):
             from_pandapower(net, "x", **wrong)  # type: ignore[arg-type]
-        assert len(caught.value.problems) == count
     choices = {"root": "nowhere", "droop": "nosuch", "opened": ["no"]}
     source = str(pgm(tmp_path / "town.json", 6, balanced=True))
     pp.to_json(net, str(tmp_path / "village.json"))
     for each in (source, str(tmp_path / "village.json")):
-        with pytest.raises(FeederInvalid) as caught:
+        with refused(FeederInvalid, *["unknown-name"] * 3) as caught:
             convert(each, tmp_path / "x", **choices)  # type: ignore[arg-type]
         told = caught.value.problems
-        assert len(told) == 3, told
         assert all(part in told[k] for k, part in enumerate(("nowhere", "'no'", "'nosuch'")))
 
 
@@ -253,17 +248,15 @@ def test_what_is_no_number_is_told_and_not_a_traceback() -> None:
     net.switch.loc[0, "element"] = 99
     net.f_hz = None
     net.bus["geo"] = '{"x": 1}'
-    with pytest.raises(FeederInvalid) as caught:
+    with refused(FeederInvalid, "unknown-index", "not-positive", *["out-of-range"] * 3) as caught:
         from_pandapower(net, "x")
-    assert len(caught.value.problems) == 5
-    for part in (
-        "r_ohm_per_km is a lot",
-        "line 1: parallel is 0",
-        "load 0: p_mw is nan",
-        "switch 0: element 99 is no line",
-        "f_hz is None",
-    ):
-        assert part in str(caught.value), part
+    assert {problem.partition(" is ")[0] for problem in caught.value.problems} == {
+        "line 0: r_ohm_per_km",
+        "line 1: parallel",
+        "load 0: p_mw",
+        "switch 0: element 99",
+        "f_hz",
+    }
 
 
 @pytest.mark.acceptance
@@ -279,7 +272,7 @@ def test_a_source_without_solution_is_converted_and_not_checked(tmp_path: Path) 
     assert "no-load current of transformer T1; without the source's power flow not known" in said
     done = convert(str(path), tmp_path / "y", root="root", one_voltage=True)
     assert "load side of transformer T1; 2 buses; what flows there is not known" in "\n".join(done.notes)
-    with pytest.raises(GridsecError, match="own power flow fails"):
+    with refused(GridsecError, "not-converged"):
         check_against_source(str(path), tmp_path / "x", root="root")
 
 
@@ -289,16 +282,15 @@ def test_what_is_doubtful_is_accepted_from_a_source_with_a_solution_only(tmp_pat
     net = village(closed=True)
     net.load["p_mw"] *= 1000.0
     pp.to_json(net, str(path))
-    with pytest.raises(FeederInvalid) as caught:
+    with refused(FeederInvalid, "not-radial", *["doubtful"] * 3) as caught:
         convert(str(path), tmp_path / "x", root="root")
     said = "\n".join(caught.value.problems)
-    for part in ("column load_kw: 2e+06 is very large", "form a loop", "own power flow fails: "):
+    for part in ("column load_kw: 2e+06 is very large", "own power flow fails: "):
         assert part in said, part
     assert "accept = [" not in said
     assert not (tmp_path / "x").exists()
-    with pytest.raises(FeederInvalid) as caught:
+    with refused(FeederInvalid, *["doubtful"] * 3):
         convert(str(path), tmp_path / "x", root="root", meshed=True)
-    assert "form a loop" not in str(caught.value)
 
 
 @pytest.mark.acceptance
@@ -310,7 +302,7 @@ def test_a_feeder_without_solution_is_told(tmp_path: Path) -> None:
     weak = tuple(replace(line, r_ohm=100 * line.r_ohm, x_ohm=100 * line.x_ohm) for line in tables.lines)
     meta = replace(tables.meta, accept=("impedance", "ratio", "load"))
     write(replace(tables, meta=meta, lines=weak), tmp_path / "x")
-    with pytest.raises(GridsecError, match="no solution"):
+    with refused(PowerFlowDiverged, "not-converged"):
         check_against_source(str(path), tmp_path / "x", root="root")
 
 

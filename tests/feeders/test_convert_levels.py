@@ -15,6 +15,7 @@ from feeders.load import from_tables
 from feeders.schema import FeederTables, read
 from feeders.studies.hidden import Curves, knowledge
 from gridsec.errors import FeederInvalid
+from tests.codes import refused
 from tests.feeders.test_convert_pgm import line, load, transformer, written
 
 
@@ -248,6 +249,6 @@ def test_lines_between_voltages_are_refused(tmp_path: Path) -> None:
     net = village()
     end, home = (net.bus.index[net.bus.name == name][0] for name in ("end", "home"))
     pp.create_line(net, end, home, 1.0, "NAYY 4x150 SE", name="wrong")
-    said = r"line 'wrong' joins the buses 'end' of 11547 V and 'home' of 230\.94 V nominal voltage"
-    with pytest.raises(FeederInvalid, match=said):
+    with refused(FeederInvalid, "inconsistent") as caught:
         convert(saved(net, tmp_path), tmp_path / "x", root="root")
+    assert "line 'wrong' joins the buses 'end' of 11547 V and 'home' of 230.94 V" in str(caught.value)

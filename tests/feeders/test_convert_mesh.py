@@ -22,6 +22,7 @@ from feeders.trials import LoadError, Meters, Trial, judge
 from gridsec.errors import FeederInvalid
 from gridsec.mesh import MeshedFeeder, PhasedMesh
 from gridsec.network import bus_voltages, model_error_bound
+from tests.codes import refused
 from tests.feeders.test_convert_check import village
 from tests.feeders.test_convert_pgm import line, written
 from tests.feeders.test_convert_pgm import load as pgm_load
@@ -40,7 +41,7 @@ def meshed_net() -> Any:
 def test_a_pandapower_net_with_rings_is_as_pandapower_solves_it(tmp_path: Path) -> None:
     net, path = meshed_net(), tmp_path / "net.json"
     pp.to_json(net, str(path))
-    with pytest.raises(FeederInvalid, match=r"form a loop.*\(converters: --meshed\)"):
+    with refused(FeederInvalid, *["not-radial"] * 5):
         convert(str(path), tmp_path / "x")
     done = convert(str(path), tmp_path / "x", meshed=True)
     assert done.check is not None
@@ -106,7 +107,7 @@ def test_the_ieee_13_node_feeder_with_three_loops(lie: Lie | None, tmp_path: Pat
     before, loads = thirteen().split("new load", 1)
     (tmp_path / "thirteen.dss").write_text(f"{before}{LOOPS}new load{loads}")
     source = str(tmp_path / "thirteen.dss")
-    with pytest.raises(FeederInvalid, match=r"form a loop.*\(converters: --meshed\)"):
+    with refused(FeederInvalid, *["not-radial"] * 3):
         convert(source, tmp_path / "x", root="650")
     done = convert(source, tmp_path / "x", root="650", meshed=True)
     assert done.check is not None
@@ -146,6 +147,6 @@ def test_a_ring_of_single_phases_is_refused(tmp_path: Path) -> None:
     pp.create_asymmetric_load(net, int(net.load.bus.iloc[0]), p_a_mw=0.002, q_a_mvar=0.0)
     path = tmp_path / "ring.json"
     pp.to_json(net, str(path))
-    with pytest.raises(FeederInvalid, match=r"only balanced feeders can be meshed|zero sequence"):
+    with refused(FeederInvalid, *["missing"] * 3):
         convert(str(path), tmp_path / "x", root="root", meshed=True)
     assert not (tmp_path / "x").exists()

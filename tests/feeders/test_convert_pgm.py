@@ -13,6 +13,7 @@ from feeders.convert import convert
 from feeders.convert_check import BALANCED_PU, UNBALANCED_PU
 from feeders.schema import read
 from gridsec.errors import FeederInvalid, GridsecError
+from tests.codes import refused
 from tests.feeders.foreign import pgm
 
 Rows = list[dict[str, Any]]
@@ -201,10 +202,9 @@ def test_all_problems_at_once(tmp_path: Path) -> None:
     tables = street()
     tables["line"][1]["from_node"] = 77
     tables["sym_load"][0]["id"] = 51
-    with pytest.raises(FeederInvalid) as caught:
+    with refused(FeederInvalid, "source-invalid", "source-invalid") as caught:
         convert(written(tmp_path, tables), tmp_path / "x")
     said = str(caught.value)
-    assert len(caught.value.problems) >= 2
     assert "valid node id" in said
     assert "unique" in said
     assert not (tmp_path / "x").exists()
@@ -213,32 +213,33 @@ def test_all_problems_at_once(tmp_path: Path) -> None:
 def test_what_is_no_feeder_is_told(tmp_path: Path) -> None:
     looped = street()
     looped["line"].append(line(23, 6, 2))
-    with pytest.raises(FeederInvalid, match="form a loop"):
+    with refused(FeederInvalid, "not-radial"):
         convert(written(tmp_path, looped), tmp_path / "x")
     opened = convert(written(tmp_path, looped), tmp_path / "x", opened=["line 23"])
     assert opened.check is not None
     assert not opened.check.exact
     fed = street()
     fed["source"].append({"id": 41, "node": 6, "status": 1, "u_ref": 1.0})
-    with pytest.raises(GridsecError, match="voltage sources at: 1, 6"):
+    with refused(GridsecError, "busbar-unclear") as caught:
         convert(written(tmp_path, fed), tmp_path / "y")
-    with pytest.raises(FeederInvalid, match="another voltage source"):
+    assert "1, 6" in str(caught.value)
+    with refused(FeederInvalid, "several-sources"):
         convert(written(tmp_path, fed), tmp_path / "y", root="2")
-    with pytest.raises(GridsecError, match="no bus 'nowhere'"):
+    with refused(GridsecError, "unknown-name"):
         convert(written(tmp_path, street()), tmp_path / "y", root="nowhere")
     mixed = street()
     mixed["node"][5]["u_rated"] = 230.0
-    with pytest.raises(GridsecError, match="Conflicting voltage for line 22"):
+    with refused(GridsecError, "not-converged") as caught:
         convert(written(tmp_path, mixed), tmp_path / "y")
+    assert "line 22" in str(caught.value)
     heavy = street()
     heavy["sym_load"][0]["p_specified"] = 1e9
-    with pytest.raises(GridsecError, match="own power flow fails"):
+    with refused(GridsecError, "not-converged"):
         convert(written(tmp_path, heavy), tmp_path / "y")
-    with pytest.raises(GridsecError, match=r"power-grid-model cannot read it|of the type 'input'"):
+    with refused(GridsecError, "wrong-type"):
         convert(written(tmp_path, street(), type="update"), tmp_path / "y")
-    with pytest.raises(FeederInvalid) as caught:
+    with refused(FeederInvalid, "missing", "missing"):
         convert(written(tmp_path, {"sym_load": []}), tmp_path / "y")
-    assert len(caught.value.problems) == 2
     assert not (tmp_path / "y").exists()
 
 

@@ -20,6 +20,7 @@ from feeders.convert_pandapower import from_pandapower
 from feeders.load import load
 from gridsec.errors import FeederInvalid, GridsecError
 from service.cli import app
+from tests.codes import refused
 
 LINE = {"r_ohm_per_km": 0.3, "x_ohm_per_km": 0.09, "c_nf_per_km": 250.0, "max_i_ka": 0.2}
 ZERO = {"r0_ohm_per_km": 0.8, "x0_ohm_per_km": 0.4, "c0_nf_per_km": 100.0}
@@ -119,7 +120,7 @@ def test_nothing_is_written_that_cannot_be_loaded(tmp_path: Path) -> None:
     """Single phases on lines without a zero sequence: no three-phase model, and no folder."""
     net = street(3)
     pp.create_asymmetric_load(net, 3, p_a_mw=0.004, name="flat")
-    with pytest.raises(FeederInvalid, match="r0_ohm: is missing"):
+    with refused(FeederInvalid, "missing", "missing"):
         converted(net, tmp_path)
     done = CliRunner().invoke(app, ["feeders", "convert", str(tmp_path / "net.json"), str(tmp_path / "out")])
     assert done.exit_code != 0
@@ -246,13 +247,13 @@ def test_a_voltage_without_the_other_is_no_agreement() -> None:
     check = compare(replace(state, volts={**state.volts, "b2": nothing}), done.tables)
     assert (check.buses, check.three_phase, check.unmatched, check.exact) == (3, False, ("b2",), False)
     assert check.sentence.endswith("; only one of them has a voltage at bus b2")
-    with pytest.raises(GridsecError, match="no bus where"):
+    with refused(GridsecError, "missing"):
         compare(replace(state, volts=dict.fromkeys(state.volts, nothing)), done.tables)
 
 
 def test_without_a_source_the_busbar_has_to_be_named() -> None:
     net = street(3)
     net.ext_grid["in_service"] = False
-    with pytest.raises(BusbarUnclear, match=r"no voltage source in service; name the busbar with --root"):
+    with refused(BusbarUnclear, "busbar-unclear"):
         from_pandapower(net, "x")
     assert from_pandapower(net, "x", root="b0").tables.meta.busbar == "b0"

@@ -11,8 +11,9 @@ import pytest
 
 from feeders.design_cache import BankGains, DesignCache, bank_gains, folder
 from gridsec import bank
-from gridsec.errors import NotObservable
+from gridsec.errors import InputInvalid, NotObservable
 from gridsec.gains import margin, options_for
+from tests.codes import refused
 from tests.gridsec.plants import line
 
 STREET = line(4)
@@ -116,10 +117,10 @@ def test_old_entries_go_first(tmp_path: Path) -> None:
 def test_a_key_is_no_path(tmp_path: Path) -> None:
     cache = DesignCache(tmp_path)
     for key in ("../x", "a/b", "", "a.b"):
-        with pytest.raises(ValueError, match="no key"):
+        with refused(InputInvalid, "wrong-text"):
             cache.get(key)
 
 
 def test_more_than_half_lying_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(NotObservable):
+    with refused(NotObservable, "too-few-meters"):
         bank_gains(STREET.lure, 2, OPTIONS, workers=1, where=tmp_path)

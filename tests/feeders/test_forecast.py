@@ -23,8 +23,10 @@ from feeders.studies.operating import box
 from feeders.studies.rehearsal import Rehearsal, rehearse
 from feeders.trials import Trial, frames
 from gridsec.arrays import Floats
+from gridsec.errors import InputInvalid
 from gridsec.frames import usual
 from gridsec.sequential import SequentialDesign, SequentialState
+from tests.codes import refused
 from tests.feeders.unmetered import CIGRE, unmetered, without
 from tests.gridsec.street import ac_voltages
 
@@ -377,12 +379,12 @@ def test_a_first_order_process_is_recovered() -> None:
     assert found.time_s == pytest.approx(time_s, rel=0.1)
     assert found.common_p == pytest.approx(common, abs=0.06)
     assert found.common_q == pytest.approx(common, abs=0.06)
-    for wrong in (
-        (np.zeros((2, 3)),) * 2,
-        (np.zeros((9, 3)), np.zeros((9, 2))),
-        (np.full((9, 3), np.nan),) * 2,
+    for wrong, code in (
+        ((np.zeros((2, 3)),) * 2, "shape"),
+        ((np.zeros((9, 3)), np.zeros((9, 2))), "shape"),
+        ((np.full((9, 3), np.nan),) * 2, "not-finite"),
     ):
-        with pytest.raises(ValueError, match="errors"):
+        with refused(InputInvalid, code):
             from_history(*wrong, step_s)
 
 

@@ -22,6 +22,7 @@ from feeders.schema import CustomerRow, FeederTables, from_json, read, to_json, 
 from gridsec.errors import FeederInvalid
 from gridsec.feeder import lindistflow
 from gridsec.online import Frame
+from tests.codes import refused
 
 ROOT = Path(__file__).parent.parent.parent
 GOOD = ROOT / "tests" / "cases" / "good"
@@ -100,22 +101,21 @@ def test_line_direction_does_not_matter(three: Site) -> None:
 
 def test_what_takes_balanced_feeders_says_so(three: Site) -> None:
     assert three.balanced is three.feeder
-    with pytest.raises(FeederInvalid, match="balanced feeders only"):
+    with refused(FeederInvalid, "not-balanced"):
         _ = load("ieee-european-lv").balanced
 
 
 def test_feeder_without_any_impedance_is_refused() -> None:
     tables = read(GOOD / "fused")
     lines = tuple(replace(line, r_ohm=0.0, x_ohm=0.0) for line in tables.lines)
-    with pytest.raises(FeederInvalid, match="no closed line has an impedance"):
+    with refused(FeederInvalid, "nothing-to-design"):
         from_tables(replace(tables, lines=lines))
 
 
 def test_tables_made_in_memory_are_checked(three: Site) -> None:
     broken = replace(three.tables, customers=(CustomerRow("x", "nowhere", -1.0),))
-    with pytest.raises(FeederInvalid) as caught:
+    with refused(FeederInvalid, "negative", "unknown-name"):
         from_tables(broken)
-    assert len(caught.value.problems) == 2
 
 
 EXTREMES = [
@@ -159,8 +159,9 @@ def test_extreme_numbers_are_refused_or_give_a_finite_model() -> None:
 
 def test_unknown_names_are_refused_with_the_known_ones() -> None:
     for name in ("no-such-feeder", "../feeders/case33bw", "feeder.toml", "data\x00"):
-        with pytest.raises(FeederInvalid, match="simbench-lv-rural1"):
+        with refused(FeederInvalid, "unknown-name") as caught:
             load(name)
+        assert "simbench-lv-rural1" in str(caught.value)
 
 
 def test_folder_of_its_own(tmp_path: Path, three: Site) -> None:

@@ -25,7 +25,7 @@ def said(*rows: CustomerRow, lines: tuple[LineRow, ...] = (LINE,)) -> tuple[str,
 
 
 def test_rows_are_counted_as_in_the_files() -> None:
-    more = "every id must be unique, as those of the phases of whoever has three"
+    more = "every id must be unique, as those of the phases of three-phase customers"
     assert said(X, Y, CustomerRow("X-a", "n1", 3.0, phases="a", meter="m3")) == (
         "customers, row 3 (X-a), column customer: 'X-a' is already the id of customers, row 1 (X); " + more,
     )

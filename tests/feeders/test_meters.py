@@ -13,6 +13,8 @@ from hypothesis import strategies as st
 
 from feeders.load import Site, from_tables
 from feeders.meters import BUSBAR, Channel, MeterErrors, Meters, Silence
+from gridsec.errors import InputInvalid
+from tests.codes import refused
 from tests.feeders.villages import tables, village
 
 START = 1_780_272_000.0
@@ -181,9 +183,9 @@ def test_silences_silence_their_meter_and_no_other() -> None:
 
 
 def test_nonsense_is_refused() -> None:
-    with pytest.raises(ValueError, match="unknown meters: m-nobody"):
+    with refused(InputInvalid, "unknown-name"):
         Meters(village(), MeterErrors(), Channel(silences=(Silence("m-nobody", 0.0, 1.0),)), 0)
-    with pytest.raises(ValueError, match="loss is a probability"):
+    with refused(InputInvalid, "out-of-range"):
         Channel(loss=1.5)
-    with pytest.raises(ValueError, match="late_s must be finite"):
+    with refused(InputInvalid, "negative"):
         Channel(late_s=np.inf)

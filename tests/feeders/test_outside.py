@@ -16,6 +16,7 @@ from feeders.estimators import Families, Family, Job
 from feeders.load import Site, load
 from feeders.outside import EstimatorUnusable
 from gridsec.errors import DesignInfeasible, FeederInvalid, NotObservable
+from tests.codes import refused
 
 GOOD = """
 from feeders.estimators import Family
@@ -69,14 +70,15 @@ def test_what_cannot_be_used_is_refused_by_name(place: Path) -> None:
     install(place, "pkg_d", GOOD, "other = pkg_d:OTHER", "alias = pkg_d:FAMILY", "twice = pkg_d:FAMILY")
     install(place, "pkg_e", GOOD, "twice = pkg_e:FAMILY")
     for name, why in (
-        ("broken", "pkg_c:FAMILY of pkg_c.* cannot be loaded: out of order"),
+        ("broken", "cannot be loaded: out of order"),
         ("other", "is no Family of that name"),
         ("alias", "is no Family of that name"),
         ("twice", "2 packages offer it"),
         ("nobody", "0 packages offer it"),
     ):
-        with pytest.raises(EstimatorUnusable, match=why):
+        with refused(EstimatorUnusable, "estimator-unusable") as caught:
             outside.load(name, Family)
+        assert why in str(caught.value)
 
 
 def test_what_a_design_says_on_purpose_is_passed_on_and_all_else_is_one_line() -> None:
@@ -94,7 +96,7 @@ def test_what_a_design_says_on_purpose_is_passed_on_and_all_else_is_one_line() -
             outside.design("mine", failing(known), site, job)
         assert told.value is known
     for other in (FeederInvalid(["of two", "reasons"]), KeyError("x"), MemoryError()):
-        with pytest.raises(EstimatorUnusable, match="'mine' cannot be designed for cigre-lv: ") as told:
+        with refused(EstimatorUnusable, "estimator-unusable") as told:
             outside.design("mine", failing(other), site, job)
         assert type(other).__name__ in str(told.value)
         assert "\n" not in str(told.value)

@@ -27,6 +27,7 @@ from gridsec.errors import FeederInvalid
 from gridsec.mesh import MeshedFeeder, PhasedMesh
 from gridsec.network import bus_voltages, model_error_bound
 from gridsec.phases import PhasedFeeder
+from tests.codes import refused
 from tests.feeders import asymmetric, villages
 from tests.feeders.watched import names_the_liar_alone
 
@@ -81,9 +82,8 @@ def test_without_the_option_a_loop_is_an_error() -> None:
     radial = replace(tables, meta=replace(tables.meta, meshed=False))
     (problem,) = validate(radial)
     assert problem.startswith("lines: ring, ")
-    for words in ("form a loop; the feeder must be radial", "or meshed to true in feeder.toml"):
-        assert words in problem
-    with pytest.raises(FeederInvalid, match="form a loop"):
+    assert problem.code == "not-radial"
+    with refused(FeederInvalid, "not-radial"):
         from_tables(radial)
 
 
@@ -124,17 +124,16 @@ def test_the_tree_is_of_the_lines_with_the_most_phases() -> None:
 def test_phases_that_only_a_tie_brings_are_refused() -> None:
     tables = dealt()
     parts = tuple(LineRow(f"far {phase}", "n6", "n7", 0.1, 0.05, phases=phase) for phase in "ab")
-    with pytest.raises(FeederInvalid) as caught:
+    with refused(FeederInvalid, "absent-phase") as caught:
         from_tables(replace(tables, lines=(*tables.lines, *parts)))
     assert "line 'far b' closes a loop and brings phase 'b' to 'n7'" in str(caught.value)
-    assert "as one row with a matrix" in str(caught.value)
     matrix = {f"{s}_{p}_ohm": v for p in ("aa", "bb") for s, v in (("r", 0.1), ("x", 0.05))}
     one = LineRow("far", "n6", "n7", 0.1, 0.05, phases="ab", **matrix, r_ab_ohm=0.0, x_ab_ohm=0.0)
     assert from_tables(replace(tables, lines=(*tables.lines, one))).ties.shape == (1, 2)
 
 
 def test_the_model_of_customers_in_several_phases_is_radial() -> None:
-    with pytest.raises(FeederInvalid, match="closed lines form loops, and this takes radial feeders only"):
+    with refused(FeederInvalid, "not-radial"):
         three_phase(dealt())
 
 
@@ -245,8 +244,9 @@ def test_taps_that_cancel_around_every_loop(taps: dict[str, float]) -> None:
     found = bus_voltages(feeder, p, 0.3 * p, (233.0 / 230.0) ** 2, steps=40)
     np.testing.assert_allclose(found, (places / site.base_volt) ** 2, rtol=0, atol=1e-9)
     wrong = [replace(row, tap=1.05 if row.line == "l5" else 1.0) for row in tables.lines]
-    with pytest.raises(FeederInvalid, match=r"'tie' closes a loop around which the taps multiply to"):
+    with refused(FeederInvalid, "inconsistent") as caught:
         from_tables(replace(tables, lines=tuple(wrong)))
+    assert "'tie'" in str(caught.value)
 
 
 def test_a_tie_of_one_phase_asks_for_the_taps_of_that_phase_alone() -> None:
@@ -348,5 +348,5 @@ def test_studies_take_lines_in_parallel_as_one() -> None:
     ids=["calibrate", "tree", "balanced"],
 )
 def test_what_takes_radial_feeders_says_so(study: Callable[[Site], object]) -> None:
-    with pytest.raises(FeederInvalid, match=r"closed lines form loops, and .*takes radial feeders only"):
+    with refused(FeederInvalid, "not-radial"):
         study(ring())

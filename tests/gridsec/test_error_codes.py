@@ -1,11 +1,9 @@
-"""Codes of errors: docs/error-codes.md against the source, and a sentence for each code."""
+"""Codes of errors: docs/error-codes.md against the source, and a sentence for each code of gridsec."""
 
 from __future__ import annotations
 
-import ast
 import re
-from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import feeders
 import gridsec
 from gridsec import bank, monitor
 from gridsec.arrays import not_negative
@@ -22,7 +21,6 @@ from gridsec.decode import Stack, gaussian, stacks
 from gridsec.decode.probability import bound_for
 from gridsec.designs import from_bytes
 from gridsec.droop import Droop, fleet, preset
-from gridsec.errors import DesignInfeasible, FeederInvalid, InputInvalid, NotObservable
 from gridsec.families import windowed
 from gridsec.feeder import Feeder, loss_correction
 from gridsec.gains import refuse_blind
@@ -45,50 +43,18 @@ from gridsec.sequential import LoadDoubt, SequentialOptions
 from gridsec.studies.droop_stability import Update
 from gridsec.studies.protect import fewest_protected
 from gridsec.subsets import subsets
-from tests.codes import codes_of
 from tests.gridsec.plants import line
 from tests.gridsec.radial import random_feeder
 from tests.gridsec.street import accuracy, make_plant
 from tests.gridsec.unbalanced import random_three_phase
+from tests.sentences import codes_in, golden, sentences, uncoded, used
 
-PACKAGE = Path(gridsec.__file__).parent
-PAGE = PACKAGE.parent / "docs" / "error-codes.md"
+PACKAGES = [Path(package.__file__).parent for package in (gridsec, feeders)]
+PAGE = PACKAGES[0].parent / "docs" / "error-codes.md"
 GOLDEN = Path(__file__).parent / "golden" / "errors.txt"
 ROW = re.compile(r"^\| `([a-z-]+)` \| (.+) \|$", re.MULTILINE)
 CODE = re.compile(r"[a-z]+(-[a-z]+)*")
 WHO = np.array([0, 1])
-
-
-def texts(node: ast.expr) -> Iterator[str]:
-    """Strings that an expression states: a constant, or both values of a choice."""
-    if isinstance(node, ast.IfExp):
-        yield from texts(node.body)
-        yield from texts(node.orelse)
-    elif isinstance(node, ast.Constant) and isinstance(node.value, str):
-        yield node.value
-
-
-def codes(source: str) -> set[str]:
-    """Literal codes of a module: of `Problem(...)`, of arguments `code=...` and their defaults."""
-    out: set[str] = set()
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Call):
-            name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
-            if name == "Problem" and node.args:
-                out.update(texts(node.args[0]))
-            for each in node.keywords:
-                if each.arg == "code":
-                    out.update(texts(each.value))
-        elif isinstance(node, ast.arguments):
-            for argument, default in zip(node.kwonlyargs, node.kw_defaults, strict=True):
-                if argument.arg == "code" and default is not None:
-                    out.update(texts(default))
-    return out
-
-
-def used() -> set[str]:
-    """Codes of the package."""
-    return set().union(*(codes(path.read_text("utf-8")) for path in PACKAGE.rglob("*.py")))
 
 
 def listed() -> list[str]:
@@ -103,18 +69,37 @@ errors.Problem("c", f"{x}")
 Problem(one.code, "no")
 raise Other("no", code="d")
 def f(x, *, code: str = "e", other: str = "no"): ...
+class Other:
+    code = "f"
+    other = "no"
 """
-    assert codes(source) == {"a", "b", "c", "d", "e"}
+    assert codes_in(source) == {"a", "b", "c", "d", "e", "f"}
+
+
+def test_errors_without_codes_are_found() -> None:
+    source = """
+raise ValueError("no")
+raise GridsecError("no") from error
+raise FeederInvalid(["no", *problems])
+raise RecordingInvalid(f"{path}: no")
+raise FeederInvalid(f"{each}" for each in problems)
+raise GridsecError("yes", code="a")
+raise FeederInvalid([Problem("a", "yes"), *problems])
+raise InputInvalid(problems)
+raise Other("yes")
+"""
+    assert uncoded(source) == [2, 3, 4, 5, 6]
 
 
 def test_the_page_lists_the_codes_of_the_source() -> None:
-    assert listed() == sorted(used())
+    assert listed() == sorted(set().union(*map(used, PACKAGES)))
     assert all(CODE.fullmatch(code) for code in listed())
 
 
-def test_wrong_input_in_the_package_has_codes() -> None:
-    plain = re.compile(r"raise ValueError\(")
-    assert [str(path) for path in PACKAGE.rglob("*.py") if plain.search(path.read_text("utf-8"))] == []
+@pytest.mark.parametrize("package", PACKAGES, ids=lambda package: package.name)
+def test_every_error_has_a_code(package: Path) -> None:
+    found = {str(path): uncoded(path.read_text("utf-8")) for path in package.rglob("*.py")}
+    assert {path: lines for path, lines in found.items() if lines} == {}
 
 
 def far_apart() -> Any:
@@ -298,35 +283,14 @@ CALLS: dict[str, Callable[[], Any]] = {
 }
 
 
-def golden() -> dict[str, list[str]]:
-    """Lines of the golden file by call, without the call."""
-    out: dict[str, list[str]] = {}
-    for each in GOLDEN.read_text("utf-8").splitlines():
-        call, rest = each.split(" | ", 1)
-        out.setdefault(call, []).append(rest)
-    return out
-
-
-def lines(made: Callable[[], Any]) -> list[str]:
-    """Class, code and sentence of each problem that a call raises."""
-    try:
-        made()
-    except (InputInvalid, FeederInvalid, NotObservable, DesignInfeasible) as caught:
-        error = caught
-    else:
-        pytest.fail("the call is not refused")
-    sentences = error.problems if isinstance(error, InputInvalid | FeederInvalid) else (str(error),)
-    found = zip(codes_of(error), sentences, strict=True)
-    return [f"{type(error).__name__} | {code} | {sentence}" for code, sentence in found]
-
-
 @pytest.mark.parametrize("call", CALLS)
 def test_sentences(call: str) -> None:
-    assert lines(CALLS[call]) == golden()[call]
+    assert sentences(CALLS[call]) == golden(GOLDEN)[call]
 
 
 def test_the_golden_file_has_a_sentence_for_each_code() -> None:
-    assert golden().keys() == CALLS.keys()
-    found = Counter(each.split(" | ")[1] for rest in golden().values() for each in rest)
+    there = golden(GOLDEN)
+    assert there.keys() == CALLS.keys()
+    found = {each.split(" | ")[1] for rest in there.values() for each in rest}
     # The default of DesignInfeasible: every call of the package states a code.
-    assert found.keys() == used() - {"design-infeasible"}
+    assert found == used(PACKAGES[0]) - {"design-infeasible"}

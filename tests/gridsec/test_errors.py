@@ -32,6 +32,25 @@ def test_codes_follow_the_problems(kind: type[FeederInvalid | InputInvalid]) -> 
     assert error.problems == ("first", "second", "third")
 
 
+@pytest.mark.parametrize("kind", [FeederInvalid, InputInvalid])
+def test_a_pickled_error_keeps_problems_codes_and_sentence(kind: type[FeederInvalid | InputInvalid]) -> None:
+    error = kind([Problem("shape", "first"), Problem("order", "second")])
+    again = pickle.loads(pickle.dumps(error))
+    assert type(again) is kind
+    assert (again.problems, again.codes, str(again)) == (error.problems, error.codes, str(error))
+
+
+def test_the_code_of_one_sentence_is_that_of_its_class_or_its_own() -> None:
+    class Late(GridsecError):
+        code = "late"
+
+    assert Late("no answer").codes == ("late",)
+    other = GridsecError("no answer", code="other")
+    again = pickle.loads(pickle.dumps(other))
+    assert (other.code, Late.code, str(other)) == ("other", "late", "no answer")
+    assert (again.codes, str(again)) == (("other",), "no answer")
+
+
 def test_refuse_raises_only_with_problems() -> None:
     refuse([])
     with refused(InputInvalid, "shape", "order") as caught:

@@ -15,7 +15,7 @@ from gridsec.errors import InputInvalid
 from gridsec.families import partial, set_search, unknown_input
 from gridsec.plant import Options, Plant
 from gridsec.sequential import LoadDoubt, SequentialOptions
-from tests.codes import codes_of, refused
+from tests.codes import refused
 from tests.gridsec.street import accuracy, make_plant
 
 FAMILIES = (monitor, partial, set_search, unknown_input)
@@ -93,7 +93,7 @@ def test_options_of_the_sequential_monitor_are_checked_alike() -> None:
         SequentialOptions(**wrong)  # type: ignore[arg-type]
     found = {
         problem.split()[0]: code
-        for problem, code in zip(caught.value.problems, codes_of(caught.value), strict=True)
+        for problem, code in zip(caught.value.problems, caught.value.codes, strict=True)
     }
     assert found == {
         "alarms_per_year": "not-positive", "scales_s": "out-of-range", "enough": "out-of-range",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +20,8 @@ from feeders.studies.calibrate_corrections import Kind
 from feeders.studies.calibrate_readings import frames
 from feeders.studies.journal import OtherStudy
 from gridsec.attack import Attack, Bias, Drift, Replay, Stuck
+from gridsec.errors import InputInvalid
+from tests.codes import refused
 from tests.feeders.studies.calibrate_cases import (
     CIGRE,
     biases,
@@ -80,7 +83,7 @@ def test_three_planted_errors_are_found_and_nothing_else(tmp_path: Path) -> None
         assert row.r_ohm == pytest.approx(truth[row.line], rel=0.15)
     with pytest.raises(FileExistsError):
         found.corrected(folder, out)
-    with pytest.raises(OtherFeeder, match="not the feeder"):
+    with refused(OtherFeeder, "other-origin"):
         found.corrected(out, tmp_path / "again")
 
 
@@ -236,12 +239,11 @@ def test_phases_of_the_busbar_that_are_apart_are_no_errors_of_meters(tmp_path: P
     readings.to_csv(path, index=False)
     assert "outside its class" not in set(calibrate(given, path, kinds=[Kind.METER]).meters["verdict"])
     for without in (readings.drop(columns="v_phases"), readings.assign(v_phases="[null, null, null]")):
-        with pytest.raises(
-            RecordingInvalid, match=r"no voltages of phase a and b and c, .*expected v_phases"
-        ):
+        with refused(RecordingInvalid, "missing") as caught:
             calibrate(given, without)
+        assert "phase a and b and c," in str(caught.value)
     readings["v_phases"] = "230"
-    with pytest.raises(RecordingInvalid, match="v_phases are three voltages"):
+    with refused(RecordingInvalid, "shape"):
         calibrate(given, readings)
 
 
@@ -271,25 +273,26 @@ def test_an_interrupted_study_goes_on_and_another_ones_journal_is_refused(tmp_pa
 
 def test_clear_errors(tmp_path: Path) -> None:
     few = recorded(tmp_path, scenario(1, ticks=20))
-    with pytest.raises(RecordingInvalid, match=r"too little data: .*; at least 48 frames over 12 h"):
+    with refused(RecordingInvalid, "too-little-data") as caught:
         calibrate(CIGRE, few)
-    with pytest.raises(RecordingInvalid, match="recorded on cigre-lv, not on kerber-landnetz"):
+    assert "at least 48 frames over 12 h" in str(caught.value)
+    with refused(RecordingInvalid, "other-origin"):
         calibrate(load("kerber-landnetz"), few)
     table = few.frame()
-    with pytest.raises(RecordingInvalid, match="does not have: m99"):
+    with refused(RecordingInvalid, "unknown-name"):
         calibrate(CIGRE, table.assign(meter=table["meter"].astype(str).replace("m03", "m99")))
-    with pytest.raises(RecordingInvalid, match="none of the busbar"):
+    with refused(RecordingInvalid, "missing"):
         calibrate(CIGRE, table[table["meter"] != ""])
-    with pytest.raises(RecordingInvalid, match="columns v_volt are missing"):
+    with refused(RecordingInvalid, "missing"):
         calibrate(CIGRE, table.drop(columns="v_volt"))
-    with pytest.raises(RecordingInvalid, match="no meter has two readings"):
+    with refused(RecordingInvalid, "too-little-data"):
         calibrate(CIGRE, table.groupby("meter", observed=True).head(1))
-    with pytest.raises(RecordingInvalid, match=r"no table of readings"):
+    with refused(RecordingInvalid, "unreadable"):
         calibrate(CIGRE, tmp_path / "none.csv")
-    with pytest.raises(ValueError, match="no meter m99"):
+    with refused(InputInvalid, "unknown-name"):
         calibrate(CIGRE, table, exclude=["m99"])
     for name, value in (("risk", 0.0), ("tolerance", 0.5)):
-        with pytest.raises(ValueError, match=f"{name} is"):
+        with refused(InputInvalid, "out-of-range"):
             calibrate(CIGRE, table, **{name: value})
 
 
@@ -297,37 +300,44 @@ def test_times_that_are_none_are_named_before_memory_is_taken_for_them(tmp_path:
     table = recorded(tmp_path, scenario(1, ticks=20)).frame()
     t, fourth = table["t"], table.index == 3
     moments = pd.to_datetime(t, unit="s")
-    for change, said in (
-        ({"t": moments}, r"t is of type datetime64.*; expected Unix time in seconds"),
-        ({"t": moments.astype(str)}, r"t of row 1 and \d+ more is '2026-06-01.*; expected Unix time"),
-        ({"t": 1000.0 * t}, r"t of row 1 and \d+ more is 178\d+; expected Unix time in seconds"),
-        ({"t": t.mask(fourth)}, r"t of row 4 is nan; expected a time$"),
-        ({"t": t.mask(fourth, 0.0)}, "t of row 4 is 0; more than ten years from the usual 178"),
-        ({"t": t.mask(fourth, 1e300)}, r"t of row 4 is 1e\+300; expected Unix time in seconds"),
-        ({"v_volt": "x", "p_kw": True}, "v_volt of row 1 and .* is 'x'; .*; p_kw is of type bool; expected"),
-        ({"t": -1.0, "meter": "m99"}, "t of row 1 .* is -1; .*does not have: m99; none of the busbar"),
+    for change, codes, row in (
+        ({"t": moments}, ["wrong-type"], "t"),
+        ({"t": moments.astype(str)}, ["wrong-type"], "t of row 1"),
+        ({"t": 1000.0 * t}, ["out-of-range"], "t of row 1"),
+        ({"t": t.mask(fourth)}, ["not-finite"], "t of row 4"),
+        ({"t": t.mask(fourth, 0.0)}, ["out-of-range"], "t of row 4"),
+        ({"t": t.mask(fourth, 1e300)}, ["out-of-range"], "t of row 4"),
+        ({"v_volt": "x", "p_kw": True}, ["wrong-type", "wrong-type"], "v_volt of row 1"),
+        ({"t": -1.0, "meter": "m99"}, ["out-of-range", "unknown-name", "missing"], "t of row 1"),
     ):
-        with pytest.raises(RecordingInvalid, match=said):
+        with refused(RecordingInvalid, *codes) as caught:
             frames(CIGRE, table.assign(**change))
+        assert re.split(" is | and ", caught.value.problems[0])[0] == row
 
 
 def test_readings_in_another_unit_are_refused_all_at_once(tmp_path: Path) -> None:
     table = recorded(tmp_path, scenario(1)).frame()
     v, p, q, busbar = table["v_volt"], table["p_kw"], table["q_kvar"], table["meter"] == ""
     third = table["meter"] == "m03"
+    to_phase, in_w = "a phase-to-phase voltage?", "in W?"
     for change, said in (
+        ({"v_volt": 3.0**0.5 * v}, {"v_volt of m01 and 6 more": to_phase}),
+        ({"v_volt": v.mask(busbar, 3.0**0.5 * v)}, {"v_volt of the busbar": to_phase}),
+        ({"v_volt": v / 1000.0}, {"v_volt of m01 and 6 more": "in kV?"}),
+        ({"v_volt": v.mask(third, 0.0)}, {"v_volt of m03": "expected V from phase to neutral"}),
         (
-            {"v_volt": 3.0**0.5 * v},
-            r"v_volt of m01 and 6 more is usually 40\d.* where 230.9 is nominal; a phase-",
+            {"p_kw": 1000.0 * p, "q_kvar": 1000.0 * q},
+            {"p_kw of m01 and 5 more": in_w, "q_kvar of m01 and 5 more": "in var?"},
         ),
-        ({"v_volt": v.mask(busbar, 3.0**0.5 * v)}, r"v_volt of the busbar is usually .*; a phase-to-phase v"),
-        ({"v_volt": v / 1000.0}, r"v_volt of m01 and 6 more is usually 0.2\d+ .*; in kV\?"),
-        ({"v_volt": v.mask(third, 0.0)}, "v_volt of m03 is usually 0 .*; expected V from phase to neutral"),
-        ({"p_kw": 1000.0 * p, "q_kvar": 1000.0 * q}, r"p_kw of m01 and .*; in W\?; q_kvar of .*; in var\?$"),
-        ({"v_volt": 3.0**0.5 * v, "p_kw": 1000.0 * p}, r"a phase-to-phase voltage\?; p_kw of .*; in W\?"),
+        (
+            {"v_volt": 3.0**0.5 * v, "p_kw": 1000.0 * p},
+            {"v_volt of m01 and 6 more": to_phase, "p_kw of m01 and 5 more": in_w},
+        ),
     ):
-        with pytest.raises(RecordingInvalid, match=said):
+        with refused(RecordingInvalid, *["doubtful"] * len(said)) as caught:
             frames(CIGRE, table.assign(**change))
+        parts = (problem.split(" is usually ") for problem in caught.value.problems)
+        assert {place: rest.split("; ")[1] for place, rest in parts} == said
     # A dead meter that is excluded keeps nobody from the study, and neither do a few absurd readings.
     frames(CIGRE, table.assign(v_volt=v.mask(third, 0.0)), exclude=["m03"])
     frames(CIGRE, table.assign(v_volt=v.mask(v.index < 200, 1e6)))

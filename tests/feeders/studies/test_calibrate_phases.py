@@ -22,6 +22,7 @@ from feeders.studies.calibrate import Calibrate, calibrate
 from feeders.studies.calibrate_corrections import Correction, Kind, apply, as_filed, left
 from feeders.studies.calibrate_feeder import network, powers, series
 from feeders.studies.calibrate_readings import Frames, frames
+from tests.codes import refused
 from tests.feeders.studies.calibrate_cases import three_phase_readings
 
 
@@ -152,9 +153,9 @@ def test_channels_of_a_meter_of_three_phases_are_read_as_the_meter(tmp_path: Pat
     gone = (table["meter"] == "m-s3-b") & (table["t"] == table["t"].min())
     assert np.flatnonzero(np.isnan(frames(three_phase(tables), table[~gone]).v_volt[:, j])).tolist() == [0]
     assert calibrate(three_phase(tables), recording).proposals.empty
-    for both in (table.replace({"meter": {"m-s3-b": "m-s3"}}), table.replace({"meter": {"m-s1": "m-s3-d"}})):
-        with pytest.raises(RecordingInvalid, match=r"both m-s3 and channels of it|does not have: m-s3-d"):
-            frames(three_phase(tables), both)
+    for renamed, code in (({"m-s3-b": "m-s3"}, "duplicate"), ({"m-s1": "m-s3-d"}, "unknown-name")):
+        with refused(RecordingInvalid, code):
+            frames(three_phase(tables), table.replace({"meter": renamed}))
 
 
 @pytest.mark.parametrize(("bus", "said"), [("s1", "a"), ("s5", "c")])

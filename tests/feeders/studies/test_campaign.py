@@ -40,7 +40,9 @@ from feeders.studies.campaign_watch import risings
 from feeders.studies.journal import OtherStudy, edition
 from feeders.trials import LoadError, Meters, Trial, frames, judge
 from feeders.variation import Variation
+from gridsec.errors import InputInvalid
 from gridsec.feeder import lindistflow
+from tests.codes import refused
 from tests.feeders import stations
 from tests.feeders.studies.campaigns import PLAN, SITE
 from tests.feeders.test_taps import village
@@ -212,34 +214,34 @@ def test_what_cannot_be_played_says_why() -> None:
     assert reasons.str.contains("6 of what 99 should lie").all()
     assert found.by_kind["kind"].tolist() == [CLEAN, CLEAN]
     assert found.scenarios["exact"].dtype == np.bool_
-    with pytest.raises(NothingPlayed, match="no scenario can be played; the first: the AC power flow"):
+    with refused(NothingPlayed, "nothing-played"):
         campaign(SITE, replace(plan, variation=Variation(load_scale=1e3), load_error=LoadError(1e4, 1e4)))
 
 
 @pytest.mark.parametrize(
-    ("wrong", "why"),
+    ("wrong", "code"),
     [
-        ({"scenes": 0}, "needs scenes"),
-        ({"liars": (0,)}, "must be positive"),
-        ({"onset_s": (10.0, 24.0)}, "before the last"),
-        ({"estimator": "oracle"}, "does not exist"),
-        ({"alarms_per_year": ()}, "false-alarm rate"),
-        ({"kinds": ()}, "no kinds"),
-        ({"learn_s": 5.0}, "0 or from 10 s on"),
+        ({"scenes": 0}, "not-positive"),
+        ({"liars": (0,)}, "not-positive"),
+        ({"onset_s": (10.0, 24.0)}, "out-of-range"),
+        ({"estimator": "oracle"}, "unknown-name"),
+        ({"alarms_per_year": ()}, "not-positive"),
+        ({"kinds": ()}, "missing"),
+        ({"learn_s": 5.0}, "out-of-range"),
     ],
 )
-def test_wrong_plans_are_told(wrong: dict[str, object], why: str) -> None:
-    with pytest.raises(ValueError, match=why):
+def test_wrong_plans_are_told(wrong: dict[str, object], code: str) -> None:
+    with refused(InputInvalid, code):
         replace(PLAN, **wrong)  # type: ignore[arg-type]
 
 
 def test_settings_reach_the_estimator() -> None:
     plan = replace(PLAN, estimator="exact-bank", settings=(("max_attacked", 2.0),))
     assert design(plan.watched(plan.trial(SITE, plan.moment(0)).stated, 1.0)).max_attacked == 2
-    with pytest.raises(ValueError, match="'colour' is no setting"):
+    with refused(InputInvalid, "unknown-name"):
         campaign(SITE, replace(PLAN, settings=(("colour", 1.0),)))
     for wrong in (1.9, np.nan, np.inf):
-        with pytest.raises(ValueError, match=f"max_attacked is {wrong}; expected a whole number"):
+        with refused(InputInvalid, "not-integer"):
             campaign(SITE, replace(PLAN, settings=(("max_attacked", wrong),)))
 
 
@@ -255,7 +257,7 @@ def test_lies_inside_the_class_are_named_once_meters_are_learned() -> None:
     assert learned[["scenario", "who", "lie_volt"]].equals(unknown[["scenario", "who", "lie_volt"]])
     assert np.isinf(unknown["delay_s"]).any()
     assert np.isfinite(learned["delay_s"]).all()
-    with pytest.raises(ValueError, match="exact-bank does not learn"):
+    with refused(InputInvalid, "inconsistent"):
         campaign(SITE, replace(plan, learn_s=3600.0, estimator="exact-bank"))
 
 
@@ -341,8 +343,9 @@ def test_a_killed_process_loses_nothing(here: Campaign, tmp_path: Path) -> None:
 
 
 def test_a_piece_that_always_kills_its_process_is_given_up() -> None:
-    with pytest.raises(WorkerLost, match="piece 7 died 2 times"):
+    with refused(WorkerLost, "worker-lost") as caught:
         list(Processes(1, retries=1).run(os._exit, [7]))
+    assert "piece 7 died 2 times" in str(caught.value)
 
 
 def threads(_: int) -> list[int]:
@@ -407,15 +410,16 @@ def test_a_dask_cluster_gives_the_same_also_when_a_worker_is_killed(here: Campai
 
 def test_no_cluster_is_told() -> None:
     pytest.importorskip("distributed")
-    with pytest.raises(ClusterUnusable, match="no Dask scheduler answers at tcp"):
+    with refused(ClusterUnusable, "cluster-unusable"):
         list(Dask("tcp://127.0.0.1:1", timeout_s=0.2).run(abs, [0]))
 
 
 @pytest.mark.parametrize("theirs", [versions() | {"numpy": "1.0"}, ModuleNotFoundError("no gridsec")])
 def test_a_worker_that_computes_otherwise_is_refused(theirs: object) -> None:
     agree("tcp://a:1", versions())
-    with pytest.raises(ClusterUnusable, match=r"tcp://a:1 are .*(1.0|no gridsec)"):
+    with refused(ClusterUnusable, "cluster-unusable") as caught:
         agree("tcp://a:1", theirs)
+    assert "tcp://a:1" in str(caught.value)
 
 
 KILLED = """
@@ -497,9 +501,9 @@ def test_texts_and_numbers_of_numpy_make_the_same_plan() -> None:
     assert Kind("b", "bias", (1.0,), volts=(2.0,)) == Kind("b", Trick.BIAS, (1.0,), volts=(2.0,))
     assert Trial(SITE, meters="site").stated.tables == Trial(SITE, meters=Meters.SITE).stated.tables
     wrong = {"alarms_per_year": (np.inf,), "lying_s": np.nan, "seed": -1}
-    with pytest.raises(ValueError, match=r"seed must not be.*false-alarm rate.*times must be finite"):
+    with refused(InputInvalid, "negative", "not-positive", "not-finite"):
         replace(PLAN, **wrong)
-    with pytest.raises(ValueError, match="times must be finite"):
+    with refused(InputInvalid, "not-finite"):
         replace(PLAN, duration_s=np.inf)
-    with pytest.raises(ValueError, match="design is 'none'; expected one of factorial, random"):
+    with refused(InputInvalid, "unknown-name"):
         replace(PLAN, design="none")

@@ -24,6 +24,7 @@ from gridsec.phases import PhasedFeeder
 from gridsec.studies.droop_network import Box, currents, network, region, sensitivity, solve
 from gridsec.studies.droop_rest import always, at_rest, injected, rest
 from gridsec.studies.droop_stability import Update, enlarged, loop, proof, reach
+from tests.codes import refused
 from tests.feeders.studies.test_droop import random_site
 from tests.feeders.studies.three_phases import apart
 
@@ -255,7 +256,7 @@ def test_charging_that_cannot_be_is_refused() -> None:
     assert isinstance(site.feeder, PhasedFeeder)
     tree = site.feeder.tree
     heavy = PhasedFeeder(replace(tree, charging=1e6 * tree.charging))
-    with pytest.raises(DesignInfeasible, match="charging"):
+    with refused(DesignInfeasible, "no-solution"):
         network(heavy)
-    with pytest.raises(FeederInvalid, match="no customer has generation"):
+    with refused(FeederInvalid, "nothing-to-design"):
         equip(site, "ieee1547-b", customers=[])

@@ -19,6 +19,7 @@ from feeders.load import load
 from feeders.studies.detectable import detectable
 from feeders.studies.journal import InUse, Journal, OtherStudy, edition, remove, versions, worked
 from feeders.studies.rehearsal import rehearse
+from tests.codes import refused
 
 CIGRE = load("cigre-lv")
 SUBJECT = {"study": "any", "number": 3}
@@ -91,7 +92,7 @@ def test_other_code_of_the_same_version_is_another_study(tmp_path: Path) -> None
         head = json.loads(path.read_text(encoding="utf-8"))
     assert head == SUBJECT | {"versions": versions(), "edition": edition()}
     path.write_text(json.dumps(head | {"edition": "0"}, sort_keys=True) + "\n", encoding="utf-8")
-    with pytest.raises(OtherStudy, match="before this program was changed"):
+    with refused(OtherStudy, "other-version"):
         Journal(path, SUBJECT)
 
 
@@ -121,7 +122,7 @@ def test_two_processes_never_write_one(tmp_path: Path) -> None:
     with Journal(shelf, SUBJECT):
         (path,) = tmp_path.iterdir()
     with held(path):
-        with pytest.raises(InUse, match="another command is writing"):
+        with refused(InUse, "in-use"):
             Journal(path, SUBJECT)
         assert worked(shelf, SUBJECT, squares(2), None) == {"0": 0, "1": 1}
         remove(path)
