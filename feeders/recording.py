@@ -14,7 +14,6 @@ import math
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
-from functools import partial
 from importlib import metadata
 from itertools import islice
 from pathlib import Path
@@ -78,10 +77,6 @@ class RecordingInvalid(Problems, GridsecError):
         self.problems = problems
         self.where = where
         super().__init__(where + "; ".join(problems))
-
-    def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
-        """Return function and arguments: a pickled error keeps its problems and their place."""
-        return partial(type(self), where=self.where), self.problems
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -34,7 +34,23 @@ class Problem(str):
         return type(self), (self.code, str(self))
 
 
-class GridsecError(Exception):
+def _restored(kind: type[BaseException], args: tuple[Any, ...], state: dict[str, Any]) -> BaseException:
+    """An error of a class, by its sentence and its attributes: without the arguments of its constructor."""
+    error = kind.__new__(kind)
+    error.args = args
+    error.__dict__.update(state)
+    return error
+
+
+class _Pickled(BaseException):
+    """An error that keeps its sentence and its attributes between processes."""
+
+    def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
+        """Return a constructor and its arguments."""
+        return _restored, (type(self), self.args, self.__dict__)
+
+
+class GridsecError(_Pickled, Exception):
     """Base of every error that this project raises on purpose.
 
     Parameters
@@ -58,7 +74,7 @@ class GridsecError(Exception):
         return (self.code,)
 
 
-class Problems:
+class Problems(_Pickled):
     """Problems of an error, all at once."""
 
     problems: tuple[str, ...]
@@ -67,10 +83,6 @@ class Problems:
     def codes(self) -> tuple[str, ...]:
         """Code of each problem; empty for a sentence without one."""
         return tuple(getattr(problem, "code", "") for problem in self.problems)
-
-    def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
-        """Return class and arguments: a pickled error keeps its problems."""
-        return type(self), (self.problems,)
 
 
 class FeederInvalid(Problems, GridsecError):

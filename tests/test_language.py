@@ -29,7 +29,7 @@ PERSON = re.compile(
 LIMITS = {
     "gridsec": (197, 285),
     "default monitor": (166, 220),
-    "feeders": (223, 253),
+    "feeders": (223, 250),
     "service": (97, 194),
     "documents": (0, 373),
 }

@@ -40,6 +40,19 @@ def test_a_pickled_error_keeps_problems_codes_and_sentence(kind: type[FeederInva
     assert (again.problems, again.codes, str(again)) == (error.problems, error.codes, str(error))
 
 
+@pytest.mark.parametrize(
+    "error",
+    [
+        NotObservable((1, 3), 2, "two meters", code="too-few-meters"),
+        DesignInfeasible("observer", "not definite", -0.5, code="not-definite"),
+    ],
+)
+def test_a_pickled_error_needs_no_arguments_of_its_constructor(error: GridsecError) -> None:
+    again = pickle.loads(pickle.dumps(error))
+    assert type(again) is type(error)
+    assert (str(again), again.__dict__) == (str(error), error.__dict__)
+
+
 def test_the_code_of_one_sentence_is_that_of_its_class_or_its_own() -> None:
     class Late(GridsecError):
         code = "late"
