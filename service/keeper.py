@@ -257,7 +257,7 @@ class Keeper:
 
     def _command(self, command: Command) -> None:
         if self.problem is not None:
-            raise StoreUnavailable(self.problem)
+            raise StoreUnavailable(self.problem, code="writes-fail")
         self._send(replace(self._job(), command=command))
 
     def _job(self) -> Job:

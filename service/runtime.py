@@ -301,14 +301,15 @@ class Runtime:
         name = self.store.name
         if entry in self._commands:
             self._commands.remove(entry)
-            raise StoreUnavailable(f"{name}: the write before has not ended within {COMMAND_S:g} s")
+            text = f"{name}: the write before has not ended within {COMMAND_S:g} s"
+            raise StoreUnavailable(text, code="write-under-way")
         raise OutcomeUnknown(
             f"{name}: no answer within {COMMAND_S:g} s; whether it is stored is not known yet"
         )
 
     def _go_on(self) -> None:
         if self._stopping:
-            raise StoreUnavailable(STOPPING)
+            raise StoreUnavailable(STOPPING, code="stopping")
 
     def _in_loop(self, run: Callable[[], object]) -> None:
         """Call something in the event loop, from any thread; not at all once the loop has ended."""
