@@ -184,7 +184,7 @@ class Runtime:
         self._inbox.close()
         for prepared in self._prepared:
             if not prepared.done():
-                prepared.set_exception(StoreUnavailable(STOPPING))
+                prepared.set_exception(StoreUnavailable(STOPPING, code="stopping"))
         self._wake.set()
         self._notify("stop")
 
@@ -224,7 +224,7 @@ class Runtime:
             try:
                 done = write()
             except Exception as error:  # noqa: BLE001 - without an outcome nothing would ever be stored again
-                done = Done(error=StoreUnavailable(f"{type(error).__name__}: {error}"))
+                done = Done(error=StoreUnavailable(f"{type(error).__name__}: {error}", code="defect"))
             self._in_loop(partial(self._take_in, partial(then, done)))
 
         self._writer.submit(run)
