@@ -42,6 +42,8 @@ T = TypeVar("T")
 class NoAnswer(psycopg.OperationalError):
     """The server has not answered within the time limit of a call; the connection is closed."""
 
+    code = "no-answer"
+
 
 class Timed(psycopg.Connection[Any]):
     """A connection that is closed when the server sends nothing for `limit_s`, s.
@@ -151,7 +153,7 @@ def code_of(cause: BaseException) -> str:
         The driver's error.
     """
     if isinstance(cause, NoAnswer):
-        return "no-answer"
+        return cause.code
     return _CODES.get(getattr(cause, "sqlstate", None) or "", "")
 
 
