@@ -159,7 +159,7 @@ def decode(site: Site, now: Mapping[str, str], kept: Kept) -> dict[str, Floats]:
         raise KeptInvalid(f"the feeder has changed since ({', '.join(changed)})", code="feeder-changed")
     lengths = {len(value) for value in record.arrays.values()}
     if record.meters != list(site.meter_ids) or lengths - {len(record.meters)}:
-        raise KeptInvalid("it is damaged: its numbers do not belong to its meters", code="damaged")
+        raise KeptInvalid("it is damaged: its numbers do not belong to its meters", code="other-meters")
     return {
         name: np.array([math.nan if x is None else x for x in value], dtype=np.float64)
         for name, value in record.arrays.items()
@@ -293,12 +293,12 @@ def decode_distrust(site: Site, kept: Kept) -> Distrust:
     record, owners = _read(site, kept, DistrustRecord), _owners(site)
     who = {suspect.meter: suspect for suspect in record.meters}
     if len(who) < len(record.meters):
-        raise KeptInvalid("it is damaged: a meter is in it twice", code="damaged")
+        raise KeptInvalid("it is damaged: a meter is in it twice", code="duplicate")
     deviants = {(deviant.customer, deviant.number) for deviant in record.inverters}
     found = [who.get(meter) for meter in site.meter_ids]
     off = {phase.phase: phase for phase in record.busbar}
     if len(off) < len(record.busbar):
-        raise KeptInvalid("it is damaged: a phase is in it twice", code="damaged")
+        raise KeptInvalid("it is damaged: a phase is in it twice", code="duplicate")
     phases = [off.get(phase) for phase in busbar_phases(site)]
     return Distrust(
         np.array([math.nan if one is None else one.scale_s for one in found], dtype=np.float64),

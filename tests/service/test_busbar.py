@@ -234,13 +234,13 @@ def test_what_is_kept_of_it_comes_back(name: str) -> None:
     gone = whole | {"busbar": [phase | {"phase": None if b == 3 else "a"}]}
     for other in (old, gone):
         assert decode_distrust(site, replace(kept, text=json.dumps(other))).same(nothing)
-    for bad in (
-        [phase, phase],
-        [phase | {"phase": "d"}],
-        [phase | {"off": None}],
-        [phase | {"scale_s": 0.0}],
+    for code, bad in (
+        ("duplicate", [phase, phase]),
+        ("damaged", [phase | {"phase": "d"}]),
+        ("damaged", [phase | {"off": None}]),
+        ("damaged", [phase | {"scale_s": 0.0}]),
     ):
-        with refused(KeptInvalid, "damaged"):
+        with refused(KeptInvalid, code):
             decode_distrust(site, replace(kept, text=json.dumps(whole | {"busbar": bad})))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import asyncio
+import json
 import math
 import re
 import sqlite3
@@ -16,6 +17,7 @@ from pkgutil import walk_packages
 from types import SimpleNamespace
 from typing import Any, cast
 
+import numpy as np
 import pandas as pd
 import pytest
 import sqlalchemy as sa
@@ -25,6 +27,7 @@ import service
 from feeders.load import load
 from feeders.schema import to_json
 from gridsec.errors import FeederInvalid, GridsecError, InputInvalid, Problem
+from gridsec.sequential import nobody
 from service import app, demo, ingest, keeper
 from service.alarms import AlarmBook, AlarmRules, acknowledge, acknowledged, restore
 from service.align import AlignRules
@@ -35,7 +38,7 @@ from service.designs import prepare
 from service.errors import FeederFixed, FeederNotLoaded, FeederUnknown, ServiceError, TooManyFeeders
 from service.foreign import converted
 from service.ingest import Meters
-from service.kept import decode, encode, fingerprint
+from service.kept import decode, decode_distrust, encode, encode_distrust, fingerprint
 from service.places import see
 from service.runtime import Runtime
 from service.settings import settings
@@ -274,9 +277,18 @@ def damaged(changes: dict[str, Any]) -> Call:
         for old, new in changes.items():
             assert old in text
             text = text.replace(old, new)
-        decode(site, fingerprint(site) | {"meters": "now"}, replace(kept, text=text))
+        now = fingerprint(site) | ({} if changes else {"meters": "now"})
+        decode(site, now, replace(kept, text=text))
 
     return made
+
+
+def suspect_twice(_: Path, __: Patch) -> None:
+    site = load("cigre-lv")
+    p, m = len(site.meter_ids), site.droop.tau.size
+    kept = encode_distrust(site, T0, replace(nobody(p, m), scale_s=np.where(np.arange(p) < 1, 60.0, np.nan)))
+    record = json.loads(kept.text)
+    decode_distrust(site, replace(kept, text=json.dumps(record | {"meters": 2 * record["meters"]})))
 
 
 def watcher(name: str, learner: object) -> Any:
@@ -446,6 +458,8 @@ CALLS: dict[str, Call] = {
     "stored state of another format": damaged({'"format":': '"format":9'}),
     "stored state of another feeder": damaged({'"feeder":"cigre-lv"': '"feeder":"town"'}),
     "stored state with another field": damaged({'"format":': '"more":1,"format":'}),
+    "stored state of other meters": damaged({'"meters":["': '"meters":["gone","'}),
+    "stored state with a meter twice": suspect_twice,
     "stored state before a change of the feeder": damaged({}),
     "learning before the design": learning(None),
     "learning by another estimator": learning(watcher("exact-bank", learner=None)),

@@ -59,8 +59,8 @@ def test_damaged_or_newer_texts_are_refused(site: Site) -> None:
         (_damaged(kept, more=1), "damaged", "`more`"),
         (_damaged(kept, feeder="other"), "other-feeder", "'other'"),
         (_damaged(kept, arrays={"a": ["x"]}), "damaged", "$.arrays"),
-        (_damaged(kept, arrays={"a": numbers["a"][1:]}), "damaged", ""),
-        (_damaged(kept, meters=["m1"]), "damaged", ""),
+        (_damaged(kept, arrays={"a": numbers["a"][1:]}), "other-meters", ""),
+        (_damaged(kept, meters=["m1"]), "other-meters", ""),
         (_damaged(kept, fingerprint={}), "feeder-changed", "(meters, lines, customers"),
     ):
         with refused(KeptInvalid, code) as caught:
@@ -95,7 +95,7 @@ def test_who_is_not_believed_comes_back_by_name(site: Site) -> None:
         (_damaged(kept, feeder="other"), "other-feeder", "'other'"),
         (_damaged(kept, more=1), "damaged", "`more`"),
         (_damaged(kept, t=1e400), "damaged", ""),
-        (_damaged(kept, meters=[suspect, suspect]), "damaged", ""),
+        (_damaged(kept, meters=[suspect, suspect]), "duplicate", ""),
         (_damaged(kept, meters=[suspect | {"scale_s": 0.0}]), "damaged", ".scale_s"),
         (_damaged(kept, meters=[suspect | {"scale_s": None}]), "damaged", ".scale_s"),
         (_damaged(kept, meters=[suspect | {"named": 1}]), "damaged", ".named"),
