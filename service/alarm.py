@@ -7,9 +7,9 @@ from dataclasses import asdict, dataclass
 from enum import StrEnum
 from typing import Any
 
-from gridsec.errors import GridsecError
 from service.conditions import AlarmKind, Evidence, Severity
 from service.data_errors import DataErrorReport
+from service.errors import ServiceError
 from service.report import ExplanationReport, StalledMeter
 
 
@@ -30,24 +30,30 @@ class Change(StrEnum):
     UPDATED = "updated"
 
 
-class AlarmUnknown(GridsecError):
+class AlarmUnknown(ServiceError):
     """No alarm has this id (any more)."""
+
+    code = "unknown-alarm"
 
     def __init__(self, alarm_id: str) -> None:
         self.alarm_id = alarm_id
         super().__init__(f"no alarm has the id {alarm_id!r}")
 
 
-class AlreadyAcknowledged(GridsecError):
-    """Somebody was faster."""
+class AlreadyAcknowledged(ServiceError):
+    """The alarm has been acknowledged before."""
+
+    code = "already-acknowledged"
 
     def __init__(self, alarm: Alarm) -> None:
         self.alarm = alarm
         super().__init__(f"alarm {alarm.id} has already been acknowledged by {alarm.acknowledged_by}")
 
 
-class RaisedAgain(GridsecError):
+class RaisedAgain(ServiceError):
     """The answer is to another occurrence than the one that stands."""
+
+    code = "raised-again"
 
     def __init__(self, alarm: Alarm, count: int) -> None:
         self.alarm = alarm

@@ -23,6 +23,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
+from gridsec.errors import InputInvalid, Problem
 from service.alarm import (
     Alarm,
     AlarmState,
@@ -96,7 +97,7 @@ class AlarmRules:
             *self.off_delays_s.values(),
         )
         if not all(math.isfinite(s) and s >= 0.0 for s in times):
-            raise ValueError(f"delays must be finite and not negative: {self}")
+            raise InputInvalid([Problem("negative", f"delays must be finite and not negative: {self}")])
 
     def on(self, kind: AlarmKind) -> float:
         """Return the on-delay of a kind, s."""
@@ -197,7 +198,8 @@ def advance(
     seen: dict[Key, Condition] = {}
     for condition in conditions:
         if condition.feeder != book.feeder:
-            raise ValueError(f"a condition of {condition.feeder!r} in the book of {book.feeder!r}")
+            text = f"a condition of {condition.feeder!r} in the book of {book.feeder!r}"
+            raise InputInvalid([Problem("other-feeder", text)])
         seen[condition.kind, condition.subject] = condition
     backwards = book.t is not None and t < book.t
     entries: dict[Key, Entry] = {}
@@ -464,7 +466,8 @@ def restore(feeder: str, alarms: Iterable[Alarm]) -> AlarmBook:
     # Ids follow a clock that may have been set back since, and then say nothing about which one stands.
     for alarm in sorted(alarms, key=lambda alarm: (alarm.active, alarm.t_raised, alarm.id)):
         if alarm.feeder != feeder:
-            raise ValueError(f"an alarm of {alarm.feeder!r} in the book of {feeder!r}")
+            text = f"an alarm of {alarm.feeder!r} in the book of {feeder!r}"
+            raise InputInvalid([Problem("other-feeder", text)])
         t = alarm.t_raised if alarm.t_cleared is None else alarm.t_cleared
         entries[alarm.kind, alarm.subject] = Entry(alarm.active, t, t, t, held=True, alarm=alarm)
     return AlarmBook(feeder, None, entries)

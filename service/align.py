@@ -21,6 +21,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from itertools import zip_longest
 
+from gridsec.errors import InputInvalid, Problem
 from service.clock_offsets import ClockOffsets
 from service.reading import Reading
 
@@ -103,9 +104,9 @@ class AlignRules:
     def __post_init__(self) -> None:
         times = (self.tick_s, self.max_age_s, self.max_skew_s, self.silence_s)
         if not all(math.isfinite(s) and s > 0.0 for s in times):
-            raise ValueError(f"times must be finite and positive: {self}")
+            raise InputInvalid([Problem("not-positive", f"times must be finite and positive: {self}")])
         if not all(math.isfinite(s) and s >= 0.0 for s in (self.grace_s, self.lead_s)):
-            raise ValueError(f"times must be finite and not negative: {self}")
+            raise InputInvalid([Problem("negative", f"times must be finite and not negative: {self}")])
 
 
 def rules(

@@ -24,7 +24,7 @@ from fastapi.responses import JSONResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from fastapi.staticfiles import StaticFiles
 
-from gridsec.errors import FeederInvalid
+from gridsec.errors import FeederInvalid, Problem
 from service import models
 from service.alarms import AlarmKind, AlarmState, AlarmUnknown, Severity
 from service.alarms import to_json as alarm_json
@@ -207,7 +207,8 @@ async def put_feeder(backend: BackendHere, feeder: FeederName, tables: dict[str,
     try:
         await to_thread.run_sync(lambda: json.dumps(tables, allow_nan=False))
     except ValueError as error:
-        raise FeederInvalid(["the JSON contains NaN or an infinity; leave the field out instead"]) from error
+        text = "the JSON contains NaN or an infinity; leave the field out instead"
+        raise FeederInvalid([Problem("not-finite", text)]) from error
     await backend.put_feeder(feeder, tables)
     return _detail(backend, feeder)
 

@@ -17,10 +17,11 @@ import structlog
 from feeders.estimators import choose
 from feeders.load import Site, from_tables, load
 from feeders.schema import from_json
-from gridsec.errors import FeederInvalid, GridsecError
+from gridsec.errors import FeederInvalid, GridsecError, Problem
 from service.align import Clock
 from service.api import MAX_STREAMS, create_api
 from service.bus import BusConfig
+from service.errors import ServiceError, prefixed
 from service.ingest import Bus
 from service.listener import BoundedServer, Shares, raise_limit
 from service.rounds import RuntimeConfig
@@ -32,8 +33,10 @@ _GRACE_S = 1
 _log = structlog.get_logger("gridsec.app")
 
 
-class AddressUnavailable(GridsecError):
+class AddressUnavailable(ServiceError):
     """The HTTP address cannot be listened on; the message says which and why."""
+
+    code = "address-unavailable"
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,16 +231,16 @@ def load_sites(names: Iterable[str]) -> dict[str, Site]:
         If any cannot be loaded, or two have the same name.
     """
     sites: dict[str, Site] = {}
-    problems: list[str] = []
+    problems: list[Problem] = []
     for name in names:
         try:
             site = load(name)
         except FeederInvalid as error:
-            start = f"{name}: "
-            problems.extend(start + problem.removeprefix(start) for problem in error.problems)
+            problems.extend(prefixed(f"{name}: ", problem) for problem in error.problems)
             continue
         if site.feeder.name in sites:
-            problems.append(f"{name}: a feeder named {site.feeder.name} has been given already")
+            text = f"{name}: a feeder named {site.feeder.name} has been given already"
+            problems.append(Problem("duplicate", text))
         sites[site.feeder.name] = site
     if problems:
         raise FeederInvalid(problems)

@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from gridsec.errors import GridsecError
+from service.errors import ServiceError
 
 
-class BusUnavailable(GridsecError):
+class BusUnavailable(ServiceError):
     """zenoh cannot be used as configured; the message says which endpoint and why."""
+
+    code = "bus-unavailable"
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,6 +15,7 @@ from rich.table import Table
 from gridsec.errors import FeederInvalid, refuse
 from service.cli_plan import said
 from service.console import FEEDER, Feeder, complain, err, out
+from service.errors import prefixed
 from service.foreign import show_check, spared
 from service.places import see
 
@@ -103,7 +104,7 @@ def feeders_validate(
             out.print(f"{escape(str(path))}: note: {escape(note)}")
         if problems:
             invalid = True
-            complain(str(FeederInvalid(f"{path}: {problem}" for problem in problems)))
+            complain(str(FeederInvalid(prefixed(f"{path}: ", problem) for problem in problems)))
         else:
             out.print(f"[green]{escape(str(path))}: valid[/]")
     if invalid:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from gridsec.errors import FeederInvalid
+from gridsec.errors import FeederInvalid, Problem
 from service import console
 from service.cli_serve import Estimator, Grace, MaxSkew
 from service.console import FAILED, complain
@@ -133,7 +133,7 @@ def _site_of(recording: Recording, feeder: str | None) -> Site:
         if feeder is not None:
             raise
         where = f"{file} was recorded on {name!r}: --feeder says where its folder is"
-        raise FeederInvalid([where, *error.problems]) from error
+        raise FeederInvalid([Problem("recorded-feeder", where), *error.problems]) from error
     if recording.feeder not in {None, site.feeder.name}:
         raise RecordingInvalid(f"{file}: recorded on {recording.feeder}, not on {site.feeder.name}")
     if recording.digest not in {None, site.digest}:

@@ -16,7 +16,7 @@ import numpy as np
 from feeders.estimators import Learner, Watcher
 from feeders.load import Site
 from gridsec.arrays import Bools, Floats
-from gridsec.errors import GridsecError
+from gridsec.errors import Problem
 from gridsec.sequential import (
     Commission,
     Learning,
@@ -25,6 +25,7 @@ from gridsec.sequential import (
     LearningState,
     to_arrays,
 )
+from service.errors import ServiceError
 from service.kept import Kept, KeptInvalid, decode, encode, fingerprint
 from service.report import LearningReport, StalledMeter
 
@@ -32,11 +33,13 @@ SAVE_S = 60.0
 """What is gathered is kept this often, s; all else at once."""
 
 
-class NothingToLearn(GridsecError):
+class NothingToLearn(ServiceError):
     """The feeder's monitor does not learn its meters' errors."""
 
-    def __init__(self, feeder: str, why: str) -> None:
-        super().__init__(f"feeder {feeder!r}: {why}")
+    code = "nothing-to-learn"
+
+    def __init__(self, feeder: str, why: Problem) -> None:
+        super().__init__(f"feeder {feeder!r}: {why}", code=why.code)
 
 
 class Stage(StrEnum):
@@ -284,13 +287,14 @@ class Commissioning:
         self._note(Step.RECOMMISSIONED, which, t, who=who, reason=reason)
         return None if state is None else after
 
-    def _why_not(self) -> str:
+    def _why_not(self) -> Problem:
         if self._watcher is None:
-            return "there is no monitor yet, or it could not be designed"
+            return Problem("no-monitor", "there is no monitor yet, or it could not be designed")
         family = self._watcher.family
         if family.learner is None:
-            return f"its estimator, {family.name}, does not learn meters' errors"
-        return "commission_s is 0: nothing is learned"
+            text = f"its estimator, {family.name}, does not learn meters' errors"
+            return Problem("never-learns", text)
+        return Problem("learning-off", "commission_s is 0: nothing is learned")
 
     def _note(
         self, change: Step, which: Bools, t: float, *, who: str | None = None, reason: str = ""

@@ -29,8 +29,8 @@ from rich.table import Table
 
 from feeders.load import Site, load
 from feeders.scenario import Sample, Scenario, random_attacks
-from gridsec.errors import GridsecError
 from service.bus import BusConfig
+from service.errors import ServiceError
 from service.ingest import Meters
 from service.simulate import Pace, play
 
@@ -41,8 +41,10 @@ ADDRESS_CODE = 5
 """The exit code of a service that found an address taken (see `cli`)."""
 
 
-class DemoFailed(GridsecError):
+class DemoFailed(ServiceError):
     """The service could not be started, or went away."""
+
+    code = "demo-failed"
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,11 +120,11 @@ class Service:
             answer = connection.getresponse()
             body = answer.read()
         except OSError as error:
-            raise DemoFailed(f"the service does not answer: {error}") from error
+            raise DemoFailed(f"the service does not answer: {error}", code="service-silent") from error
         finally:
             connection.close()
         if answer.status not in {200, 503}:
-            raise DemoFailed(f"{path}: HTTP {answer.status}")
+            raise DemoFailed(f"{path}: HTTP {answer.status}", code="http-status")
         return json.loads(body)
 
 
@@ -143,7 +145,7 @@ def free_address(wanted: str) -> str:
             except OSError:
                 continue
             return f"{host}:{probe.getsockname()[1]}"
-    raise DemoFailed(f"no free port on {host}")
+    raise DemoFailed(f"no free port on {host}", code="no-free-port")
 
 
 @contextmanager
@@ -179,7 +181,7 @@ def started(feeder: str, address: str) -> Iterator[Service]:
                 break
         if not line.startswith("http://"):
             log.seek(0)
-            raise DemoFailed(f"the service did not start:\n{log.read().strip()}")
+            raise DemoFailed(f"the service did not start:\n{log.read().strip()}", code="not-started")
         service = Service(process, line, zenoh)
         _wait_ready(service)
         yield service
@@ -206,7 +208,7 @@ def _wait_ready(service: Service) -> None:
     give_up = time.monotonic() + START_WITHIN_S
     while not (answer := service.get("/readyz"))["ok"]:
         if time.monotonic() > give_up:
-            raise DemoFailed(f"the service is not ready: {'; '.join(answer['reasons'])}")
+            raise DemoFailed(f"the service is not ready: {'; '.join(answer['reasons'])}", code="not-ready")
         time.sleep(0.1)
 
 

@@ -17,7 +17,7 @@ import structlog
 from feeders.estimators import Watcher
 from feeders.load import Site, from_tables
 from feeders.schema import from_json
-from gridsec.errors import FeederInvalid, GridsecError
+from gridsec.errors import FeederInvalid, GridsecError, Problem
 from service.watch import Watch, design
 
 _log = structlog.get_logger("gridsec.runtime")
@@ -78,7 +78,8 @@ def prepare(name: str, tables: dict[str, Any]) -> asyncio.Future[tuple[Site, Wat
     def work() -> tuple[Site, Watcher]:
         parsed = from_json(tables)
         if parsed.meta.name != name:
-            raise FeederInvalid([f"feeder: name {parsed.meta.name!r} does not fit the address {name!r}"])
+            text = f"feeder: name {parsed.meta.name!r} does not fit the address {name!r}"
+            raise FeederInvalid([Problem("inconsistent", text)])
         site = from_tables(parsed)
         return site, design(site, _progress(name))
 

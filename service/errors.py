@@ -1,33 +1,90 @@
-"""What can be wrong with a request about a feeder."""
+"""Errors of the service with stable codes, and errors of requests about a feeder.
+
+Programs and tests compare codes; sentences may change. docs/error-codes.md lists the codes.
+"""
 
 from __future__ import annotations
 
-from gridsec.errors import GridsecError
+from gridsec.errors import GridsecError, Problem
+
+__all__ = [
+    "FeederFixed",
+    "FeederNotLoaded",
+    "FeederUnknown",
+    "ServiceError",
+    "TooManyFeeders",
+    "prefixed",
+]
 
 
-class FeederUnknown(GridsecError):
+class ServiceError(GridsecError):
+    """Base of the service's errors: a sentence with a code.
+
+    Parameters
+    ----------
+    text
+        The sentence.
+    code
+        Code of the reason: lower case words joined by hyphens. Empty: that of the class.
+    """
+
+    code: str = ""
+
+    def __init__(self, text: str, *, code: str = "") -> None:
+        super().__init__(text)
+        if code:
+            self.code = code
+
+    @property
+    def codes(self) -> tuple[str, ...]:
+        """Code of each problem; by default the error is one problem."""
+        return (self.code,)
+
+
+def prefixed(start: str, problem: str) -> Problem:
+    """Return a problem with its place in front, once, and its code if it has one.
+
+    Parameters
+    ----------
+    start
+        The place, with a separator.
+    problem
+        The sentence.
+    """
+    return Problem(getattr(problem, "code", ""), start + problem.removeprefix(start))
+
+
+class FeederUnknown(ServiceError):
     """No feeder has this name."""
+
+    code = "unknown-feeder"
 
     def __init__(self, name: str) -> None:
         super().__init__(f"there is no feeder {name!r}")
 
 
-class FeederNotLoaded(GridsecError):
-    """The feeder's stored tables cannot be loaded any more: nobody watches it."""
+class FeederNotLoaded(ServiceError):
+    """The feeder's stored tables cannot be loaded any more; the feeder is not watched."""
+
+    code = "feeder-not-loaded"
 
     def __init__(self, name: str, problem: str) -> None:
         super().__init__(f"nobody watches feeder {name!r}: its stored tables cannot be loaded: {problem}")
 
 
-class FeederFixed(GridsecError):
+class FeederFixed(ServiceError):
     """The feeder belongs to the command line."""
+
+    code = "feeder-fixed"
 
     def __init__(self, name: str) -> None:
         super().__init__(f"feeder {name!r} was given when the service was started and cannot be deleted")
 
 
-class TooManyFeeders(GridsecError):
-    """No more feeders are taken over REST."""
+class TooManyFeeders(ServiceError):
+    """The limit of feeders that are put over REST is reached."""
+
+    code = "too-many-feeders"
 
     def __init__(self, most: int) -> None:
         super().__init__(f"{most} feeders have been put already, and no more are taken; delete one first")

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 from rich.markup import escape
 
 from feeders.command_line import command_line
-from gridsec.errors import FeederInvalid
+from gridsec.errors import FeederInvalid, Problem
 from service import console
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def converted(feeder: str, out: Path | None) -> str:
         with spared(folder):
             done = convert(feeder, folder, name=_name(feeder))
     except FeederInvalid as error:
-        raise FeederInvalid([*error.problems, advice]) from error
+        raise FeederInvalid([*error.problems, Problem("advice", advice)]) from error
     except BusbarUnclear as error:
         raise BusbarUnclear(f"{error}\n{advice}") from error
     finally:

@@ -57,7 +57,9 @@ def _config(config: BusConfig) -> zenoh.Config:
         for key, value in settings.items():
             built.insert_json5(key, json.dumps(value))
     except (zenoh.ZError, OSError, ValueError) as error:
-        raise BusUnavailable(f"zenoh configuration: {_first_line(error)}") from error
+        raise BusUnavailable(
+            f"zenoh configuration: {_first_line(error)}", code="bus-configuration"
+        ) from error
     return built
 
 
@@ -91,7 +93,8 @@ def session(config: BusConfig) -> Iterator[zenoh.Session]:
         opened = zenoh.open(built)
     except zenoh.ZError as error:
         ends = ", ".join((*config.listen, *config.connect)) or "no endpoint"
-        raise BusUnavailable(f"zenoh cannot be opened on {ends}: {_first_line(error)}") from error
+        text = f"zenoh cannot be opened on {ends}: {_first_line(error)}"
+        raise BusUnavailable(text, code="bus-endpoint") from error
     with opened:
         yield opened
 
@@ -427,7 +430,7 @@ class Meters:
 
     def _session(self) -> zenoh.Session:
         if self._live is None:
-            raise BusUnavailable("the meters' zenoh session is not open")
+            raise BusUnavailable("the meters' zenoh session is not open", code="bus-closed")
         return self._live
 
     def put(self, key: str, payload: bytes, encoding: str = JSON) -> None:
@@ -453,4 +456,4 @@ class Meters:
                 congestion_control=zenoh.CongestionControl.BLOCK,
             )
         except zenoh.ZError as error:
-            raise BusUnavailable(f"zenoh put: {_first_line(error)}") from error
+            raise BusUnavailable(f"zenoh put: {_first_line(error)}", code="put-failed") from error

@@ -257,7 +257,7 @@ class Keeper:
 
     def _command(self, command: Command) -> None:
         if self.problem is not None:
-            raise StoreUnavailable(self.problem)
+            raise StoreUnavailable(self.problem, code="writes-fail")
         self._send(replace(self._job(), command=command))
 
     def _job(self) -> Job:
@@ -407,7 +407,7 @@ def _write(store: Store, job: Job) -> Done:
         return replace(done, error=error)
     except Exception as error:  # noqa: BLE001 - shown to the operator as the database's problem, and tried again
         _log.exception("storing failed")
-        return replace(done, error=StoreUnavailable(f"{type(error).__name__}: {error}"))
+        return replace(done, error=StoreUnavailable(f"{type(error).__name__}: {error}", code="defect"))
     return done
 
 

@@ -22,8 +22,8 @@ import numpy as np
 from feeders.load import Site
 from feeders.schema import to_json
 from gridsec.arrays import Floats
-from gridsec.errors import GridsecError
 from gridsec.sequential import Distrust
+from service.errors import ServiceError
 from service.voltages import Phase, busbar_phases
 
 FORMAT: Final = 1
@@ -41,8 +41,10 @@ class Matter(StrEnum):
     DISTRUST = "distrust"
 
 
-class KeptInvalid(GridsecError):
-    """A kept text cannot be used; the message says why."""
+class KeptInvalid(ServiceError):
+    """A stored text of monitor state cannot be used; the message says why."""
+
+    code = "state-unusable"
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,10 +156,10 @@ def decode(site: Site, now: Mapping[str, str], kept: Kept) -> dict[str, Floats]:
     record = _read(site, kept, Record)
     changed = [name for name in now if record.fingerprint.get(name) != now[name]]
     if changed:
-        raise KeptInvalid(f"the feeder has changed since ({', '.join(changed)})")
+        raise KeptInvalid(f"the feeder has changed since ({', '.join(changed)})", code="feeder-changed")
     lengths = {len(value) for value in record.arrays.values()}
     if record.meters != list(site.meter_ids) or lengths - {len(record.meters)}:
-        raise KeptInvalid("it is damaged: its numbers do not belong to its meters")
+        raise KeptInvalid("it is damaged: its numbers do not belong to its meters", code="other-meters")
     return {
         name: np.array([math.nan if x is None else x for x in value], dtype=np.float64)
         for name, value in record.arrays.items()
@@ -291,12 +293,12 @@ def decode_distrust(site: Site, kept: Kept) -> Distrust:
     record, owners = _read(site, kept, DistrustRecord), _owners(site)
     who = {suspect.meter: suspect for suspect in record.meters}
     if len(who) < len(record.meters):
-        raise KeptInvalid("it is damaged: a meter is in it twice")
+        raise KeptInvalid("it is damaged: a meter is in it twice", code="duplicate")
     deviants = {(deviant.customer, deviant.number) for deviant in record.inverters}
     found = [who.get(meter) for meter in site.meter_ids]
     off = {phase.phase: phase for phase in record.busbar}
     if len(off) < len(record.busbar):
-        raise KeptInvalid("it is damaged: a phase is in it twice")
+        raise KeptInvalid("it is damaged: a phase is in it twice", code="duplicate")
     phases = [off.get(phase) for phase in busbar_phases(site)]
     return Distrust(
         np.array([math.nan if one is None else one.scale_s for one in found], dtype=np.float64),
@@ -333,12 +335,13 @@ def _read(site: Site, kept: Kept, kind: type[_Text]) -> _Text:
     try:
         version = msgspec.json.decode(kept.text, type=_Version).format
         if version > FORMAT:
-            raise KeptInvalid(f"it is of format {version}, and this program knows {FORMAT}")
+            text = f"it is of format {version}, and this program knows {FORMAT}"
+            raise KeptInvalid(text, code="newer-format")
         record = msgspec.json.decode(kept.text, type=kind)
     except msgspec.DecodeError as error:
-        raise KeptInvalid(f"it is damaged: {error}") from error
+        raise KeptInvalid(f"it is damaged: {error}", code="damaged") from error
     if record.feeder != site.feeder.name:
-        raise KeptInvalid(f"it is of feeder {record.feeder!r}")
+        raise KeptInvalid(f"it is of feeder {record.feeder!r}", code="other-feeder")
     return record
 
 

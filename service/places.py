@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import permutations
 from pathlib import Path
 from typing import Final
 
-from gridsec.errors import GridsecError
+from gridsec.errors import Problem
+from service.errors import ServiceError
 from service.tables import A_FEEDER, is_feeder
 
 __all__ = ["Unusable", "see"]
@@ -20,8 +21,25 @@ Given = Mapping[str, Path | None]
 NONE: Final[Given] = {}
 
 
-class Unusable(GridsecError):
-    """Files or folders that a command was given cannot be used; with all that is wrong with them."""
+class Unusable(ServiceError):
+    """Files or folders of a command cannot be used; `problems` names everything that is wrong with them.
+
+    Parameters
+    ----------
+    problems
+        One sentence each: option, path, and what is wrong.
+    """
+
+    code = "unusable-path"
+
+    def __init__(self, problems: Iterable[Problem]) -> None:
+        self.problems = tuple(problems)
+        super().__init__("\n".join(self.problems))
+
+    @property
+    def codes(self) -> tuple[str, ...]:
+        """Code of each problem."""
+        return tuple(problem.code for problem in self.problems)
 
 
 def see(
@@ -59,7 +77,7 @@ def see(
         If there is something that cannot be used.
     """
     written = {**folders, **over, **new, **files, **replaced, **simulated}
-    checks: list[tuple[Given, Callable[[Path], str | None]]] = [
+    checks: list[tuple[Given, Callable[[Path], Problem | None]]] = [
         (folders, _folder),
         (over, _over),
         (new, _new),
@@ -69,87 +87,87 @@ def see(
         (read, _read),
     ]
     problems = [
-        f"{option} {path}: {why}"
+        Problem(why.code, f"{option} {path}: {why}")
         for given, check in checks
         for option, path in given.items()
         if path is not None and (why := _why(check, path))
     ]
     problems += _same({**written, **read}, {*files, *replaced, *simulated})
     if problems:
-        raise Unusable("\n".join(problems))
+        raise Unusable(problems)
 
 
-def _why(check: Callable[[Path], str | None], path: Path) -> str | None:
+def _why(check: Callable[[Path], Problem | None], path: Path) -> Problem | None:
     try:
         return check(path)
     except OSError as error:
-        return error.strerror or str(error)
+        return Problem("no-access", error.strerror or str(error))
 
 
-def _folder(path: Path) -> str | None:
-    return _over(path) or (A_FEEDER if is_feeder(path) else None)
+def _folder(path: Path) -> Problem | None:
+    return _over(path) or (Problem("holds-feeder", A_FEEDER) if is_feeder(path) else None)
 
 
-def _over(path: Path) -> str | None:
+def _over(path: Path) -> Problem | None:
     if path.exists() and not path.is_dir():
-        return "a file; expected a folder"
+        return Problem("not-folder", "a file; expected a folder")
     if path.is_symlink() and not path.exists():
-        return "a link to what does not exist; expected a folder"
+        return Problem("dead-link", "a link to what does not exist; expected a folder")
     return _room(path)
 
 
-def _new(path: Path) -> str | None:
+def _new(path: Path) -> Problem | None:
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        return "already there; expected a new folder"
+        return Problem("exists", "already there; expected a new folder")
     return _room(path)
 
 
-def _file(path: Path) -> str | None:
+def _file(path: Path) -> Problem | None:
     if not path.exists():
         return _room(path)
     if path.is_dir():
-        return "a folder; expected a file"
+        return Problem("not-file", "a folder; expected a file")
     with path.open("ab"):
         return None
 
 
-def _replaced(path: Path) -> str | None:
+def _replaced(path: Path) -> Problem | None:
     if path.exists() and not path.is_file():
         return _file(path)
     return _room(Path(os.path.realpath(path)).parent)
 
 
-def _simulated(path: Path) -> str | None:
+def _simulated(path: Path) -> Problem | None:
     from feeders.recording import is_simulated
 
     if path.is_file() and path.stat().st_size and not is_simulated(path):
-        return "already there, and not of a simulation; expected another file"
+        return Problem("not-simulated", "already there, and not of a simulation; expected another file")
     return _replaced(path)
 
 
-def _read(path: Path) -> str | None:
+def _read(path: Path) -> Problem | None:
     if not path.exists():
-        return "there is no such file"
+        return Problem("no-file", "there is no such file")
     if path.is_dir():
-        return "a folder; expected a file"
+        return Problem("not-file", "a folder; expected a file")
     with path.open("rb"):
         return None
 
 
-def _room(path: Path) -> str | None:
+def _room(path: Path) -> Problem | None:
     """Why nothing can be made in a folder, or in one that is made for it."""
     above = path.absolute()
     there = next(each for each in (above, *above.parents) if each.exists())
     if not there.is_dir():
-        return f"{there} is a file"
+        return Problem("not-folder", f"{there} is a file")
     try:
         with tempfile.TemporaryFile(dir=there):
             return None
     except OSError as error:
-        return f"{there} cannot be written: {error.strerror or error}"
+        return Problem("not-writable", f"{there} cannot be written: {error.strerror or error}")
 
 
-def _same(given: Given, files: set[str]) -> Iterator[str]:
+def _same(given: Given, files: set[str]) -> Iterator[Problem]:
     """Files that something else is written into, or read from, as well."""
     where = {option: Path(os.path.realpath(path)) for option, path in given.items() if path is not None}
     told = set[frozenset[str]]()
@@ -158,4 +176,4 @@ def _same(given: Given, files: set[str]) -> Iterator[str]:
             continue
         if frozenset((one, other)) not in told:
             told.add(frozenset((one, other)))
-            yield f"{one} {given[one]}: {other} needs it as well"
+            yield Problem("same-path", f"{one} {given[one]}: {other} needs it as well")

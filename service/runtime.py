@@ -184,7 +184,7 @@ class Runtime:
         self._inbox.close()
         for prepared in self._prepared:
             if not prepared.done():
-                prepared.set_exception(StoreUnavailable(STOPPING))
+                prepared.set_exception(StoreUnavailable(STOPPING, code="stopping"))
         self._wake.set()
         self._notify("stop")
 
@@ -224,7 +224,7 @@ class Runtime:
             try:
                 done = write()
             except Exception as error:  # noqa: BLE001 - without an outcome nothing would ever be stored again
-                done = Done(error=StoreUnavailable(f"{type(error).__name__}: {error}"))
+                done = Done(error=StoreUnavailable(f"{type(error).__name__}: {error}", code="defect"))
             self._in_loop(partial(self._take_in, partial(then, done)))
 
         self._writer.submit(run)
@@ -301,14 +301,15 @@ class Runtime:
         name = self.store.name
         if entry in self._commands:
             self._commands.remove(entry)
-            raise StoreUnavailable(f"{name}: the write before has not ended within {COMMAND_S:g} s")
+            text = f"{name}: the write before has not ended within {COMMAND_S:g} s"
+            raise StoreUnavailable(text, code="write-under-way")
         raise OutcomeUnknown(
             f"{name}: no answer within {COMMAND_S:g} s; whether it is stored is not known yet"
         )
 
     def _go_on(self) -> None:
         if self._stopping:
-            raise StoreUnavailable(STOPPING)
+            raise StoreUnavailable(STOPPING, code="stopping")
 
     def _in_loop(self, run: Callable[[], object]) -> None:
         """Call something in the event loop, from any thread; not at all once the loop has ended."""

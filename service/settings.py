@@ -15,8 +15,9 @@ from pydantic import Field, ValidationError, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from feeders.columns import ESTIMATORS
-from gridsec.errors import GridsecError
+from gridsec.errors import InputInvalid, Problem
 from service.align import Clock
+from service.errors import ServiceError
 
 ENV_PREFIX = "GRIDSEC_"
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
@@ -25,7 +26,19 @@ _HOST = re.compile(r"^[A-Za-z0-9_-]+(\.[A-Za-z0-9_-]+)*$")
 _PREFIX = re.compile(r"^[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*$")
 
 
-class SettingsInvalid(GridsecError):
+_CODES = {
+    "enum": "unknown-name",
+    "extra_forbidden": "unknown-name",
+    "finite_number": "not-finite",
+    "greater_than": "out-of-range",
+    "greater_than_equal": "out-of-range",
+    "less_than_equal": "out-of-range",
+    "literal_error": "unknown-name",
+}
+"""Code by pydantic's type of the error; of others `wrong-type`."""
+
+
+class SettingsInvalid(ServiceError):
     """The settings are wrong; `problems` names all of them.
 
     Parameters
@@ -34,9 +47,16 @@ class SettingsInvalid(GridsecError):
         One sentence each.
     """
 
-    def __init__(self, problems: Iterable[str]) -> None:
+    code = "wrong-settings"
+
+    def __init__(self, problems: Iterable[Problem]) -> None:
         self.problems = tuple(problems)
         super().__init__("\n  - ".join(["the settings are wrong:", *self.problems]))
+
+    @property
+    def codes(self) -> tuple[str, ...]:
+        """Code of each problem."""
+        return tuple(problem.code for problem in self.problems)
 
 
 Listed = Annotated[tuple[str, ...], NoDecode]
@@ -85,7 +105,8 @@ class Settings(BaseSettings):
     def _endpoints(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         wrong = [end for end in value if not _ENDPOINT.match(end)]
         if wrong:
-            raise ValueError(f"{', '.join(wrong)}: an endpoint looks like tcp/127.0.0.1:7447")
+            text = f"{', '.join(wrong)}: an endpoint looks like tcp/127.0.0.1:7447"
+            raise InputInvalid([Problem("wrong-endpoint", text)])
         return value
 
     @field_validator("http_hosts")
@@ -93,28 +114,31 @@ class Settings(BaseSettings):
     def _names(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         wrong = [name for name in value if not _HOST.match(name)]
         if wrong:
-            raise ValueError(f"{', '.join(wrong)}: a host name looks like grid.example, without a port")
+            text = f"{', '.join(wrong)}: a host name looks like grid.example, without a port"
+            raise InputInvalid([Problem("wrong-host", text)])
         return value
 
     @field_validator("estimator")
     @classmethod
     def _known(cls, value: str | None) -> str | None:
         if value is not None and value not in ESTIMATORS:
-            raise ValueError(f"{value!r} is no estimator; there are {', '.join(ESTIMATORS)}")
+            text = f"{value!r} is no estimator; there are {', '.join(ESTIMATORS)}"
+            raise InputInvalid([Problem("unknown-name", text)])
         return value
 
     @field_validator("zenoh_config")
     @classmethod
     def _file(cls, value: Path | None) -> Path | None:
         if value is not None and not value.is_file():
-            raise ValueError(f"{value} is no file")
+            raise InputInvalid([Problem("no-file", f"{value} is no file")])
         return value
 
     @field_validator("prefix")
     @classmethod
     def _chunks(cls, value: str) -> str:
         if not _PREFIX.match(value):
-            raise ValueError(f"{value!r}: letters, digits and _ . - in chunks separated by slashes")
+            text = f"{value!r}: letters, digits and _ . - in chunks separated by slashes"
+            raise InputInvalid([Problem("wrong-prefix", text)])
         return value
 
     @field_validator("http")
@@ -134,13 +158,14 @@ def split_address(address: str) -> tuple[str, int]:
 
     Raises
     ------
-    ValueError
+    InputInvalid
         If it is none.
     """
     host, _, port = address.rpartition(":")
     host = host.removeprefix("[").removesuffix("]")
     if not host or not port.isascii() or not port.isdigit() or int(port) > 65535:
-        raise ValueError(f"{address!r}: an address looks like 127.0.0.1:8000, with a port up to 65535")
+        text = f"{address!r}: an address looks like 127.0.0.1:8000, with a port up to 65535"
+        raise InputInvalid([Problem("wrong-address", text)])
     return host, int(port)
 
 
@@ -185,10 +210,15 @@ def strangers(environment: Mapping[str, str]) -> dict[str, str]:
 _OTHERS = ("GRIDSEC_CACHE_DIR", "GRIDSEC_TESTS_REQUIRE_ALL")
 
 
-def _problem(error: Any) -> str:
+def _problem(error: Any) -> Problem:
     name = str(error["loc"][0]) if error["loc"] else "settings"
     option, variable = "--" + name.replace("_", "-").removesuffix("-s"), ENV_PREFIX + name.upper()
     option = {"--feeders": "--feeder", "--http-hosts": "--http-host"}.get(option, option)
     message = str(error["msg"]).removeprefix("Value error, ")
-    shown = "" if error["type"] == "value_error" else f" (is {error['input']!r})"
-    return f"{option} or {variable}: {message}{shown}"
+    kind = error["type"]
+    if kind == "value_error":
+        (code,) = error["ctx"]["error"].codes
+        return Problem(code, f"{option} or {variable}: {message}")
+    return Problem(
+        _CODES.get(kind, "wrong-type"), f"{option} or {variable}: {message} (is {error['input']!r})"
+    )

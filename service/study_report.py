@@ -18,7 +18,7 @@ from feeders.report.book import Report
 from feeders.report.page import FEEDER
 from feeders.report.sections import Outcome, Result
 from feeders.studies.droop_fleets import NOTHING, NoInverters
-from gridsec.errors import GridsecError
+from gridsec.errors import GridsecError, InputInvalid, Problem
 from service.planned import planned, sources
 from service.tables import write_tables
 
@@ -156,7 +156,7 @@ def _calibrate(site: Site, asked: Asked, journal: Where, tell: Progress | None) 
     from feeders.studies.calibrate import calibrate
 
     if asked.readings is None:
-        raise ValueError("there are no recorded readings to compare with")
+        raise InputInvalid([Problem("missing", "there are no recorded readings to compare with")])
     return calibrate(site, asked.readings, journal=journal, progress=tell)
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from feeders.files import replace_file
 from feeders.raw import META_FILE
+from gridsec.errors import InputInvalid, Problem
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -60,7 +61,7 @@ def write_tables(folder: Path | None, study: str, tables: Mapping[str, pd.DataFr
     folder.mkdir(parents=True, exist_ok=True)
     for name, frame in tables.items():
         if Path(name).name != name or name in ("", ".."):
-            raise ValueError(f"{name!r} is no name of a table's file")
+            raise InputInvalid([Problem("wrong-name", f"{name!r} is no name of a table's file")])
         replace_file(folder / f"{study}-{name}.csv", partial(frame.to_csv, index=False))
         replace_file(folder / f"{study}-{name}.parquet", partial(_for_parquet(frame).to_parquet, index=False))
     for old in sorted(folder.glob(f"{study}-*.csv")):

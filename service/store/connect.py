@@ -25,6 +25,31 @@ WAIT_S = 5.0
 """Wait for a free connection of the readers, s."""
 BUSY_S = 0.5
 """Wait of a commit for another process that locks an SQLite file, s."""
+_VERB_CODES = {"open": "open-failed", "read": "read-failed"}
+"""Code of a failure without a more specific one, by the verb of its message; of others `write-failed`."""
+_SQLITE_CODES = {
+    sqlite3.SQLITE_BUSY: "database-locked",
+    sqlite3.SQLITE_LOCKED: "database-locked",
+    sqlite3.SQLITE_NOTADB: "not-a-database",
+    sqlite3.SQLITE_READONLY: "read-only",
+}
+"""Code by SQLite's primary result."""
+
+
+class _FileMoved(OSError):
+    """The database's file is not at its place.
+
+    Parameters
+    ----------
+    text
+        What happened to it.
+    code
+        Code of the reason.
+    """
+
+    def __init__(self, text: str, *, code: str) -> None:
+        self.code = code
+        super().__init__(text)
 
 
 class Connections:
@@ -62,11 +87,13 @@ class Connections:
         try:
             parsed = sa.make_url(url)
         except sa.exc.ArgumentError as error:
-            raise StoreUnavailable(f"{url!r} is no database address: {error}") from error
+            text = f"{url!r} is no database address: {error}"
+            raise StoreUnavailable(text, code="wrong-address") from error
         self.name = parsed.render_as_string(hide_password=True)
         family = parsed.get_backend_name()
         if family not in {"sqlite", "postgresql"}:
-            raise StoreUnavailable(f"{self.name}: only sqlite and postgresql are supported, not {family}")
+            text = f"{self.name}: only sqlite and postgresql are supported, not {family}"
+            raise StoreUnavailable(text, code="unsupported")
         self.insert: Any = sqlite.insert if family == "sqlite" else postgresql.insert
         try:
             with self._guard("open"):
@@ -143,7 +170,7 @@ class Connections:
     @contextmanager
     def _begin(self, check: Callable[[sa.Connection], None]) -> Iterator[sa.Connection]:
         if self.lost is not None:
-            raise WriterLost(str(self.lost))
+            raise WriterLost(str(self.lost), code=self.lost.code)
         self._in_place()
         try:
             self._locked()
@@ -160,7 +187,7 @@ class Connections:
                         "stored is not known yet"
                     ) from error
         except WriterLost as error:
-            self.lost = WriterLost(f"cannot write {self.name}: {error}")
+            self.lost = WriterLost(f"cannot write {self.name}: {error}", code=error.code)
             raise self.lost from error
         except sa.exc.DBAPIError as error:
             self._note(error)
@@ -199,7 +226,7 @@ class Connections:
 
     def _check_owner(self, connection: sa.Connection) -> None:
         if connection.scalar(sa.select(WRITER.c.owner)) != self._owner:
-            raise WriterLost("another process has opened it to write since")
+            raise WriterLost("another process has opened it to write since", code="other-writer")
 
     @contextmanager
     def read(self) -> Iterator[sa.Connection]:
@@ -216,7 +243,10 @@ class Connections:
         place = _place(self._path)
         if place != self._file:
             what = "removed" if place is None else "replaced"
-            raise OSError(f"the file has been {what}; put it back, or restart to begin with what is there")
+            raise _FileMoved(
+                f"the file has been {what}; put it back, or restart to begin with what is there",
+                code="file-removed" if place is None else "file-replaced",
+            )
 
     def _locked(self) -> None:
         """See that our lock is the one that others meet: another file of that name keeps nobody away."""
@@ -224,18 +254,33 @@ class Connections:
             return
         held = os.fstat(self._lock_file.fileno())
         if _place(self._lock_path) != (held.st_dev, held.st_ino):
-            raise WriterLost(f"{self._lock_path} has been removed or replaced, and others may write")
+            text = f"{self._lock_path} has been removed or replaced, and others may write"
+            raise WriterLost(text, code="lock-moved")
 
     @contextmanager
     def _guard(self, doing: str) -> Iterator[None]:
         try:
             yield
         except (sa.exc.SQLAlchemyError, sqlite3.Error, OSError) as error:
-            raise StoreUnavailable(f"cannot {doing} {self.name}: {_text(error)}") from error
+            text = f"cannot {doing} {self.name}: {_text(error)}"
+            raise StoreUnavailable(text, code=self._code(doing, error)) from error
+
+    def _code(self, doing: str, error: BaseException) -> str:
+        """Code of a failure: by its cause, or else by the verb of its message."""
+        cause = getattr(error, "orig", None) or error
+        found = cause.code if isinstance(cause, _FileMoved) else ""
+        if isinstance(cause, sqlite3.Error):
+            found = _SQLITE_CODES.get(getattr(cause, "sqlite_errorcode", 0) & 0xFF, "")
+        elif self._session is not None:
+            from service.store.postgresql import code_of
+
+            found = code_of(cause)
+        return found or _VERB_CODES.get(doing, "write-failed")
 
     def _open_sqlite(self, url: sa.URL) -> tuple[sa.Engine, sa.Engine]:
         if not url.database or url.database == ":memory:":
-            raise StoreUnavailable(f"{self.name}: name a file; what is in memory does not survive")
+            text = f"{self.name}: name a file; what is in memory does not survive"
+            raise StoreUnavailable(text, code="in-memory")
         # One file has one lock, under whatever name it was given.
         path = self._path = Path(os.path.realpath(url.database))
         self._lock_path = path.with_name(path.name + ".lock")
@@ -243,7 +288,8 @@ class Connections:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            raise StoreUnavailable(f"cannot open {self.name}: another process writes it") from error
+            text = f"cannot open {self.name}: another process writes it"
+            raise StoreUnavailable(text, code="other-writer") from error
 
         def connect(mode: str) -> Callable[[], sqlite3.Connection]:
             def connection() -> sqlite3.Connection:

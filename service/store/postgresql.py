@@ -33,11 +33,16 @@ _ADVISORY_LOCK = 0x6772_6964_7365_6300
 _ENDED_BY_SERVER = frozenset({"57P01", "57P05", "25P03"})
 """SQLSTATE of an ended session: by an administrator, idle, idle in a transaction."""
 
+_CODES = {"55P03": "database-locked", "25006": "read-only"}
+"""Code by SQLSTATE: a lock not available, a transaction that may not write."""
+
 T = TypeVar("T")
 
 
 class NoAnswer(psycopg.OperationalError):
     """The server has not answered within the time limit of a call; the connection is closed."""
+
+    code = "no-answer"
 
 
 class Timed(psycopg.Connection[Any]):
@@ -115,7 +120,8 @@ class WriterSession:
         server = None if row is None else str(row[0])
         if self._ended and server == self._server:
             raise WriterLost(
-                "the server has ended the session that holds the writer's lock, and others may have written"
+                "the server has ended the session that holds the writer's lock, and others may have written",
+                code="session-ended",
             )
         wait = LOCK_S if self._server is None else RELOCK_S
         made.limit_s = wait + CALL_S
@@ -136,6 +142,19 @@ class WriterSession:
         if error.connection_invalidated:
             self.up = False
             self._ended = getattr(error.orig, "sqlstate", None) in _ENDED_BY_SERVER
+
+
+def code_of(cause: BaseException) -> str:
+    """Return the code of a failed call; empty if it has none of its own.
+
+    Parameters
+    ----------
+    cause
+        The driver's error.
+    """
+    if isinstance(cause, NoAnswer):
+        return cause.code
+    return _CODES.get(getattr(cause, "sqlstate", None) or "", "")
 
 
 def engines(url: sa.URL, session: WriterSession) -> tuple[sa.Engine, sa.Engine]:

@@ -4,20 +4,26 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gridsec.errors import GridsecError
 from service.alarms import Alarm, Change
+from service.errors import ServiceError
 
 
-class StoreUnavailable(GridsecError):
+class StoreUnavailable(ServiceError):
     """The database cannot be opened, read or written; the message says which one and why."""
+
+    code = "database-unavailable"
 
 
 class OutcomeUnknown(StoreUnavailable):
     """The connection broke while a transaction was committed: it is stored as a whole, or not at all."""
 
+    code = "outcome-unknown"
+
 
 class WriterLost(StoreUnavailable):
     """The lock of the one writer is lost: another process may have written, and this one must end."""
+
+    code = "writer-lost"
 
 
 @dataclass(frozen=True, slots=True)

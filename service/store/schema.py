@@ -185,7 +185,8 @@ def migrate(connection: sa.Connection, name: str) -> None:
     version = int(connection.execute(sa.select(VERSION.c.version)).scalar_one())
     if version > newest:
         raise StoreUnavailable(
-            f"{name} has schema version {version}; this program knows {newest} and is too old for it"
+            f"{name} has schema version {version}; this program knows {newest} and is too old for it",
+            code="newer-schema",
         )
     for step in MIGRATIONS[version - 1 :]:
         step(connection)

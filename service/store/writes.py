@@ -131,7 +131,8 @@ class Store(Reader):
         """Wait for the write before, within a time limit."""
         if not self._lock.acquire(timeout=ALONE_S):
             raise StoreUnavailable(
-                f"cannot write {self.name}: the write before has not ended within {ALONE_S:g} s"
+                f"cannot write {self.name}: the write before has not ended within {ALONE_S:g} s",
+                code="write-under-way",
             )
         try:
             yield

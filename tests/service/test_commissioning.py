@@ -36,6 +36,7 @@ from service.runtime import Runtime
 from service.simulate import Pace, key_of, payload_of, play
 from service.store import Store, StoreUnavailable
 from service.watch import design
+from tests.codes import refused
 from tests.service.databases import both
 from tests.service.running import FEEDER, InProcess, Outlet, free_port, service, until
 
@@ -386,7 +387,7 @@ def test_what_cannot_be_stored_is_not_begun(site: Site, honest: list[Reading], t
 def test_before_the_first_tick_and_where_nothing_is_learned(site: Site, tmp_path: Path) -> None:
     with Store(f"sqlite:///{tmp_path}/s.db") as store:
         live = rounds(store, site, install=False)
-        with pytest.raises(NothingToLearn, match="no monitor yet"):
+        with refused(NothingToLearn, "no-monitor"):
             live.recommission(FEEDER, [], "Ada", "new").result()
         live.watches[FEEDER].install(design(site))
         live.recommission(FEEDER, ["m03"], "Ada", "new").result()
@@ -396,7 +397,7 @@ def test_before_the_first_tick_and_where_nothing_is_learned(site: Site, tmp_path
         never = Commissioning(variant(site, commission_s=0.0))
         never.install(design(variant(site, commission_s=0.0)))
         assert never.progress().state is Stage.OFF
-        with pytest.raises(NothingToLearn, match="commission_s is 0"):
+        with refused(NothingToLearn, "learning-off"):
             never.renew(None, [], START, "Ada", "new")
 
 

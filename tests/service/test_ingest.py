@@ -14,6 +14,7 @@ import zenoh
 from service import ingest, outgoing
 from service.bus import BusConfig, BusUnavailable, Sample
 from service.ingest import BATCH, RING, Bus, Meters
+from tests.codes import refused
 from tests.service.running import free_port, until
 
 
@@ -177,18 +178,21 @@ def test_a_port_in_use_is_named() -> None:
     sink = Sink()
     with (
         pair(sink) as (_, _meters, end),
-        pytest.raises(BusUnavailable, match=rf"{end}.*[Aa]ddress already in use"),
+        refused(BusUnavailable, "bus-endpoint") as caught,
         Bus(BusConfig(listen=(end,)), "gridsec", sink, max_payload=1, lossless=False),
     ):
         pass
+    assert end in str(caught.value)
+    assert "address already in use" in str(caught.value).lower()
 
 
 def test_nobody_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ingest, "_OPEN_TIMEOUT_MS", 500)
     end = f"tcp/127.0.0.1:{free_port()}"
     config = BusConfig("client", connect=(end,))
-    with pytest.raises(BusUnavailable, match=end), Meters(config, "gridsec"):
+    with refused(BusUnavailable, "bus-endpoint") as caught, Meters(config, "gridsec"):
         pass
+    assert end in str(caught.value)
 
 
 def test_a_user_s_own_configuration(tmp_path: Path) -> None:
@@ -206,14 +210,14 @@ def test_a_user_s_own_configuration(tmp_path: Path) -> None:
         meters.put("f/meter/a/reading", b"1")
         until(lambda: sink.samples)
     file.write_text("{ mode: ")
-    with pytest.raises(BusUnavailable, match="configuration"), Meters(BusConfig(file=file), "gridsec"):
+    with refused(BusUnavailable, "bus-configuration"), Meters(BusConfig(file=file), "gridsec"):
         pass
 
 
 def test_a_closed_session_says_so() -> None:
     with pair(Sink()) as (_, meters, _end):
         pass
-    with pytest.raises(BusUnavailable, match="not open"):
+    with refused(BusUnavailable, "bus-closed"):
         meters.put("f/meter/a/reading", b"1")
 
 

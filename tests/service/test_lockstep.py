@@ -83,5 +83,5 @@ def test_steps_are_kept_with_readings_that_are_lost() -> None:
 
 def test_a_service_that_says_nothing_is_waited_for_and_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Aligned, "estimates", lambda _: [])
-    with pytest.raises(OutOfStep, match="no estimate"):
+    with pytest.raises(OutOfStep):
         lags(0.2, 1.0, 3)

@@ -21,25 +21,26 @@ from service.history import pack, rows
 from service.kept import Kept, Matter
 from service.report import FeederReport
 from service.store import Store, StoreUnavailable, WriterLost, postgresql, schema
+from tests.codes import refused
 from tests.service.databases import Cluster, both
 from tests.service.reports import meter, report
 from tests.service.stored import T0, a_report, an_alarm, raised
 
 
 @pytest.mark.parametrize(
-    ("url", "words"),
+    ("url", "code"),
     [
-        ("nonsense", "no database address"),
-        ("mysql://localhost/x", "only sqlite and postgresql"),
-        ("sqlite://", "name a file"),
-        ("sqlite:///:memory:", "name a file"),
-        ("sqlite:////nonexistent-folder/x.db", "No such file or directory"),
-        ("sqlite:////proc/x.db", "cannot open"),
-        ("postgresql+psycopg://gridsec:secret@/x?host=/nonexistent-folder", "cannot open"),
+        ("nonsense", "wrong-address"),
+        ("mysql://localhost/x", "unsupported"),
+        ("sqlite://", "in-memory"),
+        ("sqlite:///:memory:", "in-memory"),
+        ("sqlite:////nonexistent-folder/x.db", "open-failed"),
+        ("sqlite:////proc/x.db", "open-failed"),
+        ("postgresql+psycopg://gridsec:secret@/x?host=/nonexistent-folder", "open-failed"),
     ],
 )
-def test_a_database_that_cannot_be_used_is_a_clear_error(url: str, words: str) -> None:
-    with pytest.raises(StoreUnavailable, match=words) as caught:
+def test_a_database_that_cannot_be_used_is_a_clear_error(url: str, code: str) -> None:
+    with refused(StoreUnavailable, code) as caught:
         Store(url)
     assert "secret" not in str(caught.value)
 
@@ -48,7 +49,7 @@ def test_a_file_that_is_no_database_is_left_alone(tmp_path: Path) -> None:
     path = tmp_path / "notes.db"
     path.write_text("These are my notes, not a database. " * 200)
     before = path.read_bytes()
-    with pytest.raises(StoreUnavailable, match="not a database"):
+    with refused(StoreUnavailable, "not-a-database"):
         Store(f"sqlite:///{path}")
     assert path.read_bytes() == before
 
@@ -56,8 +57,8 @@ def test_a_file_that_is_no_database_is_left_alone(tmp_path: Path) -> None:
 @both
 def test_only_one_process_writes(url: str, family: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(postgresql, "LOCK_S", 1.0)
-    words = "another process writes it" if family == "sqlite" else "lock timeout"
-    with Store(url), pytest.raises(StoreUnavailable, match=words):
+    code = "other-writer" if family == "sqlite" else "database-locked"
+    with Store(url), refused(StoreUnavailable, code):
         Store(url)
     with Store(url) as again:
         again.check()
@@ -67,7 +68,7 @@ def test_a_database_of_two_names_has_one_writer(tmp_path: Path) -> None:
     (tmp_path / "link.db").symlink_to("gridsec.db")
     file, link = f"sqlite:///{tmp_path}/gridsec.db", f"sqlite:///{tmp_path}/link.db"
     for one, other in ((file, link), (link, file)):
-        with Store(one), pytest.raises(StoreUnavailable, match="another process writes it"):
+        with Store(one), refused(StoreUnavailable, "other-writer"):
             Store(other)
     assert not (tmp_path / "link.db.lock").exists()
 
@@ -77,19 +78,19 @@ def test_a_writer_whose_lock_was_removed_writes_no_more(tmp_path: Path) -> None:
     with Store(f"sqlite:///{tmp_path}/gridsec.db") as first:
         first.commit([raised(an_alarm())])
         (tmp_path / "gridsec.db.lock").unlink()
-        with pytest.raises(WriterLost, match=r"gridsec\.db\.lock has been removed or replaced"):
+        with refused(WriterLost, "lock-moved") as caught:
             first.check()
+        assert f"{tmp_path}/gridsec.db.lock" in str(caught.value)
         with Store(f"sqlite:///{tmp_path}/gridsec.db") as second:
             second.check()
-            with pytest.raises(StoreUnavailable, match="removed or replaced"):
+            with refused(WriterLost, "lock-moved"):
                 first.commit([raised(an_alarm(1))])
             assert [alarm.id for alarm in first.active()] == [an_alarm().id]
 
 
 @both
-def test_readers_cannot_write(store: Store, family: str) -> None:
-    words = "readonly" if family == "sqlite" else "read-only"
-    with pytest.raises(StoreUnavailable, match=words), store._read() as connection:
+def test_readers_cannot_write(store: Store) -> None:
+    with refused(StoreUnavailable, "read-only"), store._read() as connection:
         connection.execute(schema.FEEDER.delete())
 
 
@@ -113,13 +114,13 @@ def test_a_file_that_was_taken_away_is_missed_and_found_again(tmp_path: Path) ->
         store.commit([raised(an_alarm(1))])
         for name in ("s.db", "s.db-wal", "s.db-shm"):
             (tmp_path / name).rename(elsewhere / name)
-        with pytest.raises(StoreUnavailable, match="removed"):
+        with refused(StoreUnavailable, "file-removed"):
             store.commit([raised(an_alarm(2))])
-        with pytest.raises(StoreUnavailable, match="removed"):
+        with refused(StoreUnavailable, "file-removed"):
             store.alarms()
         assert not store.writable()
         path.write_bytes(b"")
-        with pytest.raises(StoreUnavailable, match="replaced"):
+        with refused(StoreUnavailable, "file-replaced"):
             store.check()
         for name in ("s.db", "s.db-wal", "s.db-shm"):
             (elsewhere / name).rename(tmp_path / name)
@@ -132,7 +133,7 @@ def test_a_locked_database_is_given_up_soon(tmp_path: Path) -> None:
         other = sqlite3.connect(tmp_path / "s.db", isolation_level=None)
         other.execute("BEGIN IMMEDIATE")
         begin = time.monotonic()
-        with pytest.raises(StoreUnavailable, match="locked"):
+        with refused(StoreUnavailable, "database-locked"):
             store.commit([raised(an_alarm())])
         assert time.monotonic() - begin < 2.0
         other.close()
@@ -260,8 +261,9 @@ def test_older_schemas_are_brought_forward_and_newer_ones_refused(
         with Store(url) as two:
             assert two.alarm(an_alarm().id) == an_alarm()
     monkeypatch.setattr(schema, "MIGRATIONS", known)
-    with pytest.raises(StoreUnavailable, match=r"version 6.* too old"):
+    with refused(StoreUnavailable, "newer-schema") as caught:
         Store(url)
+    assert "version 6;" in str(caught.value)
 
 
 def test_a_failed_migration_leaves_the_database_as_it_was(
@@ -276,8 +278,9 @@ def test_a_failed_migration_leaves_the_database_as_it_was(
 
     known = schema.MIGRATIONS
     monkeypatch.setattr(schema, "MIGRATIONS", (*known, step))
-    with pytest.raises(StoreUnavailable, match="syntax error"):
+    with refused(StoreUnavailable, "open-failed") as caught:
         Store(url)
+    assert 'near "nonsense"' in str(caught.value)
     monkeypatch.setattr(schema, "MIGRATIONS", known)
     with Store(url) as store:
         store.commit(put=("village", {}))
@@ -331,9 +334,9 @@ def test_a_restart_of_postgresql_is_survived(cluster: Cluster) -> None:
         cluster.stop()
         try:
             assert not store.writable()
-            with pytest.raises(StoreUnavailable, match="cannot write"):
+            with refused(StoreUnavailable, "write-failed"):
                 store.commit([raised(an_alarm(2))])
-            with pytest.raises(StoreUnavailable, match="cannot read"):
+            with refused(StoreUnavailable, "read-failed"):
                 store.alarms()
         finally:
             cluster.start()

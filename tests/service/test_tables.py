@@ -10,7 +10,9 @@ import pytest
 
 from feeders.load import load
 from feeders.schema import write
+from gridsec.errors import InputInvalid
 from service.tables import write_tables
+from tests.codes import refused
 
 
 def test_both_files_hold_the_table(tmp_path: Path) -> None:
@@ -44,7 +46,7 @@ def test_no_folder_and_no_rows(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["", "../up", "a/b", ".."])
 def test_a_table_stays_in_its_folder(tmp_path: Path, name: str) -> None:
-    with pytest.raises(ValueError, match="no name of a table"):
+    with refused(InputInvalid, "wrong-name"):
         write_tables(tmp_path / "in", "study", {name: pd.DataFrame({"a": [1]})})
 
 

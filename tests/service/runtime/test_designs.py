@@ -22,6 +22,7 @@ from service.rounds import RuntimeConfig
 from service.runtime import Runtime
 from service.store import Store, StoreUnavailable
 from service.watch import Phase, design
+from tests.codes import refused
 from tests.service.commands import command
 from tests.service.liars import FEEDER
 
@@ -115,7 +116,7 @@ def test_stopping_waits_for_no_feeder_that_is_being_put(
             await asyncio.sleep(0.01)
         runtime.stop()
         for answer in (put, runtime.put_feeder("third", called(site, "third"))):
-            with pytest.raises(StoreUnavailable, match="stopping"):
+            with refused(StoreUnavailable, "stopping"):
                 await answer
         await task
         assert store.feeders() == {}
