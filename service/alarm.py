@@ -7,9 +7,9 @@ from dataclasses import asdict, dataclass
 from enum import StrEnum
 from typing import Any
 
+from gridsec.errors import GridsecError
 from service.conditions import AlarmKind, Evidence, Severity
 from service.data_errors import DataErrorReport
-from service.errors import ServiceError
 from service.report import ExplanationReport, StalledMeter
 
 
@@ -30,7 +30,7 @@ class Change(StrEnum):
     UPDATED = "updated"
 
 
-class AlarmUnknown(ServiceError):
+class AlarmUnknown(GridsecError):
     """No alarm has this id (any more)."""
 
     code = "unknown-alarm"
@@ -40,7 +40,7 @@ class AlarmUnknown(ServiceError):
         super().__init__(f"no alarm has the id {alarm_id!r}")
 
 
-class AlreadyAcknowledged(ServiceError):
+class AlreadyAcknowledged(GridsecError):
     """The alarm has been acknowledged before."""
 
     code = "already-acknowledged"
@@ -50,7 +50,7 @@ class AlreadyAcknowledged(ServiceError):
         super().__init__(f"alarm {alarm.id} has already been acknowledged by {alarm.acknowledged_by}")
 
 
-class RaisedAgain(ServiceError):
+class RaisedAgain(GridsecError):
     """The answer is to another occurrence than the one that stands."""
 
     code = "raised-again"

@@ -21,7 +21,7 @@ from gridsec.errors import FeederInvalid, GridsecError, Problem
 from service.align import Clock
 from service.api import MAX_STREAMS, create_api
 from service.bus import BusConfig
-from service.errors import ServiceError, prefixed
+from service.errors import prefixed
 from service.ingest import Bus
 from service.listener import BoundedServer, Shares, raise_limit
 from service.rounds import RuntimeConfig
@@ -33,7 +33,7 @@ _GRACE_S = 1
 _log = structlog.get_logger("gridsec.app")
 
 
-class AddressUnavailable(ServiceError):
+class AddressUnavailable(GridsecError):
     """The HTTP address cannot be listened on; the message says which and why."""
 
     code = "address-unavailable"

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from service.errors import ServiceError
+from gridsec.errors import GridsecError
 
 
-class BusUnavailable(ServiceError):
+class BusUnavailable(GridsecError):
     """zenoh cannot be used as configured; the message says which endpoint and why."""
 
     code = "bus-unavailable"

@@ -16,7 +16,7 @@ import numpy as np
 from feeders.estimators import Learner, Watcher
 from feeders.load import Site
 from gridsec.arrays import Bools, Floats
-from gridsec.errors import Problem
+from gridsec.errors import GridsecError, Problem
 from gridsec.sequential import (
     Commission,
     Learning,
@@ -25,7 +25,6 @@ from gridsec.sequential import (
     LearningState,
     to_arrays,
 )
-from service.errors import ServiceError
 from service.kept import Kept, KeptInvalid, decode, encode, fingerprint
 from service.report import LearningReport, StalledMeter
 
@@ -33,7 +32,7 @@ SAVE_S = 60.0
 """What is gathered is kept this often, s; all else at once."""
 
 
-class NothingToLearn(ServiceError):
+class NothingToLearn(GridsecError):
     """The feeder's monitor does not learn its meters' errors."""
 
     code = "nothing-to-learn"

@@ -29,8 +29,8 @@ from rich.table import Table
 
 from feeders.load import Site, load
 from feeders.scenario import Sample, Scenario, random_attacks
+from gridsec.errors import GridsecError
 from service.bus import BusConfig
-from service.errors import ServiceError
 from service.ingest import Meters
 from service.simulate import Pace, play
 
@@ -41,7 +41,7 @@ ADDRESS_CODE = 5
 """The exit code of a service that found an address taken (see `cli`)."""
 
 
-class DemoFailed(ServiceError):
+class DemoFailed(GridsecError):
     """The service could not be started, or went away."""
 
     code = "demo-failed"

@@ -11,34 +11,9 @@ __all__ = [
     "FeederFixed",
     "FeederNotLoaded",
     "FeederUnknown",
-    "ServiceError",
     "TooManyFeeders",
     "prefixed",
 ]
-
-
-class ServiceError(GridsecError):
-    """Base of the service's errors: a sentence with a code.
-
-    Parameters
-    ----------
-    text
-        The sentence.
-    code
-        Code of the reason: lower case words joined by hyphens. Empty: that of the class.
-    """
-
-    code: str = ""
-
-    def __init__(self, text: str, *, code: str = "") -> None:
-        super().__init__(text)
-        if code:
-            self.code = code
-
-    @property
-    def codes(self) -> tuple[str, ...]:
-        """Code of each problem; by default the error is one problem."""
-        return (self.code,)
 
 
 def prefixed(start: str, problem: str) -> Problem:
@@ -54,7 +29,7 @@ def prefixed(start: str, problem: str) -> Problem:
     return Problem(getattr(problem, "code", ""), start + problem.removeprefix(start))
 
 
-class FeederUnknown(ServiceError):
+class FeederUnknown(GridsecError):
     """No feeder has this name."""
 
     code = "unknown-feeder"
@@ -63,7 +38,7 @@ class FeederUnknown(ServiceError):
         super().__init__(f"there is no feeder {name!r}")
 
 
-class FeederNotLoaded(ServiceError):
+class FeederNotLoaded(GridsecError):
     """The feeder's stored tables cannot be loaded any more; the feeder is not watched."""
 
     code = "feeder-not-loaded"
@@ -72,7 +47,7 @@ class FeederNotLoaded(ServiceError):
         super().__init__(f"nobody watches feeder {name!r}: its stored tables cannot be loaded: {problem}")
 
 
-class FeederFixed(ServiceError):
+class FeederFixed(GridsecError):
     """The feeder belongs to the command line."""
 
     code = "feeder-fixed"
@@ -81,7 +56,7 @@ class FeederFixed(ServiceError):
         super().__init__(f"feeder {name!r} was given when the service was started and cannot be deleted")
 
 
-class TooManyFeeders(ServiceError):
+class TooManyFeeders(GridsecError):
     """The limit of feeders that are put over REST is reached."""
 
     code = "too-many-feeders"

@@ -22,8 +22,8 @@ import numpy as np
 from feeders.load import Site
 from feeders.schema import to_json
 from gridsec.arrays import Floats
+from gridsec.errors import GridsecError
 from gridsec.sequential import Distrust
-from service.errors import ServiceError
 from service.voltages import Phase, busbar_phases
 
 FORMAT: Final = 1
@@ -41,7 +41,7 @@ class Matter(StrEnum):
     DISTRUST = "distrust"
 
 
-class KeptInvalid(ServiceError):
+class KeptInvalid(GridsecError):
     """A stored text of monitor state cannot be used; the message says why."""
 
     code = "state-unusable"

@@ -9,8 +9,7 @@ from itertools import permutations
 from pathlib import Path
 from typing import Final
 
-from gridsec.errors import Problem
-from service.errors import ServiceError
+from gridsec.errors import GridsecError, Problem
 from service.tables import A_FEEDER, is_feeder
 
 __all__ = ["Unusable", "see"]
@@ -21,7 +20,7 @@ Given = Mapping[str, Path | None]
 NONE: Final[Given] = {}
 
 
-class Unusable(ServiceError):
+class Unusable(GridsecError):
     """Files or folders of a command cannot be used; `problems` names everything that is wrong with them.
 
     Parameters

@@ -15,9 +15,8 @@ from pydantic import Field, ValidationError, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from feeders.columns import ESTIMATORS
-from gridsec.errors import InputInvalid, Problem
+from gridsec.errors import GridsecError, InputInvalid, Problem
 from service.align import Clock
-from service.errors import ServiceError
 
 ENV_PREFIX = "GRIDSEC_"
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
@@ -38,7 +37,7 @@ _CODES = {
 """Code by pydantic's type of the error; of others `wrong-type`."""
 
 
-class SettingsInvalid(ServiceError):
+class SettingsInvalid(GridsecError):
     """The settings are wrong; `problems` names all of them.
 
     Parameters

@@ -30,7 +30,7 @@ LIMITS = {
     "gridsec": (197, 285),
     "default monitor": (166, 220),
     "feeders": (223, 250),
-    "service": (97, 194),
+    "service": (96, 192),
     "documents": (0, 373),
 }
 

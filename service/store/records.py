@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from gridsec.errors import GridsecError
 from service.alarms import Alarm, Change
-from service.errors import ServiceError
 
 
-class StoreUnavailable(ServiceError):
+class StoreUnavailable(GridsecError):
     """The database cannot be opened, read or written; the message says which one and why."""
 
     code = "database-unavailable"

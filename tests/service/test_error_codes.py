@@ -35,7 +35,7 @@ from service.bus import BusConfig
 from service.cli_replay import _site_of
 from service.commissioning import Commissioning
 from service.designs import prepare
-from service.errors import FeederFixed, FeederNotLoaded, FeederUnknown, ServiceError, TooManyFeeders
+from service.errors import FeederFixed, FeederNotLoaded, FeederUnknown, TooManyFeeders
 from service.foreign import converted
 from service.ingest import Meters
 from service.kept import decode, decode_distrust, encode, encode_distrust, fingerprint
@@ -110,12 +110,12 @@ def below(kind: type[Exception]) -> Iterator[type[Exception]]:
 
 def defaults() -> set[tuple[str, str]]:
     """Each class of an error, with its own code."""
-    return {(each.__name__, vars(each)["code"]) for each in below(GridsecError) if each is not ServiceError}
+    return {(each.__name__, vars(each)["code"]) for each in below(GridsecError)}
 
 
 def test_literals_are_found() -> None:
     source = """
-class Broken(ServiceError):
+class Broken(GridsecError):
     code = "a"
     text = "no"
 raise Broken("no", code="b" if x == "no" else "c")
@@ -513,7 +513,7 @@ def golden() -> dict[str, list[str]]:
 
 def lines(made: Callable[[], Any], place: Path) -> list[str]:
     """Class, code and sentence of each problem that a call raises; line breaks and its folder are marked."""
-    with pytest.raises((ServiceError, FeederInvalid, InputInvalid)) as caught:
+    with pytest.raises((GridsecError, FeederInvalid, InputInvalid)) as caught:
         made()
     error = caught.value
     sentences = getattr(error, "problems", (str(error),))
