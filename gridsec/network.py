@@ -40,7 +40,7 @@ def busbar_places(feeder: Network) -> slice:
 
 
 def one_busbar(feeder: Network, some: Ints, others: Ints) -> Floats | float:
-    """1 for places with the same busbar voltage, else 0; (j, k) for (j,) and (k,), or 1."""
+    """1 for places with the same busbar voltage, else 0; (j, k), or 1 for all."""
     if not isinstance(feeder, InPhases):
         return 1.0
     return np.equal.outer(some % 3, others % 3).astype(np.float64)
@@ -92,7 +92,7 @@ def bus_voltages(
 
 
 def model_error_bound(feeder: Network, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:
-    """Bound (…, N) of the error of `v^2` after one correction against the AC power flow, for every customer."""
+    """Bound (…, N) of the error of `v^2` after one correction against the AC power flow, by customer."""
     if isinstance(feeder, Feeder):
         return balanced.model_error_bound(feeder, p, q, v0_squared)
     if isinstance(feeder, Meshed):
@@ -188,7 +188,7 @@ def between(feeder: Network, power: Power) -> Floats:
 
 
 def along(feeder: Network, power: Power, customers: Ints, weights: Floats) -> Floats:
-    """Sensitivity of a weighted sum of voltages, at p different customers, to every customer's power, (N,)."""
+    """Sensitivity of a weighted sum of p different customers' voltages to every customer's power, (N,)."""
     if not isinstance(feeder, Feeder):
         return 2.0 * (weights @ _matrix(feeder, power)[feeder.bus[customers]])
     # R and X are symmetric on a radial feeder.

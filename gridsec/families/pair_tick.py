@@ -220,7 +220,7 @@ def _without_inverters(
 def _with_inverters(
     design: UnknownInputDesign, state: UnknownInputState, frame: Frame, inputs: Inputs
 ) -> Floats:
-    """Largest change of the loss correction by possible injections of inverters, attacked or not."""
+    """Largest change of the loss correction by possible injections, attacked or not; (N,)."""
     plant, reach = design.setting.plant, design.doubt.reach
     feeder, droop, steps = plant.feeder, plant.droop, plant.loss_correction
     if not isinstance(feeder, Feeder):
@@ -243,7 +243,7 @@ def _with_inverters(
 
 
 def _seen(design: UnknownInputDesign, inputs: Inputs, believed: Bools, v2: Floats, error: Floats) -> Seen:
-    """Tick at the inverters' places. Readings of named meters would mislead even after the meter is cleared."""
+    """Tick at the inverters' places; readings of named meters would mislead even after their clearance."""
     now, own = design.setting, design.setting.plant.droop.customer
     meter = now.errors.meter_of
     if not inputs.live.size:

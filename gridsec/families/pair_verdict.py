@@ -42,7 +42,7 @@ _SHOWN = 8
 
 
 def explain(pairs: Pairs, trials: dict[int, Trial], order: list[int]) -> tuple[Explanation, ...]:
-    """The smallest possible pairs, likeliest first, with probabilities for normal errors of equal spread."""
+    """The smallest possible pairs, likeliest first, with probabilities for normal errors."""
     best = trials[order[0]].misfit
     weights = np.exp([-0.5 * (trials[k].misfit - best) for k in order])
     shares = weights / weights.sum()
@@ -53,7 +53,7 @@ def explain(pairs: Pairs, trials: dict[int, Trial], order: list[int]) -> tuple[E
 
 
 def deaf_inverters(design: UnknownInputDesign, trial: Trial) -> Bools:
-    """Mask (m,) of inverters with possible wrong injections above their curve's span that remain undetected."""
+    """Mask (m,) of inverters with possible undetected wrong injections above their curve's span."""
     return np.asarray(trial.attack_error > design.setting.plant.droop.span)
 
 
