@@ -311,7 +311,10 @@ def manipulated(attacks: Sequence[Attack], t: Floats, meters: int) -> Bools:
 
     Parameters
     ----------
-    t : (T,) Times, Unix s. meters Number of meters p.
+    t : (T,)
+        Times, Unix s.
+    meters
+        Number of meters p.
 
     Returns
     -------
@@ -429,8 +432,7 @@ def _random(attack: Random, t: Floats) -> Floats:
     draw = np.floor((t - attack.t_on) / attack.hold_s).astype(np.uint64)[:, None]
     meter = attack.meters.astype(np.uint64)[None, :]
     # A hash of (seed, meter, draw) in place of a generator: any time interval can be computed in any order
-    # and
-    # any chunks, with the same numbers.
+    # and any chunks, with the same numbers.
     start = np.full((1, 1), attack.seed % 2**64, dtype=np.uint64)
     bits = _scramble(_scramble(_scramble(start) ^ meter) ^ draw)
     sign = np.where(bits & np.uint64(1), 1.0, -1.0)

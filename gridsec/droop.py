@@ -363,8 +363,8 @@ def fleet(
     tau : (m,)
         Time constants, s; those of the presets for NaN or without the array.
     capability
-        `fixed`: limits of the preset. `circular`: the output is capped at
-        `sqrt(s^2 - p_gen^2)`, chong2020 after (17); the slopes stay.
+        `fixed`: limits of the preset. `circular`: the output is capped at `sqrt(s^2 - p_gen^2)`, chong2020
+        after (17); the slopes stay.
     p_gen : (m,)
         Active power that each inverter generates, pu of the feeder's base; required for `circular`.
     vbar

@@ -220,7 +220,8 @@ def common_paths(feeder: Feeder, branch: Floats, buses: Ints) -> Floats:
 
     Parameters
     ----------
-    branch : (b,) Quantity of each branch, not negative; for example `feeder.r`.
+    branch : (b,)
+        Quantity of each branch, not negative; for example `feeder.r`.
     buses : (k,)
         The second bus of each pair.
 
@@ -256,7 +257,8 @@ def path_sums(feeder: Feeder, branch: Floats) -> Floats:
 
     Parameters
     ----------
-    branch : (b,) Quantity of each branch.
+    branch : (b,)
+        Quantity of each branch.
 
     Returns
     -------

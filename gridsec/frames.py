@@ -80,7 +80,9 @@ def nothing_new(  # noqa: PLR0917  # what there was, and what there is to say wi
 
     Parameters
     ----------
-    t Time of the last frame that was used, Unix s. last
+    t
+        Time of the last frame that was used, Unix s.
+    last
         Last answer; None before the first.
     v0_squared, x
         Squared busbar voltage (or one for each phase) and injections, pu, for the answer without a last one.

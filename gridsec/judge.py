@@ -39,8 +39,11 @@ def count(tally: Tally, over: Bools, live: Bools, *, confirm: int, release: int)
 
     Parameters
     ----------
-    over : (p,) Meters with a residual above the threshold. live : (p,) Meters with a residual. confirm,
-    release
+    over : (p,)
+        Meters with a residual above the threshold.
+    live : (p,)
+        Meters with a residual.
+    confirm, release
         Readings above the threshold until a meter is named, and consecutive readings below it until it is
         neither named nor suspect.
     """

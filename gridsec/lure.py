@@ -288,7 +288,10 @@ def transition(lure: Lure, h: float, policy: StepPolicy = POLICY) -> Transition:
     ----------
     h
         Length of the step, s, not negative.
-    Raises ------ ValueError
+
+    Raises
+    ------
+    ValueError
         If h is negative or not finite.
 
     References
@@ -392,7 +395,10 @@ def advance(lure: Lure, x: Floats, u: Floats, h: float, policy: StepPolicy = POL
         Input during the step.
     h
         Length of the step, s.
-    Returns ------- (…, n)
+
+    Returns
+    -------
+    (…, n)
         State at the end.
 
     Raises
@@ -419,7 +425,9 @@ def equilibrium(lure: Lure, u: Floats, x0: Floats | None = None, *, tol: float, 
     max_iter
         Largest number of Newton steps.
 
-    Raises ------ DesignInfeasible
+    Raises
+    ------
+    DesignInfeasible
         If it is not found.
     """
     gain = np.asarray(np.linalg.solve(-lure.A, lure.G), dtype=np.float64)

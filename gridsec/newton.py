@@ -49,7 +49,9 @@ def settle(
     max_iter
         Largest number of Newton steps.
 
-    Raises ------ DesignInfeasible
+    Raises
+    ------
+    DesignInfeasible
         If the residual is still above `tol` after `max_iter` steps.
     """
     lead = np.broadcast_shapes(x0.shape[:-1], drive.shape[:-1], bias.shape[:-1], H.shape[:-2])

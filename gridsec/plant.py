@@ -156,7 +156,9 @@ def check_plant(plant: Plant, *, max_attacked: int, step_s: float, more: Iterabl
 
     Parameters
     ----------
-    max_attacked M, largest number of simultaneously manipulated meters. step_s
+    max_attacked
+        M, largest number of simultaneously manipulated meters.
+    step_s
         Expected interval between frames, s.
     more
         Further problems, found by the caller.
@@ -197,8 +199,14 @@ class Setting:
 
     Attributes
     ----------
-    model Linear power flow of the plant. errors Propagation of errors. max_attacked M. believes_q True if
-    metered net reactive power replaces that of load and inverter.
+    model
+        Linear power flow of the plant.
+    errors
+        Propagation of errors.
+    max_attacked
+        M.
+    believes_q
+        True if metered net reactive power replaces that of load and inverter.
     """
 
     plant: Plant
@@ -224,7 +232,9 @@ class MonitorDesign:
 
     Attributes
     ----------
-    model Linear power flow of the plant. bank
+    model
+        Linear power flow of the plant.
+    bank
         The observers.
     errors
         Propagation of errors.

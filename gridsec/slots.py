@@ -386,7 +386,8 @@ def drive(lay: Layout, y: Floats, u: Floats, seen: Bools, net: Floats | None) ->
 
     Parameters
     ----------
-    y : (p,) Readings as z; arbitrary where not seen.
+    y : (p,)
+        Readings as z; arbitrary where not seen.
     u : (l,)
         Known input.
     seen : (p,)

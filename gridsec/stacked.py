@@ -107,7 +107,8 @@ def advance(
 
     Parameters
     ----------
-    y : (p,) Readings; arbitrary where not seen.
+    y : (p,)
+        Readings; arbitrary where not seen.
     u : (l,)
         Known input.
     seen : (p,)

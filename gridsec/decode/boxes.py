@@ -10,8 +10,7 @@ all others is made. With W = (I + B B^T)^-1, Lambda the rows that are kept, D th
     residual_Lambda = W_Lambda s - W_LambdaD g,     residual_D = g,
 
 and both are known matrices times (xi, v). The largest value of a row of blocks without attack is therefore
-the
-sum of absolute values of its coefficients, attained by some xi and v; no norm is estimated.
+the sum of absolute values of its coefficients, attained by some xi and v; no norm is estimated.
 
 References
 ----------

@@ -18,7 +18,8 @@ def log_density(g: Floats, k: Floats) -> Floats:
 
     Parameters
     ----------
-    g : (…) Argument, >= 0.
+    g : (…)
+        Argument, >= 0.
     k : (…)
         Degrees of freedom.
 

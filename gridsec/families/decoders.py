@@ -24,7 +24,9 @@ from gridsec.sequential.decoder import Accused, Evidence
 def least_squares(evidence: Evidence) -> tuple[Accused, ...]:
     """Weighted least squares with the chi-square test; remove the largest normalised residual and repeat.
 
-    Returns ------- tuple of Accused
+    Returns
+    -------
+    tuple of Accused
         At most `most` meters, in the order of their residuals; a removed meter never returns.
 
     References
@@ -49,7 +51,9 @@ def least_squares(evidence: Evidence) -> tuple[Accused, ...]:
 def fewest(evidence: Evidence) -> tuple[Accused, ...]:
     """The smallest set of meters without which every other one is within its limits.
 
-    Returns ------- tuple of Accused
+    Returns
+    -------
+    tuple of Accused
         The set with the smallest misfit among those of the smallest size, and its rivals; the best set of the
         largest size if no set leaves all others within the limits.
 

@@ -23,7 +23,9 @@ class UnknownInputDesign:
 
     Attributes
     ----------
-    max_inverters Largest number of simultaneously attacked inverters, q_1 of yang2021. pairs
+    max_inverters
+        Largest number of simultaneously attacked inverters, q_1 of yang2021.
+    pairs
         The candidates.
     within : (c, c)
         True if the suspects of the first candidate are a subset of those of the second.

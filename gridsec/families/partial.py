@@ -24,14 +24,11 @@ unknown, not one for every meter; this provides the evidence.
 A fit is credible if it explains every meter in it, as the observer without meters must by itself. A meter is
 named if it is in no credible fit. An unmanipulated meter belongs to some set of p - M unmanipulated ones, and
 that set's fit is credible. So, with at most M manipulated meters, no unmanipulated meter is ever named, and
-the
-true state is within the union of the credible fits. The price is power: with more allowed manipulations,
-more fits can explain a small attack differently.
-Then the answer is UNDECIDED, with these explanations.
+the true state is within the union of the credible fits. The price is power: with more allowed manipulations,
+more fits can explain a small attack differently. Then the answer is UNDECIDED, with these explanations.
 
 The paper's own constants (theta, kappa) are available from `constants`; on feeders they guarantee less than
-is
-known without any meter. docs/theory-partial-observers.md, section 8, has the proof and the numbers.
+is known without any meter. docs/theory-partial-observers.md, section 8, has the proof and the numbers.
 
 References
 ----------
@@ -78,7 +75,9 @@ class PartialDesign:
 
     Attributes
     ----------
-    model The observer without meters. step_s
+    model
+        The observer without meters.
+    step_s
         Expected interval between frames, s.
     """
 
@@ -133,7 +132,9 @@ def design(
 
     Parameters
     ----------
-    max_attacked M, largest number of simultaneously manipulated meters. step_s
+    max_attacked
+        M, largest number of simultaneously manipulated meters.
+    step_s
         Expected interval between frames, s; others work, too.
 
     Raises

@@ -36,7 +36,9 @@ class SetSearchDesign:
 
     Attributes
     ----------
-    bank The observer: a bank for M = 0, with the trusted meters as its available meters. errors
+    bank
+        The observer: a bank for M = 0, with the trusted meters as its available meters.
+    errors
         Propagation of errors in an observer without manipulated meters.
     certificate
         Proof that the observer converges for every set and every switching.
@@ -124,7 +126,9 @@ def design(
 
     Parameters
     ----------
-    max_attacked M, largest number of simultaneously manipulated meters. step_s
+    max_attacked
+        M, largest number of simultaneously manipulated meters.
+    step_s
         Expected interval between frames, s. Other intervals work, too.
     dwell_s
         Delta, s; by default the time in which the observer's transient decays to the fraction

@@ -25,7 +25,10 @@ def design(
 
     Parameters
     ----------
-    decoder From `gridsec.families.decoders`, or a custom one. doubt Uncertainty of the powers of the frames.
+    decoder
+        From `gridsec.families.decoders`, or a custom one.
+    doubt
+        Uncertainty of the powers of the frames.
     step_s
         Expected interval between frames, s.
     max_attacked

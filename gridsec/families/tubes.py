@@ -127,7 +127,8 @@ def spread(errors: ErrorModel, doubt: Doubt, known: Tube, free: Tube, gain: Floa
 
     Parameters
     ----------
-    known, free Intervals of all inverters if their own meters are unmanipulated, and in any case.
+    known, free
+        Intervals of all inverters if their own meters are unmanipulated, and in any case.
     gain : (r, m)
         |2X| from inverters to the r voltages.
     """
@@ -156,7 +157,9 @@ def advance(errors: ErrorModel, doubt: Doubt, before: Tubes | None, seen: Seen, 
 
     Parameters
     ----------
-    before Intervals of the last tick; None at the first one, with inverters anywhere on their curves. h
+    before
+        Intervals of the last tick; None at the first one, with inverters anywhere on their curves.
+    h
         Length of the step, s.
     """
     z_own = Tube(seen.z - seen.z_error, seen.z + seen.z_error)

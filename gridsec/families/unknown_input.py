@@ -1,11 +1,10 @@
 """Simultaneous attacks on inverters and on meters: yang2021 on a feeder.
 
-A candidate is a pair (suspected meters, suspected inverters) of bounded size. Its unknown-input observer
-uses neither. Unmanipulated inverters follow their curves (`gridsec.families.tubes`). The injections of the
+A candidate is a pair (suspected meters, suspected inverters) of bounded size. Its unknown-input observer uses
+neither. Unmanipulated inverters follow their curves (`gridsec.families.tubes`). The injections of the
 suspected inverters are unknown inputs, up to their rating, determined by the trusted readings through 2X. The
 remainder must be possible for unmanipulated readings (`gridsec.families.pairs`). Thresholds are worst cases
-of
-all uncertainties, so that unmanipulated readings never contradict the true pair. Hence:
+of all uncertainties, so that unmanipulated readings never contradict the true pair. Hence:
 
 1. The true pair is never refuted while no more meters and inverters are attacked than assumed.
 2. Members of every pair that is not refuted are attacked: *named*.
@@ -55,7 +54,8 @@ def design(
 
     Parameters
     ----------
-    max_attacked, max_inverters Largest numbers of simultaneously attacked meters and inverters, q_2 and q_1.
+    max_attacked, max_inverters
+        Largest numbers of simultaneously attacked meters and inverters, q_2 and q_1.
     step_s
         Expected interval between frames, s; it only selects the default options, others work as well.
 

@@ -7,9 +7,8 @@ manipulated meters in either, two observers J and S differ at inverter i by at m
 
 `driven` and `free` are the worst-case bounds of `gridsec.detect`: meters at the limits of their class, loads
 anywhere in their intervals, remainders of losses and sampling, and the transient. They belong to the frame,
-so
-that the thresholds of yang2019 (10) and (19), one number each, become one for every inverter and tick;
-pi and pi_J are measured in them, and evidence is a value above 1. A window of N readings then
+so that the thresholds of yang2019 (10) and (19), one number each, become one for every inverter and tick; pi
+and pi_J are measured in them, and evidence is a value above 1. A window of N readings then
 
 - detects if pi exceeded 1 at any of them (Algorithm 1), and
 - names the meters outside every set J that passes (Algorithm 2, or its sound variant "survivors").
@@ -221,7 +220,8 @@ def consistency(
 
     Parameters
     ----------
-    bound Error bounds of observers without manipulated meters.
+    bound
+        Error bounds of observers without manipulated meters.
 
     Returns
     -------

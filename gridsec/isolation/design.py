@@ -138,8 +138,10 @@ def design(
 
     Parameters
     ----------
-    max_inputs, max_sensors Largest numbers of attacked inputs and sensors, q_1 and q_2; `max_inputs = r` is
-    the complete bank. measure
+    max_inputs, max_sensors
+        Largest numbers of attacked inputs and sensors, q_1 and q_2; `max_inputs = r` is the complete
+        bank.
+    measure
         See `IsolationDesign`. yang2021: "distance".
     rates, multiplier, tolerance, rounding
         See `observers.unknown_input.design`.

@@ -148,7 +148,8 @@ def step(
 
     Parameters
     ----------
-    y : (p,) Readings; arbitrary where unseen.
+    y : (p,)
+        Readings; arbitrary where unseen.
     u : (l,)
         Known input of this tick; finite.
     seen : (p,)

@@ -17,7 +17,9 @@ from gridsec.observers.unknown_input import UnknownInputState
 def disagreement(design: IsolationDesign, state: UnknownInputState) -> Floats:
     """Disagreement pi of every large observer, (5) and (22); infinite without a member to confirm it.
 
-    Returns ------- Floats
+    Returns
+    -------
+    Floats
         (a,).
     """
     if design.measure == "bounds":
@@ -29,7 +31,9 @@ def disagreement(design: IsolationDesign, state: UnknownInputState) -> Floats:
 def contradiction(design: IsolationDesign, state: UnknownInputState) -> Floats:
     """Largest difference of an entry from that of the company, relative to the sum of both bounds.
 
-    Returns ------- Floats
+    Returns
+    -------
+    Floats
         (a,); infinite without a member to confirm it. A finite value above 1 proves that an attack affects
         the observer or one of its company.
     """
@@ -58,7 +62,9 @@ def bounds(design: IsolationDesign, state: UnknownInputState) -> Floats:
     x_hat_S,i| + box_S,i)`, for every J: the company also bounds observers with attacked sensors. The plant's
     span limits every error.
 
-    Returns ------- Floats
+    Returns
+    -------
+    Floats
         (a, n).
     """
     x = state.x[design.large]
@@ -74,7 +80,8 @@ def estimate(design: IsolationDesign, state: UnknownInputState, index: int) -> t
 
     Parameters
     ----------
-    index Index among the large observers.
+    index
+        Index among the large observers.
 
     Returns
     -------

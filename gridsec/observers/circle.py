@@ -241,7 +241,8 @@ def between_readings(design: CircleDesign, y: Floats, u: Floats, seen: Bools) ->
 
     Parameters
     ----------
-    y : (p,) Readings; arbitrary where unseen, also NaN.
+    y : (p,)
+        Readings; arbitrary where unseen, also NaN.
     u : (l,)
         Known input.
     seen : (p,)
@@ -295,7 +296,10 @@ def step(  # noqa: PLR0917  # the border that all observer families share
         True for existing readings. The others have no influence: the observer runs on its model there.
     h
         Length of the step, s.
-    Returns ------- CircleState
+
+    Returns
+    -------
+    CircleState
         At `t + h`. Never raises on data.
     """
     system, held = between_readings(design, y, u, seen)

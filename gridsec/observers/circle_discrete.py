@@ -250,7 +250,10 @@ def settling_steps(design: DiscreteDesign, *, start: float, epsilon: float) -> i
 
     Parameters
     ----------
-    start Bound on |e(0)|; 0 for a start in the true state. epsilon Its largest remainder.
+    start
+        Bound on |e(0)|; 0 for a start in the true state.
+    epsilon
+        Its largest remainder.
 
     Raises
     ------

@@ -198,8 +198,9 @@ def correct(design: KalmanDesign, state: KalmanState, y: Floats, seen: Bools | N
 
     Parameters
     ----------
-    y : (…, p) Readings; ignored where not seen or not finite. Runs share their covariance: a sensor without a
-    reading in one run is not used in any.
+    y : (…, p)
+        Readings; ignored where not seen or not finite. Runs share their covariance: a sensor without a
+        reading in one run is not used in any.
     seen : (p,)
         True for existing readings; all by default.
 

@@ -388,8 +388,9 @@ def step(
 
     Parameters
     ----------
-    y : (…, p) Readings; ignored where not seen or not finite. Runs share their bounds: a sensor without a
-    reading in one run is not used in any.
+    y : (…, p)
+        Readings; ignored where not seen or not finite. Runs share their bounds: a sensor without a
+        reading in one run is not used in any.
     u : (…, m)
         Inputs.
     seen : (p,)

@@ -109,8 +109,7 @@ def _part(A: Floats, c: Floats, row: Floats, slowest: float, tol: float) -> Part
     hidden_count, turn = 0, np.zeros((0, 0))
     if unseen.shape[1]:
         # N(G) is invariant: the leading Schur vectors of its slow modes are invariant too, and the others
-        # complete
-        # them orthogonally.
+        # complete them orthogonally.
         _, turn, hidden_count = schur(
             unseen.T @ A @ unseen, output="real", sort=lambda re, im: np.hypot(re, im) >= slowest
         )
@@ -218,8 +217,7 @@ def riccati(S: Floats, t: Floats, Q: Floats, r: float, *, tol: float) -> Floats:
     """
     best, worst, said = S, np.inf, "no stabilising solution"
     # SciPy's balancing fails by orders of magnitude for zeros in t, as with fading modes; without it badly
-    # scaled
-    # plants are inaccurate. The residual decides.
+    # scaled plants are inaccurate. The residual decides.
     for balanced in (False, True):
         try:
             M = np.asarray(solve_discrete_are(S.T, t[:, None], Q, np.array([[r]]), balanced=balanced))

@@ -9,7 +9,7 @@ With U the squared voltages by the files and the metered powers, the readings le
     2 y_j b_j                       bias b_j of meter j, relative to the busbar's
     -(drop of U along branch l)     per unit of its length, at the places behind it
     A_ji p_i, B_ji q_i              errors of the gain of power registers
-    -B_ji load_i                    error of tan(phi) where q is not metered; -B_ji: error of q at p = 0
+    -B_ji load_i                    error of tan(phi) where q is not metered; -B_ji: q at p = 0
     -B_ji roof_i (1, cos, sin, ...) load hidden by generation, with its daily course
 
 and for customers at other places, exactly in the linear flow, ``W'(U + dU) - W U`` with W, W' the weights.
@@ -119,7 +119,8 @@ class Places:
 
         Parameters
         ----------
-        parts For each part: its customers, the place that feeds it, and the place on the other phase.
+        parts
+            For each part: its customers, the place that feeds it, and the place on the other phase.
         """
         W = self.read(self.weight[self.meters])
         shift: Floats = np.zeros_like(series.places)
@@ -282,7 +283,8 @@ def steps(series: Series, meter: int, pieces: int) -> tuple[Floats, list[tuple[f
 
     Parameters
     ----------
-    pieces Number of intervals with equally many frames.
+    pieces
+        Number of intervals with equally many frames.
 
     Returns
     -------

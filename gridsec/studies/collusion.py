@@ -4,10 +4,8 @@
 
 For given manipulated meters J this is a linear program in |J| unknowns. Every set B of |J| rows with
 independent columns of J bounds it: ``y`` with ``R_BJ' y = g_J`` gives ``g a <= |y|_1``, since rows are
-bounded
-from both sides alike. So any basis is dual feasible, and dual simplex steps lead to the optimum, for
-thousands
-of sets at once. Further meters are bounded by the remainder of g under the same multipliers:
+bounded from both sides alike. So any basis is dual feasible, and dual simplex steps lead to the optimum, for
+thousands of sets at once. Further meters are bounded by the remainder of g under the same multipliers:
 
     g a <= |y|_1 + sum of the M - |J| largest |g_k - (R_B' y)_k| reach_k,
 
@@ -52,7 +50,8 @@ class Corridor:
         out.
     reach : (p,)
         Largest attack on each meter in any collusion; 0 for protected meters.
-    liars M, largest number of manipulated meters.
+    liars
+        M, largest number of manipulated meters.
     """
 
     rows: Floats

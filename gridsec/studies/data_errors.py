@@ -1,9 +1,8 @@
 """Errors of a feeder's files that explain the readings as well as a manipulation does.
 
-The readings of a window are compared under two hypotheses. H_a: each accused meter has an offset, a
-slope and a gain of its own. H_b: customers and their meters are at other places than stated in the files.
-With
-e the squared voltages read minus those of the files, T blocks by p meters, and d the change by other places,
+The readings of a window are compared under two hypotheses. H_a: each accused meter has an offset, a slope and
+a gain of its own. H_b: customers and their meters are at other places than stated in the files. With e the
+squared voltages read minus those of the files, T blocks by p meters, and d the change by other places,
 
     H_a: e_j = c_j + s_j t + g_j m_j + n for accused j,    H_b: e = d + n,
 

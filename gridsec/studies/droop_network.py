@@ -9,8 +9,7 @@ In three phases V is turned back by the angles of the busbar, `V_i / a_i` with a
 e^{j 2 pi / 3}) by phase, and `Z_ij a_j / a_i` takes the place of Z_ij: the equation is the same, magnitudes
 are those of the phases, and without charging Z is `R + j X` of `gridsec.phases`. With closed loops Z is the
 inverse of the admittance matrix without the busbar (`gridsec.mesh`). Z need not be symmetric, its parts may
-be
-negative, and the feeder need not be a tree.
+be negative, and the feeder need not be a tree.
 
 References
 ----------

@@ -239,7 +239,12 @@ def shares_of_gain(given: Loop) -> Share:
 
     Parameters
     ----------
-    given The loop. Returns ------- Share
+    given
+        The loop.
+
+    Returns
+    -------
+    Share
         Factors are NaN where the gain may be 1 or more, so that there is no certificate.
     """
     M = np.abs(given.S) + given.error

@@ -55,7 +55,7 @@ class FalsePowers:
 
 
 def largest_story(given: FalsePowers, meter: int, liars: int, *, honest: Bools | None = None) -> Fit:
-    """Largest attack on a meter consistent with an unmanipulated feeder, with false powers of attacked meters.
+    """Largest attack on a meter consistent with an unmanipulated feeder, with false powers of such meters.
 
     Parameters
     ----------

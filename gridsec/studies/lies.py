@@ -1,9 +1,8 @@
 """Largest attacks consistent with unmanipulated meters: undetectable by any test without false alarms.
 
 Squared voltages differ from the model by ``w = B c``, c in the box [-1, 1]^k, and unmanipulated readings by
-at
-most e. Attacks ``a`` on the meters J stay undetected if some other c', e' of an unmanipulated feeder give the
-same readings; halving the differences,
+at most e. Attacks ``a`` on the meters J stay undetected if some other c', e' of an unmanipulated feeder give
+the same readings; halving the differences,
 
     a_k / 2 = b_k c + e_k (-1 .. 1),    |b_j c| <= e_j  for all meters j outside J.
 
@@ -97,7 +96,9 @@ def largest_lie(box: Box, meter: int, liars: int, *, honest: Bools | None = None
 
     Parameters
     ----------
-    liars Largest number of manipulated meters, this one among them. honest : (p,), optional
+    liars
+        Largest number of manipulated meters, this one among them.
+    honest : (p,), optional
         Protected meters: they cannot be manipulated.
 
     Raises

@@ -6,8 +6,7 @@ react. About a trajectory with slopes d of the droop curves,
     x' = A x + G diag(d) (H x - W_inverters c),   c' = 0,   y = C x - W_meters c
 
 is a pair. Its eigenvalue 0 belongs to lasting patterns, a *persistent pattern*; its other eigenvalues belong
-to
-decaying transients of the inverters. Attacks are hidden while they equal such a pattern.
+to decaying transients of the inverters. Attacks are hidden while they equal such a pattern.
 
 References
 ----------
@@ -57,7 +56,7 @@ class Patterns:
         return sum(space.shape[1] for space in self.spaces)
 
     def blind(self, live: Bools) -> Floats:
-        """Basis of the part invisible to all available meters, real and imaginary parts in columns, (n, k)."""
+        """Basis of the part invisible to all available meters, real and imaginary columns, (n, k)."""
         lost = [
             space @ kernel(seen[live], self.tol) for space, seen in zip(self.spaces, self.seen, strict=True)
         ]
@@ -91,8 +90,7 @@ def unknown_voltages(feeder: Network, unknown: Ints, *, busbar: bool, tol: float
     _, s, vh = np.linalg.svd(columns, full_matrices=False)
     some = s > tol * s[0]
     # The left singular vectors, with every row as exact as that of its customer. Those of the decomposition
-    # are
-    # only as exact as the longest row; a row beside the busbar would be rounding.
+    # are only as exact as the longest row; a row beside the busbar would be rounding.
     return np.asarray(columns @ (vh[some].T / s[some]))
 
 
@@ -117,8 +115,7 @@ def unknown_pair(lure: Lure, slope: Floats, W: Floats) -> tuple[Floats, Floats]:
     """
     A, C = linearise(lure, slope)
     # Injections in units of the voltages that they cause: subspaces stay, and ranks become decidable. Effects
-    # of
-    # inverters on each other are included, since meters may see none of the inverters.
+    # of inverters on each other are included, since meters may see none of the inverters.
     unit = float(np.linalg.norm(np.vstack([lure.C, lure.H]), 2)) or 1.0
     d = W.shape[1]
     whole = np.block([[A, -unit * (lure.G * slope) @ lure.F @ W], [np.zeros((d, A.shape[0] + d))]])

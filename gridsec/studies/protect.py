@@ -1,9 +1,8 @@
 """Smallest set of meters to protect, by constraint generation: exact, or greedy with a bound of the loss.
 
 Every successful attack is a set S of manipulated meters; a protection withstands it if and only if it
-protects
-a meter of S. So the solution is a smallest hitting set with rows generated on demand: protect a set that hits
-all attacks known so far, search for an attack against it, and repeat until there is none.
+protects a meter of S. So the solution is a smallest hitting set with rows generated on demand: protect a set
+that hits all attacks known so far, search for an attack against it, and repeat until there is none.
 
 References
 ----------
@@ -103,8 +102,7 @@ def lies_beyond(box: Box | FalsePowers, liars: int, size: Floats | float) -> Att
     p = (box.box if isinstance(box, FalsePowers) else box).meters.size
     limit = np.broadcast_to(size, p)
     # Protection only reduces attacks: meters below the bound without any are skipped, and the one furthest
-    # above
-    # it refutes first.
+    # above it refutes first.
     alone = np.array([largest_of(box, j, liars).bound for j in range(p)]) - limit
     order = [int(j) for j in np.argsort(-alone) if alone[j] > 0.0]
 

@@ -1,9 +1,8 @@
 """Detectability under the sequential monitor's decision rule, as inequalities: hidden, noticed, named.
 
 Attacks a on trusted meters move the leave-one-out residual of meter j by ``(Q a)_j / Q_jj``. Residuals
-without
-attack are sub-Gaussian with variance ``1 / Q_jj`` (Gaussian and uniform parts alike). So at one moment, on s
-scales and at p meters together, all are within ``H_j`` with probability at least 1 - risk. Hence
+without attack are sub-Gaussian with variance ``1 / Q_jj`` (Gaussian and uniform parts alike). So at one
+moment, on s scales and at p meters together, all are within ``H_j`` with probability at least 1 - risk. Hence
 
 - hidden:  ``|(Q a)_j| <= (limit_j - H_j) Q_jj`` on all scales: no meter is beyond its limit;
 - noticed: an attack without ``|(Q a)_j| <= (limit_j + H_j) Q_jj`` everywhere: some meter is beyond it;
@@ -112,8 +111,11 @@ def within(given: Rule, liars: int, *, seen: bool, honest: Bools | None = None) 
 
     Parameters
     ----------
-    liars M. seen The bound: False for limit - H (certainly within the limit: hidden), True for limit + H +
-    the model error on both sides (beyond it, some meter certainly exceeds its limit).
+    liars
+        M.
+    seen
+        The bound: False for limit - H (certainly within the limit: hidden), True for limit + H + the
+        model error on both sides (beyond it, some meter certainly exceeds its limit).
     honest : (p,), optional
         Meters that cannot be manipulated.
     """

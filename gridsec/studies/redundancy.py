@@ -49,7 +49,8 @@ class Part:
 
     Attributes
     ----------
-    branch True if a line leads from `bus` to the busbar.
+    branch
+        True if a line leads from `bus` to the busbar.
     meters : (k,)
         The meters there.
     """
@@ -64,7 +65,10 @@ def meter_redundancy(given: Patterns, meter: int, silent: Bools) -> Meter:
 
     Parameters
     ----------
-    meter An available meter. silent : (p,) Unavailable meters.
+    meter
+        An available meter.
+    silent : (p,)
+        Unavailable meters.
     """
     own = fewest_meters(given, silent=silent, must=meter)
     gone = silent.copy()

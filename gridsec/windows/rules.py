@@ -114,7 +114,8 @@ def isolation(pi_sets: Floats, thresholds: Floats, masks: Bools, length: int, ru
         The large sets.
     length
         N. An incomplete last window is left out.
-    rule "majority" or "survivors".
+    rule
+        "majority" or "survivors".
 
     Raises
     ------

@@ -62,7 +62,8 @@ class WindowVerdict:
     isolation
         Algorithm 2: ATTACKED, CLEAN if no meter is suspect and every set was judged at every step, or
         UNDECIDED.
-    suspects : (p,) Meters named by Algorithm 2.
+    suspects : (p,)
+        Meters named by Algorithm 2.
     score, threshold : (1 + s,)
         Largest pi and pi_J of the window beside their thresholds.
     """

@@ -35,7 +35,8 @@ def at(function: Vector, points: Floats) -> Floats:
     ----------
     function
         From n components to k.
-    points : (…, n) Points.
+    points : (…, n)
+        Points.
 
     Returns
     -------
@@ -58,7 +59,8 @@ def jacobian_at(function: Matrix, points: Floats) -> Floats:
     ----------
     function
         From n components to k rows of m entries.
-    points : (…, n) Points.
+    points : (…, n)
+        Points.
     """
     points = np.asarray(points, dtype=np.float64)
     rows = function([points[..., i] for i in range(points.shape[-1])])
@@ -75,7 +77,9 @@ def sat(z: Floats, bound: Floats | float) -> Floats:
 
     Parameters
     ----------
-    z : (…) Arbitrary values, also infinite. bound
+    z : (…)
+        Arbitrary values, also infinite.
+    bound
         Saturation level, scalar or broadcastable.
 
     References

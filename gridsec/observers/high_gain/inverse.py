@@ -1,8 +1,7 @@
 """Left inverses of Phi_I: given in closed form and extended by saturation, or by the nearest point.
 
 A left inverse Psi^I maps every z_I to a state in the box, and Phi_I(x) back to x. Its `factor` bounds the
-ratio
-of the residual `|z_I - Phi_I(Psi^I(z_I))|` of a set without attack to the observers' error:
+ratio of the residual `|z_I - Phi_I(Psi^I(z_I))|` of a set without attack to the observers' error:
 
 - given: `1 + Lip^(Phi_I) Lip^(Psi^I)`, kim2018's bound on `Lip^(id - Phi_I Psi^I)`;
 - nearest point: `sqrt(N_I)`, because no state in the box, and so not the true one either, has a smaller

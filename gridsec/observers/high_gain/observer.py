@@ -239,7 +239,7 @@ def _inverses(
     decays: tuple[Decay, ...],
     max_attacked: int,
 ) -> tuple[tuple[Inverse, ...], Inverse | None]:
-    """Left inverses of all sets of p - q sensors and of all sensors: the given ones, or the nearest points."""
+    """Left inverses of all sets of p - q sensors and of all sensors: the given ones, or nearest points."""
     p = len(system.partials)
     wanted = groups(p, max_attacked)
     if given is None:

@@ -93,7 +93,11 @@ class Symbolic:
 def lie(expression: Expression, field: Sequence[Expression], x: Sequence[Expression]) -> Expression:
     """Lie derivative `sum_k d(expression)/dx_k field_k`, simplified.
 
-    The field has n expressions for the n symbols x. References ---------- lee2018, Remark 5.2.1.
+    The field has n expressions for the n symbols x.
+
+    References
+    ----------
+    lee2018, Remark 5.2.1.
     """
     sympy = _sympy()
     terms = (sympy.diff(expression, symbol) * part for symbol, part in zip(x, field, strict=True))

@@ -271,7 +271,8 @@ def step(
 
     Parameters
     ----------
-    y : (p,) Readings at this tick; arbitrary where unseen.
+    y : (p,)
+        Readings at this tick; arbitrary where unseen.
     u : (l,)
         Known input from this tick on, and of this tick's readings; finite.
     seen : (p,)
