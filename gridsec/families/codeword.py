@@ -101,8 +101,13 @@ def observe(  # noqa: PLR0917  # the observers, where they were, and what came i
     Parameters
     ----------
     model
-        The observer without meters. before The observers' state. frame, inputs The frame, received and
-        prepared. h Time since the last frame, s; 0 for the first one.
+        The observer without meters.
+    before
+        The observers' state.
+    frame, inputs
+        The frame, received and prepared.
+    h
+        Time since the last frame, s; 0 for the first one.
 
     Returns
     -------

@@ -194,7 +194,9 @@ class Believed:
     size
         p, number of meters.
     meter, voltage : (k,)
-        Of the remaining rows. C : (k, m) Of the remaining rows.
+        Of the remaining rows.
+    C : (k, m)
+        Of the remaining rows.
     tests : (k + m, k)
         P = S^-1 and C^T P: the tests if only these meters are suspected.
     r, E, C_ : (k + m,), (k + m, K), (k + m, m)

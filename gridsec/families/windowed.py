@@ -90,7 +90,9 @@ class Window:
     detected
         Algorithm 1: True if pi exceeded its threshold.
     decided
-        Algorithm 2: True if there is an answer. suspects : (p,) Algorithm 2: its answer.
+        Algorithm 2: True if there is an answer.
+    suspects : (p,)
+        Algorithm 2: its answer.
     """
 
     judged: bool

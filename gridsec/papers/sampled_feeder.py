@@ -96,7 +96,9 @@ def on_feeder(
     lie : (T, p)
         Attack, squared pu (in z).
     max_attacked, length, rule
-        q, N, and the isolation rule of windows. seed Seed of the noise.
+        q, N, and the isolation rule of windows.
+    seed
+        Seed of the noise.
     """
     plant = sample(lure, h)
     slowest = spectral_radius(plant.A)

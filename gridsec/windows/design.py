@@ -105,7 +105,9 @@ def bank(
     max_attacked
         q, at least 1.
     options
-        For gains by matrix inequality. Either `options` or `proof` is required. proof For direct injection.
+        For gains by matrix inequality. Either `options` or `proof` is required.
+    proof
+        For direct injection.
     most
         Largest acceptable number of observers.
 
