@@ -76,11 +76,6 @@ def steady_rounding(accuracy: MeterAccuracy) -> Floats:
     standard deviation s its k-th harmonic shrinks by ``exp(-2 pi^2 k^2 s^2 / D^2)``. So the error is at most
     ``D / pi sum_k exp(-2 pi^2 k^2 s^2 / D^2) / k``, and never more than half a step.
 
-    Parameters
-    ----------
-    accuracy
-        The meters.
-
     Returns
     -------
     (p,)
@@ -101,8 +96,6 @@ def reading_error(accuracy: MeterAccuracy, v2: Floats, sigmas: float) -> Floats:
 
     Parameters
     ----------
-    accuracy
-        The meters.
     v2 : (p,)
         Largest possible squared voltage at the meter, pu.
     sigmas
@@ -127,8 +120,6 @@ def busbar_error(accuracy: MeterAccuracy, v0_squared: float, sigmas: float) -> f
 
     Parameters
     ----------
-    accuracy
-        The meters.
     v0_squared
         Squared reading, pu.
     sigmas
@@ -147,8 +138,6 @@ def told_error(accuracy: MeterAccuracy, y: Floats, sigmas: float) -> Floats:
 
     Parameters
     ----------
-    accuracy
-        The meters.
     y : (p,)
         Squared readings, pu.
     sigmas

@@ -163,8 +163,6 @@ def perron_bound(matrix: Floats, rounds: int) -> float:
     ----------
     matrix : (n, n)
         Any square matrix; signs are ignored.
-    rounds
-        Number of power iterations.
     """
     if matrix.size == 0:
         return 0.0

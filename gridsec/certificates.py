@@ -236,8 +236,6 @@ def verify(certificate: Certificate, lure: Lure, trusted: Bools | None = None) -
 
     Parameters
     ----------
-    certificate
-        Any kind.
     lure
         The closed loop of the claim.
     trusted : (p,)
@@ -476,8 +474,6 @@ def _level(certificate: Certificate, form: _Form, kick: Floats, load: Floats) ->
     ----------
     certificate
         A quadratic certificate: P, Lambda and alpha.
-    form
-        The system.
     kick : (…, n)
         Largest entries of the direct terms of `e'`, pu/s: `N^2 = kick^T |P| kick`.
     load : (…, m)

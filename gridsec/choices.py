@@ -22,8 +22,6 @@ def no_choice(name: str, kind: Iterable[str], *values: str) -> list[str]:
         Name of the quantity in the message.
     kind
         Allowed values: an enumeration, or `typing.get_args` of a `Literal`.
-    values
-        Given values.
     """
     known = tuple(kind)
     return [

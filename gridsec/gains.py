@@ -206,8 +206,6 @@ def circle_matrix(lure: Lure, J: Ints | Sequence[int], gains: CircleGains) -> Fl
     J : (k',)
         Meters with injection, a subset of `gains.J`. A smaller set gives the matrix of the same observer
         while the other meters are unavailable.
-    gains
-        The design.
 
     Returns
     -------
@@ -304,8 +302,6 @@ def sensitivity(lure: Lure, L: Floats, K: Floats) -> Floats:
 
     Parameters
     ----------
-    lure
-        Plant.
     L, K : (n, k), (m, k)
         Gains.
 

@@ -130,8 +130,6 @@ def close_loop(feeder: Network | ThreePhaseFeeder, droop: Droop, meters: Ints) -
     ----------
     feeder
         The feeder, balanced or not.
-    droop
-        The inverters.
     meters : (p,)
         Customer of each meter.
 

@@ -98,8 +98,6 @@ def fits(  # noqa: PLR0917  # the terms of s = B xi + v, then what is asked of t
         Number of blocks that each fit leaves out; all of them if fewer have rows.
     functionals : (F, n)
         Functionals to bound.
-    most
-        Largest number of sets.
 
     Raises
     ------

@@ -252,8 +252,6 @@ def design_hypotheses(stack: Stack, P: Floats, q: int, *, most: int = MOST_SUBSE
         As in `design_test`.
     q
         Largest number of sensors in error.
-    most
-        Largest number of sets.
 
     Raises
     ------

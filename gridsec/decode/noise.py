@@ -105,8 +105,6 @@ def detection_constants(stack: Stack, q: int, *, tol: float, most: int = MOST_SU
         Largest number of blocks in error.
     tol
         Tolerance of that test.
-    most
-        Largest number of subsets.
 
     Raises
     ------

@@ -95,8 +95,6 @@ def design(
         Tolerance of that test, relative to blocks of norm one.
     left_out
         r between q and 2q; by default the cheapest.
-    most
-        Largest number of candidates.
 
     Raises
     ------
@@ -129,8 +127,6 @@ def exact(decoder: Decoder, z: Floats, *, tol: float) -> Decoded:
 
     Parameters
     ----------
-    decoder
-        From `design`.
     z : (…, N)
         Measurements, finite.
     tol
@@ -151,8 +147,6 @@ def bounded(decoder: Decoder, z: Floats, *, limit: Floats | float) -> Decoded:
 
     Parameters
     ----------
-    decoder
-        From `design`.
     z : (…, N)
         Measurements, finite.
     limit : scalar or (…, 1) or (…, p)

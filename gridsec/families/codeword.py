@@ -102,8 +102,6 @@ def observe(  # noqa: PLR0917  # the observers, where they were, and what came i
     ----------
     model
         The observer without meters.
-    before
-        The observers' state.
     frame, inputs
         The frame, received and prepared.
     h

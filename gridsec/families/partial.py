@@ -190,8 +190,6 @@ def step(design: PartialDesign, state: PartialState, frame: Frame) -> tuple[Part
 
     Parameters
     ----------
-    design, state
-        From `design`, and from `init` or the last step.
     frame
         Data of one tick. A frame that is not later than the last one changes nothing: it returns the last
         estimate and UNDECIDED.

@@ -116,8 +116,6 @@ def step(
 
     Parameters
     ----------
-    design, state
-        From `design`, and from `init` or the last step.
     frame
         Data of one tick. A frame that is not later than the last one changes nothing: it returns the last
         estimate and UNDECIDED.

@@ -126,8 +126,6 @@ def fewest(
         Orthonormal basis of the space in its columns.
     tol
         A block does not see a unit vector if the norm of their product is at most this.
-    most
-        Largest number of nodes.
     below
         Decide only if fewer blocks than this see some direction: if so, the count is below it, otherwise any
         upper bound. Takes at most C(n + below, n) nodes. 0 for the minimum.

@@ -65,8 +65,6 @@ def circle(
 
     Parameters
     ----------
-    lure
-        Plant.
     J : (k,)
         Trusted meters.
     rate, noise, load, weight, floor
@@ -186,12 +184,8 @@ def solve_many(
     ----------
     lure
         Plant. Its matrices are sent to the workers; its nonlinearity, which no inequality needs, is not.
-    subsets
-        Trusted sets, of any sizes, in any order.
     options
         From `options_for`.
-    workers
-        Number of processes.
     progress
         Called in this process with (done, total) after finished designs.
 
@@ -430,10 +424,6 @@ def settle(lure: Lure, found: CircleGains, what: str, *, blind: bool = False) ->
 
     Parameters
     ----------
-    lure
-        Plant.
-    found
-        The solver's gains.
     what
         Name of the design in errors.
     blind

@@ -94,8 +94,6 @@ def discrete_options(
 
     Parameters
     ----------
-    system
-        Plant.
     decays
         One candidate for lambda or several.
     noise : (p,) or scalar
@@ -127,8 +125,6 @@ def discrete_circle(system: DiscreteLure, J: Sequence[int] | Ints, options: Disc
 
     Parameters
     ----------
-    system
-        Plant.
     J : (k,)
         Trusted meters.
     options
@@ -151,8 +147,6 @@ def discrete_circles(
     ----------
     system, options
         As there.
-    subsets
-        Sets of trusted meters.
 
     Raises
     ------
@@ -206,8 +200,6 @@ def discrete_contraction(system: DiscreteLure, *, decays: Sequence[float] | floa
 
     Parameters
     ----------
-    system
-        Plant.
     decays
         Candidates for lambda. The one with the smallest `sqrt(cond P) / (1 - lambda)` is used.
 

@@ -141,12 +141,8 @@ def discrete_matrix(system: DiscreteLure, J: Ints | Sequence[int], gains: Discre
 
     Parameters
     ----------
-    system
-        The plant.
     J : (k',)
         Meters with injection, a subset of `gains.J`: the observer while others are unavailable.
-    gains
-        The design.
 
     Raises
     ------

@@ -148,8 +148,6 @@ def sample(lure: Lure, h: float) -> DiscreteLure:
 
     Parameters
     ----------
-    lure
-        The continuous system.
     h
         Length of a step, s, positive.
 

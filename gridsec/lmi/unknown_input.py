@@ -134,13 +134,6 @@ def unknown_input_matrix(system: ErrorSystem, gains: UnknownInputGains) -> Float
     the increment of V minus its bound, plus the multiplier times `|half H e|^2 - |psi|^2 >= 0`. Without a
     Schur complement, this is the statement itself, not the form given to the solver.
 
-    Parameters
-    ----------
-    system
-        The error system.
-    gains
-        Gain and proof.
-
     Returns
     -------
     Floats
@@ -337,8 +330,6 @@ def unknown_input(
 
     Parameters
     ----------
-    system
-        The error system.
     rate
         Required contraction of sqrt(V) per step, in (0, 1).
     multiplier

@@ -84,8 +84,6 @@ def direct_gain(lure: Readout, trusted: Bools) -> Floats:
 
     Parameters
     ----------
-    lure
-        Plant.
     trusted : (p,)
         J as a mask.
 
@@ -112,8 +110,6 @@ def design(
 
     Parameters
     ----------
-    lure
-        Plant.
     trusted : (p,)
         J as a mask.
     gains

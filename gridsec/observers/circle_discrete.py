@@ -102,8 +102,6 @@ def design(
 
     Parameters
     ----------
-    system
-        Plant.
     trusted : (p,)
         J as a mask.
     gains
@@ -232,8 +230,6 @@ def error_bound(design: DiscreteDesign, k: int, *, start: float, noise: float, u
 
     Parameters
     ----------
-    k
-        Number of steps.
     start
         |e(0)|.
     noise
@@ -391,8 +387,6 @@ def monte_carlo(
         Initial states, one for each run.
     u : (T, l)
         Known input of the T steps.
-    seed
-        Seed of the random numbers.
     confidence
         Confidence of `exceedance`.
 

@@ -158,8 +158,6 @@ def init(design: KalmanDesign, t: float, mean: Floats, covariance: Floats) -> Ka
 
     Parameters
     ----------
-    design
-        From `design`.
     t
         Time, s.
     mean : (…, n)
@@ -261,11 +259,6 @@ def steady(design: KalmanDesign) -> Steady:
     """Stationary gain and joint covariance.
 
     The gains solve one Riccati equation for each sensor, the joint covariance one Lyapunov equation.
-
-    Parameters
-    ----------
-    design
-        From `design`.
 
     Raises
     ------

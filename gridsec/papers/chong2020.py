@@ -335,11 +335,6 @@ def under_attack(of: Design = "(12)") -> tuple[Run, Floats, Floats]:
 
     The plant starts near its equilibrium, every observer at random within the inverters' limits, equally for
     both designs.
-
-    Parameters
-    ----------
-    of
-        Gains of the observers.
     """
     at, made = setting(), observers(of)
     rng = np.random.default_rng(2020)
@@ -355,11 +350,6 @@ def exact_start(of: Design = "(12)") -> Run:
 
     Three meters; meter 1 is manipulated from the start. The observers of {1, 2}, {1} and {2} start in the
     true state, so that {1, 2} is selected with error zero. The others start 0.05 pu off.
-
-    Parameters
-    ----------
-    of
-        Gains of the observers.
     """
     at, made = setting(3), observers(of, 3, 1)
     x = equilibrium(at.lure, at.w, tol=1e-12, max_iter=200)

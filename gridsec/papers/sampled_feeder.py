@@ -97,8 +97,6 @@ def on_feeder(
         Attack, squared pu (in z).
     max_attacked, length, rule
         q, N, and the isolation rule of windows.
-    seed
-        Seed of the noise.
     """
     plant = sample(lure, h)
     slowest = spectral_radius(plant.A)

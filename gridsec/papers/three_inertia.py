@@ -112,8 +112,6 @@ def estimator(model: Plant, *, slowest: float = SLOWEST) -> BoundedDesign:
 
     Parameters
     ----------
-    model
-        From `plant`.
     slowest
         0 for the observability decomposition; the detectability decomposition by default.
     """
@@ -237,12 +235,8 @@ def simulate(
 
     Parameters
     ----------
-    model
-        From `plant`.
     design
         From `estimator` or `gaussian_estimator`.
-    seconds
-        Duration.
     seed
         Seed of disturbance and noise: uniform within their bounds, or Gaussian of the same variance.
     attacked

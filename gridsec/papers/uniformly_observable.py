@@ -356,14 +356,8 @@ def simulate(
 
     Parameters
     ----------
-    made
-        The estimator.
     attack
         Attacks (k, 4) as a function of the times (k,).
-    seconds
-        Duration.
-    seed
-        Seed of the noise.
     deviation
         If given, the noise is Gaussian with this standard deviation (lee2018).
     """
@@ -392,8 +386,6 @@ def switching(run: Run, start: float, stop: float) -> str:
 
     Parameters
     ----------
-    run
-        A simulation.
     start, stop
         Times, s.
     """

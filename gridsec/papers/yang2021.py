@@ -154,8 +154,6 @@ def simulate(
     inputs, sensors
         Attacked inputs and sensors, from 0. By default both inputs (Example 1) or the third (Example 4's
         text).
-    steps
-        Number of steps.
     seed
         Seed of the random numbers; the paper does not state its own.
     """

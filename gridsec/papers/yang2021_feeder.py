@@ -124,8 +124,6 @@ def simulate(made: IsolationDesign, *, inverter: int, meter: int, ticks: int = 8
     ----------
     inverter, meter
         Attacked inverter and meter, from 0.
-    ticks
-        Number of ticks.
     seed
         Seed of the meters' errors, which are uniform inside their bounds.
     """

@@ -107,8 +107,6 @@ def evidence(given: Fit, z: Floats, spread: Floats) -> Evidence:
 
     Parameters
     ----------
-    given
-        From `fit`.
     z : (n, H)
         Whitened effect of each hypothesis.
     spread : (H,)
@@ -169,8 +167,6 @@ def explain(given: Fit, z: Floats, own: Floats, like: float) -> tuple[Floats, Fl
 
     Parameters
     ----------
-    given
-        From `fit`.
     z : (n, H)
         Whitened effects.
     own : (H,)

@@ -237,11 +237,6 @@ def shares_of_gain(given: Loop) -> Share:
     multiplied by f leaves it below 1 up to `f = 1 / (1 - 1 / w_i)`. The part is the product of an inverter's
     entries in the leading left and right vectors: the growth of the gain with its slope alone.
 
-    Parameters
-    ----------
-    given
-        The loop.
-
     Returns
     -------
     Share

@@ -79,8 +79,6 @@ def parity(stack: Stack, kept: Ints, *, tol: float) -> Parity:
     ----------
     stack
         Phi.
-    kept
-        The sensors.
     tol
         Singular values up to this, times the largest, count as zero.
 
@@ -110,8 +108,6 @@ def fuse(prepared: Parity, P: Floats, *, tol: float) -> Fused:
 
     Parameters
     ----------
-    prepared
-        From `parity`.
     P : (N, N)
         Covariance of v; positive semidefinite.
     tol

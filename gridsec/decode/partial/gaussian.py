@@ -167,8 +167,6 @@ def design(
         From `kalman.steady`, for filters in steady state.
     rule, readmit, refresh
         As in `GaussianDesign`.
-    most
-        Largest number of sets.
 
     Raises
     ------

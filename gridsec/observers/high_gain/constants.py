@@ -242,8 +242,6 @@ def smallest_theta(slopes: Slopes, *, most: float = 1e6, tolerance: float = 1e-6
         gives infinity.
     most
         Largest theta to consider, 1/s.
-    tolerance
-        Relative tolerance.
 
     References
     ----------

@@ -93,8 +93,6 @@ def nearest(system: System, sensors: Sequence[int], *, accept: float = 0.0, iter
     accept
         Residual (largest entry) without further starts. Values up to the threshold in use change no decision:
         a set that passes with a local minimum would pass with the global one.
-    iterations
-        Largest number of steps.
     """
     chosen = tuple(int(i) for i in sensors)
     bound = system.x_bound
