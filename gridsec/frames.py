@@ -68,7 +68,7 @@ class Reconstruction:
     correction: Floats
 
 
-def nothing_new(  # noqa: PLR0917  # what there was, and what there is to say without it
+def nothing_new(  # noqa: PLR0917  # the last answer, and the values without one
     plant: Plant,
     frame: Frame,
     t: float,

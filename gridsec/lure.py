@@ -70,7 +70,7 @@ class Lure:
             wrong.append(
                 Problem(
                     "order",
-                    "an upper slope is below its lower one, which is 0 unless `Lure.of` is told another",
+                    "an upper slope is below its lower one, which is 0 by default; `Lure.of` takes another",
                 )
             )
         refuse(wrong)
@@ -298,7 +298,7 @@ def transition(lure: Lure, h: float, policy: StepPolicy = POLICY) -> Transition:
     """
     if not (np.isfinite(h) and h >= 0):
         raise InputInvalid(
-            [Problem("negative", f"a step of {h} s is no step; expected a number that is not negative")]
+            [Problem("negative", f"h is {h} s; it must be a finite number that is not negative")]
         )
     own = np.diagonal(lure.A)
     diagonal = np.count_nonzero(lure.A) == np.count_nonzero(own)

@@ -254,7 +254,7 @@ class _View:
     threshold: Floats  # (p,)
 
 
-def _conclude(  # noqa: PLR0917  # the chain's three values, then what this step added
+def _conclude(  # noqa: PLR0917  # design, state and frame, then the results of this step
     design: MonitorDesign,
     state: MonitorState,
     frame: Frame,

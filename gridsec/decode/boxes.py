@@ -79,7 +79,7 @@ class Fits:
         return np.asarray((self.disagree & ~self.left_out).any(axis=0))
 
 
-def fits(  # noqa: PLR0917  # the terms of s = B xi + v, then what is asked of them
+def fits(  # noqa: PLR0917  # the terms of s = B xi + v, then the requested bounds
     B: Floats, s: Floats, block: Ints, blocks: int, q: int, functionals: Floats, *, most: int = MOST_SUBSETS
 ) -> Fits:
     """Fit the unknowns without every set of q blocks, with the limits of unmanipulated rows.

@@ -93,7 +93,7 @@ def start(setting: Setting) -> Parts:
     return Parts(zero, zero, zero, widest, widest)
 
 
-def observe(  # noqa: PLR0917  # the observers, where they were, and what came in
+def observe(  # noqa: PLR0917  # the observers, their state, and the inputs
     setting: Setting, model: CircleDesign, before: Parts, frame: Frame, inputs: Inputs, h: float
 ) -> tuple[Uncertainty, Reconstruction, Parts, bool]:
     """Advance all observers and their bounds to a frame.

@@ -115,7 +115,7 @@ def _search(design: SetSearchDesign, inputs: Inputs, view: View, state: SetSearc
     return _Found(best | (state.dropped & ~live), accused, rivals, False)
 
 
-def _conclude(  # noqa: PLR0917  # the chain's three values, then what this step added
+def _conclude(  # noqa: PLR0917  # design, state and frame, then the results of this step
     design: SetSearchDesign, state: SetSearchState, frame: Frame, inputs: Inputs, view: View, found: _Found
 ) -> tuple[SetSearchState, Estimate, Verdict]:
     options, live = design.setting.options, inputs.live
@@ -166,7 +166,7 @@ def _error(design: SetSearchDesign, view: View, torn: bool) -> Floats:
     return np.asarray(view.base + errors.inverters @ view.sure + most)
 
 
-def _verdict(  # noqa: PLR0917  # everything one tick brought
+def _verdict(  # noqa: PLR0917  # all results of one tick
     design: SetSearchDesign,
     inputs: Inputs,
     view: View,
@@ -192,7 +192,7 @@ def _verdict(  # noqa: PLR0917  # everything one tick brought
     if found.torn and cause not in {Cause.TOO_FEW_METERS, Cause.NO_BUSBAR}:
         decision, cause = Decision.UNDECIDED, Cause.TOO_MANY_SUSPECTS
         reason = (
-            f"Whichever {design.setting.max_attacked} meters are left out, the others contradict each other: "
+            f"Without any {design.setting.max_attacked} meters, the others contradict each other: "
             "more are manipulated, or the busbar reading, a switch or a line in the model is wrong."
         )
     attack = np.where(tally.named & live, inputs.y - view.v2[plant.meters], 0.0)

@@ -399,7 +399,7 @@ def _design_claims(of: Design) -> list[Claim]:
             f"selected error after 35 s, {named}, pu",
             "Theorem 2",
             "converges",
-            f"{tail:.0e}; deceived observers {worst:.3f}",
+            f"{tail:.0e}; observers with attacked meters {worst:.3f}",
             tail < SETTLED < worst,
         ),
         Claim(

@@ -304,15 +304,17 @@ def _simulation_claims() -> list[Claim]:
                 what = f"(inputs, sensors) named, attacks in ±{amplitude:g}, {how}"
                 out.append(statement(what, f"Example {place}", str(expected), str(found)))
     worst = doubt_error(1)
-    why = "sensors 3 and 4 cannot accuse each other while 1 and 2 read the same: docs/errata/yang2021.md"
+    why = (
+        "attacks on sensors 3 and 4 cannot be told apart while 1 and 2 read the same: docs/errata/yang2021.md"
+    )
     claim = Claim(
-        "any one sensor may lie", "Example 1, q = 1", "error -> 0", f"error {worst:.3g}", worst < 1e-6
+        "attack on any one sensor", "Example 1, q = 1", "error -> 0", f"error {worst:.3g}", worst < 1e-6
     )
     out.append(replace(claim, why=why))
     worst = doubt_error(2)
     why = "b_1 - b_2 is invisible to sensors 1 and 2: docs/errata/yang2021.md"
     claim = Claim(
-        "any one input and sensor may lie", "Example 2", "error -> 0", f"error {worst:.3g}", worst < 1e-6
+        "attack on any one input and sensor", "Example 2", "error -> 0", f"error {worst:.3g}", worst < 1e-6
     )
     out.append(replace(claim, why=why))
     return out

@@ -159,7 +159,7 @@ def figure() -> Figure:
     panels = (
         _panel("Reactive injection", "pu", t, (run.x, found), [f"inverter at c{i + 1:02d}" for i in AT]),
         _panel("Wrong part of the set point", "pu", t, (run.a_u, ahead), [f"c{i + 1:02d}" for i in AT]),
-        _panel("Lie of the meter", "squared pu", t, (run.a_y, lies), [f"c{i + 1:02d}" for i in METERS]),
+        _panel("Attack on the meter", "squared pu", t, (run.a_y, lies), [f"c{i + 1:02d}" for i in METERS]),
     )
     return Figure(
         "yang2021-feeder",

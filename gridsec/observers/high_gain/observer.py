@@ -418,7 +418,7 @@ def _test(design: HighGainDesign, inverse: Inverse, z: Floats, delta: Floats) ->
     return _Trial(x, residual, reach, inverse.factor * reach)
 
 
-def _judge(  # noqa: PLR0917  # one place that sees the whole state
+def _judge(  # noqa: PLR0917  # the whole state
     design: HighGainDesign, state: HighGainState, z: Floats, age: Floats, live: Bools, large: Bools, t: float
 ) -> tuple[int, Outcome]:
     delta = error_bounds(design, age)
@@ -468,7 +468,7 @@ def _rest(design: HighGainDesign) -> Floats:
     return np.array([decay.epsilon for decay in design.decays])
 
 
-def _search(  # noqa: PLR0917  # what a test needs, and where to begin
+def _search(  # noqa: PLR0917  # the inputs of a test, and the first set
     design: HighGainDesign, sigma: int, z: Floats, delta: Floats, live: Bools, large: Bools
 ) -> tuple[int, tuple[int, ...], _Trial | None, bool]:
     """Update rule (20): next set whenever the present one fails or is incomplete."""
@@ -484,7 +484,7 @@ def _search(  # noqa: PLR0917  # what a test needs, and where to begin
     return sigma, tuple(visited), trial, alarm
 
 
-def _try(  # noqa: PLR0917  # what a test needs
+def _try(  # noqa: PLR0917  # the inputs of a test
     design: HighGainDesign, sigma: int, z: Floats, delta: Floats, live: Bools, large: Bools
 ) -> _Trial | None:
     inverse = design.inverses[sigma]
