@@ -127,8 +127,8 @@ class Uncertainty:
     Attributes
     ----------
     base : (N,)
-        Error of each customer's squared voltage for known injections of inverters: busbar,
-        loads, model; squared pu.
+        Error of each customer's squared voltage for known injections of inverters: busbar, loads, model;
+        squared pu.
     reading : (p,)
         Error of each unmanipulated reading, squared pu.
     live : (p,)
@@ -345,9 +345,9 @@ def advance(
 def ceiling(model: ErrorModel, now: Uncertainty, motion: Motion, floor: ErrorBound) -> ErrorBound:
     """A level above `floor` that the map of the bounds does not exceed.
 
-    Without output injection, the saturation of the curves. With it, the map is at most
-    `r + A bound` with a matrix A of spectral radius below 1 (the certificate), and
-    `(I - A)^-1 r` plus any multiple of `(I - A)^-1 1` is such a level.
+    Without output injection, the saturation of the curves. With it, the map is at most `r + A bound` with a
+    matrix A of spectral radius below 1 (the certificate), and `(I - A)^-1 r` plus any multiple of
+    `(I - A)^-1 1` is such a level.
 
     Parameters
     ----------

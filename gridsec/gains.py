@@ -1,8 +1,7 @@
 """Gains of circle-criterion observers and their matrix inequality.
 
-The parts of a design that need no solver: the corrected inequality (12) of chong2020 rebuilt
-as a plain matrix, its margin, the error bounds that follow from it, and the sensitivity of the observer
-to its meters.
+The parts of a design that need no solver: the corrected inequality (12) of chong2020 rebuilt as a plain
+matrix, its margin, the error bounds that follow from it, and the sensitivity of the observer to its meters.
 
 References
 ----------

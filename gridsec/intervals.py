@@ -43,8 +43,8 @@ class Sweeps:
 def bounds(sweeps: Sweeps, error: Floats) -> tuple[Floats, Floats]:
     """Bounds of the loss correction's change within the intervals and of its distance from the AC power flow.
 
-    With ``d = Z (e / |V0|)``, which bounds ``|V1' - V1|`` and is linear in the powers, and
-    ``l = |V1| - d``, the nonlinear part of the change of V2 is at most
+    With ``d = Z (e / |V0|)``, which bounds ``|V1' - V1|`` and is linear in the powers, and ``l = |V1| - d``,
+    the nonlinear part of the change of V2 is at most
 
         c = Z (e (|V1 - V0| + d) / (l |V0|) + |s| d / (l |V1|)),
 

@@ -134,7 +134,7 @@ def _doubt(now: Situation) -> tuple[Cause, str] | None:
     if any_of(silent):
         return Cause.SILENT_METERS, f"No reading from {_list(now, silent)}."
     if not now.settled:
-        return Cause.SETTLING, "The observers have not forgotten their initial state yet."
+        return Cause.SETTLING, "The observers have not settled yet."
     if any_of(pending):
         reason = f"{_list(now, pending)}: further off than allowed lately, but not often enough to be named."
         return Cause.AMBIGUOUS, reason

@@ -22,8 +22,8 @@ _RELAX = 2000
 def advance(lay: Layout, state: SlotState, inputs: Drive, h: float, policy: StepPolicy) -> SlotState:
     """All observers a time h later, under constant inputs.
 
-    The same exponential Runge-Kutta substeps, and the same equilibrium after long steps, as
-    those of `gridsec.lure.advance` for each observer alone.
+    The same exponential Runge-Kutta substeps, and the same equilibrium after long steps, as those of
+    `gridsec.lure.advance` for each observer alone.
     """
     prepared = state.prepared
     if prepared.h != h:

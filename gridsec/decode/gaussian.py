@@ -3,9 +3,9 @@
     z = Phi x + v + e,    v ~ N(0, P)
 
 The residual of the minimum-variance estimate has the *singular* covariance
-`P - Phi (Phi^T P^-1 Phi)^-1 Phi^T`, of rank N - n. Its standardised square sum g is therefore chi-square
-with N - n degrees of freedom. lee2018 prints N, which gives far fewer false alarms than specified and
-misses attacks: docs/errata/lee2018-chapter-2.md.
+`P - Phi (Phi^T P^-1 Phi)^-1 Phi^T`, of rank N - n. Its standardised square sum g is therefore chi-square with
+N - n degrees of freedom. lee2018 prints N, which gives far fewer false alarms than specified and misses
+attacks: docs/errata/lee2018-chapter-2.md.
 
 References
 ----------

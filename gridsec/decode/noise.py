@@ -244,8 +244,8 @@ def _subset_norms(stack: Stack, kept: Ints) -> tuple[Floats, Floats]:
 def _best_prediction(stack: Stack, q: int, r: int, most: int) -> float:
     """eta'_(p,q,r): max over |Lambda| = p - q of min over its subsets of p - r of max over the rest.
 
-    In terms of omitted blocks: Lambda ignores a set of q, its subset ignores r, and the
-    rest is the difference.
+    In terms of omitted blocks: Lambda ignores a set of q, its subset ignores r, and the rest is the
+    difference.
     """
     p = stack.count
     if r == q:

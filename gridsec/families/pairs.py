@@ -6,14 +6,13 @@ One tick is one linear relation,
 
 where r are the readings (voltages, and net reactive powers where reported) minus the model with unmanipulated
 inverters in the middle of their intervals, a the wrong injections, and d all errors of unmanipulated
-readings: meters, loads, the busbar, the model, the inverters' intervals. A pair drops the
-rows of its meters and takes the injections of its inverters as unknown inputs. Their columns U of C are
-removed by
+readings: meters, loads, the busbar, the model, the inverters' intervals. A pair drops the rows of its meters
+and takes the injections of its inverters as unknown inputs. Their columns U of C are removed by
 
     Q = S^-1 - S^-1 U (U^T S^-1 U)^-1 U^T S^-1,       S = E diag(h^2 / 3) E^T,
 
-since Q U = 0. Every row f of Q, and of C^T Q, is a test that the rest passes if unmanipulated: |f r| <= |f E|
-h.
+since Q U = 0. Every row f of Q, and of C^T Q, is a test that the rest passes if unmanipulated:
+|f r| <= |f E| h.
 
 References
 ----------

@@ -12,8 +12,8 @@ to meter j is
   neither is named for it.
 
 Everything else of x decays without it (section 4.2.1, the detectable part): an observer without any meter,
-common to all and out of reach of an attack. Likewise the loads and the busbar voltage are
-known within intervals. So the code word is
+common to all and out of reach of an attack. Likewise the loads and the busbar voltage are known within
+intervals. So the code word is
 
     s = B xi + v + e,    xi = ((x - x_0) / free, d_p / p_error, d_q / q_error, d_v0 / error),    |xi| <= 1,
 

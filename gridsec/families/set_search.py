@@ -9,15 +9,15 @@ all of its readings agree with its estimate, and search for another one only if 
    `gridsec.detect` for exactly this set. After a switch it starts from the saturation bound and falls as the
    transient of the observer decays.
 3. *Search.* If the test fails, every set D of at most M dropped meters is tried, the smallest first, and
-   among equals the one with the smallest residuals. D passes if all other meters are within
-   `threshold_j(D)`, which uses only their own readings: an inverter with a meter in
-   D, or without one, may be anywhere within saturation. Named meters stay dropped as long as possible.
+   among equals the one with the smallest residuals. D passes if all other meters are within `threshold_j(D)`,
+   which uses only their own readings: an inverter with a meter in D, or without one, may be anywhere within
+   saturation. Named meters stay dropped as long as possible.
 4. *Dwell.* A dropped meter is trusted again once it was within its limit for a time Delta, and for `release`
    consecutive readings.
 
-If at most M meters are manipulated, they are one of the sets that pass. So a meter in *every* passing set
-is manipulated, and only such meters are named. If several smallest sets pass, all of
-them are given as explanations, and no meter outside one of them is named.
+If at most M meters are manipulated, they are one of the sets that pass. So a meter in *every* passing set is
+manipulated, and only such meters are named. If several smallest sets pass, all of them are given as
+explanations, and no meter outside one of them is named.
 
 The papers' sets have partial observers of their own, with estimates that can be compared at once. Here a
 candidate is judged by the injections that its members' readings alone imply, which needs no observer.

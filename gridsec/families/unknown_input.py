@@ -14,8 +14,8 @@ of all uncertainties, so that unmanipulated readings never contradict the true p
 
 A pair is refuted by its `confirm`-th contradiction, until `release` consecutive ticks do not contradict it.
 Active powers are trusted, as in all banks. An inverter with an effect on the readings below their errors
-cannot be judged, and then the answer is not CLEAN. Meters of class 0.5 alone judge only the
-largest inverters; with reported net reactive power of customers, most are judged.
+cannot be judged, and then the answer is not CLEAN. Meters of class 0.5 alone judge only the largest
+inverters; with reported net reactive power of customers, most are judged.
 
 References
 ----------

@@ -139,8 +139,8 @@ def contraction(lure: Lure, *, rate: float) -> Certificate:
     """
     cp = cvxpy_late()
     what = f"certificate of direct injection for all sets of meters at rate {rate:g}/s"
-    # Units as in _Template: every slope bound becomes 1. An inverter of slope bound 0 gets a
-    # small one, which is still a bound.
+    # Units as in _Template: every slope bound becomes 1. An inverter of slope bound 0 gets a small one, which
+    # is still a bound.
     slope = np.maximum(lure.slope, 1e-3 * (float(np.max(lure.slope, initial=0.0)) or 1.0))
     clock, n = float(np.linalg.norm(lure.A, 2)), len(lure.A)
     A, G, H = lure.A * slope / slope[:, None] / clock, lure.G * slope / slope[:, None] / clock, lure.H * slope
@@ -279,10 +279,9 @@ def _solve_chunk(lure: Lure, options: CircleOptions, group: Sequence[Ints]) -> l
 class _Template:
     """The scaled inequality for sets of one size, canonicalised once and solved for several sets.
 
-    Units: time in `1 / |A|`, z and y in `z_unit` (a typical load error), nonlinearity i in
-    `slope_i z_unit` (so that every slope bound becomes 1), states in the effect of the nonlinearities
-    in one unit of time, noise in its root mean square. All entries are then of order one,
-    for any base power of the feeder.
+    Units: time in `1 / |A|`, z and y in `z_unit` (a typical load error), nonlinearity i in `slope_i z_unit`
+    (so that every slope bound becomes 1), states in the effect of the nonlinearities in one unit of time,
+    noise in its root mean square. All entries are then of order one, for any base power of the feeder.
     """
 
     def __init__(

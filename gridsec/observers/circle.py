@@ -2,10 +2,9 @@
 
     x_hat' = A x_hat + G phi(zeta) + B u + L r,   zeta = H x_hat + F u + K r,   r = (y - C x_hat - D u)_J
 
-Readings are held over a step. For any gains, the observer between two readings is itself a
-Lur'e system, with `A - L C` and `H - K C` in the place of A and H. So one exponential
-integrator (and one equilibrium, for steps far above every time constant) serves plant and observers.
-Everything is in z coordinates: `y = vbar^2 - v^2`.
+Readings are held over a step. For any gains, the observer between two readings is itself a Lur'e system, with
+`A - L C` and `H - K C` in the place of A and H. So one exponential integrator (and one equilibrium, for steps
+far above every time constant) serves plant and observers. Everything is in z coordinates: `y = vbar^2 - v^2`.
 
 References
 ----------

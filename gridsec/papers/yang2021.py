@@ -1,9 +1,9 @@
 """yang2021, Examples 1 to 4: existence of the observers, Figures 1 to 12, as printed and corrected.
 
-As printed, neither bank is complete: Assumptions 2 and 3 do not hold, and Theorems 1 and 2 do not cover
-the examples. The figures are reproduced nevertheless, because their attacks spare the
-missing members. The corrections are the smallest that make every member exist: fewest entries of C, then
-least change (docs/errata/yang2021.md).
+As printed, neither bank is complete: Assumptions 2 and 3 do not hold, and Theorems 1 and 2 do not cover the
+examples. The figures are reproduced nevertheless, because their attacks spare the missing members. The
+corrections are the smallest that make every member exist: fewest entries of C, then least change
+(docs/errata/yang2021.md).
 """
 
 from __future__ import annotations

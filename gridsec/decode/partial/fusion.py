@@ -3,9 +3,9 @@
     z = Phi x + v + e,    v ~ N(0, P),  P >= 0
 
 The joint covariance of partial filters is usually singular: at the start all of them have the same initial
-error, and modes that several sensors cannot observe are predicted by all of them with
-exactly the same error. P^-1 then does not exist. Parity space avoids it: with N the
-annihilator of Phi, `N z` has covariance `V = N P N^T`, and
+error, and modes that several sensors cannot observe are predicted by all of them with exactly the same error.
+P^-1 then does not exist. Parity space avoids it: with N the annihilator of Phi, `N z` has covariance
+`V = N P N^T`, and
 
     g = (N z)^T V^+ (N z),     x_hat = Phi^+ (I - P N^T V^+ N) z
 

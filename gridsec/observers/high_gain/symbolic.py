@@ -3,9 +3,9 @@
 The only module that imports sympy, and only when called: sympy is optional.
 
 Lie derivatives are exact. The order n_i is the number of Lie derivatives with independent differentials;
-alpha_i and beta_ij are found by matching a polynomial in z_i against the exact expression,
-and accepted only if the difference vanishes. If no polynomial of the given degree matches,
-`alpha_i` is evaluated at any state with the given z_i, which makes it a function of z_i.
+alpha_i and beta_ij are found by matching a polynomial in z_i against the exact expression, and accepted only
+if the difference vanishes. If no polynomial of the given degree matches, `alpha_i` is evaluated at any state
+with the given z_i, which makes it a function of z_i.
 """
 
 from __future__ import annotations
