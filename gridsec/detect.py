@@ -181,8 +181,8 @@ def widest(model: ErrorModel, x: Floats | None = None) -> ErrorBound:
 def gap(model: ErrorModel, now: Uncertainty, bound: ErrorBound, *, own: bool = False) -> Floats:
     """Error of squared voltages in any observer without manipulated meters and at most 2M meters left out.
 
-    `base_i + sum over undriven inverters 2 X_ik free_k + sum over meters 2 X_ij driven_j + the 2M largest of
-    2 X_ij (free_j - driven_j)`: the worst choice of 2M omitted meters.
+    `base_i + sum over undriven inverters 2 X_ik free_k + sum over meters 2 X_ij driven_j
+    + the 2M largest of 2 X_ij (free_j - driven_j)`: the worst choice of 2M omitted meters.
 
     Parameters
     ----------

@@ -34,8 +34,8 @@ class CircleOptions:
     noise : (p,)
         Scale of each meter's error n_j, squared pu. The attack enters like the noise.
     load : (l, r)
-        Shape of the error of the known input, u - u_hat = load @ delta with |delta_i| about 1.
-        It contains correlations between customers; a diagonal matrix has none.
+        Shape of the error of the known input, u - u_hat = load @ delta with |delta_i| about 1. It contains
+        correlations between customers; a diagonal matrix has none.
     weight : (n, n)
         Q, weight of an error: e^T Q e.
     floor

@@ -279,8 +279,8 @@ def transition(lure: Lure, h: float, policy: StepPolicy = POLICY) -> Transition:
 
     The number of substeps follows the fastest rate. A state of a diagonal A that is faster than `rest` is
     treated as exactly that fast: it ends the step as settled as any other, and a feeder that mixes
-    milliseconds with hours costs no more. Its effect on other states within the step is delayed by up to `h /
-    ln(1 / settled)`, 7 % of the step.
+    milliseconds with hours costs no more. Its effect on other states within the step is delayed by up to
+    `h / ln(1 / settled)`, 7 % of the step.
 
     Parameters
     ----------

@@ -67,8 +67,7 @@ class Fits:
         """Blocks left out by every credible fit; (p,). None if no fit is credible.
 
         If at most q blocks are attacked, an unmanipulated block j belongs to some set of p - q unmanipulated
-        ones.
-        The fit of that set is credible and does not leave j out: a certain block is attacked.
+        ones. The fit of that set is credible and does not leave j out: a certain block is attacked.
         """
         fine = self.credible
         return np.asarray(self.left_out[fine].all(axis=0) & fine.any())

@@ -2,9 +2,8 @@
 
 In floating point a repeated eigenvalue comes back as a cluster. An m-fold one of a Jordan block spreads by
 `eps^(1/m)`, far more than the distance of distinct ones can be, so no threshold on distances separates the
-two.
-The restriction of A to the invariant subspace of a cluster does: minus its mean eigenvalue it is nilpotent
-and singular if the cluster is one eigenvalue, and not if it is several.
+two. The restriction of A to the invariant subspace of a cluster does: minus its mean eigenvalue it is
+nilpotent and singular if the cluster is one eigenvalue, and not if it is several.
 """
 
 from __future__ import annotations

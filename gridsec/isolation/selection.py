@@ -58,9 +58,9 @@ def _dead(design: IsolationDesign, state: UnknownInputState) -> Bools:
 def bounds(design: IsolationDesign, state: UnknownInputState) -> Floats:
     """Bounds of the errors of all large observers, under any attack.
 
-    Some small observer S within J is free of attacks, by Lemmas 1 to 3, so `|e_J,i| <= max_S (|x_hat_J,i -
-    x_hat_S,i| + box_S,i)`, for every J: the company also bounds observers with attacked sensors. The plant's
-    span limits every error.
+    Some small observer S within J is free of attacks, by Lemmas 1 to 3, so
+    `|e_J,i| <= max_S (|x_hat_J,i - x_hat_S,i| + box_S,i)`, for every J: the company also bounds observers
+    with attacked sensors. The plant's span limits every error.
 
     Returns
     -------

@@ -195,8 +195,8 @@ def discrete_prove(
 def discrete_contraction(system: DiscreteLure, *, decays: Sequence[float] | float) -> DirectProof:
     """One proof of direct injection for all sets of meters: the inequality without meters.
 
-    A trusted meter replaces a slope of the loop by zero, which the proof covers. It needs `lower <= 0 <=
-    upper`.
+    A trusted meter replaces a slope of the loop by zero, which the proof covers. It needs
+    `lower <= 0 <= upper`.
 
     Parameters
     ----------

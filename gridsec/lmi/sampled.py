@@ -184,8 +184,8 @@ def held_error(lure: Lure, h: float, away: Floats) -> Floats:
     """Largest motion of z within one step of a droop loop with constant input.
 
     Inverter j obeys `tau_j x_j' = -x_j + K_j(z_j)`, so `|x_j(s) - x_j(0)| <= q_j sup |K_j(z_j) - x_j(0)|`
-    with `q_j = 1 - exp(-h / tau_j)`. With `away_j >= |K_j(z_j(0)) - x_j(0)|`, the motion m solves `m = q
-    (away + d |H| m)`, if the spectral radius of `diag(q d) |H|` is below 1.
+    with `q_j = 1 - exp(-h / tau_j)`. With `away_j >= |K_j(z_j(0)) - x_j(0)|`, the motion m solves
+    `m = q (away + d |H| m)`, if the spectral radius of `diag(q d) |H|` is below 1.
 
     Parameters
     ----------
@@ -217,8 +217,8 @@ def held_error(lure: Lure, h: float, away: Floats) -> Floats:
 def drift_error(lure: Lure, h: float, jump: Floats) -> Floats:
     """Largest motion of z for a loop that was at rest once, with small input jumps between steps.
 
-    With `|F (u(k+1) - u(k))| <= jump` the motion m of the inverters within any step obeys `m <= d ((1 + 2 q)
-    |H| m + jump)`, if the spectral radius of `(1 + 2 q) diag(d) |H|` is below 1.
+    With `|F (u(k+1) - u(k))| <= jump` the motion m of the inverters within any step obeys
+    `m <= d ((1 + 2 q) |H| m + jump)`, if the spectral radius of `(1 + 2 q) diag(d) |H|` is below 1.
 
     Parameters
     ----------

@@ -145,8 +145,8 @@ def at_rest(net: Network, droop: Droop, loads: Box) -> Band:
     """Limits while the fleet is at rest: loads in the box that move slowly against the time constants.
 
     The AC equilibria of the two corners, widened by the largest effect of closed-loop sensitivities of the
-    wrong sign. Two equilibria differ by `dv = Jw dw - Jq Delta dv`; with `|dv| <= U |dw|`, `U = (I - |Jq|
-    D)^-1 |Jw|`, the lower end of every sensitivity is `L = Jw - |Jq| D U`.
+    wrong sign. Two equilibria differ by `dv = Jw dw - Jq Delta dv`; with `|dv| <= U |dw|`,
+    `U = (I - |Jq| D)^-1 |Jw|`, the lower end of every sensitivity is `L = Jw - |Jq| D U`.
 
     Parameters
     ----------

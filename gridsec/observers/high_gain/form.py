@@ -4,9 +4,9 @@
     z_i' = A z_i + e alpha_i(z_i) + beta_i(z_i) u,    beta_ij depends on z_i1, …, z_ij only
     y_i = z_i1 + a_i + v_i
 
-All functions are written over *components*: they take a sequence of n entries and use NumPy's
-operations on them, so that the same function serves numbers, arrays and intervals.
-`linear` computes the decomposition of a linear system, `symbolic.decompose` that of a system in sympy.
+All functions are written over *components*: they take a sequence of n entries and use NumPy's operations on
+them, so that the same function serves numbers, arrays and intervals. `linear` computes the decomposition of a
+linear system, `symbolic.decompose` that of a system in sympy.
 """
 
 from __future__ import annotations
@@ -370,8 +370,8 @@ def _along(phi: Vector, points: Floats, direction: Floats, step: float) -> Float
 def linear(A: Floats, B: Floats, C: Floats, x_bound: Floats, *, tolerance: float = 1e-9) -> System:
     """Decomposition of `x' = A x + B u, y = C x`: for linear systems Assumption 2 always holds.
 
-    Phi_i is the observability matrix of (A, c_i) up to its rank n_i, and alpha_i are the coefficients of `c_i
-    A^{n_i}` in its rows.
+    Phi_i is the observability matrix of (A, c_i) up to its rank n_i, and alpha_i are the coefficients of
+    `c_i A^{n_i}` in its rows.
 
     Parameters
     ----------
