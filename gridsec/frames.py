@@ -113,8 +113,8 @@ def known(frame: Frame) -> Frame:
 def usual(frame: Frame) -> Frame:
     """The frame for estimators that derive deviations from intervals: widths by the usual deviations.
 
-    Customers with reported reactive but without active power keep the whole interval: readings are compared
-    with everything that is possible.
+    A reactive power reported without the active one keeps its whole interval: readings are compared with
+    everything that is possible.
     """
     if frame.p_std is None or frame.q_std is None:
         return frame

@@ -224,7 +224,7 @@ class Verdict:
     kinds : (p,)
         Class of each suspect's manipulation, None where unknown; () from estimators that do not classify.
     explanations
-        Explanations that fit the data about equally well, in descending probability; empty for a single one.
+        Explanations that fit the data about equally well, likeliest first; () from estimators without any.
     unjudged : (m,)
         Inverters that the data do not determine although inverters are judged; (0,) for none.
     busbar : (b,)

@@ -153,8 +153,8 @@ def unknown_input_matrix(system: ErrorSystem, gains: UnknownInputGains) -> Float
 def unknown_input_margin(system: ErrorSystem, gains: UnknownInputGains) -> float:
     """Margin of the design inequality; proven if positive.
 
-    Smallest eigenvalue of the negated matrix with every row and column divided by the size of its diagonal
-    terms, so that units have no effect. Negative infinity if P is not positive definite or a multiplier is
+    Smallest eigenvalue of the negated matrix, with rows and columns scaled by its subtracted diagonal terms
+    (rate^2 P, Lambda, mu), so that units have no effect. Negative infinity if P is not positive definite or a multiplier is
     negative. Bounds of half-width zero do not count: their psi is zero.
 
     Parameters

@@ -6,10 +6,9 @@ the same readings; halving the differences,
 
     a_k / 2 = b_k c + e_k (-1 .. 1),    |b_j c| <= e_j  for all meters j outside J.
 
-So the largest consistent attack on meter k is ``2 max (b_k c + e_k)`` over c and over J with k in J, |J| <=
-M:
-a mixed-integer program with tight big-M constants, ``sum |b_j| - e_j``. The resulting error of a customer's
-voltage is the same program with ``2 max b_i c``.
+So the largest consistent attack on meter k is ``2 max (b_k c + e_k)`` over c and over J with k in J and
+|J| <= M: a mixed-integer program with tight big-M constants, ``sum |b_j| - e_j``. The resulting error of a
+customer's voltage is the same program with ``2 max b_i c``.
 
 References
 ----------

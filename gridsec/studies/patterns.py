@@ -5,8 +5,8 @@ react. About a trajectory with slopes d of the droop curves,
 
     x' = A x + G diag(d) (H x - W_inverters c),   c' = 0,   y = C x - W_meters c
 
-is a pair. Its eigenvalue 0 belongs to lasting patterns, a *persistent pattern*; its other eigenvalues belong
-to decaying transients of the inverters. Attacks are hidden while they equal such a pattern.
+is a pair. Its eigenvalue 0 belongs to *persistent patterns*, its other eigenvalues to decaying transients of
+the inverters. Attacks are hidden while they equal such a pattern.
 
 References
 ----------
