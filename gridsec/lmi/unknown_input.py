@@ -154,8 +154,8 @@ def unknown_input_margin(system: ErrorSystem, gains: UnknownInputGains) -> float
     """Margin of the design inequality; proven if positive.
 
     Smallest eigenvalue of the negated matrix, with rows and columns scaled by its subtracted diagonal terms
-    (rate^2 P, Lambda, mu), so that units have no effect. Negative infinity if P is not positive definite or a multiplier is
-    negative. Bounds of half-width zero do not count: their psi is zero.
+    (rate^2 P, Lambda, mu), so that units have no effect. Negative infinity if P is not positive definite or a
+    multiplier is negative. Bounds of half-width zero do not count: their psi is zero.
 
     Parameters
     ----------
